@@ -1,0 +1,100 @@
+"""Errors that a caller can act on.
+
+::
+
+    OrthoError
+        InputError            the user can correct it (exit code 2)
+            TooFewPoints      fewer points than the model needs
+            DegeneratePoints  enough points, but in a geometry that does not determine the model
+            CrsError          a coordinate system or a transformation between two is missing or wrong
+            DatumError        a height datum is missing, contradicts itself, or its grid is not installed
+            CoverageError     the DEM does not cover the scene
+        ModelError            the mathematics failed
+            NotConverged      an iteration did not come to an end
+        PluginError           a plugin broke the contract
+
+A bad point is NaN; a bad request is one of these.
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+
+
+class OrthoError(Exception):
+    """Base of all errors of this package.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong, in one sentence.
+    file : path, optional
+        The file that it was found in.
+    field : str, optional
+        The field, key, column or option.
+    remedy : str, optional
+        What the user can do about it.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        file: str | PathLike[str] | None = None,
+        field: str | None = None,
+        remedy: str | None = None,
+    ) -> None:
+        self.message = message
+        self.file = None if file is None else str(file)
+        self.field = field
+        self.remedy = remedy
+        super().__init__(message)
+
+    def __str__(self) -> str:
+        where = ": ".join(part for part in (self.file, self.field) if part)
+        text = f"{where}: {self.message}" if where else self.message
+        return f"{text}\n  Remedy: {self.remedy}" if self.remedy else text
+
+    def __reduce__(self):
+        # Keyword-only arguments do not survive the default pickling, and errors cross process borders in batch runs.
+        return _rebuild, (type(self), self.message, self.file, self.field, self.remedy)
+
+
+def _rebuild(kind, message, file, field, remedy):
+    return kind(message, file=file, field=field, remedy=remedy)
+
+
+class InputError(OrthoError):
+    """Something that the user gave is wrong; the message says what to do."""
+
+
+class TooFewPoints(InputError):
+    """There are fewer points than the model has to have."""
+
+
+class DegeneratePoints(InputError):
+    """The points do not determine the model (collinear, coplanar, clustered)."""
+
+
+class CrsError(InputError):
+    """A coordinate reference system, or the way between two, is missing or wrong."""
+
+
+class DatumError(InputError):
+    """A height datum is unknown, contradictory, or its geoid grid is not installed."""
+
+
+class CoverageError(InputError):
+    """The DEM does not cover the scene."""
+
+
+class ModelError(OrthoError):
+    """The mathematics failed on input that looked right."""
+
+
+class NotConverged(ModelError):
+    """An iteration did not converge."""
+
+
+class PluginError(OrthoError):
+    """A plugin broke the contract of hookspecs.py."""

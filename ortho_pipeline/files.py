@@ -1,0 +1,73 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from ortho_pipeline.errors import InputError
+
+
+@contextlib.contextmanager
+def whole_or_nothing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a temporary path beside `path` and move it there when the block ends well.
+
+    The temporary file has the same suffix (drivers go by it) and lies in the same folder (a rename is atomic only
+    within a file system). On an exception it is removed and a file that was at `path` before is untouched.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written.
+    """
+    final = Path(path)
+    # A rename onto a symbolic link would replace the link, not what it points to.
+    final = final.resolve() if final.is_symlink() else final
+    try:
+        final.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{final.stem}.", suffix=f".part{final.suffix}", dir=final.parent)
+    except OSError as error:
+        raise InputError(
+            f"cannot write here ({error.strerror})", file=final.parent, remedy="choose a folder that you may write to"
+        ) from error
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        # mkstemp makes files private; outputs get what the umask of the user says.
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        with open(temporary, "rb+") as written:
+            os.fsync(written.fileno())
+        os.replace(temporary, final)
+        _sync_folder(final.parent)
+    finally:
+        for left in temporary.parent.glob(f"{temporary.name}*"):
+            left.unlink(missing_ok=True)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write `text` as UTF-8 to `path`, whole or not at all."""
+    with whole_or_nothing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def sha256(path: str | os.PathLike[str]) -> str:
+    """Return the SHA-256 of a file as hexadecimal text."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _sync_folder(folder: Path) -> None:
+    # Without this a power cut after the rename can lose the new name.
+    if os.name == "posix":
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,398 @@
+"""Compiled kernels of the warp.
+
+One call of `warp_block` makes one block of output pixels in a single pass: image coordinates out of the block's
+lattice, terrain heights out of the DEM, pixel values out of the source. Nothing is stored per pixel but the values.
+
+The lattice gives, at nodes every `spacing` output pixels, DEM coordinates (u, v) and image coordinates as a polynomial
+in the normalised height t = (h - h_mid) / h_half. Between nodes everything is bilinear.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+NEAREST, BILINEAR, CUBIC, LANCZOS, AVERAGE = range(5)
+# Unsigned indices spare the compiled code a test for Python's negative ones in every access.
+_ONE, _TWO = np.uint64(1), np.uint64(2)
+
+_jit = numba.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+_inline = numba.njit(nogil=True, cache=True, inline="always", boundscheck=False, error_model="numpy")
+
+
+@_jit
+def block_coordinates(
+    row: int,
+    left: int,
+    right: int,
+    spacing: int,
+    nodes: Any,
+    dem_nodes: Any,
+    heights: Any,
+    dem_left: int,
+    dem_top: int,
+    cubic_dem: bool,
+    middle: float,
+    half: float,
+    columns: Any,
+    rows: Any,
+) -> None:
+    """Fill `columns` and `rows` with the image coordinates of output pixels left…right of one row of a block.
+
+    `row`, `left`, `right` count from the block's first pixel; NaN where there is no height or no projection.
+    """
+    levels = nodes.shape[2]
+    inverse = 1.0 / spacing
+    cell_row = row // spacing
+    ty = (row - cell_row * spacing) * inverse
+    dem_rows, dem_columns = heights.shape
+    start, slope = np.empty(2 * levels), np.empty(2 * levels)
+    for cell in range(left // spacing, (right - 1) // spacing + 1):
+        for k in range(levels):
+            for axis in range(2):
+                upper = nodes[cell_row, cell, k, axis]
+                begin = upper + (nodes[cell_row + 1, cell, k, axis] - upper) * ty
+                upper = nodes[cell_row, cell + 1, k, axis]
+                end = upper + (nodes[cell_row + 1, cell + 1, k, axis] - upper) * ty
+                start[2 * k + axis], slope[2 * k + axis] = begin, end - begin
+        u0 = dem_nodes[cell_row, cell, 0] + (dem_nodes[cell_row + 1, cell, 0] - dem_nodes[cell_row, cell, 0]) * ty
+        v0 = dem_nodes[cell_row, cell, 1] + (dem_nodes[cell_row + 1, cell, 1] - dem_nodes[cell_row, cell, 1]) * ty
+        u1 = dem_nodes[cell_row, cell + 1, 0]
+        v1 = dem_nodes[cell_row, cell + 1, 1]
+        u1 += (dem_nodes[cell_row + 1, cell + 1, 0] - u1) * ty
+        v1 += (dem_nodes[cell_row + 1, cell + 1, 1] - v1) * ty
+        u0, v0, u1, v1 = u0 - dem_left, v0 - dem_top, u1 - dem_left, v1 - dem_top
+        du, dv = u1 - u0, v1 - v0
+        # Coordinates are linear along a row of a cell, so its two ends tell whether all of it lies within the DEM.
+        within = (
+            min(u0, u1) >= 0.0 and max(u0, u1) < dem_columns - 1 and min(v0, v1) >= 0.0 and max(v0, v1) < dem_rows - 1
+        )
+        first, last = max(left, cell * spacing), min(right, (cell + 1) * spacing)
+        # First the heights, kept in `columns`; then both coordinates: two simple loops are faster than one long one.
+        if within and not cubic_dem:
+            for column in range(first, last):
+                tx = (column - cell * spacing) * inverse
+                u, v = u0 + du * tx, v0 + dv * tx
+                i, j = np.uint64(u), np.uint64(v)
+                fu, fv = u - i, v - j
+                upper = heights[j, i] + (heights[j, i + _ONE] - heights[j, i]) * fu
+                lower = heights[j + _ONE, i] + (heights[j + _ONE, i + _ONE] - heights[j + _ONE, i]) * fu
+                height = upper + (lower - upper) * fv
+                if height != height:
+                    height = _dem_height(heights, int(i), int(j), fu, fv, False)
+                columns[column - left] = height
+        else:
+            for column in range(first, last):
+                tx = (column - cell * spacing) * inverse
+                columns[column - left] = _dem_height_at(heights, u0 + du * tx, v0 + dv * tx, cubic_dem)
+        if levels == 3:
+            c0, c1, c2, r0, r1, r2 = start[0], start[2], start[4], start[1], start[3], start[5]
+            dc0, dc1, dc2, dr0, dr1, dr2 = slope[0], slope[2], slope[4], slope[1], slope[3], slope[5]
+            for column in range(first, last):
+                tx = (column - cell * spacing) * inverse
+                t = (columns[column - left] - middle) / half
+                columns[column - left] = ((c2 + dc2 * tx) * t + (c1 + dc1 * tx)) * t + (c0 + dc0 * tx)
+                rows[column - left] = ((r2 + dr2 * tx) * t + (r1 + dr1 * tx)) * t + (r0 + dr0 * tx)
+        else:
+            for column in range(first, last):
+                tx = (column - cell * spacing) * inverse
+                t = (columns[column - left] - middle) / half
+                col = line = 0.0
+                for k in range(levels - 1, -1, -1):
+                    col = col * t + (start[2 * k] + slope[2 * k] * tx)
+                    line = line * t + (start[2 * k + 1] + slope[2 * k + 1] * tx)
+                columns[column - left] = col
+                rows[column - left] = line
+
+
+@_inline
+def _dem_height_at(heights, u, v, cubic_dem):
+    """Interpolate the DEM at sample coordinates (u, v) of its window; NaN outside of it."""
+    rows, columns = heights.shape
+    if not (0.0 <= u <= columns - 1 and 0.0 <= v <= rows - 1):
+        return np.nan
+    # The last sample itself is still covered.
+    i, j = min(int(u), columns - 2), min(int(v), rows - 2)
+    return _dem_height(heights, i, j, u - i, v - j, cubic_dem)
+
+
+@_inline
+def _dem_height(heights, i, j, fu, fv, cubic_dem):
+    """Interpolate the DEM at (i + fu, j + fv); NaN where a sample with weight is void."""
+    # A sample of weight zero must not spoil the result: 0 * NaN is NaN.
+    upper = heights[j, i] if fu == 0.0 else heights[j, i] + (heights[j, i + 1] - heights[j, i]) * fu
+    if fv == 0.0:
+        bilinear = upper
+    else:
+        lower = heights[j + 1, i] if fu == 0.0 else heights[j + 1, i] + (heights[j + 1, i + 1] - heights[j + 1, i]) * fu
+        bilinear = upper + (lower - upper) * fv
+    if not cubic_dem:
+        return bilinear
+    if not (i >= 1 and j >= 1 and i + 2 < heights.shape[1] and j + 2 < heights.shape[0]):
+        return bilinear
+    a0, a1, a2, a3 = cubic_weights(fu)
+    b0, b1, b2, b3 = cubic_weights(fv)
+    total = 0.0
+    for k in range(4):
+        b = b0 if k == 0 else b1 if k == 1 else b2 if k == 2 else b3
+        line = j - 1 + k
+        total += b * (
+            a0 * heights[line, i - 1] + a1 * heights[line, i] + a2 * heights[line, i + 1] + a3 * heights[line, i + 2]
+        )
+    return total if total == total else bilinear
+
+
+@_inline
+def cubic_weights(f):
+    """Weights of Keys' cubic convolution (a = -0.5) of samples -1, 0, 1, 2 for a point at f between 0 and 1."""
+    f2 = f * f
+    f3 = f2 * f
+    return (
+        0.5 * (-f3 + 2.0 * f2 - f),
+        0.5 * (3.0 * f3 - 5.0 * f2 + 2.0),
+        0.5 * (-3.0 * f3 + 4.0 * f2 + f),
+        0.5 * (f3 - f2),
+    )
+
+
+@_inline
+def _bilinear(source, x, y, left, top, full_width, full_height):
+    """Value at (x, y), which count from the centre of the source's first pixel; beyond the edge, the edge."""
+    i, j = int(np.floor(x)), int(np.floor(y))
+    fx, fy = x - i, y - j
+    i0, i1 = max(i, 0), min(i + 1, full_width - 1)
+    j0, j1 = max(j, 0), min(j + 1, full_height - 1)
+    i0, i1, j0, j1 = i0 - left, i1 - left, j0 - top, j1 - top
+    upper = source[j0, i0] * (1.0 - fx) + source[j0, i1] * fx
+    lower = source[j1, i0] * (1.0 - fx) + source[j1, i1] * fx
+    return upper * (1.0 - fy) + lower * fy
+
+
+@_inline
+def _bilinear_valid(source, valid, x, y, left, top, full_width, full_height):
+    """As `_bilinear`, of the valid pixels only, with weights that sum to one; NaN if none is."""
+    i, j = int(np.floor(x)), int(np.floor(y))
+    fx, fy = x - i, y - j
+    total, weights = 0.0, 0.0
+    for b in range(2):
+        for a in range(2):
+            ia, jb = i + a, j + b
+            if 0 <= ia < full_width and 0 <= jb < full_height and valid[jb - top, ia - left]:
+                weight = (fx if a else 1.0 - fx) * (fy if b else 1.0 - fy)
+                total += weight * source[jb - top, ia - left]
+                weights += weight
+    return total / weights if weights > 1e-5 else np.nan
+
+
+@_inline
+def _cubic(source, x, y, left, top):
+    """Value at (x, y) by cubic convolution; the 4 x 4 neighbours have to be there."""
+    i, j = int(np.floor(x)), int(np.floor(y))
+    a0, a1, a2, a3 = cubic_weights(x - i)
+    b0, b1, b2, b3 = cubic_weights(y - j)
+    i, j = i - left, j - top
+    line0 = a0 * source[j - 1, i - 1] + a1 * source[j - 1, i] + a2 * source[j - 1, i + 1] + a3 * source[j - 1, i + 2]
+    line1 = a0 * source[j, i - 1] + a1 * source[j, i] + a2 * source[j, i + 1] + a3 * source[j, i + 2]
+    line2 = a0 * source[j + 1, i - 1] + a1 * source[j + 1, i] + a2 * source[j + 1, i + 1] + a3 * source[j + 1, i + 2]
+    line3 = a0 * source[j + 2, i - 1] + a1 * source[j + 2, i] + a2 * source[j + 2, i + 1] + a3 * source[j + 2, i + 2]
+    return b0 * line0 + b1 * line1 + b2 * line2 + b3 * line3
+
+
+@_inline
+def _all_valid(valid, i, j):
+    for b in range(4):
+        for a in range(4):
+            if not valid[j + b, i + a]:
+                return False
+    return True
+
+
+@_jit
+def warp_block(
+    kernel: int,
+    source: Any,
+    valid: Any,
+    masked: bool,
+    left: int,
+    top: int,
+    full_width: int,
+    full_height: int,
+    spacing: int,
+    nodes: Any,
+    dem_nodes: Any,
+    heights: Any,
+    dem_left: int,
+    dem_top: int,
+    cubic_dem: bool,
+    middle: float,
+    half: float,
+    low: float,
+    high: float,
+    integer: bool,
+    fill: Any,
+    block: Any,
+    out: Any,
+    out_valid: Any,
+    reach: int,
+) -> int:
+    """Make output pixels of one block.
+
+    Parameters
+    ----------
+    source : (bands, h, w)
+        Window of the source whose first pixel is (left, top); `valid` of the same shape counts if `masked`.
+    nodes : (ny, nx, levels, 2), dem_nodes : (ny, nx, 2), heights : (rows, columns)
+        The lattice and the window of the DEM whose first sample is (dem_left, dem_top).
+    low, high, integer, fill
+        Range of the output type, whether it is an integer type, and the value of invalid pixels.
+    block : (4,) first row, last row + 1, first column, last column + 1 within the block
+    out : (bands, rows, columns), out_valid : (rows, columns)
+        Where the pixels go.
+    reach : int
+        How many pixels around a point the kernel reads.
+
+    Returns
+    -------
+    int
+        Number of pixels whose neighbours lie in the source but not in the window; the caller reads a larger one.
+    """
+    first_row, last_row, first, last = block[0], block[1], block[2], block[3]
+    columns, rows = np.empty(last - first), np.empty(last - first)
+    bands, window_height, window_width = source.shape
+    # Points within these bounds have all neighbours both in the source and in the window.
+    low_col = left + reach if left > 0 else reach
+    low_row = top + reach if top > 0 else reach
+    high_col, high_row = left + window_width - reach - 1, top + window_height - reach - 1
+    short = 0
+    for row in range(first_row, last_row):
+        block_coordinates(
+            row, first, last, spacing, nodes, dem_nodes, heights, dem_left, dem_top, cubic_dem, middle, half, columns, rows
+        )
+        inside = not masked
+        for k in range(last - first):
+            inside &= (columns[k] >= low_col) & (columns[k] < high_col) & (rows[k] >= low_row) & (rows[k] < high_row)
+        line = row - first_row
+        if inside:
+            for band in range(bands):
+                if kernel == NEAREST:
+                    _row_nearest(source[band], columns, rows, left, top, out[band, line])
+                elif kernel == BILINEAR:
+                    _row_bilinear(source[band], columns, rows, left, top, integer, out[band, line])
+                else:
+                    _row_cubic(source[band], columns, rows, left, top, low, high, integer, out[band, line])
+            out_valid[line] = True
+        else:
+            short += _row_with_edges(
+                kernel, source, valid, masked, columns, rows, left, top, full_width, full_height, low, high, integer, fill,
+                out[:, line], out_valid[line], reach
+            )  # fmt: skip
+    return short
+
+
+@_inline
+def _row_nearest(source, columns, rows, left, top, out):
+    for k in range(columns.size):
+        out[k] = source[np.uint64(rows[k] - top), np.uint64(columns[k] - left)]
+
+
+@_inline
+def _row_bilinear(source, columns, rows, left, top, integer, out):
+    x0, y0 = left + 0.5, top + 0.5
+    rounding = 0.5 if integer else 0.0
+    for k in range(columns.size):
+        x, y = columns[k] - x0, rows[k] - y0
+        i, j = np.uint64(x), np.uint64(y)
+        fx, fy = x - i, y - j
+        upper = source[j, i] * (1.0 - fx) + source[j, i + _ONE] * fx
+        lower = source[j + _ONE, i] * (1.0 - fx) + source[j + _ONE, i + _ONE] * fx
+        value = upper * (1.0 - fy) + lower * fy + rounding
+        out[k] = np.floor(value) if integer else value
+
+
+@_inline
+def _row_cubic(source, columns, rows, left, top, low, high, integer, out):
+    x0, y0 = left + 0.5, top + 0.5
+    for k in range(columns.size):
+        x, y = columns[k] - x0, rows[k] - y0
+        i, j = np.uint64(x), np.uint64(y)
+        a0, a1, a2, a3 = cubic_weights(x - i)
+        b0, b1, b2, b3 = cubic_weights(y - j)
+        value = (
+            b0 * _cubic_line(source[j - _ONE], i, a0, a1, a2, a3)
+            + b1 * _cubic_line(source[j], i, a0, a1, a2, a3)
+            + b2 * _cubic_line(source[j + _ONE], i, a0, a1, a2, a3)
+            + b3 * _cubic_line(source[j + _TWO], i, a0, a1, a2, a3)
+        )
+        out[k] = min(max(np.floor(value + 0.5), low), high) if integer else value
+
+
+@_inline
+def _cubic_line(line, i, a0, a1, a2, a3):
+    return a0 * line[i - _ONE] + a1 * line[i] + a2 * line[i + _ONE] + a3 * line[i + _TWO]
+
+
+@_jit
+def _row_with_edges(
+    kernel: int,
+    source: Any,
+    valid: Any,
+    masked: bool,
+    columns: Any,
+    rows: Any,
+    left: int,
+    top: int,
+    full_width: int,
+    full_height: int,
+    low: float,
+    high: float,
+    integer: bool,
+    fill: Any,
+    out: Any,
+    out_valid: Any,
+    reach: int,
+) -> int:
+    """Make one row ``(bands, columns)`` that touches the edge of the source, or invalid pixels; see `warp_block`."""
+    bands, window_height, window_width = source.shape
+    short = 0
+    for k in range(columns.size):
+        col, line = columns[k], rows[k]
+        found = False
+        if not (0.0 <= col <= full_width and 0.0 <= line <= full_height):
+            for band in range(bands):
+                out[band, k] = fill
+            out_valid[k] = False
+            continue
+        here_col, here_row = min(int(col), full_width - 1), min(int(line), full_height - 1)
+        if (
+            max(here_col - reach, 0) < left
+            or max(here_row - reach, 0) < top
+            or min(here_col + reach, full_width - 1) >= left + window_width
+            or min(here_row + reach, full_height - 1) >= top + window_height
+        ):
+            short += 1
+            continue
+        for band in range(bands):
+            if masked and not valid[band, here_row - top, here_col - left]:
+                out[band, k] = fill
+                continue
+            found = True
+            if kernel == NEAREST:
+                out[band, k] = source[band, here_row - top, here_col - left]
+                continue
+            x, y = col - 0.5, line - 0.5
+            value = 0.0
+            i, j = int(np.floor(x)), int(np.floor(y))
+            inner = kernel == CUBIC and i >= 1 and j >= 1 and i + 2 < full_width and j + 2 < full_height
+            if inner and masked:
+                inner = _all_valid(valid[band], i - 1 - left, j - 1 - top)
+            if inner:
+                value = _cubic(source[band], x, y, left, top)
+            elif masked:
+                value = _bilinear_valid(source[band], valid[band], x, y, left, top, full_width, full_height)
+            else:
+                value = _bilinear(source[band], x, y, left, top, full_width, full_height)
+            out[band, k] = min(max(np.floor(value + 0.5), low), high) if integer else value
+        out_valid[k] = found
+    return short

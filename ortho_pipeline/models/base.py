@@ -1,0 +1,206 @@
+"""SensorModel: what maps ground to image. A new geometry writes one method and inherits the rest."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ortho_pipeline.errors import InputError
+
+Array = NDArray[np.float64]
+
+#: Newton's method ends when the image point is met this closely (pixels) ...
+INVERSE_TOLERANCE = 1e-9
+#: ... and a point is only returned if its re-projection closes within this (pixels).
+INVERSE_VERIFIED = 1e-5
+_INVERSE_STEPS = 25
+
+
+@dataclass(frozen=True, eq=False)
+class SensorModel(ABC):
+    """Map from ground to image, steered by a named parameter vector.
+
+    Subclasses are frozen dataclasses and implement `ground_to_image`. A closed form may override any of the other
+    methods; `ortho_pipeline.testing.check_sensor_model` then compares it with the numeric default.
+
+    Ground points are ``(N, 3)`` x, y, ellipsoidal height in `crs`; image points ``(N, 2)`` column, row in pixels with
+    the outer corner of the first pixel at (0, 0). A point that cannot be mapped is a row of NaN.
+    """
+
+    kind: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def crs(self) -> str:
+        """CRS of the ground coordinates, as text that `crs.parse_crs` reads."""
+
+    @abstractmethod
+    def ground_to_image(self, ground: ArrayLike) -> Array:
+        """Project ground points ``(N, 3)`` into the image ``(N, 2)``; NaN where there is no projection."""
+
+    @property
+    @abstractmethod
+    def domain(self) -> tuple[Array, Array]:
+        """Centre and half-size ``(3,)`` of the box of ground in which the model is meant to be used."""
+
+    @property
+    def height_range(self) -> tuple[float, float]:
+        """Lowest and highest ellipsoidal height (m) for which the model is meant."""
+        centre, half = self.domain
+        return float(centre[2] - half[2]), float(centre[2] + half[2])
+
+    @property
+    def reference_height(self) -> float:
+        """Ellipsoidal height (m) in the middle of `height_range`."""
+        return float(self.domain[0][2])
+
+    # -- parameters --------------------------------------------------------------------------------------------------
+
+    @property
+    def param_names(self) -> tuple[str, ...]:
+        """Names of the adjustable parameters, in the order of `params`."""
+        return ()
+
+    @property
+    def params(self) -> Array:
+        """Adjustable parameters ``(P,)``."""
+        return np.zeros(0)
+
+    def with_params(self, params: ArrayLike) -> Self:
+        """Return this model with other parameters ``(P,)``."""
+        if np.size(params):
+            raise InputError(f"the model {self.kind!r} has no adjustable parameters")
+        return self
+
+    # -- derived maps ------------------------------------------------------------------------------------------------
+
+    def ground_partials(self, ground: ArrayLike) -> Array:
+        """Return d(image)/d(ground) as ``(N, 2, 3)``, by central differences over a 1e-4 part of the domain."""
+        ground = as_ground(ground)
+        _, half = self.domain
+        partials = np.empty((len(ground), 2, 3))
+        for axis, step in enumerate(1e-4 * half):
+            nudge = np.zeros(3)
+            nudge[axis] = step
+            partials[:, :, axis] = (self.ground_to_image(ground + nudge) - self.ground_to_image(ground - nudge)) / (
+                2 * step
+            )
+        return partials
+
+    def param_partials(self, ground: ArrayLike) -> Array:
+        """Return d(image)/d(params) as ``(N, 2, P)``, by central differences."""
+        ground = as_ground(ground)
+        params = self.params
+        partials = np.empty((len(ground), 2, len(params)))
+        for k, value in enumerate(params):
+            step = 1e-6 * max(abs(value), 1e-3)
+            ahead, behind = params.copy(), params.copy()
+            ahead[k] += step
+            behind[k] -= step
+            partials[:, :, k] = (
+                self.with_params(ahead).ground_to_image(ground) - self.with_params(behind).ground_to_image(ground)
+            ) / (ahead[k] - behind[k])
+        return partials
+
+    def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
+        """Intersect the rays of image points ``(N, 2)`` with ellipsoidal heights ``(N,)`` or one height.
+
+        Newton's method with `ground_partials`, started in the middle of the domain. The result is projected again and
+        is NaN unless it closes within 1e-5 px and lies within 1.5 half-sizes of the domain, because a ratio of
+        polynomials has false roots outside of it.
+
+        Returns
+        -------
+        ndarray (N, 3)
+            Ground points in `crs`.
+        """
+        image = as_image(image)
+        centre, half = self.domain
+        ground = np.empty((len(image), 3))
+        ground[:, :2] = centre[:2]
+        ground[:, 2] = height
+        left = np.flatnonzero(np.isfinite(image).all(axis=1) & np.isfinite(ground[:, 2]))
+        for _ in range(_INVERSE_STEPS):
+            if not len(left):
+                break
+            miss = image[left] - self.ground_to_image(ground[left])
+            step = solve_2x2(self.ground_partials(ground[left])[:, :, :2], miss)
+            # A step beyond the domain comes from a bad linearisation far from the solution: go half-way there.
+            longest = np.abs(step / half[:2]).max(axis=1, initial=0.0)
+            step /= np.maximum(longest, 1.0)[:, None]
+            ground[left, :2] += step
+            with np.errstate(invalid="ignore"):
+                left = left[(np.abs(miss).max(axis=1) > INVERSE_TOLERANCE) & (longest > 1e-15)]
+        with np.errstate(invalid="ignore"):
+            closed = np.abs(self.ground_to_image(ground) - image).max(axis=1, initial=0.0) <= INVERSE_VERIFIED
+            inside = (np.abs(ground[:, :2] - centre[:2]) <= 1.5 * half[:2]).all(axis=1)
+        ground[~(closed & inside)] = np.nan
+        return ground
+
+    # -- files -------------------------------------------------------------------------------------------------------
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the model as plain data that JSON holds without loss; `models.model_from_dict` reads it."""
+        data: dict[str, Any] = {"kind": self.kind}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            data[field.name] = _plain(value)
+        return data
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Make the model from what `to_dict` returned."""
+        names = {field.name for field in fields(cls)}
+        given = {key: value for key, value in data.items() if key != "kind"}
+        if set(given) != names:
+            wrong = sorted(set(given) ^ names)
+            raise InputError(f"a model of kind {cls.kind!r} has the fields {sorted(names)}", field=", ".join(wrong))
+        return cls(**given)
+
+    def _replace(self, **changes: Any) -> Self:
+        return replace(self, **changes)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, SensorModel):
+        return value.to_dict()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return value
+
+
+def as_ground(ground: ArrayLike) -> Array:
+    """Return ground points as ``(N, 3)`` float64."""
+    return _as_points(ground, 3, "ground")
+
+
+def as_image(image: ArrayLike) -> Array:
+    """Return image points as ``(N, 2)`` float64."""
+    return _as_points(image, 2, "image")
+
+
+def _as_points(points: ArrayLike, columns: int, what: str) -> Array:
+    array = np.asarray(points, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != columns:
+        raise InputError(f"{what} points have the shape (N, {columns}), not {array.shape}")
+    return array
+
+
+def solve_2x2(matrices: Array, right: Array) -> Array:
+    """Solve ``(N, 2, 2)`` systems for ``(N, 2)`` right sides; NaN where singular."""
+    a, b, c, d = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1.0 / (a * d - b * c)
+        solved = np.stack(
+            [(d * right[:, 0] - b * right[:, 1]) * scale, (a * right[:, 1] - c * right[:, 0]) * scale], axis=1
+        )
+    solved[~np.isfinite(solved).all(axis=1)] = np.nan
+    return solved

@@ -1,0 +1,144 @@
+r"""Bias correction in image space over any sensor model.
+
+The image point of the model, :math:`(c, r)`, is moved to
+
+.. math::
+    c' &= c + a_0 + a_1 (c - c_0) + a_2 (r - r_0) \\
+    r' &= r + b_0 + b_1 (c - c_0) + b_2 (r - r_0)
+
+``shift`` has :math:`a_0, b_0`; ``shift-drift`` adds :math:`a_2, b_2` (the row is time for a line scanner); ``affine``
+has all six. Being increments to the identity, all parameters are zero where nothing has to be corrected, which is what
+a significance test asks. The origin (the middle of the image) makes the shift the correction there.
+
+Source: formula 2 of Willneff et al. (CARTOSAT-1), formula 7 of Bueyueksalih et al. (OrbView-3); Fraser and Hanley 2003.
+Symbols (formula 7): a1, a4 = shifts + origin terms; a2 - 1, a3 = col_per_col, col_per_row; a5, a6 - 1 = row_per_col,
+row_per_row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.models.base import Array, SensorModel, as_ground, as_image
+
+COEFFICIENTS = ("col_shift", "col_per_col", "col_per_row", "row_shift", "row_per_col", "row_per_row")
+FREE = {
+    "none": (),
+    "shift": ("col_shift", "row_shift"),
+    "shift-drift": ("col_shift", "col_per_row", "row_shift", "row_per_row"),
+    "affine": COEFFICIENTS,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class ImageCorrection(SensorModel):
+    """A sensor model whose image points are moved by a shift, shift and drift, or affine transformation.
+
+    Parameters
+    ----------
+    model : SensorModel
+        What is corrected.
+    correction : {'none', 'shift', 'shift-drift', 'affine'}
+        Which coefficients are parameters; the others are zero.
+    origin : (float, float)
+        Column and row (px) about which the linear terms turn.
+    coefficients : (6,)
+        In the order of `COEFFICIENTS`; shifts in pixels, the others in pixels per pixel.
+    """
+
+    kind: ClassVar[str] = "image_correction"
+
+    model: SensorModel
+    correction: str
+    origin: tuple[float, float]
+    coefficients: Array
+
+    def __post_init__(self) -> None:
+        if self.correction not in FREE:
+            raise InputError(f"no correction is called {self.correction!r}", remedy=f"one of {', '.join(FREE)}")
+        coefficients = np.array(self.coefficients, dtype=np.float64)
+        if coefficients.shape != (6,) or not np.isfinite(coefficients).all():
+            raise InputError("a correction has 6 finite coefficients", field="coefficients")
+        if abs(np.linalg.det(_matrix(coefficients))) < 1e-6:
+            raise InputError("this correction cannot be inverted", field="coefficients")
+        coefficients.setflags(write=False)
+        object.__setattr__(self, "coefficients", coefficients)
+        object.__setattr__(self, "origin", (float(self.origin[0]), float(self.origin[1])))
+
+    @classmethod
+    def identity(cls, model: SensorModel, correction: str, origin: tuple[float, float]) -> Self:
+        """Return the correction that changes nothing, to start an adjustment from."""
+        return cls(model, correction, origin, np.zeros(6))
+
+    @property
+    def crs(self) -> str:
+        return self.model.crs
+
+    @property
+    def domain(self) -> tuple[Array, Array]:
+        return self.model.domain
+
+    @property
+    def param_names(self) -> tuple[str, ...]:
+        return FREE[self.correction]
+
+    @property
+    def params(self) -> Array:
+        return self.coefficients[self._free]
+
+    def with_params(self, params: ArrayLike) -> Self:
+        coefficients = np.zeros(6)
+        coefficients[self._free] = params
+        return self._replace(coefficients=coefficients)
+
+    @property
+    def _free(self) -> list[int]:
+        return [COEFFICIENTS.index(name) for name in self.param_names]
+
+    @property
+    def matrix(self) -> Array:
+        """The 2 x 2 matrix of the affine transformation (identity plus the linear coefficients)."""
+        return _matrix(self.coefficients)
+
+    @property
+    def offset(self) -> Array:
+        """The constant ``(2,)`` for which corrected = `matrix` @ image + `offset`."""
+        return self.coefficients[[0, 3]] - (self.matrix - np.eye(2)) @ self.origin
+
+    def ground_to_image(self, ground: ArrayLike) -> Array:
+        image = self.model.ground_to_image(ground)
+        return image + (image - self.origin) @ (self.matrix - np.eye(2)).T + self.coefficients[[0, 3]]
+
+    def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
+        moved = as_image(image) - self.origin - self.coefficients[[0, 3]]
+        return self.model.image_to_ground(np.linalg.solve(self.matrix, moved.T).T + self.origin, height)
+
+    def ground_partials(self, ground: ArrayLike) -> Array:
+        return np.einsum("ij,njk->nik", self.matrix, self.model.ground_partials(ground))
+
+    def param_partials(self, ground: ArrayLike) -> Array:
+        ground = as_ground(ground)
+        centred = self.model.ground_to_image(ground) - self.origin
+        partials = np.zeros((len(ground), 2, 6))
+        partials[:, 0, 0] = partials[:, 1, 3] = 1.0
+        partials[:, 0, 1:3] = partials[:, 1, 4:6] = centred
+        partials[~np.isfinite(centred).all(axis=1)] = np.nan
+        return partials[:, :, self._free]
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        from ortho_pipeline.models import model_from_dict
+
+        inner = data.get("model")
+        if not isinstance(inner, dict):
+            raise InputError("a correction needs the model that it corrects", field="model")
+        return super().from_dict({**data, "model": model_from_dict(inner)})
+
+
+def _matrix(coefficients: Array) -> Array:
+    return np.eye(2) + coefficients[[1, 2, 4, 5]].reshape(2, 2)

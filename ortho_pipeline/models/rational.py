@@ -1,0 +1,210 @@
+r"""Rational functions: image coordinates as ratios of polynomials of the ground.
+
+The RPC model of vendors (RPC00B) is the cubic case with its coefficients given. With ground coordinates normalised to
+:math:`L, P, H` (longitude, latitude, ellipsoidal height; minus offset, over scale),
+
+.. math:: c_n = \frac{a \cdot t(L, P, H)}{b \cdot t(L, P, H)}, \qquad
+          column = c_n \cdot col\_scale + col\_off
+
+and likewise for the row, with the 20 terms :math:`t` in the order of `RPC_TERMS`.
+
+Source: NIMA STDI-0002, appendix E (RPC00B); Grodecki and Dial 2001; formula 6 of Bueyueksalih et al. (OrbView-3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.models.base import Array, SensorModel, as_ground
+
+#: Exponents of (L, P, H) in the order of RPC00B: 1, L, P, H, LP, LH, PH, LL, PP, HH, PLH, LLL, LPP, LHH, LLP, PPP,
+#: PHH, LLH, PPH, HHH.
+RPC_TERMS = np.array(
+    [
+        (0, 0, 0),
+        (1, 0, 0),
+        (0, 1, 0),
+        (0, 0, 1),
+        (1, 1, 0),
+        (1, 0, 1),
+        (0, 1, 1),
+        (2, 0, 0),
+        (0, 2, 0),
+        (0, 0, 2),
+        (1, 1, 1),
+        (3, 0, 0),
+        (1, 2, 0),
+        (1, 0, 2),
+        (2, 1, 0),
+        (0, 3, 0),
+        (0, 1, 2),
+        (2, 0, 1),
+        (0, 2, 1),
+        (0, 0, 3),
+    ]
+)
+
+#: Beyond this many scales from its centre an RPC is extrapolation without meaning, and has false roots.
+DOMAIN_LIMIT = 1.5
+
+
+def rpc_terms(lon: Array, lat: Array, h: Array) -> Array:
+    """Return the 20 terms of RPC00B as ``(20, N)`` for normalised coordinates ``(N,)``."""
+    terms = np.empty((20, lon.size))
+    terms[0] = 1.0
+    terms[1], terms[2], terms[3] = lon, lat, h
+    np.multiply(lon, lat, out=terms[4])
+    np.multiply(lon, h, out=terms[5])
+    np.multiply(lat, h, out=terms[6])
+    np.multiply(lon, lon, out=terms[7])
+    np.multiply(lat, lat, out=terms[8])
+    np.multiply(h, h, out=terms[9])
+    np.multiply(terms[4], h, out=terms[10])
+    np.multiply(terms[7], lon, out=terms[11])
+    np.multiply(lon, terms[8], out=terms[12])
+    np.multiply(lon, terms[9], out=terms[13])
+    np.multiply(terms[7], lat, out=terms[14])
+    np.multiply(terms[8], lat, out=terms[15])
+    np.multiply(lat, terms[9], out=terms[16])
+    np.multiply(terms[7], h, out=terms[17])
+    np.multiply(terms[8], h, out=terms[18])
+    np.multiply(terms[9], h, out=terms[19])
+    return terms
+
+
+def rpc_term_partials(lon: Array, lat: Array, h: Array) -> Array:
+    """Return d(terms)/d(L, P, H) as ``(3, 20, N)``."""
+    powers = [np.stack([np.ones_like(v), v, v * v, v * v * v]) for v in (lon, lat, h)]
+    partials = np.zeros((3, 20, lon.size))
+    for axis in range(3):
+        for term, exponents in enumerate(RPC_TERMS):
+            if exponents[axis]:
+                lowered = exponents.copy()
+                lowered[axis] -= 1
+                value = float(exponents[axis]) * powers[0][lowered[0]]
+                partials[axis, term] = value * powers[1][lowered[1]] * powers[2][lowered[2]]
+    return partials
+
+
+@dataclass(frozen=True, eq=False)
+class RPC(SensorModel):
+    """Rational polynomial coefficients as delivered by vendors, in WGS84 longitude, latitude, ellipsoidal height.
+
+    `col_off` and `row_off` are in this package's image convention, that is SAMP_OFF + 0.5 and LINE_OFF + 0.5.
+    Coefficients are ``(20,)`` in the order of RPC00B. Longitudes are unwrapped about `lon_off`, so scenes across the
+    antimeridian work. Ground beyond 1.5 scales in longitude or latitude projects to NaN.
+
+    Raises
+    ------
+    InputError
+        For a number that is not finite, a scale of zero, or a denominator that is zero everywhere.
+    """
+
+    kind: ClassVar[str] = "rpc"
+
+    col_off: float
+    row_off: float
+    lon_off: float
+    lat_off: float
+    h_off: float
+    col_scale: float
+    row_scale: float
+    lon_scale: float
+    lat_scale: float
+    h_scale: float
+    col_num: Array = field(repr=False)
+    col_den: Array = field(repr=False)
+    row_num: Array = field(repr=False)
+    row_den: Array = field(repr=False)
+    err_bias: float | None = None
+    err_rand: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("col", "row", "lon", "lat", "h"):
+            for part in ("off", "scale"):
+                value = float(getattr(self, f"{name}_{part}"))
+                if not np.isfinite(value):
+                    raise InputError("an RPC needs finite numbers", field=f"{name}_{part}")
+                if part == "scale" and value == 0.0:
+                    raise InputError("an RPC scale cannot be zero", field=f"{name}_{part}")
+                object.__setattr__(self, f"{name}_{part}", value)
+        for name in ("col_num", "col_den", "row_num", "row_den"):
+            values = np.array(getattr(self, name), dtype=np.float64)
+            if values.shape != (20,):
+                raise InputError(f"an RPC has 20 coefficients here, not {values.size}", field=name)
+            if not np.isfinite(values).all():
+                raise InputError("an RPC needs finite coefficients", field=name)
+            if not values.any():
+                raise InputError("all coefficients of an RPC are zero here", field=name)
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
+        centre = self.ground_to_image(np.array([[self.lon_off, self.lat_off, self.h_off]]))
+        if not np.isfinite(centre).all():
+            raise InputError("the denominator of an RPC is zero at its centre", field="col_den, row_den")
+
+    @property
+    def crs(self) -> str:
+        return "EPSG:4979"
+
+    @property
+    def domain(self) -> tuple[Array, Array]:
+        return (
+            np.array([self.lon_off, self.lat_off, self.h_off]),
+            np.abs([self.lon_scale, self.lat_scale, self.h_scale]),
+        )
+
+    def normalise(self, ground: ArrayLike) -> tuple[Array, Array, Array]:
+        """Return normalised longitude, latitude, height, each ``(N,)``; NaN outside the domain."""
+        ground = as_ground(ground)
+        lon = ground[:, 0] - self.lon_off
+        with np.errstate(invalid="ignore"):
+            if np.abs(lon).max(initial=0.0) > 180.0:
+                lon = np.remainder(lon + 180.0, 360.0) - 180.0
+            lon = lon / self.lon_scale
+            lat = (ground[:, 1] - self.lat_off) / self.lat_scale
+            outside = (np.abs(lon) > DOMAIN_LIMIT) | (np.abs(lat) > DOMAIN_LIMIT)
+        if outside.any():
+            lon[outside] = np.nan
+        return lon, lat, (ground[:, 2] - self.h_off) / self.h_scale
+
+    def ground_to_image(self, ground: ArrayLike) -> Array:
+        terms = rpc_terms(*self.normalise(ground))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            col = (self.col_num @ terms) / (self.col_den @ terms) * self.col_scale + self.col_off
+            row = (self.row_num @ terms) / (self.row_den @ terms) * self.row_scale + self.row_off
+        image = np.stack([col, row], axis=1)
+        image[~np.isfinite(image).all(axis=1)] = np.nan
+        return image
+
+    def ground_partials(self, ground: ArrayLike) -> Array:
+        normalised = self.normalise(ground)
+        terms = rpc_terms(*normalised)
+        dterms = rpc_term_partials(*normalised)
+        scales = (self.lon_scale, self.lat_scale, self.h_scale)
+        partials = np.empty((terms.shape[1], 2, 3))
+        sides = ((self.col_num, self.col_den, self.col_scale), (self.row_num, self.row_den, self.row_scale))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for side, (num, den, scale) in enumerate(sides):
+                n, d = num @ terms, den @ terms
+                for axis in range(3):
+                    slope = (num @ dterms[axis]) - (n / d) * (den @ dterms[axis])
+                    partials[:, side, axis] = slope / d * (scale / scales[axis])
+        return partials
+
+    def shifted(self, columns: float, rows: float) -> RPC:
+        """Return the model of a crop whose first pixel is (columns, rows) of this image."""
+        return self._replace(col_off=self.col_off - columns, row_off=self.row_off - rows)
+
+    def scaled(self, factor: float) -> RPC:
+        """Return the model of this image resampled to pixels `factor` times as large."""
+        return self._replace(
+            col_off=self.col_off / factor,
+            row_off=self.row_off / factor,
+            col_scale=self.col_scale / factor,
+            row_scale=self.row_scale / factor,
+        )

@@ -1,0 +1,589 @@
+"""Rasters: every GDAL read and write of pixels.
+
+Files are opened by a list of drivers and never through what a file claims of itself: a VRT named ``.tif`` would let
+GDAL read any file of the machine. One `gdal.Dataset` is used by one thread only; `RasterSource` opens one per thread.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import whole_or_nothing
+
+gdal.UseExceptions()
+
+#: Raster drivers that only read pixels out of the file they are given (and its side-cars).
+DRIVERS = (
+    "GTiff", "COG", "NITF", "JP2OpenJPEG", "JP2KAK", "JPEG", "PNG", "HFA", "ENVI", "PCIDSK", "PCRaster", "DTED",
+    "SRTMHGT", "AAIGrid", "GTX", "NTv2", "DIMAP", "ERS", "EHdr", "BMP", "USGSDEM", "SGI", "ISIS3", "KEA", "BYN",
+    "VRT", "MEM",
+)  # fmt: skip
+#: A raster side beyond this is taken for a damaged header.
+MAX_SIDE = 4_000_000
+#: GDAL reads whole blocks: one larger than this is refused before it is allocated (bytes).
+MAX_BLOCK = 1 << 30
+_MAX_VRT = 5_000_000
+
+
+def open_dataset(path: str | os.PathLike[str], *, allow_network: bool = False, siblings: bool = True) -> gdal.Dataset:
+    """Open a raster for reading.
+
+    Parameters
+    ----------
+    path : path
+        A file; `/vsi…` and URLs only with `allow_network`.
+    siblings : bool
+        Whether GDAL may look at side-car files. Without them RPC metadata are those of the file itself.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, of no allowed format, damaged, or a VRT that reaches outside of its own folder.
+    """
+    name = os.fspath(path)
+    drivers = list(DRIVERS)
+    if name.startswith("/vsi") or "://" in name:
+        if not allow_network:
+            raise InputError(
+                "network and virtual paths are not opened", file=name, remedy="allow them with --allow-network"
+            )
+        drivers.remove("VRT")
+    elif not Path(name).is_file() and not (Path(name).is_dir()):
+        raise InputError("there is no such file", file=name, remedy="check the path")
+    elif Path(name).suffix.lower() == ".vrt":
+        _check_vrt(Path(name))
+    else:
+        drivers.remove("VRT")
+    options: dict[str, Any] = {} if siblings else {"sibling_files": [Path(name).name]}
+    try:
+        dataset = gdal.OpenEx(name, gdal.OF_RASTER | gdal.OF_READONLY, allowed_drivers=drivers, **options)
+    except RuntimeError as error:
+        raise InputError(
+            f"GDAL cannot open this as a raster ({_first_line(error)})",
+            file=name,
+            remedy="give a raster of a format that GDAL reads; 'ortho doctor' lists the allowed ones",
+        ) from error
+    _check_size(dataset, name)
+    return dataset
+
+
+def _check_size(dataset: gdal.Dataset, name: str) -> None:
+    width, height = dataset.RasterXSize, dataset.RasterYSize
+    if dataset.RasterCount == 0:
+        raise InputError("this file has no raster band", file=name)
+    band = dataset.GetRasterBand(1)
+    block = math.prod(band.GetBlockSize()) * gdal.GetDataTypeSize(band.DataType) // 8
+    if max(width, height) > MAX_SIDE or block > MAX_BLOCK:
+        raise InputError(
+            f"the header claims {width} x {height} pixels in blocks of {block} bytes",
+            file=name,
+            remedy="the file is damaged, or has to be tiled first (gdal_translate -co TILED=YES)",
+        )
+
+
+def _check_vrt(path: Path) -> None:
+    from defusedxml import ElementTree
+    from defusedxml.common import DefusedXmlException
+
+    if path.stat().st_size > _MAX_VRT:
+        raise InputError("a VRT of more than 5 MB is not opened", file=path)
+    try:
+        root = ElementTree.fromstring(path.read_bytes())
+    except (ElementTree.ParseError, DefusedXmlException, ValueError) as error:
+        raise InputError(f"this VRT is no well-formed XML ({error})", file=path) from error
+    if root.get("subClass") not in (None, "VRTDataset") or next(root.iter("PixelFunctionType"), None) is not None:
+        raise InputError(
+            "only plain VRTs are opened", file=path, remedy="make a file of it first (gdal_translate in.vrt out.tif)"
+        )
+    folder = path.resolve().parent
+    for element in root.iter():
+        if element.tag in ("SourceFilename", "SourceDataset"):
+            _check_vrt_source(path, folder, element.text or "", element.get("relativeToVRT") == "1")
+
+
+def _check_vrt_source(path: Path, folder: Path, name: str, relative: bool) -> None:
+    source = (folder / name if relative else Path(name)).resolve()
+    if not source.is_relative_to(folder) or name.startswith("/vsi") or ":" in name.replace(":\\", ""):
+        raise InputError(
+            f"this VRT reads {name!r}, which is outside of its own folder",
+            file=path,
+            field="SourceFilename",
+            remedy="put the VRT beside its sources, or make a file of it (gdal_translate in.vrt out.tif)",
+        )
+    if source.suffix.lower() == ".vrt" and source != path.resolve() and source.is_file():
+        _check_vrt(source)
+
+
+def _first_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """North-up pixel grid of an output raster.
+
+    `left` and `top` are the map coordinates of the outer corner of the first pixel, `dx` and `dy` the (positive) size
+    of a pixel, in units of `crs`.
+    """
+
+    crs: pyproj.CRS
+    left: float
+    top: float
+    dx: float
+    dy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if not (self.dx > 0 and self.dy > 0 and math.isfinite(self.left) and math.isfinite(self.top)):
+            raise InputError("a pixel has a positive size", field="resolution")
+        if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
+            raise InputError(
+                f"the output would have {self.width} x {self.height} pixels",
+                field="extent",
+                remedy="check the extent and the resolution, which are in units of the output CRS",
+            )
+
+    @classmethod
+    def of_extent(
+        cls, crs: pyproj.CRS, extent: Sequence[float], resolution: tuple[float, float], *, align: bool = False
+    ) -> Grid:
+        """Return the grid of an extent (xmin, ymin, xmax, ymax), widened to multiples of the resolution if `align`."""
+        xmin, ymin, xmax, ymax = (float(value) for value in extent)
+        dx, dy = resolution
+        if not all(map(math.isfinite, (xmin, ymin, xmax, ymax, dx, dy))) or not (xmin < xmax and ymin < ymax):
+            raise InputError(
+                f"{xmin} {ymin} {xmax} {ymax} is no extent", field="extent", remedy="give xmin ymin xmax ymax"
+            )
+        if not (dx > 0 and dy > 0):
+            raise InputError("a pixel has a positive size", field="resolution")
+        if align:
+            # A hair of tolerance keeps an extent that is already aligned from growing by a pixel of rounding.
+            xmin, ymin = math.floor(xmin / dx + 1e-6) * dx, math.floor(ymin / dy + 1e-6) * dy
+            xmax, ymax = math.ceil(xmax / dx - 1e-6) * dx, math.ceil(ymax / dy - 1e-6) * dy
+        width, height = max(1, round((xmax - xmin) / dx)), max(1, round((ymax - ymin) / dy))
+        return cls(crs, xmin, ymax, dx, dy, width, height)
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """xmin, ymin, xmax, ymax."""
+        return self.left, self.top - self.height * self.dy, self.left + self.width * self.dx, self.top
+
+    @property
+    def geotransform(self) -> tuple[float, float, float, float, float, float]:
+        """GDAL's six numbers."""
+        return self.left, self.dx, 0.0, self.top, 0.0, -self.dy
+
+    def xy(self, columns: NDArray[Any], rows: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return map coordinates of pixel positions (corner convention: the centre of the first pixel is 0.5, 0.5)."""
+        return self.left + np.asarray(columns) * self.dx, self.top - np.asarray(rows) * self.dy
+
+
+class RasterSource:
+    """A raster that several threads read windows of.
+
+    Attributes
+    ----------
+    width, height, count : int
+    dtype : numpy.dtype
+        Common type of all bands.
+    nodata : tuple of float or None, per band
+    validity : {'all', 'nodata', 'mask', 'alpha'}
+        How the raster says which of its pixels are valid. NaN is never valid.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, allow_network: bool = False) -> None:
+        self.path = os.fspath(path)
+        self._allow_network = allow_network
+        self._local = threading.local()
+        dataset = self.dataset
+        self.width, self.height, self.count = dataset.RasterXSize, dataset.RasterYSize, dataset.RasterCount
+        bands = [dataset.GetRasterBand(i + 1) for i in range(self.count)]
+        types = {gdal.GetDataTypeName(band.DataType) for band in bands}
+        if any(gdal.DataTypeIsComplex(band.DataType) for band in bands):
+            raise InputError(
+                "complex pixels are not resampled", file=self.path, remedy="split them into real bands first"
+            )
+        self.dtype = np.result_type(*(_numpy_type(band.DataType) for band in bands))
+        self.type_names = sorted(types)
+        self.nodata = tuple(_nodata(band, self.dtype) for band in bands)
+        self.palette = any(band.GetColorTable() is not None for band in bands)
+        flags = bands[0].GetMaskFlags()
+        if any(value is not None for value in self.nodata):
+            self.validity = "nodata"
+        elif flags & gdal.GMF_ALPHA:
+            self.validity = "alpha"
+        else:
+            self.validity = "mask" if flags & gdal.GMF_PER_DATASET else "all"
+
+    @property
+    def dataset(self) -> gdal.Dataset:
+        """The GDAL dataset of the calling thread."""
+        if not hasattr(self._local, "dataset"):
+            self._local.dataset = open_dataset(self.path, allow_network=self._allow_network)
+        return self._local.dataset
+
+    def read(self, left: int, top: int, width: int, height: int) -> NDArray[Any]:
+        """Return the pixels ``(count, height, width)`` of a window that lies inside the raster."""
+        pixels = np.empty((self.count, height, width), dtype=self.dtype)
+        self._io(self.dataset.ReadAsArray, left, top, width, height, buf_obj=pixels)
+        return pixels
+
+    def read_valid(self, left: int, top: int, pixels: NDArray[Any]) -> NDArray[np.bool_] | None:
+        """Return which of the `pixels` of a window ``(count, h, w)`` are valid; None where all are."""
+        _, height, width = pixels.shape
+        valid = None
+        if self.validity == "nodata":
+            valid = np.ones(pixels.shape, dtype=bool)
+            for band, value in enumerate(self.nodata):
+                if value is not None and not math.isnan(value):
+                    np.not_equal(pixels[band], pixels.dtype.type(value), out=valid[band])
+        elif self.validity in ("mask", "alpha"):
+            mask = self._io(self.dataset.GetRasterBand(1).GetMaskBand().ReadAsArray, left, top, width, height)
+            valid = np.broadcast_to(mask != 0, pixels.shape).copy()
+        if pixels.dtype.kind == "f":
+            numbers = ~np.isnan(pixels)
+            if not numbers.all():
+                valid = numbers if valid is None else valid & numbers
+        return None if valid is None or valid.all() else valid
+
+    def _io(self, read: Any, *window: int, **options: Any) -> Any:
+        try:
+            return read(*window, **options)
+        except RuntimeError as error:
+            raise InputError(
+                f"the pixels cannot be read ({_first_line(error)})",
+                file=self.path,
+                remedy="the file is cut off or damaged: copy it again",
+            ) from error
+
+
+def _numpy_type(gdal_type: int) -> np.dtype[Any]:
+    from osgeo import gdal_array
+
+    return np.dtype(gdal_array.GDALTypeCodeToNumericTypeCode(gdal_type))
+
+
+def _nodata(band: gdal.Band, dtype: np.dtype[Any]) -> float | None:
+    value = band.GetNoDataValue()
+    if value is None or (math.isnan(value) and dtype.kind != "f"):
+        return None
+    if dtype.kind in "iu":
+        # A value that the type cannot hold marks nothing.
+        limits = np.iinfo(dtype)
+        return value if float(value).is_integer() and limits.min <= value <= limits.max else None
+    return value
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What an output raster takes over from its source."""
+
+    count: int
+    dtype: np.dtype[Any]
+    validity: str
+    nodata: float | None = None
+    descriptions: tuple[str, ...] = ()
+    interpretations: tuple[int, ...] = ()
+    color_table: Any = None
+    scales: tuple[tuple[float, float, str], ...] = ()
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, source: RasterSource) -> Profile:
+        """Return the profile of an ortho of `source`.
+
+        Nodata stays nodata (one value for all bands, as GeoTIFF has it), alpha stays alpha; everything else gets a
+        mask, because no pixel value may be given a meaning that it did not have.
+        """
+        bands = [source.dataset.GetRasterBand(i + 1) for i in range(source.count)]
+        values = set(source.nodata)
+        if source.validity == "nodata" and len(values) == 1:
+            validity, nodata = "nodata", source.nodata[0]
+        else:
+            validity, nodata = ("alpha" if source.validity == "alpha" else "mask"), None
+        return cls(
+            count=source.count,
+            dtype=source.dtype,
+            validity=validity,
+            nodata=nodata,
+            descriptions=tuple(band.GetDescription() for band in bands),
+            interpretations=tuple(band.GetColorInterpretation() for band in bands),
+            color_table=bands[0].GetColorTable(),
+            scales=tuple((band.GetScale() or 1.0, band.GetOffset() or 0.0, band.GetUnitType()) for band in bands),
+        )
+
+
+def limit_cache(size: int) -> None:
+    """Limit GDAL's block cache to `size` bytes (at least 16 MB); its default is a share of the machine's memory."""
+    gdal.SetCacheMax(max(size, 16_000_000))
+
+
+class RasterWriter:
+    """A GeoTIFF or COG that is written in windows and appears at its path when it is complete.
+
+    Use as a context manager: an exception inside leaves nothing behind, and a file that was there before untouched.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        grid: Grid,
+        profile: Profile,
+        *,
+        driver: str = "COG",
+        creation_options: Mapping[str, str] | None = None,
+        threads: int = 1,
+    ) -> None:
+        if driver not in ("COG", "GTiff"):
+            raise InputError(f"orthos are not written as {driver!r}", field="format", remedy="COG or GTiff")
+        self.path, self.grid, self.profile, self.driver = Path(path), grid, profile, driver
+        self.options = _creation_options(driver, dict(creation_options or {}), threads)
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> RasterWriter:
+        self._final = whole_or_nothing(self.path)
+        self._temporary = self._final.__enter__()
+        try:
+            if self.driver == "COG":
+                # The COG driver copies a finished raster: overviews come before the pixels in the file.
+                self._work = self._temporary.with_name(self._temporary.name + ".work.tif")
+                options = {"TILED": "YES", "BIGTIFF": "IF_SAFER", "BLOCKXSIZE": "512", "BLOCKYSIZE": "512"}
+            else:
+                self._work, options = self._temporary, self.options
+            self._dataset = self._create(self._work, options)
+        except BaseException as error:
+            self._final.__exit__(type(error), error, error.__traceback__)
+            raise
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        if kind is None:
+            try:
+                self._finish()
+            except BaseException as problem:
+                self._dataset = None
+                self._final.__exit__(type(problem), problem, problem.__traceback__)
+                raise
+        self._dataset = None
+        self._final.__exit__(kind, error, trace)
+
+    def write(self, left: int, top: int, pixels: NDArray[Any], valid: NDArray[np.bool_] | None) -> None:
+        """Write a window ``(count, h, w)``; `valid` ``(h, w)`` goes to the mask, if the profile has one."""
+        with self._lock, self.disk_errors():
+            self._dataset.WriteArray(pixels, left, top)
+            if self.profile.validity == "mask" and valid is not None:
+                mask = valid.view(np.uint8) * np.uint8(255)
+                self._dataset.GetRasterBand(1).GetMaskBand().WriteArray(mask, left, top)
+
+    def _create(self, path: Path, options: Mapping[str, str]) -> gdal.Dataset:
+        from osgeo import gdal_array
+
+        profile, grid = self.profile, self.grid
+        code = gdal_array.NumericTypeCodeToGDALTypeCode(profile.dtype.type)
+        with self.disk_errors():
+            dataset = gdal.GetDriverByName("GTiff").Create(
+                str(path), grid.width, grid.height, profile.count, code, [f"{k}={v}" for k, v in options.items()]
+            )
+        dataset.SetProjection(grid.crs.to_wkt())
+        dataset.SetGeoTransform(grid.geotransform)
+        dataset.SetMetadataItem("AREA_OR_POINT", "Area")
+        for key, value in profile.metadata.items():
+            dataset.SetMetadataItem(key, value)
+        for i in range(profile.count):
+            _describe(dataset.GetRasterBand(i + 1), profile, i)
+        if profile.validity == "mask":
+            gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", "YES")
+            try:
+                dataset.CreateMaskBand(gdal.GMF_PER_DATASET)
+            finally:
+                gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", None)
+        return dataset
+
+    def _finish(self) -> None:
+        with self.disk_errors():
+            self._dataset.FlushCache()
+            self._dataset = None
+            if self.driver == "COG":
+                source = gdal.Open(str(self._work))
+                options = [f"{k}={v}" for k, v in self.options.items()]
+                gdal.GetDriverByName("COG").CreateCopy(str(self._temporary), source, options=options)
+        check = gdal.Open(str(self._temporary))
+        if (check.RasterXSize, check.RasterYSize) != (self.grid.width, self.grid.height):
+            raise InputError("the output was not written whole", file=self.path, remedy="check the free disk space")
+
+    def copy(self, path: Path) -> None:
+        """Fill the raster from another of the same size, whose band behind the last one is the mask."""
+        dataset = gdal.Open(str(path))
+        step = 2048
+        for top in range(0, self.grid.height, step):
+            for left in range(0, self.grid.width, step):
+                size = min(step, self.grid.width - left), min(step, self.grid.height - top)
+                pixels = dataset.ReadAsArray(left, top, *size).reshape(-1, size[1], size[0])
+                valid = pixels[-1] > 0 if self.profile.validity == "mask" else None
+                self.write(left, top, pixels[: self.profile.count].astype(self.profile.dtype, copy=False), valid)
+
+    def disk_errors(self) -> _DiskErrors:
+        """Return a context in which GDAL's errors become an `InputError` that names the output."""
+        return _DiskErrors(self.path)
+
+
+class _DiskErrors:
+    """Turns GDAL's write errors (a full disk, mostly) into an `InputError`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        if kind is not None and issubclass(kind, RuntimeError):
+            raise InputError(
+                f"the output cannot be written ({_first_line(error)})",
+                file=self.path,
+                remedy="check the free disk space and the creation options",
+            ) from error
+
+
+def _describe(band: gdal.Band, profile: Profile, index: int) -> None:
+    if profile.nodata is not None:
+        band.SetNoDataValue(profile.nodata)
+    if profile.descriptions:
+        band.SetDescription(profile.descriptions[index])
+    if profile.interpretations:
+        band.SetColorInterpretation(profile.interpretations[index])
+    if profile.color_table is not None and index == 0:
+        band.SetColorTable(profile.color_table)
+    if profile.scales and profile.scales[index] != (1.0, 0.0, ""):
+        scale, offset, unit = profile.scales[index]
+        band.SetScale(scale)
+        band.SetOffset(offset)
+        band.SetUnitType(unit)
+
+
+def _creation_options(driver: str, given: dict[str, str], threads: int) -> dict[str, str]:
+    """Return lossless defaults under what the user gave; an option that the driver does not know is an error."""
+    given = {key.upper(): value for key, value in given.items()}
+    listed = gdal.GetDriverByName(driver).GetMetadataItem("DMD_CREATIONOPTIONLIST") or ""
+    unknown = [key for key in given if f"name='{key}'" not in listed and f'name="{key}"' not in listed]
+    if unknown:
+        raise InputError(
+            f"the {driver} driver has no creation option {', '.join(unknown)}",
+            field="creation option",
+            remedy=f"see the page of the {driver} driver in GDAL's documentation",
+        )
+    defaults = {"BIGTIFF": "IF_SAFER"}
+    if driver == "GTiff":
+        defaults |= {"TILED": "YES", "BLOCKXSIZE": "512", "BLOCKYSIZE": "512"}
+        if given.get("TILED", "YES").upper() == "NO":
+            defaults = {"BIGTIFF": "IF_SAFER"}
+    else:
+        defaults |= {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "LEVEL": "6", "NUM_THREADS": str(max(1, threads))}
+        if given.get("COMPRESS", "DEFLATE").upper() not in ("DEFLATE", "ZSTD", "LZW"):
+            defaults.pop("PREDICTOR")
+            defaults.pop("LEVEL")
+    return defaults | given
+
+
+def warp_with_gdal(
+    source: RasterSource,
+    rpc: Mapping[str, str],
+    heights: tuple[NDArray[np.float64], Sequence[float], pyproj.CRS] | float,
+    grid: Grid,
+    path: str | os.PathLike[str],
+    *,
+    resampling: str = "bilinear",
+    driver: str = "COG",
+    creation_options: Mapping[str, str] | None = None,
+    memory: int = 512_000_000,
+    threads: int = 1,
+    progress: Any = None,
+) -> None:
+    """Write the orthoimage of `source` by GDAL's own warper, exactly (no approximated transformer).
+
+    Parameters
+    ----------
+    rpc : mapping
+        GDAL's ``RPC`` metadata domain; it takes the place of the source's own, and of its GCPs.
+    heights : (array (rows, columns), geotransform, crs) or float
+        Ellipsoidal heights of the surface with NaN for voids, or one height.
+    """
+    view = gdal.GetDriverByName("VRT").CreateCopy("", source.dataset)
+    view.SetGCPs([], "")
+    view.SetMetadata(dict(rpc), "RPC")
+    profile = Profile.of(source)
+    dem = f"/vsimem/ortho_dem_{os.getpid()}_{threading.get_ident()}.tif"
+    options = ["METHOD=RPC"]  # GDAL would otherwise prefer GCPs
+    if isinstance(heights, tuple):
+        _write_dem(dem, *heights)
+        options += [f"RPC_DEM={dem}", "RPC_DEMINTERPOLATION=bilinear", "RPC_DEM_APPLY_VDATUM_SHIFT=NO"]
+    else:
+        options += [f"RPC_HEIGHT={heights!r}"]
+    writer = RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads)
+    with writer, writer.disk_errors():
+        target = writer.path.with_name(f".{writer.path.stem}.gdal.part.tif")
+        try:
+            _warp_exactly(view, target, source, profile, grid, options, resampling, memory, threads, progress)
+            writer.copy(target)
+        finally:
+            target.unlink(missing_ok=True)
+            gdal.Unlink(dem)
+
+
+def _write_dem(path: str, heights: NDArray[np.float64], geotransform: Sequence[float], crs: pyproj.CRS) -> None:
+    rows, columns = heights.shape
+    dataset = gdal.GetDriverByName("GTiff").Create(path, columns, rows, 1, gdal.GDT_Float64)
+    dataset.SetProjection(crs.to_wkt())
+    dataset.SetGeoTransform(tuple(geotransform))
+    dataset.GetRasterBand(1).SetNoDataValue(-1e6)
+    dataset.GetRasterBand(1).WriteArray(np.where(np.isnan(heights), -1e6, heights))
+
+
+def _warp_exactly(
+    view: gdal.Dataset,
+    target: Path,
+    source: RasterSource,
+    profile: Profile,
+    grid: Grid,
+    transformer_options: list[str],
+    resampling: str,
+    memory: int,
+    threads: int,
+    progress: Any,
+) -> None:
+    callback = None if progress is None else (lambda share, *_: progress(share) or 1)
+    gdal.Warp(
+        str(target),
+        view,
+        format="GTiff",
+        outputBounds=grid.extent,
+        width=grid.width,
+        height=grid.height,
+        dstSRS=grid.crs.to_wkt(),
+        transformerOptions=transformer_options,
+        errorThreshold=0,
+        resampleAlg=resampling,
+        dstAlpha=profile.validity == "mask",
+        dstNodata=profile.nodata,
+        multithread=threads > 1,
+        warpMemoryLimit=memory // 2,
+        # Without these two the values depend on how the warper cuts the image into chunks.
+        warpOptions=["XSCALE=1", "YSCALE=1", f"NUM_THREADS={threads}", "INIT_DEST=0" if profile.nodata is None else
+                     "INIT_DEST=NO_DATA"],
+        creationOptions=["TILED=YES", "BIGTIFF=IF_SAFER"],
+        callback=callback,
+    )  # fmt: skip

@@ -1,0 +1,548 @@
+r"""Orthorectification: a lattice of exact model evaluations, terrain per pixel, a compiled kernel.
+
+Image coordinates are smooth in (x, y) and height, terrain is not. So in each block of 256 x 256 output pixels the exact
+model is evaluated at lattice nodes (every 64 pixels to begin with) at a few heights that span the block's terrain; in
+between they are bilinear in plan and a polynomial in height. The height itself comes from the DEM at full resolution
+for every pixel. The cost of a pixel thus does not depend on the sensor model.
+
+The error is not assumed but measured: at points spread over each block (in plan and height) the lattice is compared
+with the exact model, and the block is refined until the difference is below half of the tolerance. With a block's
+parallax :math:`p` (pixels between its lowest and highest terrain), an error :math:`\delta` in DEM samples moves a point
+by at most :math:`p\,\delta`, whatever cliffs the DEM has; that is added.
+
+Blocks lie at fixed places of the output grid and are the unit of all decisions, so the output does not depend on tile
+size, memory or number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_pipeline import kernels
+from ortho_pipeline.crs import GroundTransform
+from ortho_pipeline.dem import Surface
+from ortho_pipeline.errors import InputError, ModelError
+from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.raster import Grid, Profile, RasterSource, RasterWriter, limit_cache
+
+#: Side of a block in output pixels.
+BLOCK = 256
+#: (lattice spacing in output pixels, number of heights), tried one after the other.
+REFINEMENTS = ((64, 3), (32, 3), (16, 3), (16, 5), (8, 5), (4, 5), (2, 5), (1, 5))
+#: Points per block at which the lattice is verified.
+VERIFIED = 24
+RESAMPLING = {"nearest": kernels.NEAREST, "bilinear": kernels.BILINEAR, "cubic": kernels.CUBIC}
+#: Source pixels that a kernel reads around the one that holds the point.
+_REACH = {"nearest": 0, "bilinear": 1, "cubic": 2}
+#: Source pixels beyond the lattice nodes of a window, for what lies higher or lower between the nodes.
+_MARGIN = 4
+
+
+@dataclass(frozen=True)
+class WarpResult:
+    """What `rectify` did.
+
+    `max_error_px` is the largest difference (source pixels) between lattice and exact model at the verified points;
+    `finest_spacing` the smallest lattice spacing that a block needed; `valid_pixels` how many output pixels have a
+    value.
+    """
+
+    max_error_px: float
+    tolerance_px: float
+    finest_spacing: int
+    refined_blocks: int
+    blocks: int
+    pixels: int
+    valid_pixels: int
+    seconds: float
+
+
+def rectify(
+    model: SensorModel,
+    source: RasterSource,
+    surface: Surface,
+    grid: Grid,
+    path: str | os.PathLike[str],
+    *,
+    resampling: str = "bilinear",
+    dem_interpolation: str = "bilinear",
+    tolerance: float = 0.01,
+    memory: int = 512_000_000,
+    threads: int | None = None,
+    driver: str = "COG",
+    creation_options: Mapping[str, str] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> WarpResult:
+    """Write the orthoimage of `source` on `grid`.
+
+    Parameters
+    ----------
+    tolerance : float
+        Bound on the geometric error of the lattice in source pixels.
+    memory : int
+        Bytes for windows and GDAL's cache together (the interpreter and its libraries come on top).
+    progress : callable, optional
+        Called with the finished share, 0 to 1.
+
+    Raises
+    ------
+    InputError
+        For an unknown kernel, a palette with anything but nearest, or files that cannot be read or written.
+    ModelError
+        If the tolerance cannot be held.
+    """
+    begin = time.monotonic()
+    _check(source, resampling, dem_interpolation, tolerance)
+    threads = threads or os.cpu_count() or 1
+    job = _Job(
+        model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, memory // (4 * threads)
+    )
+    side = BLOCK * max(1, min(4, int(math.sqrt(memory / threads / 16 / source.count / source.dtype.itemsize)) // BLOCK))
+    profile = Profile.of(source)
+    limit_cache(memory // 4)
+    with RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads) as writer:
+        tiles = list(_tiles(grid, side))
+        for done, _ in enumerate(_bounded(threads, lambda tile: job.make(writer, tile), tiles), start=1):
+            if progress:
+                progress(done / len(tiles))
+    return WarpResult(
+        max_error_px=job.worst,
+        tolerance_px=tolerance,
+        finest_spacing=job.finest,
+        refined_blocks=job.refined,
+        blocks=math.ceil(grid.width / BLOCK) * math.ceil(grid.height / BLOCK),
+        pixels=grid.width * grid.height,
+        valid_pixels=job.valid_pixels,
+        seconds=time.monotonic() - begin,
+    )
+
+
+def _check(source: RasterSource, resampling: str, dem_interpolation: str, tolerance: float) -> None:
+    if resampling not in RESAMPLING:
+        raise InputError(
+            f"no kernel is called {resampling!r}", field="resampling", remedy=f"one of {', '.join(RESAMPLING)}"
+        )
+    if dem_interpolation not in ("bilinear", "cubic"):
+        raise InputError(
+            f"DEMs are not interpolated by {dem_interpolation!r}", field="dem-interpolation", remedy="bilinear or cubic"
+        )
+    if source.palette and resampling != "nearest":
+        raise InputError(
+            "the pixels are indices into a palette, which cannot be averaged",
+            file=source.path,
+            field="resampling",
+            remedy="use --resampling nearest, or expand the palette first (gdal_translate -expand rgb)",
+        )
+    if not tolerance > 0:
+        raise InputError("the tolerance is positive", field="tolerance")
+
+
+def _tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
+    for top in range(0, grid.height, side):
+        for left in range(0, grid.width, side):
+            yield top, left, min(side, grid.height - top), min(side, grid.width - left)
+
+
+def _bounded(threads: int, work: Callable[[Any], Any], items: list[Any]) -> Iterator[Any]:
+    """Yield results of `work` over `items` in any order, with no more than `threads` under way."""
+    with ThreadPoolExecutor(threads, thread_name_prefix="warp") as pool:
+        pending: set[Any] = set()
+        try:
+            for item in items:
+                pending.add(pool.submit(work, item))
+                if len(pending) >= threads + 1:
+                    finished, pending = wait(pending, return_when=FIRST_COMPLETED)
+                    for future in finished:
+                        yield future.result()
+            for future in pending:
+                yield future.result()
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+class _Exact:
+    """The exact geometry of an output grid: pixels and heights to source image and DEM coordinates."""
+
+    def __init__(self, model: SensorModel, surface: Surface, grid: Grid) -> None:
+        self._model, self._surface, self._grid = model, surface, grid
+        self._to_model = GroundTransform(grid.crs, model.crs)
+        self._to_dem = None if surface.constant_height is not None else GroundTransform(grid.crs, surface.crs)
+        self._flat = self._ignores_height()
+
+    def _ignores_height(self) -> bool:
+        # Between projections of one datum the height takes no part, which saves transforming every level.
+        grid = self._grid
+        x, y = grid.xy(np.array([0.0, 0.5, 1.0]) * grid.width, np.array([0.0, 0.5, 1.0]) * grid.height)
+        low, high = (self._to_model(np.stack([x, y, np.full(3, height)], axis=1)) for height in (0.0, 5000.0))
+        return bool(np.array_equal(low[:, :2], high[:, :2]) and (low[:, 2] == 0).all() and (high[:, 2] == 5000).all())
+
+    def image(self, columns: Array, rows: Array, heights: Array) -> Array:
+        """Source image points ``(..., levels, 2)`` of output positions ``(...)`` at heights ``(..., levels)``."""
+        x, y = self._grid.xy(columns, rows)
+        levels = heights.shape[-1]
+        if self._flat:
+            flat = self._to_model(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
+            ground = np.repeat(flat, levels, axis=0)
+            ground[:, 2] = heights.ravel()
+        else:
+            plan = np.stack([np.repeat(x.ravel(), levels), np.repeat(y.ravel(), levels), heights.ravel()], axis=1)
+            ground = self._to_model(plan)
+        return self._model.ground_to_image(ground).reshape(*heights.shape, 2)
+
+    def dem(self, columns: Array, rows: Array) -> Array:
+        """DEM sample coordinates ``(..., 2)`` of output pixel positions ``(...)``."""
+        if self._to_dem is None:
+            return np.full((*np.shape(columns), 2), 0.5)
+        x, y = self._grid.xy(columns, rows)
+        plan = self._to_dem(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
+        return self._surface.samples_at(plan[:, :2]).reshape(*np.shape(columns), 2)
+
+
+@dataclass(eq=False)
+class _Block:
+    """One block: where it is, its terrain, its lattice."""
+
+    row: int
+    column: int
+    spacing: int = 0
+    nodes: Array | None = None
+    dem_nodes: Array | None = None
+    middle: float = 0.0
+    half: float = 1.0
+    window: tuple[int, int, int, int] | None = None  # source left, top, right, bottom
+
+
+def _positions(spacing: int) -> tuple[Array, Array]:
+    """Return offsets (columns, rows) of lattice nodes from a block's first pixel, each ``(n, n)``."""
+    steps = np.arange(0, BLOCK + spacing, spacing, dtype=float)
+    columns, rows = np.meshgrid(steps, steps)
+    return columns, rows
+
+
+def _levels(count: int) -> Array:
+    """Return normalised heights at which the model is evaluated: Chebyshev-Lobatto nodes of [-1, 1]."""
+    return -np.cos(np.pi * np.arange(count) / (count - 1))
+
+
+def _scatter(block: tuple[int, int]) -> tuple[Array, Array, Array]:
+    """Return `VERIFIED` points (column, row offsets in the block, normalised height), other ones in each block.
+
+    A low-discrepancy sequence, started at a place that depends on the block: spread more evenly than random points, and
+    the same in every run.
+    """
+    steps = np.array([0.8191725133961645, 0.6710436067037893, 0.5497004779019703])  # R3 sequence
+    start = np.array([0.5, 0.25, 0.75]) + np.array([block[0] * 0.7548776662, block[1] * 0.5698402910, sum(block) * 0.3])
+    points = np.remainder(start + np.arange(VERIFIED)[:, None] * steps, 1.0)
+    return points[:, 0] * (BLOCK - 1), points[:, 1] * (BLOCK - 1), 2 * points[:, 2] - 1
+
+
+class _Job:
+    """The work on one output raster, shared by its threads."""
+
+    def __init__(
+        self,
+        model: SensorModel,
+        source: RasterSource,
+        surface: Surface,
+        grid: Grid,
+        resampling: str,
+        cubic_dem: bool,
+        tolerance: float,
+        window_bytes: int,
+    ) -> None:
+        self.source, self.surface, self.grid = source, surface, grid
+        self.exact = _Exact(model, surface, grid)
+        self.kernel, self.reach = RESAMPLING[resampling], _REACH[resampling]
+        self.cubic_dem, self.tolerance, self.window_bytes = cubic_dem, tolerance, window_bytes
+        self.profile = Profile.of(source)
+        self.low, self.high, self.integer, self.fill = _range(source.dtype, self.profile)
+        self._lock = threading.Lock()
+        self.worst, self.finest, self.refined, self.valid_pixels = 0.0, REFINEMENTS[0][0], 0, 0
+
+    # -- a tile ------------------------------------------------------------------------------------------------------
+
+    def make(self, writer: RasterWriter, tile: tuple[int, int, int, int]) -> None:
+        """Compute one tile (top, left, height, width; a multiple of blocks) and write it."""
+        top, left, height, width = tile
+        out = np.full((self.source.count, height, width), self.fill, dtype=self.source.dtype)
+        valid = np.zeros((height, width), dtype=bool)
+        blocks = [
+            _Block(row, column)
+            for row in range(top // BLOCK, -(-(top + height) // BLOCK))
+            for column in range(left // BLOCK, -(-(left + width) // BLOCK))
+        ]
+        for group in self._groups(blocks):
+            self._warp(group, tile, out, valid)
+        if self.profile.validity == "nodata":
+            _keep_off_nodata(out, valid, self.fill, self.low, self.high)
+        with self._lock:
+            self.valid_pixels += int(np.count_nonzero(valid))
+        writer.write(left, top, out, valid)
+
+    def _groups(self, blocks: list[_Block]) -> Iterator[tuple[list[_Block], Array, tuple[int, int]]]:
+        """Yield blocks that share a DEM window, with lattices, and that window."""
+        uv = self._nodes_dem(blocks, REFINEMENTS[0][0])
+        window = self._dem_window(uv)
+        if window is None:
+            return
+        if len(blocks) > 1 and window[2] * window[3] * 8 > self.window_bytes:
+            for block in blocks:
+                yield from self._groups([block])
+            return
+        heights = self._heights(window)
+        origin = window[:2]
+        seen = self._lattices(blocks, uv, heights, origin)
+        if seen:
+            yield seen, heights, origin
+
+    def _nodes_dem(self, blocks: list[_Block], spacing: int) -> Array:
+        columns, rows = self._offsets(blocks, *_positions(spacing))
+        return self.exact.dem(columns, rows)
+
+    @staticmethod
+    def _offsets(blocks: list[_Block], columns: Array, rows: Array) -> tuple[Array, Array]:
+        """Return output positions of pixel centres, ``(blocks, ...)``, at offsets from each block's first pixel."""
+        shape = (-1,) + (1,) * columns.ndim
+        corner_columns = np.array([block.column for block in blocks], dtype=float).reshape(shape) * BLOCK
+        corner_rows = np.array([block.row for block in blocks], dtype=float).reshape(shape) * BLOCK
+        return corner_columns + columns + 0.5, corner_rows + rows + 0.5
+
+    def _dem_window(self, uv: Array) -> tuple[int, int, int, int] | None:
+        if self.surface.constant_height is not None:
+            return 0, 0, 2, 2
+        finite = uv.reshape(-1, 2)
+        finite = finite[np.isfinite(finite).all(axis=1)]
+        rows, columns = self.surface.shape
+        if not len(finite):
+            return None
+        low = np.maximum(np.floor(finite.min(axis=0)).astype(int) - 3, -3)
+        high = np.minimum(np.floor(finite.max(axis=0)).astype(int) + 5, (columns + 3, rows + 3))
+        if (high - low < 2).any():
+            return None
+        return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
+
+    def _heights(self, window: tuple[int, int, int, int]) -> Array:
+        if self.surface.constant_height is not None:
+            return np.full((2, 2), float(self.surface.constant_height))
+        return self.surface.window(*window)
+
+    # -- lattices ----------------------------------------------------------------------------------------------------
+
+    def _lattices(self, blocks: list[_Block], uv: Array, heights: Array, origin: tuple[int, int]) -> list[_Block]:
+        """Give each block its lattice; return those that see terrain and the source."""
+        with_terrain = [k for k, block in enumerate(blocks) if self._terrain(block, uv[k], heights, origin)]
+        blocks, uv = [blocks[k] for k in with_terrain], uv[with_terrain]
+        if not blocks:
+            return []
+        spacing, levels = REFINEMENTS[0]
+        self._evaluate(blocks, spacing, levels, uv)
+        worst = self._verify(blocks)
+        for block, error in zip(blocks, worst, strict=True):
+            final, steps = float(error), iter(REFINEMENTS[1:])
+            while final > self.tolerance / 2:
+                try:
+                    spacing, levels = next(steps)
+                except StopIteration:
+                    raise ModelError(
+                        f"the warp cannot hold {self.tolerance} px (the error is {final:.3g} px)",
+                        remedy="allow more with --tolerance, or check the model near this part of the scene",
+                    ) from None
+                self._evaluate([block], spacing, levels, self._nodes_dem([block], spacing))
+                final = float(self._verify([block])[0])
+            with self._lock:
+                self.worst, self.finest = max(self.worst, final), min(self.finest, block.spacing)
+                self.refined += block.spacing != REFINEMENTS[0][0]
+        return [block for block in blocks if block.window is not None]
+
+    def _terrain(self, block: _Block, uv: Array, heights: Array, origin: tuple[int, int]) -> bool:
+        """Find the range of heights under a block; False where there are none."""
+        finite = uv.reshape(-1, 2)
+        finite = finite[np.isfinite(finite).all(axis=1)]
+        if not len(finite):
+            return False
+        margin = 3 if self.cubic_dem else 1
+        low = np.maximum(np.floor(finite.min(axis=0)).astype(int) - margin - origin, 0)
+        high = np.maximum(np.floor(finite.max(axis=0)).astype(int) + 2 + margin - origin, 0)
+        under = heights[low[1] : high[1], low[0] : high[0]]
+        if not np.isfinite(under).any():
+            return False
+        lowest, highest = float(np.nanmin(under)), float(np.nanmax(under))
+        # A cubic DEM overshoots between its samples by up to a quarter of their range.
+        extra = 0.25 * (highest - lowest) if self.cubic_dem else 0.0
+        block.middle = (lowest + highest) / 2
+        block.half = max((highest - lowest) / 2 + extra, 0.5)
+        return True
+
+    def _evaluate(self, blocks: list[_Block], spacing: int, levels: int, uv: Array) -> None:
+        """Set the lattices of `blocks` from exact model evaluations."""
+        columns, rows = self._offsets(blocks, *_positions(spacing))
+        steps = _levels(levels)
+        middle = np.array([block.middle for block in blocks])[:, None, None, None]
+        half = np.array([block.half for block in blocks])[:, None, None, None]
+        heights = np.broadcast_to(middle + half * steps, (*columns.shape, levels))
+        image = self.exact.image(columns, rows, heights)
+        polynomial = np.linalg.inv(np.vander(steps, increasing=True))
+        coefficients = np.einsum("kl,...la->...ka", polynomial, image)
+        for k, block in enumerate(blocks):
+            block.spacing, block.nodes, block.dem_nodes = spacing, coefficients[k], uv[k]
+            block.window = self._source_window(image[k])
+
+    def _source_window(self, image: Array) -> tuple[int, int, int, int] | None:
+        """Return the window of the source (left, top, right, bottom) under image points; None if it is empty."""
+        points = image.reshape(-1, 2)
+        points = points[np.isfinite(points).all(axis=1)]
+        if not len(points):
+            return None
+        size = np.array([self.source.width, self.source.height])
+        pad = self.reach + _MARGIN
+        low = np.clip(np.floor(points.min(axis=0)) - pad, 0, size).astype(int)
+        high = np.clip(np.ceil(points.max(axis=0)) + pad, 0, size).astype(int)
+        return None if (high <= low).any() else (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+
+    def _verify(self, blocks: list[_Block]) -> Array:
+        """Return the worst error (source px) of each block's lattice at its verification points ``(blocks,)``."""
+        scattered = np.array([_scatter((block.row, block.column)) for block in blocks])
+        columns, rows, t = scattered[:, 0], scattered[:, 1], scattered[:, 2]
+        corner_columns = np.array([block.column for block in blocks])[:, None] * BLOCK + 0.5
+        corner_rows = np.array([block.row for block in blocks])[:, None] * BLOCK + 0.5
+        middle = np.array([block.middle for block in blocks])[:, None]
+        half = np.array([block.half for block in blocks])[:, None]
+        output = columns + corner_columns, rows + corner_rows
+        exact = self.exact.image(*output, (middle + half * t)[:, :, None])[:, :, 0]
+        exact_uv = self.exact.dem(*output)
+        errors = np.zeros(len(blocks))
+        for k, block in enumerate(blocks):
+            image, uv, parallax = _interpolate(block, columns[k], rows[k], t[k])
+            errors[k] = self._misfit(image, exact[k], uv, exact_uv[k], parallax)
+        return errors
+
+    def _misfit(self, image: Array, exact: Array, uv: Array, exact_uv: Array, parallax: Array) -> float:
+        size = np.array([self.source.width, self.source.height])
+        with np.errstate(invalid="ignore"):
+            inside = [((points >= -2) & (points <= size + 2)).all(axis=1) for points in (image, exact)]
+            error = np.hypot(*(image - exact).T) + parallax * np.abs(uv - exact_uv).sum(axis=1)
+        counts = inside[0] | inside[1]
+        # A point that one of them puts into the image and the other nowhere is infinitely wrong.
+        return float(np.where(np.isnan(error), np.inf, error)[counts].max(initial=0.0))
+
+    # -- pixels ------------------------------------------------------------------------------------------------------
+
+    def _warp(
+        self,
+        group: tuple[list[_Block], Array, tuple[int, int]],
+        tile: tuple[int, int, int, int],
+        out: NDArray[Any],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        blocks, heights, origin = group
+        windows = np.array([block.window for block in blocks])
+        left, top = windows[:, :2].min(axis=0)
+        right, bottom = windows[:, 2:].max(axis=0)
+        pixel = self.source.count * self.source.dtype.itemsize
+        if len(blocks) > 1 and (right - left) * (bottom - top) * pixel > self.window_bytes:
+            for block in blocks:
+                self._warp(([block], heights, origin), tile, out, valid)
+            return
+        pixels = _Pixels(self.source, int(left), int(top), int(right), int(bottom))
+        for block in blocks:
+            rows = block.row * BLOCK - tile[0], block.column * BLOCK - tile[1]
+            area = (0, min(BLOCK, tile[2] - rows[0]), 0, min(BLOCK, tile[3] - rows[1]))
+            self._warp_block(block, pixels, heights, origin, area, rows, out, valid)
+
+    def _warp_block(
+        self,
+        block: _Block,
+        pixels: _Pixels,
+        heights: Array,
+        origin: tuple[int, int],
+        area: tuple[int, int, int, int],
+        place: tuple[int, int],
+        out: NDArray[Any],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        rows = slice(place[0] + area[0], place[0] + area[1])
+        columns = slice(place[1] + area[2], place[1] + area[3])
+        while True:
+            short = kernels.warp_block(
+                self.kernel, pixels.values, pixels.valid, pixels.masked, pixels.left, pixels.top,
+                self.source.width, self.source.height, block.spacing, block.nodes, block.dem_nodes, heights,
+                origin[0], origin[1], self.cubic_dem, block.middle, block.half, self.low, self.high, self.integer,
+                self.fill, np.array(area), out[:, rows, columns], valid[rows, columns], self.reach,
+            )  # fmt: skip
+            if not short:
+                return
+            pixels = pixels.wider(self.source)
+
+
+class _Pixels:
+    """A window of the source."""
+
+    def __init__(self, source: RasterSource, left: int, top: int, right: int, bottom: int) -> None:
+        self.left, self.top, self.right, self.bottom = left, top, right, bottom
+        self.values = source.read(left, top, right - left, bottom - top)
+        valid = source.read_valid(left, top, self.values)
+        self.masked = valid is not None
+        self.valid = valid if valid is not None else np.ones((1, 1, 1), dtype=bool)
+
+    def wider(self, source: RasterSource) -> _Pixels:
+        """Return a window larger by 64 pixels all around (terrain between the nodes reached beyond this one)."""
+        return _Pixels(
+            source,
+            max(0, self.left - 64),
+            max(0, self.top - 64),
+            min(source.width, self.right + 64),
+            min(source.height, self.bottom + 64),
+        )
+
+
+def _interpolate(block: _Block, columns: Array, rows: Array, t: Array) -> tuple[Array, Array, Array]:
+    """Return what the kernel gets from a lattice: image points, DEM points, parallax (px over the block's heights)."""
+    assert block.nodes is not None
+    assert block.dem_nodes is not None
+    i, j = (columns // block.spacing).astype(int), (rows // block.spacing).astype(int)
+    fx, fy = columns / block.spacing - i, rows / block.spacing - j
+
+    def plan(nodes: Array) -> Array:
+        weight = fx.reshape(-1, *[1] * (nodes.ndim - 2)), fy.reshape(-1, *[1] * (nodes.ndim - 2))
+        upper = nodes[j, i] * (1 - weight[0]) + nodes[j, i + 1] * weight[0]
+        lower = nodes[j + 1, i] * (1 - weight[0]) + nodes[j + 1, i + 1] * weight[0]
+        return upper * (1 - weight[1]) + lower * weight[1]
+
+    coefficients = plan(block.nodes)
+    powers = t[:, None] ** np.arange(coefficients.shape[1])
+    image = np.einsum("nk,nka->na", powers, coefficients)
+    parallax = 2 * np.hypot(*coefficients[:, 1].T)
+    return image, plan(block.dem_nodes), parallax
+
+
+def _range(dtype: np.dtype[Any], profile: Profile) -> tuple[float, float, bool, Any]:
+    """Return lowest and highest value of the output type, whether it is an integer type, and the fill value."""
+    fill = dtype.type(0 if profile.nodata is None else profile.nodata)
+    if dtype.kind in "iu":
+        limits = np.iinfo(dtype)
+        return float(limits.min), float(limits.max), True, fill
+    return -math.inf, math.inf, False, fill
+
+
+def _keep_off_nodata(out: NDArray[Any], valid: NDArray[np.bool_], fill: Any, low: float, high: float) -> None:
+    """Move valid pixels that happened to get the nodata value to the next value, as GDAL does."""
+    if np.isnan(fill):
+        return
+    for band in out:
+        clash = (band == fill) & valid
+        if clash.any():
+            if band.dtype.kind in "iu":
+                band[clash] = fill + 1 if fill < high else fill - 1
+            else:
+                band[clash] = np.nextafter(fill, np.inf, dtype=band.dtype)
