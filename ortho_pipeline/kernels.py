@@ -22,6 +22,11 @@ _jit = numba.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy"
 _inline = numba.njit(nogil=True, cache=True, inline="always", boundscheck=False, error_model="numpy")
 
 
+@_inline
+def _between(first, second, share):
+    return first + (second - first) * share
+
+
 @_jit
 def block_coordinates(
     row: int,
@@ -52,18 +57,13 @@ def block_coordinates(
     for cell in range(left // spacing, (right - 1) // spacing + 1):
         for k in range(levels):
             for axis in range(2):
-                upper = nodes[cell_row, cell, k, axis]
-                begin = upper + (nodes[cell_row + 1, cell, k, axis] - upper) * ty
-                upper = nodes[cell_row, cell + 1, k, axis]
-                end = upper + (nodes[cell_row + 1, cell + 1, k, axis] - upper) * ty
+                begin = _between(nodes[cell_row, cell, k, axis], nodes[cell_row + 1, cell, k, axis], ty)
+                end = _between(nodes[cell_row, cell + 1, k, axis], nodes[cell_row + 1, cell + 1, k, axis], ty)
                 start[2 * k + axis], slope[2 * k + axis] = begin, end - begin
-        u0 = dem_nodes[cell_row, cell, 0] + (dem_nodes[cell_row + 1, cell, 0] - dem_nodes[cell_row, cell, 0]) * ty
-        v0 = dem_nodes[cell_row, cell, 1] + (dem_nodes[cell_row + 1, cell, 1] - dem_nodes[cell_row, cell, 1]) * ty
-        u1 = dem_nodes[cell_row, cell + 1, 0]
-        v1 = dem_nodes[cell_row, cell + 1, 1]
-        u1 += (dem_nodes[cell_row + 1, cell + 1, 0] - u1) * ty
-        v1 += (dem_nodes[cell_row + 1, cell + 1, 1] - v1) * ty
-        u0, v0, u1, v1 = u0 - dem_left, v0 - dem_top, u1 - dem_left, v1 - dem_top
+        u0 = _between(dem_nodes[cell_row, cell, 0], dem_nodes[cell_row + 1, cell, 0], ty) - dem_left
+        v0 = _between(dem_nodes[cell_row, cell, 1], dem_nodes[cell_row + 1, cell, 1], ty) - dem_top
+        u1 = _between(dem_nodes[cell_row, cell + 1, 0], dem_nodes[cell_row + 1, cell + 1, 0], ty) - dem_left
+        v1 = _between(dem_nodes[cell_row, cell + 1, 1], dem_nodes[cell_row + 1, cell + 1, 1], ty) - dem_top
         du, dv = u1 - u0, v1 - v0
         # Coordinates are linear along a row of a cell, so its two ends tell whether all of it lies within the DEM.
         within = (
@@ -201,9 +201,9 @@ def _cubic(source, x, y, left, top):
 
 
 @_inline
-def _all_valid(valid, i, j):
-    for b in range(4):
-        for a in range(4):
+def _all_valid(valid, i, j, size):
+    for b in range(size):
+        for a in range(size):
             if not valid[j + b, i + a]:
                 return False
     return True
@@ -236,6 +236,7 @@ def warp_block(
     out: Any,
     out_valid: Any,
     reach: int,
+    box: Any,
 ) -> int:
     """Make output pixels of one block.
 
@@ -252,6 +253,8 @@ def warp_block(
         Where the pixels go.
     reach : int
         How many pixels around a point the kernel reads.
+    box : (2,)
+        Columns and rows of the source that one output pixel covers, for `AVERAGE`.
 
     Returns
     -------
@@ -268,7 +271,20 @@ def warp_block(
     short = 0
     for row in range(first_row, last_row):
         block_coordinates(
-            row, first, last, spacing, nodes, dem_nodes, heights, dem_left, dem_top, cubic_dem, middle, half, columns, rows
+            row,
+            first,
+            last,
+            spacing,
+            nodes,
+            dem_nodes,
+            heights,
+            dem_left,
+            dem_top,
+            cubic_dem,
+            middle,
+            half,
+            columns,
+            rows,
         )
         inside = not masked
         for k in range(last - first):
@@ -280,13 +296,17 @@ def warp_block(
                     _row_nearest(source[band], columns, rows, left, top, out[band, line])
                 elif kernel == BILINEAR:
                     _row_bilinear(source[band], columns, rows, left, top, integer, out[band, line])
-                else:
+                elif kernel == CUBIC:
                     _row_cubic(source[band], columns, rows, left, top, low, high, integer, out[band, line])
+                elif kernel == LANCZOS:
+                    _row_lanczos(source[band], columns, rows, left, top, low, high, integer, out[band, line])
+                else:
+                    _row_average(source[band], columns, rows, left, top, box, integer, out[band, line])
             out_valid[line] = True
         else:
             short += _row_with_edges(
-                kernel, source, valid, masked, columns, rows, left, top, full_width, full_height, low, high, integer, fill,
-                out[:, line], out_valid[line], reach
+                kernel, source, valid, masked, columns, rows, left, top, full_width, full_height, low, high, integer,
+                fill, out[:, line], out_valid[line], reach, box
             )  # fmt: skip
     return short
 
@@ -333,6 +353,80 @@ def _cubic_line(line, i, a0, a1, a2, a3):
     return a0 * line[i - _ONE] + a1 * line[i] + a2 * line[i + _ONE] + a3 * line[i + _TWO]
 
 
+@_inline
+def _row_lanczos(source, columns, rows, left, top, low, high, integer, out):
+    for k in range(columns.size):
+        value = _lanczos(source, columns[k] - left - 0.5, rows[k] - top - 0.5)
+        out[k] = min(max(np.floor(value + 0.5), low), high) if integer else value
+
+
+@_inline
+def _lanczos_weights(f):
+    """Weights of the Lanczos kernel (a = 3) of samples -2 … 3 for a point at f between 0 and 1; their sum is one."""
+    if f < 1e-9:
+        return 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
+    if f > 1.0 - 1e-9:
+        return 0.0, 0.0, 0.0, 1.0, 0.0, 0.0
+    # sin(pi (f + k)) = ± sin(pi f) cancels but for its sign; sin(pi (f + k) / 3) follows from sin and cos(pi f / 3).
+    sine, cosine = np.sin(np.pi * f / 3.0), np.cos(np.pi * f / 3.0)
+    half, root = 0.5, 0.8660254037844386
+    plus1, plus2 = sine * half + cosine * root, -sine * half + cosine * root
+    less1, less2, less3 = sine * half - cosine * root, -sine * half - cosine * root, -sine
+    w0 = plus2 / ((f + 2.0) * (f + 2.0))
+    w1 = -plus1 / ((f + 1.0) * (f + 1.0))
+    w2 = sine / (f * f)
+    w3 = -less1 / ((f - 1.0) * (f - 1.0))
+    w4 = less2 / ((f - 2.0) * (f - 2.0))
+    w5 = -less3 / ((f - 3.0) * (f - 3.0))
+    scale = 1.0 / (w0 + w1 + w2 + w3 + w4 + w5)
+    return w0 * scale, w1 * scale, w2 * scale, w3 * scale, w4 * scale, w5 * scale
+
+
+@_inline
+def _lanczos(source, x, y):
+    """Value at (x, y), counted from the centre of the window's first pixel; the 6 x 6 neighbours have to be there."""
+    i, j = np.uint64(x), np.uint64(y)
+    a0, a1, a2, a3, a4, a5 = _lanczos_weights(x - i)
+    weights = _lanczos_weights(y - j)
+    total = 0.0
+    for b in range(6):
+        line = source[j - _TWO + np.uint64(b)]
+        total += weights[b] * (
+            a0 * line[i - _TWO]
+            + a1 * line[i - _ONE]
+            + a2 * line[i]
+            + a3 * line[i + _ONE]
+            + a4 * line[i + _TWO]
+            + a5 * line[i + _TWO + _ONE]
+        )
+    return total
+
+
+@_inline
+def _row_average(source, columns, rows, left, top, box, integer, out):
+    everywhere = np.ones((1, 1), dtype=np.bool_)
+    for k in range(columns.size):
+        value = _average_valid(source, everywhere, False, columns[k] - left, rows[k] - top, box)
+        out[k] = np.floor(value + 0.5) if integer else value
+
+
+@_inline
+def _average_valid(source, valid, masked, col, row, box):
+    """Mean of the valid pixels in a box about (col, row), each weighted by the area that lies in the box."""
+    height, width = source.shape
+    first, last = max(col - 0.5 * box[0], 0.0), min(col + 0.5 * box[0], float(width))
+    above, below = max(row - 0.5 * box[1], 0.0), min(row + 0.5 * box[1], float(height))
+    total, area = 0.0, 0.0
+    for j in range(int(above), min(int(np.ceil(below)), height)):
+        tall = min(j + 1.0, below) - max(float(j), above)
+        for i in range(int(first), min(int(np.ceil(last)), width)):
+            if not masked or valid[j, i]:
+                weight = tall * (min(i + 1.0, last) - max(float(i), first))
+                total += weight * source[j, i]
+                area += weight
+    return total / area if area > 0.0 else np.nan
+
+
 @_jit
 def _row_with_edges(
     kernel: int,
@@ -352,6 +446,7 @@ def _row_with_edges(
     out: Any,
     out_valid: Any,
     reach: int,
+    box: Any,
 ) -> int:
     """Make one row ``(bands, columns)`` that touches the edge of the source, or invalid pixels; see `warp_block`."""
     bands, window_height, window_width = source.shape
@@ -382,13 +477,18 @@ def _row_with_edges(
                 out[band, k] = source[band, here_row - top, here_col - left]
                 continue
             x, y = col - 0.5, line - 0.5
-            value = 0.0
             i, j = int(np.floor(x)), int(np.floor(y))
-            inner = kernel == CUBIC and i >= 1 and j >= 1 and i + 2 < full_width and j + 2 < full_height
-            if inner and masked:
-                inner = _all_valid(valid[band], i - 1 - left, j - 1 - top)
-            if inner:
+            # Kernels with negative weights fall back to the bilinear one where a neighbour is missing.
+            span = 1 if kernel == CUBIC else 2
+            inner = i >= span and j >= span and i + span + 1 < full_width and j + span + 1 < full_height
+            if inner and masked and kernel != BILINEAR:
+                inner = _all_valid(valid[band], i - span - left, j - span - top, 2 * span + 2)
+            if kernel == AVERAGE:
+                value = _average_valid(source[band], valid[band if masked else 0], masked, col - left, line - top, box)
+            elif kernel == CUBIC and inner:
                 value = _cubic(source[band], x, y, left, top)
+            elif kernel == LANCZOS and inner:
+                value = _lanczos(source[band], x - left, y - top)
             elif masked:
                 value = _bilinear_valid(source[band], valid[band], x, y, left, top, full_width, full_height)
             else:

@@ -37,13 +37,21 @@ from ortho_pipeline.raster import Grid, Profile, RasterSource, RasterWriter, lim
 
 #: Side of a block in output pixels.
 BLOCK = 256
+#: Side of a tile, the piece of work of a thread.
+TILE = 4 * BLOCK
 #: (lattice spacing in output pixels, number of heights), tried one after the other.
 REFINEMENTS = ((64, 3), (32, 3), (16, 3), (16, 5), (8, 5), (4, 5), (2, 5), (1, 5))
 #: Points per block at which the lattice is verified.
 VERIFIED = 24
-RESAMPLING = {"nearest": kernels.NEAREST, "bilinear": kernels.BILINEAR, "cubic": kernels.CUBIC}
-#: Source pixels that a kernel reads around the one that holds the point.
-_REACH = {"nearest": 0, "bilinear": 1, "cubic": 2}
+RESAMPLING = {
+    "nearest": kernels.NEAREST,
+    "bilinear": kernels.BILINEAR,
+    "cubic": kernels.CUBIC,
+    "lanczos": kernels.LANCZOS,
+    "average": kernels.AVERAGE,
+}
+#: Source pixels that a kernel reads around the one that holds the point ('average': plus half of its box).
+_REACH = {"nearest": 0, "bilinear": 1, "cubic": 2, "lanczos": 3, "average": 1}
 #: Source pixels beyond the lattice nodes of a window, for what lies higher or lower between the nodes.
 _MARGIN = 4
 
@@ -107,11 +115,10 @@ def rectify(
     job = _Job(
         model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, memory // (4 * threads)
     )
-    side = BLOCK * max(1, min(4, int(math.sqrt(memory / threads / 16 / source.count / source.dtype.itemsize)) // BLOCK))
     profile = Profile.of(source)
     limit_cache(memory // 4)
     with RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads) as writer:
-        tiles = list(_tiles(grid, side))
+        tiles = list(_tiles(grid, TILE))
         for done, _ in enumerate(_bounded(threads, lambda tile: job.make(writer, tile), tiles), start=1):
             if progress:
                 progress(done / len(tiles))
@@ -220,7 +227,10 @@ class _Block:
     dem_nodes: Array | None = None
     middle: float = 0.0
     half: float = 1.0
-    window: tuple[int, int, int, int] | None = None  # source left, top, right, bottom
+    terrain: tuple[int, int, int, int] = (0, 0, 0, 0)  # DEM samples left, top, right, bottom
+    reach: int = 0
+    box: tuple[float, float] = (1.0, 1.0)  # source columns and rows under one output pixel
+    window: tuple[int, int, int, int] | None = None  # source pixels left, top, right, bottom
 
 
 def _positions(spacing: int) -> tuple[Array, Array]:
@@ -263,7 +273,7 @@ class _Job:
     ) -> None:
         self.source, self.surface, self.grid = source, surface, grid
         self.exact = _Exact(model, surface, grid)
-        self.kernel, self.reach = RESAMPLING[resampling], _REACH[resampling]
+        self.kernel, self._reach = RESAMPLING[resampling], _REACH[resampling]
         self.cubic_dem, self.tolerance, self.window_bytes = cubic_dem, tolerance, window_bytes
         self.profile = Profile.of(source)
         self.low, self.high, self.integer, self.fill = _range(source.dtype, self.profile)
@@ -273,7 +283,7 @@ class _Job:
     # -- a tile ------------------------------------------------------------------------------------------------------
 
     def make(self, writer: RasterWriter, tile: tuple[int, int, int, int]) -> None:
-        """Compute one tile (top, left, height, width; a multiple of blocks) and write it."""
+        """Compute one tile (top, left, height, width) and write it."""
         top, left, height, width = tile
         out = np.full((self.source.count, height, width), self.fill, dtype=self.source.dtype)
         valid = np.zeros((height, width), dtype=bool)
@@ -282,29 +292,16 @@ class _Job:
             for row in range(top // BLOCK, -(-(top + height) // BLOCK))
             for column in range(left // BLOCK, -(-(left + width) // BLOCK))
         ]
-        for group in self._groups(blocks):
-            self._warp(group, tile, out, valid)
+        terrain = _Terrain(self.surface, self.cubic_dem, self.window_bytes)
+        uv = self._nodes_dem(blocks, REFINEMENTS[0][0])
+        seen = self._lattices(blocks, uv, terrain.ranges(blocks, uv))
+        for group, heights, origin in terrain.groups(seen):
+            self._warp(group, heights, origin, tile, out, valid)
         if self.profile.validity == "nodata":
-            _keep_off_nodata(out, valid, self.fill, self.low, self.high)
+            _keep_off_nodata(out, valid, self.fill, self.high)
         with self._lock:
             self.valid_pixels += int(np.count_nonzero(valid))
         writer.write(left, top, out, valid)
-
-    def _groups(self, blocks: list[_Block]) -> Iterator[tuple[list[_Block], Array, tuple[int, int]]]:
-        """Yield blocks that share a DEM window, with lattices, and that window."""
-        uv = self._nodes_dem(blocks, REFINEMENTS[0][0])
-        window = self._dem_window(uv)
-        if window is None:
-            return
-        if len(blocks) > 1 and window[2] * window[3] * 8 > self.window_bytes:
-            for block in blocks:
-                yield from self._groups([block])
-            return
-        heights = self._heights(window)
-        origin = window[:2]
-        seen = self._lattices(blocks, uv, heights, origin)
-        if seen:
-            yield seen, heights, origin
 
     def _nodes_dem(self, blocks: list[_Block], spacing: int) -> Array:
         columns, rows = self._offsets(blocks, *_positions(spacing))
@@ -318,37 +315,16 @@ class _Job:
         corner_rows = np.array([block.row for block in blocks], dtype=float).reshape(shape) * BLOCK
         return corner_columns + columns + 0.5, corner_rows + rows + 0.5
 
-    def _dem_window(self, uv: Array) -> tuple[int, int, int, int] | None:
-        if self.surface.constant_height is not None:
-            return 0, 0, 2, 2
-        finite = uv.reshape(-1, 2)
-        finite = finite[np.isfinite(finite).all(axis=1)]
-        rows, columns = self.surface.shape
-        if not len(finite):
-            return None
-        low = np.maximum(np.floor(finite.min(axis=0)).astype(int) - 3, -3)
-        high = np.minimum(np.floor(finite.max(axis=0)).astype(int) + 5, (columns + 3, rows + 3))
-        if (high - low < 2).any():
-            return None
-        return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
-
-    def _heights(self, window: tuple[int, int, int, int]) -> Array:
-        if self.surface.constant_height is not None:
-            return np.full((2, 2), float(self.surface.constant_height))
-        return self.surface.window(*window)
-
     # -- lattices ----------------------------------------------------------------------------------------------------
 
-    def _lattices(self, blocks: list[_Block], uv: Array, heights: Array, origin: tuple[int, int]) -> list[_Block]:
-        """Give each block its lattice; return those that see terrain and the source."""
-        with_terrain = [k for k, block in enumerate(blocks) if self._terrain(block, uv[k], heights, origin)]
+    def _lattices(self, blocks: list[_Block], uv: Array, with_terrain: list[int]) -> list[_Block]:
+        """Give each block that has terrain its lattice; return those that see the source."""
         blocks, uv = [blocks[k] for k in with_terrain], uv[with_terrain]
         if not blocks:
             return []
-        spacing, levels = REFINEMENTS[0]
-        self._evaluate(blocks, spacing, levels, uv)
-        worst = self._verify(blocks)
-        for block, error in zip(blocks, worst, strict=True):
+        # One call for all blocks of a tile, whatever the memory: the last bits of a result may depend on a call's size.
+        self._evaluate(blocks, *REFINEMENTS[0], uv)
+        for block, error in zip(blocks, self._verify(blocks), strict=True):
             final, steps = float(error), iter(REFINEMENTS[1:])
             while final > self.tolerance / 2:
                 try:
@@ -365,25 +341,6 @@ class _Job:
                 self.refined += block.spacing != REFINEMENTS[0][0]
         return [block for block in blocks if block.window is not None]
 
-    def _terrain(self, block: _Block, uv: Array, heights: Array, origin: tuple[int, int]) -> bool:
-        """Find the range of heights under a block; False where there are none."""
-        finite = uv.reshape(-1, 2)
-        finite = finite[np.isfinite(finite).all(axis=1)]
-        if not len(finite):
-            return False
-        margin = 3 if self.cubic_dem else 1
-        low = np.maximum(np.floor(finite.min(axis=0)).astype(int) - margin - origin, 0)
-        high = np.maximum(np.floor(finite.max(axis=0)).astype(int) + 2 + margin - origin, 0)
-        under = heights[low[1] : high[1], low[0] : high[0]]
-        if not np.isfinite(under).any():
-            return False
-        lowest, highest = float(np.nanmin(under)), float(np.nanmax(under))
-        # A cubic DEM overshoots between its samples by up to a quarter of their range.
-        extra = 0.25 * (highest - lowest) if self.cubic_dem else 0.0
-        block.middle = (lowest + highest) / 2
-        block.half = max((highest - lowest) / 2 + extra, 0.5)
-        return True
-
     def _evaluate(self, blocks: list[_Block], spacing: int, levels: int, uv: Array) -> None:
         """Set the lattices of `blocks` from exact model evaluations."""
         columns, rows = self._offsets(blocks, *_positions(spacing))
@@ -396,16 +353,20 @@ class _Job:
         coefficients = np.einsum("kl,...la->...ka", polynomial, image)
         for k, block in enumerate(blocks):
             block.spacing, block.nodes, block.dem_nodes = spacing, coefficients[k], uv[k]
-            block.window = self._source_window(image[k])
+            if self.kernel == kernels.AVERAGE:
+                block.box = _box(block)
+                block.reach = self._reach + math.ceil(max(block.box) / 2)
+            else:
+                block.reach = self._reach
+            block.window = self._source_window(image[k], block.reach + _MARGIN)
 
-    def _source_window(self, image: Array) -> tuple[int, int, int, int] | None:
+    def _source_window(self, image: Array, pad: int) -> tuple[int, int, int, int] | None:
         """Return the window of the source (left, top, right, bottom) under image points; None if it is empty."""
         points = image.reshape(-1, 2)
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             return None
         size = np.array([self.source.width, self.source.height])
-        pad = self.reach + _MARGIN
         low = np.clip(np.floor(points.min(axis=0)) - pad, 0, size).astype(int)
         high = np.clip(np.ceil(points.max(axis=0)) + pad, 0, size).astype(int)
         return None if (high <= low).any() else (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
@@ -440,19 +401,20 @@ class _Job:
 
     def _warp(
         self,
-        group: tuple[list[_Block], Array, tuple[int, int]],
+        blocks: list[_Block],
+        heights: Array,
+        origin: tuple[int, int],
         tile: tuple[int, int, int, int],
         out: NDArray[Any],
         valid: NDArray[np.bool_],
     ) -> None:
-        blocks, heights, origin = group
         windows = np.array([block.window for block in blocks])
         left, top = windows[:, :2].min(axis=0)
         right, bottom = windows[:, 2:].max(axis=0)
         pixel = self.source.count * self.source.dtype.itemsize
         if len(blocks) > 1 and (right - left) * (bottom - top) * pixel > self.window_bytes:
             for block in blocks:
-                self._warp(([block], heights, origin), tile, out, valid)
+                self._warp([block], heights, origin, tile, out, valid)
             return
         pixels = _Pixels(self.source, int(left), int(top), int(right), int(bottom))
         for block in blocks:
@@ -478,11 +440,76 @@ class _Job:
                 self.kernel, pixels.values, pixels.valid, pixels.masked, pixels.left, pixels.top,
                 self.source.width, self.source.height, block.spacing, block.nodes, block.dem_nodes, heights,
                 origin[0], origin[1], self.cubic_dem, block.middle, block.half, self.low, self.high, self.integer,
-                self.fill, np.array(area), out[:, rows, columns], valid[rows, columns], self.reach,
+                self.fill, np.array(area), out[:, rows, columns], valid[rows, columns], block.reach,
+                np.array(block.box),
             )  # fmt: skip
             if not short:
                 return
             pixels = pixels.wider(self.source)
+
+
+class _Terrain:
+    """The heights under one tile, read at once or, where memory is short, block by block."""
+
+    def __init__(self, surface: Surface, cubic: bool, window_bytes: int) -> None:
+        self._surface, self._cubic, self._window_bytes = surface, cubic, window_bytes
+        self._whole: tuple[Array, tuple[int, int]] | None = None
+
+    def ranges(self, blocks: list[_Block], uv: Array) -> list[int]:
+        """Set the height range of each block from its lattice in the DEM; return the indices of those with heights."""
+        windows = [self._window(nodes) for nodes in uv]
+        present = [k for k, window in enumerate(windows) if window is not None]
+        if not present:
+            return []
+        together = np.array([windows[k] for k in present])
+        whole = (*together[:, :2].min(axis=0), *together[:, 2:].max(axis=0))
+        if (whole[2] - whole[0]) * (whole[3] - whole[1]) * 8 <= self._window_bytes:
+            self._whole = self._read(whole), (int(whole[0]), int(whole[1]))
+        return [k for k in present if self._range(blocks[k], windows[k])]
+
+    def groups(self, blocks: list[_Block]) -> Iterator[tuple[list[_Block], Array, tuple[int, int]]]:
+        """Yield blocks with the window of heights that they share and the place of its first sample."""
+        if self._whole is not None:
+            if blocks:
+                yield blocks, *self._whole
+            return
+        for block in blocks:
+            yield [block], self._read(block.terrain), block.terrain[:2]
+
+    def _window(self, nodes: Array) -> tuple[int, int, int, int] | None:
+        """Return the samples (left, top, right, bottom) under lattice nodes, with those that interpolation needs."""
+        if self._surface.constant_height is not None:
+            return 0, 0, 2, 2
+        points = nodes.reshape(-1, 2)
+        points = points[np.isfinite(points).all(axis=1)]
+        rows, columns = self._surface.shape
+        if not len(points):
+            return None
+        low = np.maximum(np.floor(points.min(axis=0)).astype(int) - 2, -2)
+        high = np.minimum(np.floor(points.max(axis=0)).astype(int) + 5, (columns + 2, rows + 2))
+        return None if (high - low < 2).any() else (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+
+    def _read(self, window: Any) -> Array:
+        left, top, right, bottom = (int(value) for value in window)
+        if self._surface.constant_height is not None:
+            return np.full((2, 2), float(self._surface.constant_height))
+        return self._surface.window(left, top, right - left, bottom - top)
+
+    def _range(self, block: _Block, window: Any) -> bool:
+        left, top, right, bottom = block.terrain = window
+        if self._whole is None:
+            under = self._read(window)
+        else:
+            heights, (first, above) = self._whole
+            under = heights[top - above : bottom - above, left - first : right - first]
+        if not np.isfinite(under).any():
+            return False
+        lowest, highest = float(np.nanmin(under)), float(np.nanmax(under))
+        # A cubic DEM overshoots between its samples by up to a quarter of their range.
+        extra = 0.25 * (highest - lowest) if self._cubic else 0.0
+        block.middle = (lowest + highest) / 2
+        block.half = max((highest - lowest) / 2 + extra, 0.5)
+        return True
 
 
 class _Pixels:
@@ -526,6 +553,19 @@ def _interpolate(block: _Block, columns: Array, rows: Array, t: Array) -> tuple[
     return image, plan(block.dem_nodes), parallax
 
 
+def _box(block: _Block) -> tuple[float, float]:
+    """Return how many columns and rows of the source one output pixel covers in the mean over a block, at least 1."""
+    assert block.nodes is not None
+    level = block.nodes[:, :, 0]
+    across = np.abs(np.diff(level, axis=1)) / block.spacing
+    down = np.abs(np.diff(level, axis=0)) / block.spacing
+    finite = [part[np.isfinite(part).all(axis=2)] for part in (across, down)]
+    if not all(len(part) for part in finite):
+        return 1.0, 1.0
+    size = np.maximum(finite[0].mean(axis=0) + finite[1].mean(axis=0), 1.0)
+    return float(size[0]), float(size[1])
+
+
 def _range(dtype: np.dtype[Any], profile: Profile) -> tuple[float, float, bool, Any]:
     """Return lowest and highest value of the output type, whether it is an integer type, and the fill value."""
     fill = dtype.type(0 if profile.nodata is None else profile.nodata)
@@ -535,7 +575,7 @@ def _range(dtype: np.dtype[Any], profile: Profile) -> tuple[float, float, bool, 
     return -math.inf, math.inf, False, fill
 
 
-def _keep_off_nodata(out: NDArray[Any], valid: NDArray[np.bool_], fill: Any, low: float, high: float) -> None:
+def _keep_off_nodata(out: NDArray[Any], valid: NDArray[np.bool_], fill: Any, high: float) -> None:
     """Move valid pixels that happened to get the nodata value to the next value, as GDAL does."""
     if np.isnan(fill):
         return

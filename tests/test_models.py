@@ -1,0 +1,157 @@
+"""Sensor models: RPC and image correction against closed forms, numeric derivatives and the traps of the field."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.models import RPC, ImageCorrection, SensorModel, model_from_dict
+from ortho_pipeline.models.rational import RPC_TERMS, rpc_terms
+from ortho_pipeline.testing import check_sensor_model
+
+
+def make_rpc(**changes) -> RPC:
+    """An RPC like that of a half-metre satellite 20 degrees off nadir, with all 78 coefficients at work."""
+    random = np.random.default_rng(7)
+    cubic = random.normal(0, 2e-5, (4, 10))
+    fields = {
+        "col_off": 6000.0, "row_off": 6100.0, "lon_off": 24.4, "lat_off": -33.65, "h_off": 700.0,
+        "col_scale": 6300.0, "row_scale": 6350.0, "lon_scale": 0.034, "lat_scale": 0.029, "h_scale": 500.0,
+        "col_num": [2e-3, 1.0, 0.05, 0.04, 1e-3, 4e-4, -3e-4, -6e-4, -5e-4, 8e-6, *cubic[0]],
+        "col_den": [1.0, -1.7e-3, -2e-3, 3e-4, 1e-5, 2e-6, -3e-6, 4e-6, -5e-6, 6e-7, *cubic[1] / 10],
+        "row_num": [-3e-3, 0.04, -1.0, 0.03, -1.5e-3, 2e-5, 3e-4, 4e-4, 3e-4, -3e-6, *cubic[2]],
+        "row_den": [1.0, -1.4e-3, -1.1e-3, -5e-4, 2e-5, -2e-6, 1e-6, -3e-6, 1e-6, -5e-7, *cubic[3] / 10],
+    }  # fmt: skip
+    return RPC(**{**fields, **changes})
+
+
+def box_of(model: SensorModel, count: int = 500, seed: int = 1) -> np.ndarray:
+    centre, half = model.domain
+    return centre + half * np.random.default_rng(seed).uniform(-1, 1, (count, 3))
+
+
+def test_terms_follow_the_exponents():
+    lon, lat, h = np.random.default_rng(0).uniform(-1, 1, (3, 50))
+    expected = [lon**a * lat**b * h**c for a, b, c in RPC_TERMS]
+    np.testing.assert_allclose(rpc_terms(lon, lat, h), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        make_rpc(),
+        ImageCorrection(make_rpc(), "shift", (5000, 5000), [3.0, 0, 0, -2.0, 0, 0]),
+        ImageCorrection(make_rpc(), "shift-drift", (5000, 5000), [3.0, 0, 1e-3, -2.0, 0, 2e-4]),
+        ImageCorrection(make_rpc(), "affine", (5000, 5000), [3.0, 1e-3, -2e-4, -2.0, 3e-4, -1e-3]),
+    ],
+    ids=lambda model: getattr(model, "correction", "rpc"),
+)
+def test_contract(model):
+    check_sensor_model(model, box_of(model))
+
+
+def test_offsets_are_in_the_corner_convention():
+    # With numerators without a constant the centre of the box projects to the offsets: SAMP_OFF + 0.5, LINE_OFF + 0.5.
+    model = make_rpc(col_num=[0, 1, *[0] * 18], row_num=[0, 0, -1, *[0] * 17])
+    np.testing.assert_array_equal(model.ground_to_image([[24.4, -33.65, 700.0]]), [[6000.0, 6100.0]])
+
+
+def test_crop_shifts_and_scale_scales_exactly():
+    model, ground = make_rpc(), box_of(make_rpc())
+    image = model.ground_to_image(ground)
+    np.testing.assert_allclose(model.shifted(123, 45).ground_to_image(ground), image - (123, 45), atol=1e-9)
+    np.testing.assert_allclose(model.scaled(4).ground_to_image(ground), image / 4, atol=1e-9)
+    # In vendors' terms: off' = (off + 0.5) / k - 0.5.
+    assert model.scaled(4).col_off - 0.5 == pytest.approx((model.col_off - 0.5 + 0.5) / 4 - 0.5, abs=1e-12)
+
+
+def test_inverse_closes_over_the_whole_box():
+    model = make_rpc()
+    ground = box_of(model, 10_000)
+    image = model.ground_to_image(ground)
+    found = model.image_to_ground(image, ground[:, 2])
+    assert np.abs(model.ground_to_image(found) - image).max() < 1e-5
+    np.testing.assert_allclose(found, ground, atol=1e-11)
+
+
+def test_inverse_gives_nan_instead_of_a_false_root():
+    model = make_rpc()
+    far = np.array([[1e6, 1e6], [np.nan, 0.0], [6000.0, 1e9]])
+    assert np.isnan(model.image_to_ground(far, 700.0)).all()
+    assert np.isnan(model.image_to_ground([[6000.0, 6000.0]], np.nan)).all()
+
+
+def test_ground_far_outside_has_no_image():
+    model = make_rpc()
+    assert np.isnan(model.ground_to_image([[24.4 + 1.6 * 0.034, -33.65, 700.0]])).all()
+    assert np.isfinite(model.ground_to_image([[24.4 + 1.4 * 0.034, -33.65, 700.0]])).all()
+
+
+@pytest.mark.parametrize("turn", [-360.0, 360.0])
+def test_antimeridian(turn):
+    model = make_rpc(lon_off=179.99)
+    ground = box_of(model)
+    np.testing.assert_allclose(
+        model.ground_to_image(ground + [turn, 0, 0]), model.ground_to_image(ground), rtol=0, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"lon_scale": 0.0}, "lon_scale"),
+        ({"h_off": np.nan}, "h_off"),
+        ({"col_num": [1.0] * 19}, "col_num"),
+        ({"row_num": [np.inf] * 20}, "row_num"),
+        ({"row_den": [0.0] * 20}, "row_den"),
+        ({"col_den": [0.0, 1.0, *[0.0] * 18]}, "col_den"),
+    ],
+)
+def test_degenerate_rpc_is_refused(changes, field):
+    with pytest.raises(InputError) as caught:
+        make_rpc(**changes)
+    assert field in caught.value.field
+
+
+@pytest.mark.filterwarnings("error")
+def test_zero_denominator_inside_the_box_is_nan_without_a_warning():
+    model = make_rpc(lon_off=24.5, lon_scale=0.5, col_den=[1.0, -1.0, *[0.0] * 18])
+    image = model.ground_to_image([[25.0, -33.65, 700.0], [24.5, -33.65, 700.0]])
+    assert np.isnan(image[0]).all()
+    assert np.isfinite(image[1]).all()
+
+
+def test_correction_is_the_stated_affine_transformation():
+    rpc = make_rpc()
+    ground = box_of(rpc)
+    model = ImageCorrection(rpc, "affine", (5000, 6000), [3.0, 1e-3, -2e-4, -2.0, 3e-4, -1e-3])
+    col, row = rpc.ground_to_image(ground).T
+    expected = np.stack(
+        [col + 3 + 1e-3 * (col - 5000) - 2e-4 * (row - 6000), row - 2 + 3e-4 * (col - 5000) - 1e-3 * (row - 6000)], 1
+    )
+    np.testing.assert_allclose(model.ground_to_image(ground), expected, atol=1e-9)
+    np.testing.assert_allclose(rpc.ground_to_image(ground) @ model.matrix.T + model.offset, expected, atol=1e-8)
+
+
+def test_unknown_correction_is_refused():
+    with pytest.raises(InputError, match="shfit"):
+        ImageCorrection.identity(make_rpc(), "shfit", (0, 0))
+
+
+def test_models_survive_json_without_loss():
+    model = ImageCorrection(make_rpc(err_bias=12.5), "affine", (5000.1, 5000), [3.1, 1e-3, -2e-4, -2.0, 3e-4, -1e-3])
+    again = model_from_dict(json.loads(json.dumps(model.to_dict())))
+    ground = box_of(model)
+    np.testing.assert_array_equal(again.ground_to_image(ground), model.ground_to_image(ground))
+    assert again.model.err_bias == 12.5
+
+
+@pytest.mark.parametrize(
+    "data", [{}, {"kind": "warp drive"}, {"kind": "rpc"}, {"kind": "rpc", "colour": 3}, {"kind": "image_correction"}]
+)
+def test_bad_model_data_is_an_input_error(data):
+    with pytest.raises(InputError):
+        model_from_dict(data)
