@@ -425,16 +425,20 @@ class RasterWriter:
         if (check.RasterXSize, check.RasterYSize) != (self.grid.width, self.grid.height):
             raise InputError("the output was not written whole", file=self.path, remedy="check the free disk space")
 
-    def copy(self, path: Path) -> None:
-        """Fill the raster from another of the same size, whose band behind the last one is the mask."""
-        dataset = gdal.Open(str(path))
-        step = 2048
+    def copy(self, path: Path) -> int:
+        """Fill the raster from another of its size, whose last band is the mask; return the count of valid pixels."""
+        dataset, count, step = gdal.Open(str(path)), 0, 2048
         for top in range(0, self.grid.height, step):
             for left in range(0, self.grid.width, step):
                 size = min(step, self.grid.width - left), min(step, self.grid.height - top)
                 pixels = dataset.ReadAsArray(left, top, *size).reshape(-1, size[1], size[0])
-                valid = pixels[-1] > 0 if self.profile.validity == "mask" else None
+                if self.profile.validity == "nodata":
+                    valid = (pixels != self.profile.nodata).any(axis=0)
+                else:
+                    valid = pixels[-1] > 0
                 self.write(left, top, pixels[: self.profile.count].astype(self.profile.dtype, copy=False), valid)
+                count += int(np.count_nonzero(valid))
+        return count
 
     def disk_errors(self) -> _DiskErrors:
         """Return a context in which GDAL's errors become an `InputError` that names the output."""
@@ -512,8 +516,8 @@ def warp_with_gdal(
     memory: int = 512_000_000,
     threads: int = 1,
     progress: Any = None,
-) -> None:
-    """Write the orthoimage of `source` by GDAL's own warper, exactly (no approximated transformer).
+) -> int:
+    """Write the orthoimage of `source` by GDAL's own warper, exactly; return how many pixels are valid.
 
     Parameters
     ----------
@@ -538,7 +542,7 @@ def warp_with_gdal(
         target = writer.path.with_name(f".{writer.path.stem}.gdal.part.tif")
         try:
             _warp_exactly(view, target, source, profile, grid, options, resampling, memory, threads, progress)
-            writer.copy(target)
+            return writer.copy(target)
         finally:
             target.unlink(missing_ok=True)
             gdal.Unlink(dem)

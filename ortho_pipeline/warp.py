@@ -33,7 +33,7 @@ from ortho_pipeline.crs import GroundTransform
 from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import InputError, ModelError
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.raster import Grid, Profile, RasterSource, RasterWriter, limit_cache
+from ortho_pipeline.raster import Grid, Profile, RasterSource, RasterWriter, limit_cache, warp_with_gdal
 
 #: Side of a block in output pixels.
 BLOCK = 256
@@ -112,6 +112,7 @@ def rectify(
     begin = time.monotonic()
     _check(source, resampling, dem_interpolation, tolerance)
     threads = threads or os.cpu_count() or 1
+    surface = _seamless(surface, grid)
     job = _Job(
         model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, memory // (4 * threads)
     )
@@ -132,6 +133,71 @@ def rectify(
         valid_pixels=job.valid_pixels,
         seconds=time.monotonic() - begin,
     )
+
+
+def rectify_gdal(
+    rpc: Mapping[str, str],
+    source: RasterSource,
+    surface: Surface,
+    grid: Grid,
+    path: str | os.PathLike[str],
+    *,
+    resampling: str = "bilinear",
+    memory: int = 512_000_000,
+    threads: int | None = None,
+    driver: str = "COG",
+    creation_options: Mapping[str, str] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> WarpResult:
+    """Write the orthoimage by GDAL's own warper with its exact RPC transformer: a cross-check of `rectify`.
+
+    Parameters
+    ----------
+    rpc : mapping
+        GDAL's ``RPC`` metadata of the model (`rpc.rpc_metadata`).
+    """
+    begin = time.monotonic()
+    _check(source, resampling, "bilinear", 1.0)
+    valid = warp_with_gdal(
+        source, rpc, _heights_under(surface, grid), grid, path, resampling=resampling, driver=driver,
+        creation_options=creation_options, memory=memory, threads=threads or os.cpu_count() or 1, progress=progress,
+    )  # fmt: skip
+    return WarpResult(
+        max_error_px=0.0,
+        tolerance_px=0.0,
+        finest_spacing=1,
+        refined_blocks=0,
+        blocks=0,
+        pixels=grid.width * grid.height,
+        valid_pixels=valid,
+        seconds=time.monotonic() - begin,
+    )
+
+
+def _seamless(surface: Surface, grid: Grid) -> Surface:
+    """Return the surface with the seam of a global DEM away from the grid."""
+    if surface.constant_height is not None:
+        return surface
+    x, y = grid.xy(np.array([grid.width / 2]), np.array([grid.height / 2]))
+    return surface.around(float(GroundTransform(grid.crs, "EPSG:4979")([[x[0], y[0], 0.0]])[0, 0]))
+
+
+def _heights_under(surface: Surface, grid: Grid) -> tuple[Array, tuple[float, ...], Any] | float:
+    """Return the ellipsoidal heights under a grid with their geotransform and CRS, for GDAL."""
+    if surface.constant_height is not None:
+        return surface.constant_height
+    columns, rows = np.meshgrid(np.linspace(0, grid.width, 65), np.linspace(0, grid.height, 65))
+    x, y = grid.xy(columns.ravel(), rows.ravel())
+    plan = GroundTransform(grid.crs, surface.crs)(np.stack([x, y, np.zeros(x.size)], axis=1))
+    samples = surface.samples_at(plan[:, :2])
+    low = np.floor(np.nanmin(samples, axis=0)).astype(int) - 3
+    size = np.ceil(np.nanmax(samples, axis=0)).astype(int) + 4 - low
+    heights = surface.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]))
+    u, a, b, v, c, d = surface.pixel_from_crs
+    inverse = np.linalg.inv([[a, b], [c, d]])
+    # GDAL's geotransform starts at the corner of the first sample.
+    corner = inverse @ (low - 0.5 - np.array([u, v]))
+    return heights, (corner[0], inverse[0, 0], inverse[0, 1], corner[1], inverse[1, 0], inverse[1, 1]), surface.crs
 
 
 def _check(source: RasterSource, resampling: str, dem_interpolation: str, tolerance: float) -> None:
@@ -485,8 +551,9 @@ class _Terrain:
         rows, columns = self._surface.shape
         if not len(points):
             return None
-        low = np.maximum(np.floor(points.min(axis=0)).astype(int) - 2, -2)
-        high = np.minimum(np.floor(points.max(axis=0)).astype(int) + 5, (columns + 2, rows + 2))
+        low, high = np.floor(points.min(axis=0)).astype(int) - 2, np.floor(points.max(axis=0)).astype(int) + 5
+        if self._surface.fill in ("error", "mask"):  # with any other rule there are heights beyond the DEM
+            low, high = np.maximum(low, -2), np.minimum(high, (columns + 2, rows + 2))
         return None if (high - low < 2).any() else (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
 
     def _read(self, window: Any) -> Array:

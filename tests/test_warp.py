@@ -1,0 +1,554 @@
+"""The warp against GDAL's own warper and transformer, on ramps whose pixels are their own coordinates, and its traps.
+
+Ramps: a Float32 source with two bands that hold column and row of their own pixel. Warped bilinearly they give, in
+every output pixel, the image coordinates that the warp used, to be compared with GDAL's exact RPC transformer at
+heights that scipy interpolates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+from osgeo import gdal
+from scipy.interpolate import RegularGridInterpolator
+
+from ortho_pipeline import warp
+from ortho_pipeline.dem import Surface
+from ortho_pipeline.errors import InputError, ModelError
+from ortho_pipeline.models import RPC, SensorModel
+from ortho_pipeline.raster import Grid, RasterSource
+from ortho_pipeline.rpc import rpc_metadata
+from ortho_pipeline.warp import rectify, rectify_gdal
+
+UTM = pyproj.CRS.from_epsg(32735)
+WIDTH, HEIGHT, GSD = 700, 620, 0.5
+CENTRE = (24.4, -33.65)
+EAST, NORTH = pyproj.Transformer.from_crs(4326, UTM, always_xy=True).transform(*CENTRE)
+
+
+def make_rpc(tilt: float = 0.36, gsd: float = GSD) -> RPC:
+    """An RPC of `gsd` metres; `tilt` is the tangent of the angle off nadir (1 is 45 degrees)."""
+    random = np.random.default_rng(2)
+    cubic = random.normal(0, 3e-6, (4, 10))
+    half = np.array([WIDTH, HEIGHT]) / 2
+    parallax = tilt * 500.0 / gsd / half  # normalised, for 500 m of height
+    return RPC(
+        *half, *CENTRE, 700.0, *half, half[0] * gsd / 92_800, half[1] * gsd / 110_900, 500.0,
+        [1e-3, 1.0, 0.03, 0.9 * parallax[0], 1e-3, 4e-4, -3e-4, -6e-4, -5e-4, 8e-5, *cubic[0]],
+        [1.0, -1.7e-3, -2e-3, 3e-4, *[0.0] * 6, *cubic[1] / 10],
+        [-2e-3, 0.02, -1.0, 0.4 * parallax[1], -1.5e-3, 2e-5, 3e-4, 4e-4, 3e-4, -3e-5, *cubic[2]],
+        [1.0, -1.4e-3, -1.1e-3, -5e-4, *[0.0] * 6, *cubic[3] / 10],
+    )  # fmt: skip
+
+
+def rough(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    noise = np.random.default_rng(0).normal(0, 3, x.shape)
+    return 700 + 30 * np.sin(x / 60) * np.cos(y / 45) + 8 * np.sin(x / 13 + y / 17) + noise
+
+
+def cliffs(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Steps of 100 m within three samples of 10 m, in both directions."""
+    return 650 + 100 * np.clip((x - EAST + 60) / 30, 0, 1) + 100 * np.clip((y - NORTH - 20) / 30, 0, 1)
+
+
+@dataclass
+class Scene:
+    folder: Path
+    model: RPC
+    heights: Callable[[np.ndarray, np.ndarray], np.ndarray] = rough
+
+    def write(self, pixels: np.ndarray, name: str = "source.tif", nodata=None, mask=None, options=()) -> Path:
+        """Write pixels (bands, rows, columns) with the RPC in the tag."""
+        from osgeo import gdal_array
+
+        path = self.folder / name
+        bands, rows, columns = pixels.shape
+        kind = gdal_array.NumericTypeCodeToGDALTypeCode(pixels.dtype.type)
+        dataset = gdal.GetDriverByName("GTiff").Create(str(path), columns, rows, bands, kind, list(options))
+        dataset.SetMetadata(rpc_metadata(self.model), "RPC")
+        for i in range(bands):
+            dataset.GetRasterBand(i + 1).WriteArray(pixels[i])
+            if nodata is not None:
+                dataset.GetRasterBand(i + 1).SetNoDataValue(nodata)
+        if mask is not None:
+            gdal.SetConfigOption("GDAL_TIFF_INTERNAL_MASK", "YES")
+            dataset.CreateMaskBand(gdal.GMF_PER_DATASET)
+            dataset.GetRasterBand(1).GetMaskBand().WriteArray(mask)
+            gdal.SetConfigOption("GDAL_TIFF_INTERNAL_MASK", None)
+        dataset = None
+        return path
+
+    def dem(self, step: float = 10.0, count: int = 80, crs: pyproj.CRS = UTM) -> Path:
+        path = self.folder / "dem.tif"
+        if crs.is_geographic:
+            step_x, step_y, (x0, y0) = step / 92_800, step / 110_900, CENTRE
+        else:
+            step_x, step_y, (x0, y0) = step, step, (EAST, NORTH)
+        left, top = x0 - count / 2 * step_x, y0 + count / 2 * step_y
+        x, y = np.meshgrid(left + step_x * (np.arange(count) + 0.5), top - step_y * (np.arange(count) + 0.5))
+        if crs.is_geographic:
+            x, y = pyproj.Transformer.from_crs(crs, UTM, always_xy=True).transform(x, y)
+        dataset = gdal.GetDriverByName("GTiff").Create(str(path), count, count, 1, gdal.GDT_Float64)
+        dataset.SetProjection(crs.to_wkt())
+        dataset.SetGeoTransform((left, step_x, 0, top, 0, -step_y))
+        dataset.WriteArray(self.heights(x, y))
+        dataset = None
+        return path
+
+    def surface(self, **options) -> Surface:
+        return Surface.open(self.dem(**options), "ellipsoid")
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return Scene(tmp_path, make_rpc())
+
+
+def grid_of(size: float = 380.0, step: float = GSD, crs: pyproj.CRS = UTM, shift: float = 0.0) -> Grid:
+    # An origin off the lattice of anything else.
+    left, top = EAST - size / 2 + 0.13 + shift, NORTH + size / 2 + 0.21
+    return Grid.of_extent(crs, (left, top - size, left + size, top), (step, step))
+
+
+def ramps() -> np.ndarray:
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32) + np.float32(0.5)
+    return np.stack([columns, rows])
+
+
+def texture(dtype=np.uint16, seed: int = 4, bands: int = 1) -> np.ndarray:
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
+    noise = np.random.default_rng(seed).normal(0, 10, (bands, HEIGHT, WIDTH))
+    return (120 + 60 * np.sin(columns / 5) * np.cos(rows / 7) + noise).astype(dtype)
+
+
+def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    dataset = gdal.Open(str(path))
+    pixels = dataset.ReadAsArray().reshape(dataset.RasterCount, dataset.RasterYSize, dataset.RasterXSize)
+    return pixels, dataset.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0
+
+
+def exact_image(model: RPC, dem: Path, grid: Grid) -> np.ndarray:
+    """Image coordinates (2, rows, columns) of all output pixels by GDAL's transformer, at heights from scipy."""
+    columns, rows = np.meshgrid(np.arange(grid.width) + 0.5, np.arange(grid.height) + 0.5)
+    x, y = grid.xy(columns.ravel(), rows.ravel())
+    dataset = gdal.Open(str(dem))
+    left, dx, _, top, _, dy = dataset.GetGeoTransform()
+    heights = dataset.ReadAsArray()
+    lines = top + dy * (np.arange(heights.shape[0]) + 0.5)
+    samples = left + dx * (np.arange(heights.shape[1]) + 0.5)
+    dem_crs = pyproj.CRS.from_wkt(dataset.GetProjection())
+    u, v = pyproj.Transformer.from_crs(grid.crs, dem_crs, always_xy=True).transform(x, y)
+    h = RegularGridInterpolator((lines[::-1], samples), heights[::-1])(np.stack([v, u], axis=1))
+    lon, lat = pyproj.Transformer.from_crs(grid.crs, 4326, always_xy=True).transform(x, y)
+    memory = gdal.GetDriverByName("MEM").Create("", WIDTH, HEIGHT)
+    memory.SetMetadata(rpc_metadata(model), "RPC")
+    points, _ = gdal.Transformer(memory, None, ["METHOD=RPC"]).TransformPoints(
+        1, np.stack([lon, lat, h], axis=1).tolist()
+    )
+    return np.array(points)[:, :2].T.reshape(2, grid.height, grid.width)
+
+
+def inner(image: np.ndarray, margin: float = 3.0) -> np.ndarray:
+    return (image[0] > margin) & (image[0] < WIDTH - margin) & (image[1] > margin) & (image[1] < HEIGHT - margin)
+
+
+# -- geometry --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tilt", [0.36, 1.0], ids=["20 degrees", "45 degrees"])
+@pytest.mark.parametrize("heights", [rough, cliffs])
+@pytest.mark.parametrize("dem_crs", [UTM, pyproj.CRS.from_epsg(4326)], ids=["utm", "geographic"])
+def test_every_pixel_is_within_the_tolerance(tmp_path, tilt, heights, dem_crs):
+    scene = Scene(tmp_path, make_rpc(tilt), heights)
+    surface, grid = scene.surface(crs=dem_crs), grid_of()
+    result = rectify(
+        scene.model, RasterSource(scene.write(ramps())), surface, grid, tmp_path / "ortho.tif", driver="GTiff"
+    )
+    found, _ = read(tmp_path / "ortho.tif")
+    exact = exact_image(scene.model, tmp_path / "dem.tif", grid)
+    use = inner(exact)
+    assert use.sum() > 100_000
+    # Float32 ramps hold 700 to 3e-5 px, which is far below the tolerance of 0.01 px.
+    assert np.abs(found - exact)[:, use].max() < 0.01
+    assert result.max_error_px < 0.005
+
+
+@pytest.mark.parametrize("kernel", ["nearest", "bilinear", "cubic", "lanczos"])
+def test_values_are_those_of_exact_gdalwarp(scene, tmp_path, kernel):
+    source, surface, grid = RasterSource(scene.write(texture())), scene.surface(), grid_of()
+    rectify(scene.model, source, surface, grid, tmp_path / "ours.tif", resampling=kernel, driver="GTiff")
+    rectify_gdal(
+        rpc_metadata(scene.model), source, surface, grid, tmp_path / "gdal.tif", resampling=kernel, driver="GTiff"
+    )
+    (ours, valid), (theirs, their_valid) = read(tmp_path / "ours.tif"), read(tmp_path / "gdal.tif")
+    use = inner(exact_image(scene.model, tmp_path / "dem.tif", grid), 4) & valid & their_valid
+    difference = np.abs(ours.astype(int) - theirs)[0][use]
+    assert use.sum() > 100_000
+    # Nearest takes the neighbour where a point falls within the lattice's 0.001 px of an edge: 2 x 2 x 0.001 of them.
+    assert (difference <= 1).mean() >= (0.996 if kernel == "nearest" else 0.999)
+    assert (valid == their_valid).mean() > 0.9999
+
+
+def test_gdalwarp_on_the_command_line_agrees(scene, tmp_path):
+    """As a user would: gdalwarp -rpc with the ellipsoidal DEM, exact transformer, whole-image kernel."""
+    path, surface, grid = scene.write(texture()), scene.surface(), grid_of()
+    rectify(scene.model, RasterSource(path), surface, grid, tmp_path / "ours.tif", resampling="cubic", driver="GTiff")
+    gdal.Warp(
+        str(tmp_path / "gdal.tif"), str(path), rpc=True, outputBounds=grid.extent, xRes=GSD, yRes=GSD,
+        dstSRS="EPSG:32735", transformerOptions=["METHOD=RPC", f"RPC_DEM={tmp_path / 'dem.tif'}"],
+        errorThreshold=0, resampleAlg="cubic",
+        warpOptions=["XSCALE=1", "YSCALE=1"],
+    )  # fmt: skip
+    (ours, valid), (theirs, _) = read(tmp_path / "ours.tif"), read(tmp_path / "gdal.tif")
+    use = inner(exact_image(scene.model, tmp_path / "dem.tif", grid)) & valid
+    assert (np.abs(ours.astype(int) - theirs)[0][use] <= 1).mean() >= 0.999
+
+
+@pytest.mark.parametrize("kernel", ["nearest", "bilinear", "cubic", "lanczos", "average"])
+def test_one_bright_pixel_lands_on_its_ground_point(scene, tmp_path, kernel):
+    pixels = np.zeros((1, HEIGHT, WIDTH), np.float32)
+    pixels[0, 300, 350] = 1000.0
+    surface = Surface.constant(700.0)
+    ground = scene.model.image_to_ground([[350.5, 300.5]], 700.0)
+    east, north = pyproj.Transformer.from_crs(4326, UTM, always_xy=True).transform(*ground[0, :2])
+    fine = 0.05  # ten output pixels to one of the source show the kernel's centre
+    grid = Grid.of_extent(UTM, (east - 4, north - 4, east + 4, north + 4), (fine, fine))
+    rectify(
+        scene.model, RasterSource(scene.write(pixels)), surface, grid, tmp_path / "o.tif", resampling=kernel,
+        driver="GTiff",
+    )  # fmt: skip
+    spot = read(tmp_path / "o.tif")[0][0].astype(float)
+    rows, columns = np.mgrid[0 : grid.height, 0 : grid.width] + 0.5
+    x, y = grid.xy((spot * columns).sum() / spot.sum(), (spot * rows).sum() / spot.sum())
+    assert np.hypot(x - east, y - north) < 0.05 * GSD
+
+
+def test_a_rendered_ground_pattern_comes_back(tmp_path):
+    """Closed loop: render a pattern of the ground through the model, orthorectify, compare with the pattern."""
+    scene, level = Scene(tmp_path, make_rpc()), 700.0
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+    ground = scene.model.image_to_ground(np.stack([columns.ravel(), rows.ravel()], 1), level)
+    x, y = pyproj.Transformer.from_crs(4326, UTM, always_xy=True).transform(ground[:, 0], ground[:, 1])
+
+    def pattern(x, y):
+        return 1000 + 100 * np.sin((x - EAST) / 6) + 100 * np.cos((y - NORTH) / 5)
+
+    pixels = pattern(x, y).reshape(1, HEIGHT, WIDTH).astype(np.float32)
+    grid = grid_of(240.0)
+    rectify(
+        scene.model, RasterSource(scene.write(pixels)), Surface.constant(level), grid, tmp_path / "o.tif",
+        resampling="cubic", driver="GTiff",
+    )  # fmt: skip
+    found, valid = read(tmp_path / "o.tif")
+    out_rows, out_columns = np.mgrid[0 : grid.height, 0 : grid.width] + 0.5
+    expected = pattern(*grid.xy(out_columns, out_rows))
+    # A slope of 100 / 6 per metre makes 0.05 px (0.025 m) worth 0.42.
+    assert np.abs(found[0] - expected)[valid].max() < 0.42
+    assert valid.mean() > 0.9
+
+
+# -- the lattice -----------------------------------------------------------------------------------------------------
+
+
+class Bent(SensorModel):
+    """A plugin's model in plain NumPy, with ripples that a coarse lattice cannot follow."""
+
+    kind = "test_bent"
+
+    def __init__(self, ripple: float = 0.3, length: float = 40.0) -> None:
+        object.__setattr__(self, "ripple", ripple)
+        object.__setattr__(self, "length", length)
+
+    @property
+    def crs(self) -> str:
+        return "EPSG:32735"
+
+    @property
+    def domain(self):
+        return np.array([EAST, NORTH, 700.0]), np.array([200.0, 200.0, 500.0])
+
+    def ground_to_image(self, ground):
+        x, y, h = np.asarray(ground, float).T
+        col = WIDTH / 2 + (x - EAST) / GSD + self.ripple * np.sin((y - NORTH) / self.length) + 0.1 * (h - 700)
+        row = HEIGHT / 2 - (y - NORTH) / GSD + self.ripple * np.cos((x - EAST) / self.length)
+        return np.stack([col, row], axis=1)
+
+
+def test_lattice_is_refined_until_it_holds_the_tolerance(scene, tmp_path):
+    model, grid = Bent(), grid_of(200.0)
+    result = rectify(
+        model, RasterSource(scene.write(ramps())), Surface.constant(700.0), grid, tmp_path / "o.tif", driver="GTiff"
+    )
+    rows, columns = np.mgrid[0 : grid.height, 0 : grid.width] + 0.5
+    x, y = grid.xy(columns.ravel(), rows.ravel())
+    exact = model.ground_to_image(np.stack([x, y, np.full(x.size, 700.0)], 1)).T.reshape(2, grid.height, grid.width)
+    assert np.abs(read(tmp_path / "o.tif")[0] - exact)[:, inner(exact)].max() < 0.01
+    assert result.finest_spacing < 64
+    assert result.refined_blocks > 0
+
+
+def test_a_tolerance_that_cannot_be_held_is_an_error_and_leaves_no_file(scene, tmp_path):
+    with pytest.raises(ModelError, match="cannot hold"):
+        rectify(
+            Bent(ripple=30.0, length=0.05), RasterSource(scene.write(ramps())), Surface.constant(700.0), grid_of(100.0),
+            tmp_path / "o.tif", tolerance=1e-9,
+        )  # fmt: skip
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["source.tif"]
+
+
+@pytest.mark.parametrize("kernel", ["bilinear", "cubic"])
+def test_output_is_the_same_for_any_memory_and_threads(scene, tmp_path, kernel):
+    source, surface, grid = RasterSource(scene.write(texture(np.float32, bands=2))), scene.surface(), grid_of()
+    outputs = []
+    for k, (memory, threads) in enumerate([(512_000_000, 1), (512_000_000, 4), (400_000, 2)]):
+        path = tmp_path / f"{k}.tif"
+        rectify(
+            scene.model, source, surface, grid, path, resampling=kernel, memory=memory, threads=threads, driver="GTiff"
+        )
+        outputs.append(read(path))
+    for pixels, valid in outputs[1:]:
+        np.testing.assert_array_equal(pixels, outputs[0][0])
+        np.testing.assert_array_equal(valid, outputs[0][1])
+
+
+def test_output_does_not_depend_on_the_size_of_the_tiles(scene, tmp_path, monkeypatch):
+    source, surface, grid = RasterSource(scene.write(texture(np.float32))), scene.surface(), grid_of()
+    pixels = []
+    for blocks in (4, 1):
+        monkeypatch.setattr(warp, "TILE", blocks * warp.BLOCK)
+        rectify(scene.model, source, surface, grid, tmp_path / "o.tif", driver="GTiff")
+        pixels.append(read(tmp_path / "o.tif")[0])
+    np.testing.assert_array_equal(*pixels)
+
+
+def test_adjacent_grids_meet_without_a_seam(scene, tmp_path):
+    """Two halves of a grid, cut at a block, hold the pixels of the whole."""
+    source, surface, whole = RasterSource(scene.write(texture(np.float32))), scene.surface(), grid_of()
+    cut = 2 * warp.BLOCK
+    right = Grid(UTM, whole.left + cut * GSD, whole.top, GSD, GSD, whole.width - cut, whole.height)
+    rectify(scene.model, source, surface, whole, tmp_path / "whole.tif", driver="GTiff")
+    rectify(scene.model, source, surface, right, tmp_path / "right.tif", driver="GTiff")
+    whole_pixels, part = read(tmp_path / "whole.tif")[0][:, :, cut:], read(tmp_path / "right.tif")[0]
+    # The grids' origins round differently in the last bit, so the values do, but nothing more.
+    np.testing.assert_allclose(part, whole_pixels, atol=1e-3)
+
+
+# -- heights ---------------------------------------------------------------------------------------------------------
+
+
+def test_voids_of_the_dem_are_holes_and_do_not_bleed(scene, tmp_path):
+    dem = scene.dem()
+    dataset = gdal.Open(str(dem), gdal.GA_Update)
+    heights = dataset.ReadAsArray()
+    heights[40, 40] = -32768.0  # not declared as nodata
+    dataset.WriteArray(heights)
+    left, dx, _, top, _, dy = dataset.GetGeoTransform()
+    dataset = None
+    grid = grid_of(200.0)
+    rectify(
+        scene.model, RasterSource(scene.write(texture())), Surface.open(dem, "ellipsoid", fill="mask"), grid,
+        tmp_path / "o.tif", driver="GTiff",
+    )  # fmt: skip
+    _, valid = read(tmp_path / "o.tif")
+    rows, columns = np.mgrid[0 : grid.height, 0 : grid.width] + 0.5
+    x, y = grid.xy(columns, rows)
+    near = (np.abs((x - left) / dx - 40.5) < 1) & (np.abs((y - top) / dy - 40.5) < 1)
+    np.testing.assert_array_equal(valid, ~near)
+
+
+def test_cubic_dem_interpolates_its_samples(scene, tmp_path):
+    """At the samples of a DEM all interpolators agree; between them cubic follows a smooth surface more closely."""
+    smooth = Scene(tmp_path, make_rpc(1.0), lambda x, y: 700 + 20 * np.sin(x / 15) * np.cos(y / 15))
+    surface, grid = smooth.surface(), grid_of(150.0)
+    source, errors = RasterSource(smooth.write(ramps())), {}
+    rows, columns = np.mgrid[0 : grid.height, 0 : grid.width] + 0.5
+    x, y = grid.xy(columns.ravel(), rows.ravel())
+    lon, lat = pyproj.Transformer.from_crs(UTM, 4326, always_xy=True).transform(x, y)
+    exact = smooth.model.ground_to_image(np.stack([lon, lat, smooth.heights(x, y)], 1)).T.reshape(2, *rows.shape)
+    for way in ("bilinear", "cubic"):
+        rectify(smooth.model, source, surface, grid, tmp_path / "o.tif", dem_interpolation=way, driver="GTiff")
+        errors[way] = np.abs(read(tmp_path / "o.tif")[0] - exact)[:, inner(exact)].max()
+    assert errors["cubic"] < errors["bilinear"] / 2
+
+
+# -- values ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int16, np.int32, np.uint32, np.float32, np.float64])
+@pytest.mark.parametrize("kernel", ["cubic", "lanczos"])
+def test_overshoot_is_clipped_in_every_type(scene, tmp_path, dtype, kernel):
+    limits = np.iinfo(dtype) if np.issubdtype(dtype, np.integer) else None
+    low, high = (limits.min, limits.max) if limits else (0.0, 255.0)
+    pixels = np.full((1, HEIGHT, WIDTH), low, dtype)
+    pixels[:, ::8] = high  # lines one pixel wide overshoot on both sides
+    pixels[:, :, ::9] = high
+    path = scene.write(pixels)
+    rectify(
+        scene.model, RasterSource(path), Surface.constant(700.0), grid_of(100.0), tmp_path / "o.tif", resampling=kernel,
+        driver="GTiff",
+    )  # fmt: skip
+    found, valid = read(tmp_path / "o.tif")
+    assert found.dtype == dtype
+    middle = (float(low) + float(high)) / 2
+    if limits:
+        # Wrapped values would turn the valleys beside lines into peaks.
+        assert found[0][valid].min() == low
+        assert (found[0][valid].astype(float) < middle).mean() > 0.5
+    else:
+        assert found[0][valid].min() < low
+
+
+def test_bands_are_warped_alike(scene, tmp_path):
+    pixels = texture(bands=8)
+    for options in ([], ["INTERLEAVE=BAND"]):
+        path = scene.write(pixels, "many.tif", options=options)
+        rectify(scene.model, RasterSource(path), scene.surface(), grid_of(), tmp_path / "many_o.tif", driver="GTiff")
+        single = scene.write(pixels[5:6], "single.tif")
+        rectify(scene.model, RasterSource(single), scene.surface(), grid_of(), tmp_path / "one_o.tif", driver="GTiff")
+        np.testing.assert_array_equal(read(tmp_path / "many_o.tif")[0][5], read(tmp_path / "one_o.tif")[0][0])
+
+
+def test_values_of_nearest_are_values_of_the_source(scene, tmp_path):
+    pixels = (np.random.default_rng(0).integers(0, 2, (1, HEIGHT, WIDTH)) * 7).astype(np.uint8)
+    path = scene.write(pixels)
+    rectify(scene.model, RasterSource(path), scene.surface(), grid_of(200.0), tmp_path / "o.tif", resampling="nearest")
+    found, valid = read(tmp_path / "o.tif")
+    assert set(np.unique(found[0][valid])) == {0, 7}
+    assert valid.all()  # a valid 0 stays valid
+
+
+@pytest.mark.parametrize("kernel", ["bilinear", "cubic", "lanczos", "average"])
+def test_nodata_does_not_bleed(scene, tmp_path, kernel):
+    pixels = np.full((1, HEIGHT, WIDTH), 1000, np.uint16)
+    pixels[:, 200:400, 300:420] = 0
+    path = scene.write(pixels, nodata=0)
+    rectify(scene.model, RasterSource(path), scene.surface(), grid_of(), tmp_path / "o.tif", resampling=kernel)
+    found, _ = read(tmp_path / "o.tif")
+    assert set(np.unique(found)) == {0, 1000}
+    assert gdal.Open(str(tmp_path / "o.tif")).GetRasterBand(1).GetNoDataValue() == 0
+
+
+def test_mask_and_nan_are_not_valid(scene, tmp_path):
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[200:400, 300:420] = 0
+    values = np.full((1, HEIGHT, WIDTH), 5.0, np.float32)
+    poisoned = values.copy()
+    poisoned[0][mask == 0] = 1e30
+    holes = values.copy()
+    holes[0][mask == 0] = np.nan
+    outputs = []
+    for name, pixels, kind in (("mask.tif", poisoned, mask), ("nan.tif", holes, None)):
+        path = scene.write(pixels, name, mask=kind)
+        rectify(scene.model, RasterSource(path), scene.surface(), grid_of(), tmp_path / f"o_{name}", driver="GTiff")
+        outputs.append(read(tmp_path / f"o_{name}"))
+    for pixels, valid in outputs:
+        np.testing.assert_allclose(pixels[0][valid], 5.0, rtol=1e-6)
+        assert 0.05 < 1 - valid.mean() < 0.6
+    np.testing.assert_array_equal(outputs[0][1], outputs[1][1])
+
+
+def test_a_valid_pixel_never_becomes_nodata(scene, tmp_path):
+    """Between 4 and 6 lies 5, which is nodata: such a pixel moves to the next value."""
+    pixels = np.full((1, HEIGHT, WIDTH), 4, np.uint8)
+    pixels[:, :, ::2] = 6
+    path = scene.write(pixels, nodata=5)
+    rectify(scene.model, RasterSource(path), Surface.constant(700.0), grid_of(150.0), tmp_path / "o.tif")
+    assert set(np.unique(read(tmp_path / "o.tif")[0])) == {4, 6}
+
+
+def test_palette_is_kept_by_nearest_and_refused_by_others(scene, tmp_path):
+    path = scene.write(texture(np.uint8))
+    dataset = gdal.Open(str(path), gdal.GA_Update)
+    table = gdal.ColorTable()
+    for i in range(256):
+        table.SetColorEntry(i, (i, 255 - i, 7, 255))
+    dataset.GetRasterBand(1).SetColorTable(table)
+    dataset = None
+    source = RasterSource(path)
+    with pytest.raises(InputError, match="palette"):
+        rectify(scene.model, source, Surface.constant(700.0), grid_of(50.0), tmp_path / "o.tif")
+    rectify(
+        scene.model, source, Surface.constant(700.0), grid_of(50.0), tmp_path / "o.tif", resampling="nearest",
+        driver="GTiff",
+    )  # fmt: skip
+    assert gdal.Open(str(tmp_path / "o.tif")).GetRasterBand(1).GetColorTable().GetColorEntry(9) == (9, 246, 7, 255)
+
+
+def test_alpha_stays_alpha(scene, tmp_path):
+    pixels = texture(np.uint8, bands=4)
+    pixels[3] = 255
+    pixels[3, :, :350] = 0
+    path = scene.write(pixels, options=["PHOTOMETRIC=RGB", "ALPHA=YES"])
+    rectify(scene.model, RasterSource(path), scene.surface(), grid_of(), tmp_path / "o.tif", driver="GTiff")
+    dataset = gdal.Open(str(tmp_path / "o.tif"))
+    assert dataset.RasterCount == 4
+    assert dataset.GetRasterBand(4).GetColorInterpretation() == gdal.GCI_AlphaBand
+    assert set(np.unique(dataset.GetRasterBand(4).ReadAsArray())) == {0, 255}
+
+
+def test_complex_pixels_are_refused(scene):
+    with pytest.raises(InputError, match="complex"):
+        RasterSource(scene.write(np.zeros((1, HEIGHT, WIDTH), np.complex64)))
+
+
+def test_average_is_the_mean_under_the_output_pixel(scene, tmp_path):
+    pixels = texture(np.float32)
+    path, step = scene.write(pixels), 4.0  # eight source pixels a side
+    rectify(
+        scene.model, RasterSource(path), Surface.constant(700.0), grid_of(160.0, step), tmp_path / "a.tif",
+        resampling="average", driver="GTiff",
+    )  # fmt: skip
+    rectify(
+        scene.model, RasterSource(path), Surface.constant(700.0), grid_of(160.0, step / 64), tmp_path / "f.tif",
+        resampling="nearest", driver="GTiff",
+    )  # fmt: skip
+    coarse, fine = read(tmp_path / "a.tif")[0][0], read(tmp_path / "f.tif")[0][0]
+    mean = fine.reshape(40, 64, 40, 64).mean(axis=(1, 3))
+    # The box follows the image's axes, a rotated pixel does not: agree within a tenth of the pattern's spread.
+    assert np.sqrt(np.mean((coarse - mean) ** 2)) < 0.1 * pixels.std()
+
+
+# -- files -----------------------------------------------------------------------------------------------------------
+
+
+def test_cog_has_overviews_and_no_rpc(scene, tmp_path):
+    rectify(scene.model, RasterSource(scene.write(texture())), scene.surface(), grid_of(), tmp_path / "o.tif")
+    dataset = gdal.Open(str(tmp_path / "o.tif"))
+    assert dataset.GetMetadataItem("LAYOUT", "IMAGE_STRUCTURE") == "COG"
+    assert dataset.GetMetadataItem("COMPRESSION", "IMAGE_STRUCTURE") == "DEFLATE"
+    assert dataset.GetMetadata("RPC") == {}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dem.tif", "o.tif", "source.tif"]
+
+
+def test_nothing_is_left_when_the_source_is_cut_off(scene, tmp_path):
+    path = scene.write(texture())
+    path.write_bytes(path.read_bytes()[:200_000])
+    (tmp_path / "o.tif").write_bytes(b"the old one")
+    with pytest.raises(InputError) as caught:
+        rectify(scene.model, RasterSource(path), Surface.constant(700.0), grid_of(), tmp_path / "o.tif")
+    assert str(path) in str(caught.value)
+    assert (tmp_path / "o.tif").read_bytes() == b"the old one"
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["o.tif", "source.tif"]
+
+
+@pytest.mark.parametrize("options", [{"COMPRES": "LZW"}, {"TILES": "YES"}])
+def test_unknown_creation_options_are_refused(scene, tmp_path, options):
+    with pytest.raises(InputError, match="creation option"):
+        rectify(
+            scene.model, RasterSource(scene.write(texture())), Surface.constant(700.0), grid_of(50.0),
+            tmp_path / "o.tif", creation_options=options,
+        )  # fmt: skip
+
+
+def test_non_square_pixels(scene, tmp_path):
+    left, top = EAST - 80, NORTH + 80
+    grid = Grid.of_extent(UTM, (left, top - 160, left + 160, top), (0.4, 1.6))
+    assert (grid.width, grid.height) == (400, 100)
+    rectify(scene.model, RasterSource(scene.write(ramps())), scene.surface(), grid, tmp_path / "o.tif", driver="GTiff")
+    exact = exact_image(scene.model, tmp_path / "dem.tif", grid)
+    assert np.abs(read(tmp_path / "o.tif")[0] - exact)[:, inner(exact)].max() < 0.01
