@@ -188,7 +188,7 @@ def as_image(image: ArrayLike) -> Array:
 
 
 def _as_points(points: ArrayLike, columns: int, what: str) -> Array:
-    array = np.asarray(points, dtype=np.float64)
+    array = np.ascontiguousarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != columns:
         raise InputError(f"{what} points have the shape (N, {columns}), not {array.shape}")
     return array

@@ -20,7 +20,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.models.base import Array, SensorModel, as_ground
+from ortho_pipeline.models.base import (
+    INVERSE_TOLERANCE,
+    INVERSE_VERIFIED,
+    Array,
+    SensorModel,
+    as_ground,
+    as_image,
+)
 
 #: Exponents of (L, P, H) in the order of RPC00B: 1, L, P, H, LP, LH, PH, LL, PP, HH, PLH, LLL, LPP, LHH, LLP, PPP,
 #: PHH, LLH, PPH, HHH.
@@ -49,6 +56,8 @@ RPC_TERMS = np.array(
     ]
 )
 
+#: From this many points on the compiled kernels are used: loading them takes longer than few points do.
+COMPILED_FROM = 20_000
 #: Beyond this many scales from its centre an RPC is extrapolation without meaning, and has false roots.
 DOMAIN_LIMIT = 1.5
 
@@ -163,7 +172,7 @@ class RPC(SensorModel):
         ground = as_ground(ground)
         lon = ground[:, 0] - self.lon_off
         with np.errstate(invalid="ignore"):
-            if np.abs(lon).max(initial=0.0) > 180.0:
+            if (np.abs(lon) > 180.0).any():
                 lon = np.remainder(lon + 180.0, 360.0) - 180.0
             lon = lon / self.lon_scale
             lat = (ground[:, 1] - self.lat_off) / self.lat_scale
@@ -173,6 +182,49 @@ class RPC(SensorModel):
         return lon, lat, (ground[:, 2] - self.h_off) / self.h_scale
 
     def ground_to_image(self, ground: ArrayLike) -> Array:
+        ground = as_ground(ground)
+        if len(ground) < COMPILED_FROM:
+            return self._project(ground)
+        from ortho_pipeline.models import rpc_kernel
+
+        image = np.empty((len(ground), 2))
+        rpc_kernel.project(ground, *self._tables(), DOMAIN_LIMIT, image)
+        return image
+
+    def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
+        image = as_image(image)
+        if len(image) < COMPILED_FROM:
+            return super().image_to_ground(image, height)
+        from ortho_pipeline.models import rpc_kernel
+
+        ground = np.empty((len(image), 3))
+        heights = np.ascontiguousarray(np.broadcast_to(np.asarray(height, dtype=np.float64), len(image)))
+        rpc_kernel.intersect(
+            image, heights, *self._tables(), self._inverse_start(), DOMAIN_LIMIT, INVERSE_TOLERANCE, INVERSE_VERIFIED,
+            25, ground,
+        )  # fmt: skip
+        return ground
+
+    def _tables(self) -> tuple[Array, Array, Array]:
+        """Return offsets and scales of lon, lat, h, column, row, and the coefficients, for the compiled kernels."""
+        offsets = np.array([self.lon_off, self.lat_off, self.h_off, self.col_off, self.row_off])
+        scales = np.array([self.lon_scale, self.lat_scale, self.h_scale, self.col_scale, self.row_scale])
+        return offsets, scales, np.stack([self.col_num, self.col_den, self.row_num, self.row_den])
+
+    def _inverse_start(self) -> Array:
+        """Return first approximations ``(2, 6)`` of the inverse: see `rpc_kernel.intersect`."""
+        steps = np.linspace(-1.0, 1.0, 5)
+        lon, lat, h = (axis.ravel() for axis in np.meshgrid(steps, steps, steps))
+        ground = np.stack(
+            [lon * self.lon_scale + self.lon_off, lat * self.lat_scale + self.lat_off, h * self.h_scale + self.h_off], 1
+        )
+        image = (self._project(ground) - (self.col_off, self.row_off)) / (self.col_scale, self.row_scale)
+        good = np.isfinite(image).all(axis=1)
+        col, row, h = image[good, 0], image[good, 1], h[good]
+        design = np.stack([np.ones_like(col), col, row, h, col * h, row * h], axis=1)
+        return np.linalg.lstsq(design, np.stack([lon[good], lat[good]], axis=1))[0].T.copy()
+
+    def _project(self, ground: Array) -> Array:
         terms = rpc_terms(*self.normalise(ground))
         with np.errstate(divide="ignore", invalid="ignore"):
             col = (self.col_num @ terms) / (self.col_den @ terms) * self.col_scale + self.col_off
