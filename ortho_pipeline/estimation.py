@@ -31,6 +31,8 @@ from ortho_pipeline.points import Points
 
 #: A scaled normal matrix beyond this condition is taken as singular: the points do not determine the model.
 CONDITION_LIMIT = 1e6
+#: The same if some corner of the model's domain would be predicted so many times worse than a point is measured.
+EXTRAPOLATION_LIMIT = 100.0
 #: Chance that a good set of points loses any of its points to the search for gross errors.
 BLUNDER_RISK = 0.001
 #: More than this share of rejected control points is an error, not a clean-up.
@@ -191,6 +193,7 @@ def fit(
         rejected = {int(problem.rows[i]): reason for i, reason in reasons.items()}
         _refuse_many(points, rejected, len(keep))
     solution = problem.solve(keep)
+    _refuse_extrapolation(solution, points.source)
     used = np.zeros(len(points), dtype=bool)
     used[problem.rows[keep]] = True
     predicted = solution.model.ground_to_image(points.ground)
@@ -230,6 +233,23 @@ def _refuse_many(points: Points, rejected: dict[int, str], count: int) -> None:
             "which of them are wrong cannot be decided",
             file=points.source,
             remedy="measure these points again, or remove the wrong ones",
+        )
+
+
+def _refuse_extrapolation(solution: _Solution, source: str) -> None:
+    if not len(solution.model.params) or not len(solution.sigma):
+        return
+    centre, half = solution.model.domain
+    corners = centre + half * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    partials = solution.model.param_partials(corners)
+    spread = np.sqrt(np.einsum("nip,pq,niq->ni", partials, solution.cofactors, partials))
+    factor = float(np.nanmax(spread, initial=0.0) / np.median(solution.sigma))
+    if factor > EXTRAPOLATION_LIMIT:
+        raise DegeneratePoints(
+            f"the control points do not determine the whole scene: at a corner the model is {factor:.0f} times less "
+            "certain than a measured point",
+            file=source,
+            remedy="spread the points over the image (and over height, for 3D models), or take a simpler model",
         )
 
 
@@ -290,7 +310,7 @@ class _Problem:
         model = _minimise(self.model, ground, image, sigma, self.priors) if count else self.model
         residuals = image - model.ground_to_image(ground)
         jacobian = model.param_partials(ground) if count else np.zeros((len(ground), 2, 0))
-        design = np.vstack([(jacobian / sigma[:, :, None]).reshape(-1, count), self._prior_rows()])
+        design = np.vstack([(jacobian / sigma[:, :, None]).reshape(2 * len(ground), count), self._prior_rows()])
         cofactors, condition = _cofactors(design, self.source)
         observed = (residuals / sigma).ravel()
         believed = np.array([(p.mean - model.params[self._index(k)]) / p.sigma for k, p in self.priors.items()])

@@ -71,40 +71,48 @@ def block_coordinates(
         )
         first, last = max(left, cell * spacing), min(right, (cell + 1) * spacing)
         # First the heights, kept in `columns`; then both coordinates: two simple loops are faster than one long one.
-        if within and not cubic_dem:
-            for column in range(first, last):
-                tx = (column - cell * spacing) * inverse
-                u, v = u0 + du * tx, v0 + dv * tx
-                i, j = np.uint64(u), np.uint64(v)
-                fu, fv = u - i, v - j
-                upper = heights[j, i] + (heights[j, i + _ONE] - heights[j, i]) * fu
-                lower = heights[j + _ONE, i] + (heights[j + _ONE, i + _ONE] - heights[j + _ONE, i]) * fu
-                height = upper + (lower - upper) * fv
-                if height != height:
-                    height = _dem_height(heights, int(i), int(j), fu, fv, False)
-                columns[column - left] = height
-        else:
-            for column in range(first, last):
-                tx = (column - cell * spacing) * inverse
-                columns[column - left] = _dem_height_at(heights, u0 + du * tx, v0 + dv * tx, cubic_dem)
+        for column in range(first, last):
+            tx = (column - cell * spacing) * inverse
+            u, v = u0 + du * tx, v0 + dv * tx
+            if within and not cubic_dem:
+                columns[column - left] = _dem_height_within(heights, u, v)
+            else:
+                columns[column - left] = _dem_height_at(heights, u, v, cubic_dem)
         if levels == 3:
-            c0, c1, c2, r0, r1, r2 = start[0], start[2], start[4], start[1], start[3], start[5]
-            dc0, dc1, dc2, dr0, dr1, dr2 = slope[0], slope[2], slope[4], slope[1], slope[3], slope[5]
-            for column in range(first, last):
-                tx = (column - cell * spacing) * inverse
-                t = (columns[column - left] - middle) / half
-                columns[column - left] = ((c2 + dc2 * tx) * t + (c1 + dc1 * tx)) * t + (c0 + dc0 * tx)
-                rows[column - left] = ((r2 + dr2 * tx) * t + (r1 + dr1 * tx)) * t + (r0 + dr0 * tx)
-        else:
-            for column in range(first, last):
-                tx = (column - cell * spacing) * inverse
-                t = (columns[column - left] - middle) / half
-                col = line = 0.0
-                for k in range(levels - 1, -1, -1):
-                    col = col * t + (start[2 * k] + slope[2 * k] * tx)
-                    line = line * t + (start[2 * k + 1] + slope[2 * k + 1] * tx)
-                columns[column - left] = col
-                rows[column - left] = line
+            _quadratic(start, slope, cell * spacing, first, last, left, inverse, middle, half, columns, rows)
+            continue
+        for column in range(first, last):
+            tx = (column - cell * spacing) * inverse
+            t = (columns[column - left] - middle) / half
+            col = line = 0.0
+            for k in range(levels - 1, -1, -1):
+                col = col * t + (start[2 * k] + slope[2 * k] * tx)
+                line = line * t + (start[2 * k + 1] + slope[2 * k + 1] * tx)
+            columns[column - left] = col
+            rows[column - left] = line
+
+
+@_inline
+def _quadratic(start, slope, origin, first, last, left, inverse, middle, half, columns, rows):
+    """Turn heights in `columns` into image coordinates by the quadratics of one row of a cell."""
+    c0, c1, c2, r0, r1, r2 = start[0], start[2], start[4], start[1], start[3], start[5]
+    dc0, dc1, dc2, dr0, dr1, dr2 = slope[0], slope[2], slope[4], slope[1], slope[3], slope[5]
+    for column in range(first, last):
+        tx = (column - origin) * inverse
+        t = (columns[column - left] - middle) / half
+        columns[column - left] = ((c2 + dc2 * tx) * t + (c1 + dc1 * tx)) * t + (c0 + dc0 * tx)
+        rows[column - left] = ((r2 + dr2 * tx) * t + (r1 + dr1 * tx)) * t + (r0 + dr0 * tx)
+
+
+@_inline
+def _dem_height_within(heights, u, v):
+    """Interpolate the DEM bilinearly at (u, v), which lies between samples of its window."""
+    i, j = np.uint64(u), np.uint64(v)
+    fu, fv = u - i, v - j
+    upper = heights[j, i] + (heights[j, i + _ONE] - heights[j, i]) * fu
+    lower = heights[j + _ONE, i] + (heights[j + _ONE, i + _ONE] - heights[j + _ONE, i]) * fu
+    height = upper + (lower - upper) * fv
+    return height if height == height else _dem_height(heights, int(i), int(j), fu, fv, False)
 
 
 @_inline
@@ -427,6 +435,29 @@ def _average_valid(source, valid, masked, col, row, box):
     return total / area if area > 0.0 else np.nan
 
 
+@_inline
+def _edge_value(kernel, source, valid, masked, col, row, left, top, full_width, full_height, box):
+    """Value at image point (col, row) where neighbours may be missing; its own pixel is valid.
+
+    Kernels with negative weights fall back to the bilinear one there, which takes the valid neighbours alone.
+    """
+    x, y = col - 0.5, row - 0.5
+    i, j = int(np.floor(x)), int(np.floor(y))
+    span = 1 if kernel == CUBIC else 2
+    inner = i >= span and j >= span and i + span + 1 < full_width and j + span + 1 < full_height
+    if inner and masked and kernel != BILINEAR:
+        inner = _all_valid(valid, i - span - left, j - span - top, 2 * span + 2)
+    if kernel == AVERAGE:
+        return _average_valid(source, valid, masked, col - left, row - top, box)
+    if kernel == CUBIC and inner:
+        return _cubic(source, x, y, left, top)
+    if kernel == LANCZOS and inner:
+        return _lanczos(source, x - left, y - top)
+    if masked:
+        return _bilinear_valid(source, valid, x, y, left, top, full_width, full_height)
+    return _bilinear(source, x, y, left, top, full_width, full_height)
+
+
 @_jit
 def _row_with_edges(
     kernel: int,
@@ -476,23 +507,10 @@ def _row_with_edges(
             if kernel == NEAREST:
                 out[band, k] = source[band, here_row - top, here_col - left]
                 continue
-            x, y = col - 0.5, line - 0.5
-            i, j = int(np.floor(x)), int(np.floor(y))
-            # Kernels with negative weights fall back to the bilinear one where a neighbour is missing.
-            span = 1 if kernel == CUBIC else 2
-            inner = i >= span and j >= span and i + span + 1 < full_width and j + span + 1 < full_height
-            if inner and masked and kernel != BILINEAR:
-                inner = _all_valid(valid[band], i - span - left, j - span - top, 2 * span + 2)
-            if kernel == AVERAGE:
-                value = _average_valid(source[band], valid[band if masked else 0], masked, col - left, line - top, box)
-            elif kernel == CUBIC and inner:
-                value = _cubic(source[band], x, y, left, top)
-            elif kernel == LANCZOS and inner:
-                value = _lanczos(source[band], x - left, y - top)
-            elif masked:
-                value = _bilinear_valid(source[band], valid[band], x, y, left, top, full_width, full_height)
-            else:
-                value = _bilinear(source[band], x, y, left, top, full_width, full_height)
+            value = _edge_value(
+                kernel, source[band], valid[band if masked else 0], masked, col, line, left, top, full_width,
+                full_height, box
+            )  # fmt: skip
             out[band, k] = min(max(np.floor(value + 0.5), low), high) if integer else value
         out_valid[k] = found
     return short

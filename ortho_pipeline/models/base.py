@@ -120,6 +120,7 @@ class SensorModel(ABC):
         """
         image = as_image(image)
         centre, half = self.domain
+        reach = 1.5 * (1 - 1e-12) * half[:2]
         ground = np.empty((len(image), 3))
         ground[:, :2] = centre[:2]
         ground[:, 2] = height
@@ -133,6 +134,8 @@ class SensorModel(ABC):
             longest = np.abs(step / half[:2]).max(axis=1, initial=0.0)
             step /= np.maximum(longest, 1.0)[:, None]
             ground[left, :2] += step
+            # Outside of the domain there may be no projection to come back by.
+            ground[left, :2] = np.clip(ground[left, :2], centre[:2] - reach, centre[:2] + reach)
             with np.errstate(invalid="ignore"):
                 left = left[(np.abs(miss).max(axis=1) > INVERSE_TOLERANCE) & (longest > 1e-15)]
         with np.errstate(invalid="ignore"):

@@ -1,0 +1,61 @@
+# ortho-pipeline: everything that a person or a CI machine runs.
+#
+#   make demo     set up, orthorectify the sample scene, say where the ortho and the report are
+#   make test     set up, run all tests
+#   make check    formatting, lint, types, tests
+#   make bench    speed and memory against gdalwarp
+#   make images   draw the pictures of README.md again
+#   make clean    remove .venv, caches and out/
+#
+# PYTHON=python3.12     the interpreter that .venv is made from (3.11 or newer)
+# GDAL=auto             auto:   the system's GDAL; installed with apt where it is missing and we may; otherwise the wheel
+#                       system: the system's GDAL or nothing
+#                       wheel:  the PyPI package gdal-wheel, which brings a GDAL of its own (Python 3.12 or newer, no root)
+
+PYTHON ?= python3
+GDAL ?= auto
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.set-up
+WORKERS ?= 2
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.ONESHELL:
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check bench images clean
+
+help:
+	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml Makefile tools/setup.sh
+	@PYTHON="$(PYTHON)" GDAL="$(GDAL)" VENV="$(VENV)" bash tools/setup.sh
+	touch $@
+
+demo: setup
+	@echo
+	$(BIN)/ortho rectify sample_data/scene.tif --gcps sample_data/gcps.geojson \
+	    --dem sample_data/dem.tif -o out/demo
+	echo
+	echo "Ortho:   $(CURDIR)/out/demo/scene_ortho.tif   (any GIS opens it)"
+	echo "Report:  $(CURDIR)/out/demo/scene_report.html (any browser opens it)"
+
+test: setup
+	@$(BIN)/python -m pytest -q -n $(WORKERS)
+
+check: setup
+	@$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -q -n $(WORKERS)
+
+bench: setup
+	@$(BIN)/python benchmarks/warp.py
+
+images: setup
+	@$(BIN)/python docs/make_images.py
+
+clean:
+	rm -rf $(VENV) out build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache

@@ -1,0 +1,56 @@
+"""Orthorectification of satellite imagery on GDAL: sensor plugins, honest adjustment, fast exact warping.
+
+The names below are the public interface; each is loaded when it is first used, so importing the package is light.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+#: Public name -> module that holds it.
+_HOMES = {
+    "Fit": "estimation",
+    "Grid": "raster",
+    "ImageCorrection": "models",
+    "OrthoError": "errors",
+    "OutputOptions": "options",
+    "PointOptions": "options",
+    "Points": "points",
+    "RPC": "models",
+    "RasterSource": "raster",
+    "Scene": "hookspecs",
+    "SceneOptions": "options",
+    "Sensor": "hookspecs",
+    "SensorModel": "models",
+    "Surface": "dem",
+    "SurfaceOptions": "options",
+    "Vertical": "crs",
+    "fit": "estimation",
+    "hookimpl": "hookspecs",
+    "load_model": "model_file",
+    "open_scene": "plugins",
+    "read_points": "points",
+    "read_rpc": "rpc",
+    "rectify": "pipeline",
+    "save_model": "model_file",
+    "write_points": "points",
+}
+
+__all__ = sorted(_HOMES)  # noqa: PLE0605
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("ortho-pipeline")
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -1,0 +1,595 @@
+"""Heights of a surface above the ellipsoid, and where a ray meets it.
+
+What a DEM's numbers are measured above is decided once, in `Surface.open`, and undone where samples are read: scale,
+unit, voids, geoid. Everything after sees ellipsoidal metres, or NaN.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import os
+import threading
+from collections import OrderedDict
+from typing import Any
+
+import numpy as np
+import pyproj
+from numpy.typing import ArrayLike, NDArray
+from osgeo import gdal
+from pyproj.exceptions import CRSError
+
+from ortho_pipeline.crs import Vertical, declared_vertical, ground_transform, horizontal, parse_crs
+from ortho_pipeline.datum import dem_unit, dem_vertical, dem_vertical_remedy
+from ortho_pipeline.errors import CrsError, DatumError, InputError
+from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.raster import open_dataset
+
+Array = NDArray[np.float64]
+
+#: Heights (m) outside of this are voids, declared or not.
+SANE_HEIGHTS = (-500.0, 9000.0)
+#: ``fill='nearest'`` looks this far (samples) for a valid height.
+NEAREST_REACH = 512
+#: The undulation is computed exactly on a lattice no wider than this (m) and interpolated between: within 2 mm.
+UNDULATION_SPACING = 500.0
+_TILE = 256
+_CACHED_TILES = 64
+
+
+class Surface:
+    """A DEM, or a plane of constant height, as ellipsoidal heights.
+
+    Make it with `open` or `constant`. Safe to use from several threads: each has a GDAL handle of its own.
+
+    Attributes
+    ----------
+    crs : pyproj.CRS
+        Horizontal system of the samples, x first.
+    shape : tuple
+        (rows, columns) of samples.
+    pixel_from_crs : tuple of 6 floats
+        ``u = a + b x + c y``, ``v = d + e x + f y``; (0, 0) is the centre of the first sample.
+    constant_height : float or None
+        The height of a plane, None for a DEM.
+    fill : 'error', 'mask', 'nearest' or float
+        What stands for a void: NaN for the first two; a height with the others.
+    provenance : dict
+        Path, declared and used height datum, warnings; JSON values.
+    """
+
+    def __init__(self, *, constant_height: float | None = None) -> None:
+        self.constant_height = constant_height
+        self.crs = pyproj.CRS.from_epsg(4326)
+        self.shape = (0, 0)
+        self.pixel_from_crs = (0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+        self.fill: str | float = "error"
+        self.provenance: dict[str, Any] = {"constant_height": constant_height}
+        self.vertical = Vertical("ellipsoid")
+        self._path, self._allow_network = "", False
+        self._metres_per_unit, self._scale, self._offset = 1.0, 1.0, 0.0
+        self._crs_from_pixel = (0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+        self._roll = 0
+        self._spacing = 1
+        self._range: tuple[float, float] | None = None
+        self._forget()
+
+    def _forget(self) -> None:
+        self._local = threading.local()
+        self._lock = threading.Lock()
+        self._tiles: OrderedDict[tuple[int, int, bool], Array] = OrderedDict()
+
+    @classmethod
+    def constant(cls, height: float) -> Surface:
+        """Return a plane at an ellipsoidal height (m)."""
+        if not math.isfinite(height):
+            raise InputError(f"{height} is not a height", field="height", remedy="give ellipsoidal metres")
+        return cls(constant_height=float(height))
+
+    @classmethod
+    def open(
+        cls,
+        path: str | os.PathLike[str],
+        vertical: Vertical | str | None = None,
+        override: bool = False,
+        fill: str | float = "error",
+        allow_network: bool = False,
+    ) -> Surface:
+        """Open a DEM.
+
+        Parameters
+        ----------
+        vertical : Vertical or str, optional
+            What the heights are measured above; needed where the DEM does not say it.
+        override : bool
+            Let `vertical` stand against a datum that the DEM declares by an authority code.
+        fill : 'error', 'mask', 'nearest' or float
+            See the class; a number is an ellipsoidal height in metres.
+
+        Raises
+        ------
+        DatumError
+            If the height datum is unknown, contradicted, or its geoid grid is not installed or does not reach here.
+        CrsError
+            If the DEM has no usable georeference.
+        InputError
+            If it cannot be opened.
+        """
+        surface = cls()
+        surface._path, surface._allow_network = os.fspath(path), allow_network
+        surface.fill = _parse_fill(fill)
+        dataset = surface._dataset()
+        crs = surface._place(dataset)
+        declared = declared_vertical(crs)
+        option = None if vertical is None else Vertical.parse(vertical)
+        surface.vertical, warnings = dem_vertical(surface._path, declared, option, override)
+        surface._metres_per_unit = dem_unit(surface._path, dataset.GetRasterBand(1).GetUnitType(), declared)
+        surface.provenance = {
+            "path": surface._path,
+            "crs": surface.crs.name,
+            "declared_vertical": declared.name if declared else None,
+            "declared_by": None if declared is None else ("code" if declared.certain else "name"),
+            "option": option.name if option else None,
+            "override": override,
+            "vertical": surface.vertical.name,
+            "vertical_label": surface.vertical.label,
+            "metres_per_unit": surface._metres_per_unit,
+            "fill": surface.fill,
+            "warnings": warnings,
+        }
+        surface._check_geoid()
+        return surface
+
+    # -- opening -----------------------------------------------------------------------------------------------------
+
+    def _dataset(self) -> gdal.Dataset:
+        if not hasattr(self._local, "dataset"):
+            self._local.dataset = open_dataset(self._path, allow_network=self._allow_network)
+        return self._local.dataset
+
+    def _place(self, dataset: gdal.Dataset) -> pyproj.CRS:
+        """Take size, CRS and geotransform over from the dataset; return the full CRS."""
+        reference, transform = dataset.GetSpatialRef(), dataset.GetGeoTransform(can_return_null=True)
+        if reference is None or transform is None:
+            missing = "CRS" if reference is None else "geotransform"
+            raise CrsError(
+                f"this DEM has no {missing}", file=self._path, remedy="set it with gdal_edit.py -a_srs / -a_ullr"
+            )
+        try:
+            crs = pyproj.CRS.from_wkt(reference.ExportToWkt(["FORMAT=WKT2_2018"]))
+            self.crs = horizontal(crs)
+            ground_transform(self.crs, "EPSG:4979")
+        except (CrsError, CRSError) as error:
+            raise CrsError(
+                f"the CRS of this DEM cannot be used ({getattr(error, 'message', error)})",
+                file=self._path,
+                remedy="set a CRS of known datum with gdal_edit.py -a_srs",
+            ) from error
+        x, a, b, y, c, d = transform
+        if not np.isfinite(transform).all() or abs(a * d - b * c) <= 1e-14 * (abs(a) + abs(b)) * (abs(c) + abs(d)):
+            raise CrsError(f"the geotransform {transform} of this DEM is degenerate", file=self._path)
+        self.shape = dataset.RasterYSize, dataset.RasterXSize
+        band = dataset.GetRasterBand(1)
+        if gdal.DataTypeIsComplex(band.DataType):
+            raise InputError("complex numbers are not heights", file=self._path)
+        # GDAL counts from the corner of the first pixel; heights belong to the centres.
+        self._set_affine((x + 0.5 * (a + b), a, b, y + 0.5 * (c + d), c, d))
+        scale, offset = band.GetScale(), band.GetOffset()
+        self._scale, self._offset = (1.0 if scale is None else scale), (0.0 if offset is None else offset)
+        self._spacing = int(np.clip(UNDULATION_SPACING / self._sample_metres(), 1, 64))
+        return crs
+
+    def _set_affine(self, crs_from_pixel: tuple[float, float, float, float, float, float]) -> None:
+        x, a, b, y, c, d = self._crs_from_pixel = crs_from_pixel
+        inverse = np.linalg.inv([[a, b], [c, d]])
+        shift = -inverse @ [x, y]
+        self.pixel_from_crs = (
+            float(shift[0]), float(inverse[0, 0]), float(inverse[0, 1]),
+            float(shift[1]), float(inverse[1, 0]), float(inverse[1, 1]),
+        )  # fmt: skip
+
+    def _sample_metres(self) -> float:
+        _, a, b, _, c, d = self._crs_from_pixel
+        unit = 111320.0 if self.crs.is_geographic else self.crs.axis_info[0].unit_conversion_factor
+        return unit * max(math.hypot(a, c), math.hypot(b, d))
+
+    def _check_geoid(self) -> None:
+        """Fail now, with the DEM's name, if the geoid grid is missing or does not reach any part of the DEM."""
+        rows, columns = self.shape
+        v, u = (axis.ravel() for axis in np.meshgrid(np.linspace(0, rows - 1, 5), np.linspace(0, columns - 1, 5)))
+        try:
+            undulation = self.vertical.undulation(*self._lonlat(u, v))
+        except DatumError as error:
+            raise DatumError(
+                error.message, file=self._path, field="--dem-vertical", remedy=dem_vertical_remedy(error.remedy or "")
+            ) from error
+        if not np.isfinite(undulation).any():
+            raise DatumError(
+                f"the geoid grid of {self.vertical.label} does not reach this DEM",
+                file=self._path,
+                field="--dem-vertical",
+                remedy=dem_vertical_remedy(),
+            )
+
+    def around(self, lon: float) -> Surface:
+        """Return this surface with the seam of a global DEM opposite to `lon` (degrees); any other DEM unchanged.
+
+        Sample coordinates are then continuous about `lon`, also over the antimeridian.
+        """
+        x, a, b, y, c, d = self._crs_from_pixel
+        columns = self.shape[1]
+        if not self.crs.is_geographic or b or c or abs(abs(a) * columns - 360) > 1e-6 * abs(a):
+            return self
+        shift = round((lon - (x + a * (columns - 1) / 2)) / a)
+        other = copy.copy(self)
+        other._forget()
+        other._roll = (self._roll + shift) % columns
+        other._set_affine((x + shift * a, a, b, y, c, d))
+        return other
+
+    # -- places ------------------------------------------------------------------------------------------------------
+
+    def samples_at(self, xy: ArrayLike) -> Array:
+        """Return sample coordinates (u, v) ``(N, 2)`` of positions (x, y) ``(N, 2)`` in `crs`.
+
+        Longitudes are taken modulo 360 into the range of the DEM, so that it may run from -180 or from 0 degrees.
+        """
+        xy = np.asarray(xy, dtype=float)
+        x, y = xy[:, 0], xy[:, 1]
+        if self.crs.is_geographic:
+            rows, columns = self.shape
+            x0, a, b, *_ = self._crs_from_pixel
+            middle = x0 + a * (columns - 1) / 2 + b * (rows - 1) / 2
+            far = np.abs(x - middle) > 180
+            if far.any():
+                x = np.where(far, middle + np.remainder(x - middle + 180, 360) - 180, x)
+        p = self.pixel_from_crs
+        return np.stack([p[0] + p[1] * x + p[2] * y, p[3] + p[4] * x + p[5] * y], axis=1)
+
+    def _lonlat(self, u: Array, v: Array) -> tuple[Array, Array]:
+        p = self._crs_from_pixel
+        ground = np.stack([p[0] + p[1] * u + p[2] * v, p[3] + p[4] * u + p[5] * v, np.zeros(len(u))], axis=1)
+        lonlat = ground_transform(self.crs, "EPSG:4979")(ground)
+        return lonlat[:, 0], lonlat[:, 1]
+
+    # -- heights -----------------------------------------------------------------------------------------------------
+
+    def heights(self, xy: ArrayLike, crs: str | pyproj.CRS | None = None) -> Array:
+        """Return heights ``(N,)`` at positions ``(N, 2)`` (x, y) of `crs` (that of the surface by default).
+
+        Bilinear between sample centres; NaN outside and beside a void, unless `fill` gives them a height.
+        """
+        return self._heights(xy, crs, filled=True)
+
+    def coverage(self, xy: ArrayLike, crs: str | pyproj.CRS | None = None) -> float:
+        """Return the share (0 to 1) of positions ``(N, 2)`` that have a height of their own, not a filled one."""
+        heights = self._heights(xy, crs, filled=False)
+        return float(np.isfinite(heights).mean()) if len(heights) else 1.0
+
+    def _heights(self, xy: ArrayLike, crs: str | pyproj.CRS | None, filled: bool) -> Array:
+        xy = np.asarray(xy, dtype=float)
+        if xy.ndim != 2 or xy.shape[1] < 2:
+            raise InputError(f"positions have the shape (N, 2), not {xy.shape}")
+        if self.constant_height is not None:
+            return np.where(np.isfinite(xy[:, :2]).all(axis=1), self.constant_height, np.nan)
+        if crs is not None:
+            transform = ground_transform(parse_crs(crs), self.crs)
+            xy = transform(np.column_stack([xy[:, :2], np.zeros(len(xy))]))
+        u, v = self.samples_at(xy[:, :2]).T
+        out = np.full(len(u), np.nan)
+        rows, columns = self.shape
+        finite = np.isfinite(u) & np.isfinite(v)
+        if filled and self.fill == "nearest":
+            u, v = np.clip(u, 0, columns - 1), np.clip(v, 0, rows - 1)
+        with np.errstate(invalid="ignore"):
+            inside = finite & (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
+        index = np.flatnonzero(inside)
+        tiles = np.stack([v[index] // _TILE, u[index] // _TILE], axis=1).astype(int)
+        unique, member = np.unique(tiles, axis=0, return_inverse=True)
+        order = np.argsort(member.ravel(), kind="stable")
+        ends = np.cumsum(np.bincount(member.ravel(), minlength=len(unique)))
+        for (row, column), these in zip(unique.tolist(), np.split(index[order], ends[:-1]), strict=False):
+            tile = self._tile(row, column, filled)
+            out[these] = _bilinear(tile, u[these] - column * _TILE, v[these] - row * _TILE)
+        if filled and isinstance(self.fill, float):
+            out[finite & np.isnan(out)] = self.fill
+        return out
+
+    def _tile(self, row: int, column: int, filled: bool) -> Array:
+        key = row, column, filled
+        with self._lock:
+            if key in self._tiles:
+                self._tiles.move_to_end(key)
+                return self._tiles[key]
+        # One sample more than the step, for the neighbours of the last ones.
+        tile = self._window(column * _TILE, row * _TILE, _TILE + 1, _TILE + 1, filled)
+        with self._lock:
+            self._tiles[key] = tile
+            while len(self._tiles) > _CACHED_TILES:
+                self._tiles.popitem(last=False)
+        return tile
+
+    def window(self, u0: int, v0: int, nu: int, nv: int) -> Array:
+        """Return the heights ``(nv, nu)`` of samples, from column `u0` and row `v0`; it may reach outside.
+
+        NaN for a void and outside of the DEM, unless `fill` gives them a height. Does not depend on how a
+        larger window is cut into smaller ones.
+        """
+        return self._window(int(u0), int(v0), int(nu), int(nv), filled=True)
+
+    def _window(self, u0: int, v0: int, nu: int, nv: int, filled: bool) -> Array:
+        if self.constant_height is not None:
+            return np.full((nv, nu), self.constant_height)
+        if filled and self.fill == "nearest":
+            return self._nearest(u0, v0, nu, nv)
+        rows, columns = self.shape
+        left, top = max(u0, 0), max(v0, 0)
+        right, bottom = min(u0 + nu, columns), min(v0 + nv, rows)
+        out = np.full((nv, nu), np.nan)
+        if right > left and bottom > top:
+            out[top - v0 : bottom - v0, left - u0 : right - u0] = self._read(left, top, right - left, bottom - top)
+        if filled and isinstance(self.fill, float):
+            out[np.isnan(out)] = self.fill
+        return out
+
+    def _nearest(self, u0: int, v0: int, nu: int, nv: int) -> Array:
+        """Fill voids by the nearest valid sample within `NEAREST_REACH`; outside of the DEM its edge goes on."""
+        rows, columns = self.shape
+        u, v = np.clip(np.arange(u0, u0 + nu), 0, columns - 1), np.clip(np.arange(v0, v0 + nv), 0, rows - 1)
+        left, top, right, bottom = int(u[0]), int(v[0]), int(u[-1]) + 1, int(v[-1]) + 1
+        heights = self._read(left, top, right - left, bottom - top)
+        if np.isnan(heights).any():
+            from scipy.ndimage import distance_transform_edt
+
+            west, north = max(0, left - NEAREST_REACH), max(0, top - NEAREST_REACH)
+            east, south = min(columns, right + NEAREST_REACH), min(rows, bottom + NEAREST_REACH)
+            wide = self._read(west, north, east - west, south - north)
+            void = np.isnan(wide)
+            if not void.all():
+                distance, (near_v, near_u) = distance_transform_edt(void, return_indices=True)
+                wide = np.where(distance <= NEAREST_REACH, wide[near_v, near_u], np.nan)
+            heights = wide[top - north : bottom - north, left - west : right - west]
+        return heights[np.ix_(v - top, u - left)]
+
+    def _read(self, left: int, top: int, width: int, height: int) -> Array:
+        """Return ellipsoidal heights of a window inside the DEM; NaN for voids."""
+        columns = self.shape[1]
+        if self._roll:
+            first = (left + self._roll) % columns
+            split = min(width, columns - first)
+            parts = [self._read_metres(first, top, split, height)]
+            if split < width:
+                parts.append(self._read_metres(0, top, width - split, height))
+            heights = np.concatenate(parts, axis=1)
+        else:
+            heights = self._read_metres(left, top, width, height)
+        if not self.vertical.is_ellipsoid:
+            heights += self._undulation(left, top, width, height)
+        return heights
+
+    def _read_metres(self, left: int, top: int, width: int, height: int) -> Array:
+        dataset = self._dataset()
+        band = dataset.GetRasterBand(1)
+        try:
+            raw = band.ReadAsArray(left, top, width, height)
+            mask = None
+            if band.GetMaskFlags() & gdal.GMF_PER_DATASET:
+                mask = band.GetMaskBand().ReadAsArray(left, top, width, height)
+        except RuntimeError as error:
+            raise InputError(f"the heights cannot be read ({error})", file=self._path) from error
+        heights = raw.astype(float) * (self._scale * self._metres_per_unit) + self._offset * self._metres_per_unit
+        with np.errstate(invalid="ignore"):
+            void = ~((heights >= SANE_HEIGHTS[0]) & (heights <= SANE_HEIGHTS[1]))
+        nodata = band.GetNoDataValue()
+        if nodata is not None and math.isfinite(nodata):
+            with np.errstate(over="ignore"):
+                void |= raw == (raw.dtype.type(nodata) if raw.dtype.kind == "f" else nodata)
+        if mask is not None:
+            void |= mask == 0
+        heights[void] = np.nan
+        return heights
+
+    def _undulation(self, left: int, top: int, width: int, height: int) -> Array:
+        """Return the undulation ``(height, width)`` of samples.
+
+        The lattice lies on multiples of its spacing in the DEM, so a sample's value does not depend on the window.
+        """
+        step = self._spacing
+        first_u, first_v = left // step, top // step
+        node_u = np.arange(first_u, (left + width - 1) // step + 2) * step
+        node_v = np.arange(first_v, (top + height - 1) // step + 2) * step
+        u, v = np.arange(left, left + width), np.arange(top, top + height)
+        nodes = self._undulation_at(node_u, node_v) if step > 1 else None
+        if nodes is None or not np.isfinite(nodes).all():
+            # At the rim of a geoid grid (and of a projection) nodes are missing that no sample needs.
+            return self._undulation_at(u, v)
+        i, j = u // step - first_u, v // step - first_v
+        across, down = (u % step) / step, ((v % step) / step)[:, None]
+        along = nodes[:, i] * (1 - across) + nodes[:, i + 1] * across
+        return along[j] * (1 - down) + along[j + 1] * down
+
+    def _undulation_at(self, u: NDArray[Any], v: NDArray[Any]) -> Array:
+        grid_u, grid_v = np.meshgrid(u.astype(float), v.astype(float))
+        return self.vertical.undulation(*self._lonlat(grid_u.ravel(), grid_v.ravel())).reshape(grid_u.shape)
+
+    @property
+    def height_range(self) -> tuple[float, float]:
+        """Lowest and highest height (m) of the whole surface, with a fill height; every sample is read, once."""
+        if self._range is None:
+            rows, columns = self.shape
+            self._range = self.range_within(0, 0, columns, rows)
+        return self._range
+
+    def range_within(self, u0: int, v0: int, nu: int, nv: int) -> tuple[float, float]:
+        """Return the lowest and the highest height (m) of a window of samples, with a fill height.
+
+        Raises
+        ------
+        InputError
+            If there is no valid height in it.
+        """
+        if self.constant_height is not None:
+            return self.constant_height, self.constant_height
+        rows, columns = self.shape
+        right, bottom = min(u0 + nu, columns), min(v0 + nv, rows)
+        low, high = (self.fill, self.fill) if isinstance(self.fill, float) else (math.inf, -math.inf)
+        for top in range(max(v0, 0), bottom, 1024):
+            for left in range(max(u0, 0), right, 1024):
+                heights = self._window(left, top, min(1024, right - left), min(1024, bottom - top), filled=False)
+                if not np.isnan(heights).all():
+                    low, high = min(low, float(np.nanmin(heights))), max(high, float(np.nanmax(heights)))
+        if low > high:
+            raise InputError(
+                "this DEM holds no valid height here", file=self._path, remedy="check its nodata value, unit and extent"
+            )
+        return low, high
+
+
+def _bilinear(heights: Array, u: Array, v: Array) -> Array:
+    """Interpolate; a void counts only where its weight is not zero."""
+    i, j = np.floor(u).astype(int), np.floor(v).astype(int)
+    fu, fv = u - i, v - j
+    out = np.zeros(len(u))
+    for down, across, weight in (
+        (0, 0, (1 - fu) * (1 - fv)),
+        (0, 1, fu * (1 - fv)),
+        (1, 0, (1 - fu) * fv),
+        (1, 1, fu * fv),
+    ):
+        out += np.where(weight > 0, heights[j + down, i + across] * weight, 0.0)
+    return out
+
+
+def _parse_fill(fill: str | float) -> str | float:
+    if isinstance(fill, str) and fill in ("error", "mask", "nearest"):
+        return fill
+    try:
+        height = float(fill)
+    except ValueError:
+        height = math.nan
+    if not math.isfinite(height):
+        raise InputError(
+            f"{fill!r} does not say how to fill voids",
+            field="--dem-fill",
+            remedy="give error, mask, nearest or an ellipsoidal height in metres",
+        )
+    return height
+
+
+# -- rays ------------------------------------------------------------------------------------------------------------
+
+
+def intersect(model: SensorModel, image: ArrayLike, surface: Surface, *, tolerance: float = 1e-3) -> Array:
+    """Intersect the rays of image points with a surface.
+
+    The ray comes down from above the highest terrain in steps of at most one DEM sample in plan, so that the first,
+    visible, intersection is found also where a ridge hides the slope behind it; then the bracket is narrowed.
+
+    Parameters
+    ----------
+    image : array_like, shape (N, 2)
+        Column, row.
+    tolerance : float
+        Greatest difference (m) in height between ray and surface.
+
+    Returns
+    -------
+    ndarray, shape (N, 3)
+        Ground in the model's CRS; NaN where the ray meets no terrain of the surface, or a void first.
+    """
+    image = np.asarray(image, dtype=float)
+    if surface.constant_height is not None:
+        return model.image_to_ground(image, surface.constant_height)
+    ray = _Ray(model, image, surface)
+    seen = ray.height_range()
+    if seen is None:
+        return np.full((len(image), 3), np.nan)
+    above, below = _bracket(ray, seen[0] - 1.0, seen[1] + 1.0)
+    height = _narrow(ray, above, below, tolerance)
+    ground = np.full((len(image), 3), np.nan)
+    met = np.isfinite(height)
+    ground[met] = model.image_to_ground(image[met], height[met])
+    return ground
+
+
+class _Ray:
+    """Image points as functions of height."""
+
+    def __init__(self, model: SensorModel, image: Array, surface: Surface) -> None:
+        self.model, self.image, self.surface = model, image, surface
+        self._transform = ground_transform(parse_crs(model.crs), surface.crs)
+
+    def plan(self, index: NDArray[np.intp], height: Array) -> Array:
+        """Positions in the surface's CRS ``(n, 2)``."""
+        return self._transform(self.model.image_to_ground(self.image[index], height))[:, :2]
+
+    def clearance(self, index: NDArray[np.intp], height: Array) -> Array:
+        """Height of the ray above the terrain; NaN off the DEM."""
+        return height - self.surface.heights(self.plan(index, height))
+
+    def height_range(self) -> tuple[float, float] | None:
+        """Lowest and highest terrain below the rays; None if there is none."""
+        every = np.arange(len(self.image))
+        ends = [self.plan(every, np.full(len(every), height)) for height in SANE_HEIGHTS]
+        uv = self.surface.samples_at(np.concatenate(ends))
+        uv = uv[np.isfinite(uv).all(axis=1)]
+        rows, columns = self.surface.shape
+        low = np.clip(np.floor(uv.min(axis=0, initial=np.inf)) - 1, 0, (columns, rows))
+        high = np.clip(np.ceil(uv.max(axis=0, initial=-np.inf)) + 2, 0, (columns, rows))
+        u0, v0, u1, v1 = (int(value) for value in (*low, *high))
+        try:
+            return self.surface.range_within(u0, v0, u1 - u0, v1 - v0)
+        except InputError:
+            return None
+
+
+def _bracket(ray: _Ray, low: float, high: float) -> tuple[Array, Array]:
+    """Return heights above and below the first intersection; NaN where there is none."""
+    count = len(ray.image)
+    every = np.arange(count)
+    ends = [ray.surface.samples_at(ray.plan(every, np.full(count, height))) for height in (low, high)]
+    length = np.hypot(*(ends[1] - ends[0]).T)
+    # A ray whose ends are not known (beyond the model) is still worth a try, at the pace of the others.
+    typical = float(np.nanmax(length)) if np.isfinite(length).any() else 1.0
+    steps = np.clip(np.ceil(np.where(np.isfinite(length), length, typical)), 1, 2000).astype(int)
+    above, below = np.full(count, np.nan), np.full(count, np.nan)
+    last = np.full(count, high)
+    last_clear = ray.clearance(every, last)
+    active = every
+    for step in range(1, int(steps.max(initial=0)) + 1):
+        height = high + (low - high) * np.minimum(step / steps[active], 1.0)
+        clear = ray.clearance(active, height)
+        with np.errstate(invalid="ignore"):
+            under = clear <= 0
+            met = under & (last_clear[active] > 0)
+        above[active[met]], below[active[met]] = last[active[met]], height[met]
+        last[active], last_clear[active] = height, clear
+        active = active[~under & (step < steps[active])]
+        if not len(active):
+            break
+    return above, below
+
+
+def _narrow(ray: _Ray, above: Array, below: Array, tolerance: float) -> Array:
+    """Return the heights where the rays meet the terrain, between `above` and `below` (NaN rows stay)."""
+    out = np.full(len(above), np.nan)
+    active = np.flatnonzero(np.isfinite(above))
+    a, b = above.copy(), below.copy()
+    fa, fb = np.full(len(a), np.nan), np.full(len(a), np.nan)
+    fa[active], fb[active] = ray.clearance(active, a[active]), ray.clearance(active, b[active])
+    for step in range(60):
+        if not len(active):
+            break
+        with np.errstate(invalid="ignore", divide="ignore"):
+            secant = a[active] - fa[active] * (b[active] - a[active]) / (fb[active] - fa[active])
+        # Every third step halves: false position alone creeps where the terrain is steep and bent.
+        height = 0.5 * (a[active] + b[active]) if step % 3 == 2 else secant
+        clear = ray.clearance(active, height)
+        done = np.abs(clear) <= tolerance
+        out[active[done]] = height[done]
+        with np.errstate(invalid="ignore"):
+            over, under = active[clear > 0], active[clear <= 0]
+            a[over], fa[over] = height[clear > 0], clear[clear > 0]
+            b[under], fb[under] = height[clear <= 0], clear[clear <= 0]
+        active = active[~done & np.isfinite(clear)]
+    return out

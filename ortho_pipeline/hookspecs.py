@@ -1,0 +1,124 @@
+"""All that a plugin author reads.
+
+A plugin is a module that is named in the entry-point group ``ortho_pipeline`` of an installed distribution
+(``tinysat = "tinysat_plugin"`` under ``[project.entry-points.ortho_pipeline]``). It translates what a vendor wrote
+into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole of a plugin::
+
+    from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+    from ortho_pipeline.rpc import rpc_of_dataset
+
+    @hookimpl
+    def ortho_sensors():
+        yield Sensor("tinysat", "TinySat level 1A scenes", recognises, open_scene, {"band": "band to use, 1 to 4"})
+
+    def recognises(dataset):                        # an open gdal.Dataset; cheap, and False for what is not yours
+        return dataset.GetMetadataItem("TIFFTAG_SOFTWARE") == "TINYSAT"
+
+    def open_scene(dataset, *, band="1"):           # the declared options arrive as keyword arguments
+        rpc, source = rpc_of_dataset(dataset)
+        return Scene("tinysat", dataset.GetDescription(), dataset.RasterXSize, dataset.RasterYSize, {"rpc": rpc},
+                     source, facts={"band": int(band)})
+
+Test it with `ortho_pipeline.testing.check_sensor`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import pluggy
+
+from ortho_pipeline.models.base import SensorModel
+
+PROJECT_NAME = "ortho_pipeline"
+hookspec = pluggy.HookspecMarker(PROJECT_NAME)
+hookimpl = pluggy.HookimplMarker(PROJECT_NAME)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One opened product: its image and the models that suit it.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of the sensor that opened it.
+    path : path
+        The image file.
+    width, height : int
+        Size of the image in pixels.
+    models : mapping of str to SensorModel
+        Best first; image coordinates are (column, row) from the outer corner of the first pixel.
+    model_source : str
+        The file or tag that the first model was read from.
+    facts : mapping
+        What is worth showing to people (acquisition time, sun elevation, cloud cover ...): JSON values.
+    warnings : tuple of str
+        What the user ought to know before trusting the result.
+    """
+
+    sensor: str
+    path: str | PathLike[str]
+    width: int
+    height: int
+    models: Mapping[str, SensorModel]
+    model_source: str
+    facts: Mapping[str, object] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "path", Path(self.path))
+
+    @property
+    def model(self) -> SensorModel:
+        """The first, best model."""
+        return next(iter(self.models.values()))
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What a plugin offers: how to recognise and to open one kind of product.
+
+    Parameters
+    ----------
+    name : str
+        Short name in lower case, unique among all plugins (``--sensor NAME``).
+    description : str
+        One line for `ortho sensors`.
+    recognises : callable(dataset) -> bool
+        True if the open `gdal.Dataset` is such a product. No exception for what is not.
+    open_scene : callable(dataset, **options) -> Scene
+        Translates the vendor's metadata. Raises `ortho_pipeline.errors.InputError` for a damaged product.
+    options : mapping of str to str
+        The keyword options of `open_scene`, with a line of help for each. Any other option is refused
+        before `open_scene` is called.
+    fallback : bool
+        A fallback sensor serves any product of a general kind: it is asked only when no other sensor
+        recognises the dataset, and it is taken when it alone declares the options that the user gave.
+    """
+
+    name: str
+    description: str
+    recognises: Callable[[Any], bool]
+    open_scene: Callable[..., Scene]
+    options: Mapping[str, str] = field(default_factory=dict)
+    fallback: bool = False
+
+
+@hookspec
+def ortho_sensors() -> Iterable[Sensor]:
+    """Return the sensors that this plugin offers."""
+    raise NotImplementedError
+
+
+@hookspec
+def ortho_models() -> Mapping[str, type[SensorModel]]:
+    """Return further model families by name: classes whose ``from_dict`` undoes their ``to_dict``.
+
+    The name is the ``kind`` of the class, as `ortho_pipeline.models.model_from_dict` looks it up.
+    """
+    raise NotImplementedError

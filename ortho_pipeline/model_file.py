@@ -1,0 +1,135 @@
+"""The model file ``<stem>_model.json``: a sensor model that opens again, and where it came from."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import write_text
+from ortho_pipeline.models import model_from_dict
+from ortho_pipeline.models.base import SensorModel
+
+SCHEMA_VERSION = 1
+DOCUMENT = "ortho-pipeline model"
+_MAX_BYTES = 50_000_000
+
+
+@dataclass(frozen=True)
+class SavedModel:
+    """What a model file holds.
+
+    Parameters
+    ----------
+    model : SensorModel
+    sensor : str
+        Name of the sensor that opened the scene; empty if no scene was involved.
+    model_source : str
+        The file or tag that the model as delivered was read from.
+    size : (int, int) or None
+        Columns and rows of the image that the model belongs to.
+    provenance : mapping
+        JSON values: inputs, their checksums, software, adjustment.
+    """
+
+    model: SensorModel
+    sensor: str = ""
+    model_source: str = ""
+    size: tuple[int, int] | None = None
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+
+def write_model_file(saved: SavedModel, path: str | os.PathLike[str]) -> None:
+    """Write a model file, whole or not at all; numbers are kept to the last bit."""
+    document = {
+        "document": DOCUMENT,
+        "schema_version": SCHEMA_VERSION,
+        "software": f"ortho-pipeline {metadata.version('ortho-pipeline')}",
+        "sensor": saved.sensor,
+        "model_source": saved.model_source,
+        "size": None if saved.size is None else list(saved.size),
+        "model": saved.model.to_dict(),
+        "provenance": dict(saved.provenance),
+    }
+    write_text(path, json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
+    """Read a model file.
+
+    Raises
+    ------
+    InputError
+        If it is no model file, of a later schema, or its model does not fit its kind.
+    """
+    document = _document(Path(path))
+    version = document.get("schema_version")
+    if document.get("document") != DOCUMENT or not isinstance(document.get("model"), dict):
+        raise InputError(
+            "this is no model file of ortho-pipeline",
+            file=path,
+            remedy="give a <stem>_model.json; RPC files go to --rpc",
+        )
+    if version != SCHEMA_VERSION:
+        raise InputError(
+            f"schema version {version!r} is not known here (this version reads {SCHEMA_VERSION})",
+            file=path,
+            field="schema_version",
+            remedy="update ortho-pipeline",
+        )
+    size = document.get("size")
+    if size is not None and not (
+        isinstance(size, list) and len(size) == 2 and all(isinstance(n, int) and n > 0 for n in size)
+    ):
+        raise InputError(f"{size!r} is no image size", file=path, field="size", remedy="two positive integers, or null")
+    try:
+        model = model_from_dict(document["model"])
+    except InputError as error:
+        raise InputError(
+            error.message, file=path, field=".".join(filter(None, ("model", error.field))), remedy=error.remedy
+        ) from error
+    provenance = document.get("provenance")
+    return SavedModel(
+        model=model,
+        sensor=str(document.get("sensor") or ""),
+        model_source=str(document.get("model_source") or ""),
+        size=None if size is None else (size[0], size[1]),
+        provenance=provenance if isinstance(provenance, dict) else {},
+    )
+
+
+def save_model(model: SensorModel, path: str | os.PathLike[str]) -> None:
+    """Write `model` alone as a model file; `load_model` returns it again."""
+    write_model_file(SavedModel(model), path)
+
+
+def load_model(path: str | os.PathLike[str]) -> SensorModel:
+    """Return the sensor model of a model file.
+
+    Raises
+    ------
+    InputError
+        As for `read_model_file`.
+    """
+    return read_model_file(path).model
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise InputError("a model file of more than 50 MB is not read", file=path)
+        document = json.loads(path.read_text(encoding="utf-8-sig"), parse_constant=_no_constant)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", file=path, remedy="check the path") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"this is no JSON ({error})", file=path, remedy="give a <stem>_model.json") from error
+    return document if isinstance(document, dict) else {}
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a number that a model may hold")

@@ -1,0 +1,90 @@
+"""What a user can ask for, grouped as the pipeline takes it; every field has the default of the command line."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """How the image is opened.
+
+    Parameters
+    ----------
+    sensor : str, optional
+        Name of the sensor, where several or none recognise the image.
+    rpc : str, optional
+        ``tag``, ``sidecar`` or an RPC file.
+    model : path, optional
+        A model file that takes the place of the image's own model.
+    allow_network : bool
+        Whether URLs and GDAL's virtual file systems may be opened.
+    """
+
+    sensor: str | None = None
+    rpc: str | None = None
+    model: str | os.PathLike[str] | None = None
+    allow_network: bool = False
+
+
+@dataclass(frozen=True)
+class PointOptions:
+    """Which points there are, and what is adjusted to them.
+
+    Parameters
+    ----------
+    gcps : path, optional
+        A file of points, or ``own`` for those in the image.
+    crs, vertical : str, optional
+        For files that do not say.
+    pixel_origin : {'corner', 'center'}
+        Where CSV files count pixels from.
+    check : str, optional
+        ``every:N`` or ``ids:a,b``: which points only check.
+    correction : {'none', 'shift', 'shift-drift', 'affine'}, optional
+        Default: shift if there are control points.
+    """
+
+    gcps: str | os.PathLike[str] | None = None
+    crs: str | None = None
+    vertical: str | None = None
+    pixel_origin: str = "corner"
+    check: str | None = None
+    correction: str | None = None
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """Where heights come from: a DEM, or one ellipsoidal height in metres.
+
+    Parameters
+    ----------
+    fill : str
+        ``error``, ``mask``, ``nearest`` or a height: what is done where the DEM has no height.
+    override_vertical : bool
+        Believe `vertical` even where the DEM declares another height datum.
+    """
+
+    dem: str | os.PathLike[str] | None = None
+    vertical: str | None = None
+    override_vertical: bool = False
+    fill: str = "error"
+    height: float | None = None
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """What the ortho looks like and how it is computed; `memory` in bytes, `tolerance` in source pixels."""
+
+    crs: str | None = None
+    resolution: float | None = None
+    extent: Sequence[float] | None = None
+    resampling: str = "bilinear"
+    format: str = "COG"
+    creation_options: Mapping[str, str] = field(default_factory=dict)
+    engine: str = "ortho"
+    memory: int = 512_000_000
+    threads: int | None = None
+    tolerance: float = 0.01

@@ -1,0 +1,499 @@
+"""Control, check and tie points: one table type, read from and written to every common format.
+
+Whatever a file's convention is, points have image coordinates (column, row) from the outer corner of the first pixel,
+and ground coordinates x, y in a stated CRS with heights in metres above the WGS84 ellipsoid (NaN: not given).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+from numpy.typing import ArrayLike, NDArray
+
+from ortho_pipeline.crs import (
+    VERTICAL_FORMS,
+    DeclaredVertical,
+    Vertical,
+    declared_vertical,
+    ground_transform,
+    horizontal,
+    parse_crs,
+    same_crs,
+)
+from ortho_pipeline.errors import CrsError, DatumError, InputError
+from ortho_pipeline.files import write_text
+from ortho_pipeline.point_files import CSV_COLUMNS, ROLES, Row, Table, read_table
+
+Array = NDArray[np.float64]
+
+#: Standard deviation (px) of an image measurement whose file gives none.
+DEFAULT_SIGMA_IMAGE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points that were measured in an image and on the ground.
+
+    Parameters
+    ----------
+    ids : tuple of str
+        All different.
+    image : ndarray (N, 2)
+        Column, row in pixels.
+    ground : ndarray (N, 3)
+        x, y in `crs`, height in metres above the ellipsoid; NaN is a height that is not given.
+    roles : ndarray (N,) of str
+        ``control``, ``check`` or ``tie``.
+    sigma_image : ndarray (N,)
+        Standard deviation of the image measurement, px.
+    sigma_ground : ndarray (N, 3)
+        Standard deviation of the ground coordinates in metres; 0 is perfect.
+    crs : pyproj.CRS
+        Horizontal CRS, x first.
+    source : str
+        Where they come from, for people.
+    """
+
+    ids: tuple[str, ...]
+    image: Array
+    ground: Array
+    roles: NDArray[np.str_]
+    sigma_image: Array
+    sigma_ground: Array
+    crs: pyproj.CRS
+    source: str
+
+    def __post_init__(self) -> None:
+        count = len(self.ids)
+        for name, shape in (
+            ("image", (count, 2)),
+            ("ground", (count, 3)),
+            ("sigma_image", (count,)),
+            ("sigma_ground", (count, 3)),
+        ):
+            array = np.asarray(getattr(self, name), dtype=float)
+            if array.shape != shape:
+                raise InputError(f"{name} has the shape {array.shape}, not {shape}", field=name)
+            object.__setattr__(self, name, array)
+        roles = np.asarray(self.roles, dtype="<U7")
+        if roles.shape != (count,) or not np.isin(roles, ROLES).all():
+            raise InputError(f"each point has one role of {', '.join(ROLES)}", field="roles")
+        object.__setattr__(self, "roles", roles)
+        if len(set(self.ids)) != count:
+            twice = sorted({name for name in self.ids if self.ids.count(name) > 1})
+            raise InputError(f"the id {twice[0]!r} stands twice", file=self.source or None, field="id")
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def control(self) -> NDArray[np.bool_]:
+        """Which points are control ``(N,)``."""
+        return self.roles == "control"
+
+    @property
+    def check(self) -> NDArray[np.bool_]:
+        """Which points are check points ``(N,)``."""
+        return self.roles == "check"
+
+    def select(self, mask: ArrayLike) -> Points:
+        """Return the points of a mask ``(N,)`` or of indices, in their order."""
+        index = np.arange(len(self))[np.asarray(mask)]
+        return replace(
+            self,
+            ids=tuple(self.ids[i] for i in index),
+            image=self.image[index],
+            ground=self.ground[index],
+            roles=self.roles[index],
+            sigma_image=self.sigma_image[index],
+            sigma_ground=self.sigma_ground[index],
+        )
+
+    def with_roles(self, roles: ArrayLike) -> Points:
+        """Return these points with other roles ``(N,)``."""
+        return replace(self, roles=np.asarray(roles))
+
+    def with_ground(self, ground: ArrayLike) -> Points:
+        """Return these points at another place ``(N, 3)`` of the same CRS."""
+        return replace(self, ground=np.asarray(ground, dtype=float))
+
+    def to_crs(self, target: str | pyproj.CRS) -> Points:
+        """Return these points in another CRS; heights that are not given stay so.
+
+        Raises
+        ------
+        CrsError
+            If there is no transformation.
+        """
+        target = parse_crs(target)
+        missing = ~np.isfinite(self.ground[:, 2])
+        ground = self.ground.copy()
+        ground[missing, 2] = 0.0
+        ground = ground_transform(self.crs, target)(ground)
+        if not target.is_geocentric:
+            ground[missing, 2] = np.nan
+            target = horizontal(target)
+        elif missing.any():
+            ground[missing] = np.nan
+        return replace(self, ground=ground, crs=target)
+
+
+# -- reading ---------------------------------------------------------------------------------------------------------
+
+
+def read_points(
+    path: str | os.PathLike[str],
+    *,
+    crs: str | pyproj.CRS | None = None,
+    vertical: str | Vertical | None = None,
+    pixel_origin: str = "corner",
+    image_name: str | None = None,
+) -> Points:
+    """Read points of any known format (see `ortho_pipeline.point_files`).
+
+    Parameters
+    ----------
+    crs, vertical : optional
+        What the coordinates and the heights are in, where the file does not say it.
+    pixel_origin : 'corner' or 'center'
+        Where (0, 0) is in the first pixel, for CSV and ODM files; the others have a convention of their own.
+    image_name : str, optional
+        Keep the points of this image, where a file holds points of several.
+
+    Raises
+    ------
+    InputError, CrsError, DatumError
+        Names file, line and column, and what to do.
+    """
+    if pixel_origin not in ("corner", "center"):
+        raise InputError(f"{pixel_origin!r} is not a pixel origin", field="--pixel-origin", remedy="corner or center")
+    table = read_table(path, image_name)
+    ids = _ids(path, table.rows)
+    image = np.array([row.image for row in table.rows])
+    if pixel_origin == "center" and table.centre_origin_allowed:
+        image += 0.5
+    ground = np.array([row.ground for row in table.rows])
+    wheres = [row.where for row in table.rows]
+    full = _crs_of(path, table, crs)
+    plane = horizontal(full)
+    _check_places(path, plane, wheres, ground)
+    _refuse_duplicates(path, wheres, image, ground, [row.role for row in table.rows])
+    datum, unit = _vertical_of(path, table, full, vertical, bool(np.isfinite(ground[:, 2]).any()))
+    ground[:, 2] *= unit
+    return Points(
+        ids=ids,
+        image=image,
+        ground=_ellipsoidal(path, wheres, ground, plane, datum),
+        roles=np.array([row.role for row in table.rows], dtype="<U7"),
+        sigma_image=np.array([_or(row.sigma_image, DEFAULT_SIGMA_IMAGE) for row in table.rows]),
+        sigma_ground=np.array([[_or(row.sigma_xy, 0.0)] * 2 + [_or(row.sigma_h, 0.0)] for row in table.rows]),
+        crs=plane,
+        source=os.fspath(path),
+    )
+
+
+def gcps_of_dataset(
+    dataset: Any, *, crs: str | pyproj.CRS | None = None, vertical: str | Vertical | None = None
+) -> Points:
+    """Return the ground control points that an open GDAL dataset carries.
+
+    Heights that are all zero are GDAL's way to say that there are none: they are NaN here.
+
+    Raises
+    ------
+    InputError, CrsError, DatumError
+        If there are none, or the CRS or the height datum is not known.
+    """
+    path = dataset.GetDescription()
+    gcps = dataset.GetGCPs()
+    if not gcps:
+        raise InputError("this raster carries no ground control points", file=path, remedy="give a point file")
+    named = all(gcp.Id for gcp in gcps) and len({gcp.Id for gcp in gcps}) == len(gcps)
+    flat = all(gcp.GCPZ == 0 for gcp in gcps)
+    rows = [
+        Row(
+            where=f"GCP {count}",
+            id=gcp.Id if named else str(count),
+            image=(float(gcp.GCPPixel), float(gcp.GCPLine)),
+            ground=(float(gcp.GCPX), float(gcp.GCPY), math.nan if flat else float(gcp.GCPZ)),
+        )
+        for count, gcp in enumerate(gcps, start=1)
+    ]
+    image, ground = np.array([row.image for row in rows]), np.array([row.ground for row in rows])
+    if not (np.isfinite(image).all() and np.isfinite(ground[:, :2]).all()):
+        raise InputError("a ground control point is not finite", file=path, field="GCP")
+    table = Table("GCPs", rows, crs=dataset.GetGCPProjection() or None)
+    full = _crs_of(path, table, crs)
+    plane, wheres = horizontal(full), [row.where for row in rows]
+    _check_places(path, plane, wheres, ground)
+    _refuse_duplicates(path, wheres, image, ground, [row.role for row in rows])
+    datum, unit = _vertical_of(path, table, full, vertical, not flat)
+    ground[:, 2] *= unit
+    return Points(
+        ids=tuple(str(row.id) for row in rows),
+        image=image,
+        ground=_ellipsoidal(path, wheres, ground, plane, datum),
+        roles=np.full(len(rows), "control", dtype="<U7"),
+        sigma_image=np.full(len(rows), DEFAULT_SIGMA_IMAGE),
+        sigma_ground=np.zeros((len(rows), 3)),
+        crs=plane,
+        source=path,
+    )
+
+
+def _or(value: float | None, default: float) -> float:
+    return default if value is None else value
+
+
+def _ids(path: str | os.PathLike[str], rows: Sequence[Row]) -> tuple[str, ...]:
+    """Number the points without an id by their place in the file; refuse an id that stands twice."""
+    first: dict[str, str] = {}
+    for count, row in enumerate(rows, start=1):
+        row.id = row.id if row.id is not None else str(count)
+        if row.id in first:
+            raise InputError(
+                f"the id {row.id!r} stands twice, first in {first[row.id]}",
+                file=path,
+                field=row.where,
+                remedy="give each point an id of its own",
+            )
+        first[row.id] = row.where
+    return tuple(str(row.id) for row in rows)
+
+
+def _crs_of(path: str | os.PathLike[str], table: Table, option: str | pyproj.CRS | None) -> pyproj.CRS:
+    try:
+        stated = None if table.crs is None else parse_crs(table.crs)
+    except CrsError as error:
+        raise CrsError(error.message, file=path, field="CRS", remedy=error.remedy) from error
+    given = None if option is None else parse_crs(option)
+    if stated is None and given is None:
+        raise CrsError(
+            "the CRS of these points is not known", file=path, field="--points-crs", remedy="give --points-crs EPSG:n"
+        )
+    if stated is None or given is None:
+        return given if stated is None else stated  # type: ignore[return-value]
+    if not same_crs(horizontal(stated), horizontal(given)):
+        raise CrsError(
+            f"the file says {stated.name!r}, --points-crs says {given.name!r}",
+            file=path,
+            field="--points-crs",
+            remedy="leave the option out",
+        )
+    # The one that also says what heights are in tells more.
+    return stated if declared_vertical(given) is None else given
+
+
+def _vertical_of(
+    path: str | os.PathLike[str], table: Table, crs: pyproj.CRS, option: str | Vertical | None, needed: bool
+) -> tuple[Vertical, float]:
+    """Return the height datum of the points, and metres per unit of their heights."""
+    declared = declared_vertical(crs)
+    if table.assumed_vertical is not None and option is not None:
+        # The CRS is what the format prescribes, not what anybody said of these heights.
+        declared = None
+    given = None if option is None else Vertical.parse(option)
+    stated = None if table.vertical is None else Vertical.parse(table.vertical)
+    unit = declared.metres_per_unit if declared else 1.0
+    certain = stated or _certain(declared)
+    if given is not None and certain is not None and given != certain:
+        raise DatumError(
+            f"the heights of these points are in {certain.label}, --points-vertical says {given.label}",
+            file=path,
+            field="--points-vertical",
+            remedy="leave the option out",
+        )
+    found = given or stated or (declared.vertical if declared else None)
+    if found is None and table.assumed_vertical is not None:
+        found = Vertical.parse(table.assumed_vertical)
+    if found is None and not needed:
+        return Vertical("ellipsoid"), unit
+    if found is None:
+        raise DatumError(
+            "it is not known what the heights of these points are measured above",
+            file=path,
+            field="--points-vertical",
+            remedy=f"say it with --points-vertical ({VERTICAL_FORMS})",
+        )
+    return found, unit
+
+
+def _certain(declared: DeclaredVertical | None) -> Vertical | None:
+    return declared.vertical if declared is not None and declared.certain else None
+
+
+def _ellipsoidal(
+    path: str | os.PathLike[str], wheres: Sequence[str], ground: Array, crs: pyproj.CRS, vertical: Vertical
+) -> Array:
+    given = np.isfinite(ground[:, 2])
+    if vertical.is_ellipsoid or not given.any():
+        return ground
+    plan = np.column_stack([ground[:, :2], np.zeros(len(ground))])
+    lonlat = ground_transform(crs, "EPSG:4979")(plan)
+    try:
+        undulation = vertical.undulation(lonlat[:, 0], lonlat[:, 1])
+    except DatumError as error:
+        raise DatumError(error.message, file=path, field="--points-vertical", remedy=error.remedy) from error
+    outside = given & ~np.isfinite(undulation)
+    if outside.any():
+        raise DatumError(
+            f"the geoid of {vertical.label} does not reach this point",
+            file=path,
+            field=wheres[int(np.flatnonzero(outside)[0])],
+            remedy="check its coordinates and --points-crs",
+        )
+    out = ground.copy()
+    out[given, 2] += undulation[given]
+    return out
+
+
+def _check_places(path: str | os.PathLike[str], crs: pyproj.CRS, wheres: Sequence[str], ground: Array) -> None:
+    if crs.is_geographic:
+        unit = math.degrees(crs.axis_info[0].unit_conversion_factor)
+        for where, (x, y, _) in zip(wheres, ground, strict=True):
+            if abs(y * unit) > 90 or abs(x * unit) > 360:
+                raise InputError(
+                    f"longitude {x}, latitude {y} is not on Earth",
+                    file=path,
+                    field=where,
+                    remedy="x is longitude and y latitude; projected coordinates need another --points-crs",
+                )
+
+
+def _refuse_duplicates(
+    path: str | os.PathLike[str], wheres: Sequence[str], image: Array, ground: Array, roles: Sequence[str]
+) -> None:
+    """Refuse points that stand twice: the same ground or the same pixel, to all digits that can matter."""
+    # A millimetre in degrees and in metres; pixels to a millionth.
+    digits = 8 if np.abs(ground[:, :2]).max(initial=0) <= 360 else 3
+    for what, keys in (("ground", np.round(ground, digits)), ("image", np.round(image, 6))):
+        first: dict[tuple[float, ...], int] = {}
+        for count, key in enumerate(map(tuple, np.nan_to_num(keys, nan=-1e9).tolist())):
+            other = first.setdefault(key, count)
+            if other != count:
+                both = sorted({roles[other], roles[count]})
+                as_both = f", as {' and '.join(both)}" if len(both) > 1 else ""
+                raise InputError(
+                    f"the same {what} coordinates as in {wheres[other]}{as_both}",
+                    file=path,
+                    field=wheres[count],
+                    remedy="remove one of the two",
+                )
+
+
+# -- roles -----------------------------------------------------------------------------------------------------------
+
+
+def assign_roles(points: Points, spec: str) -> Points:
+    """Make check points of some control points.
+
+    Parameters
+    ----------
+    spec : str
+        ``every:N`` for each N-th control point (the N-th first), or ``ids:a,b,c`` for these points.
+
+    Raises
+    ------
+    InputError
+        If the text is neither, or an id does not exist.
+    """
+    kind, _, rest = spec.partition(":")
+    roles = points.roles.copy()
+    if kind == "every" and rest.strip().isascii() and rest.strip().isdigit() and 0 < int(rest) <= 1_000_000:
+        roles[np.flatnonzero(points.control)[int(rest) - 1 :: int(rest)]] = "check"
+        return points.with_roles(roles)
+    names = [name.strip() for name in rest.split(",") if name.strip()]
+    if kind == "ids" and names:
+        unknown = [name for name in names if name not in points.ids]
+        if unknown:
+            raise InputError(
+                f"there is no point {', '.join(unknown)}",
+                file=points.source or None,
+                field="--check",
+                remedy=f"the ids are {', '.join(points.ids[:12])}{' ...' if len(points) > 12 else ''}",
+            )
+        roles[np.isin(np.array(points.ids), names)] = "check"
+        return points.with_roles(roles)
+    raise InputError(f"{spec!r} does not choose check points", field="--check", remedy="give every:N or ids:a,b,c")
+
+
+# -- writing ---------------------------------------------------------------------------------------------------------
+
+
+def write_points(points: Points, path: str | os.PathLike[str]) -> None:
+    """Write points as ``.csv``/``.tsv``, ``.geojson`` (lon, lat, EPSG:4979) or QGIS ``.points``; whole or not at all.
+
+    CSV and GeoJSON read back as they were; a QGIS file has no ids, heights, roles or sigmas.
+
+    Raises
+    ------
+    InputError
+        For another suffix, or a folder that cannot be written.
+    """
+    writers = {".csv": _csv_text, ".tsv": _csv_text, ".geojson": _geojson_text, ".points": _qgis_text}
+    suffix = Path(path).suffix.lower()
+    if suffix not in writers:
+        raise InputError("points are not written in this format", file=path, remedy=f"one of {', '.join(writers)}")
+    write_text(path, writers[suffix](points, suffix))
+
+
+def _csv_text(points: Points, suffix: str) -> str:
+    out = io.StringIO()
+    out.write(f"#CRS: {_crs_text(points.crs)}\n#vertical: ellipsoid\n")
+    # An id that starts with '#' would read as a comment without quotation marks.
+    hidden = any(name.startswith("#") for name in points.ids)
+    writer = csv.writer(
+        out,
+        delimiter="\t" if suffix == ".tsv" else ",",
+        lineterminator="\n",
+        quoting=csv.QUOTE_ALL if hidden else csv.QUOTE_MINIMAL,
+    )
+    writer.writerow(CSV_COLUMNS)
+    # One column holds both plan components: the larger one is the careful choice.
+    sigma_xy = points.sigma_ground[:, :2].max(axis=1)
+    numbers = np.column_stack([points.image, points.ground])
+    sigmas = np.column_stack([points.sigma_image, sigma_xy, points.sigma_ground[:, 2]])
+    for k, name in enumerate(points.ids):
+        cells = ["" if math.isnan(value) else repr(value) for value in numbers[k].tolist()]
+        writer.writerow([name, *cells, str(points.roles[k]), *map(repr, sigmas[k].tolist())])
+    return out.getvalue()
+
+
+def _geojson_text(points: Points, suffix: str) -> str:
+    geographic = points.to_crs("EPSG:4979")
+    features = []
+    for k, name in enumerate(points.ids):
+        place = [float(value) for value in geographic.ground[k]]
+        properties = {
+            "id": name,
+            "ji": [float(value) - 0.5 for value in points.image[k]],
+            "role": str(points.roles[k]),
+            "sigma_image": float(points.sigma_image[k]),
+            "sigma_xy": float(points.sigma_ground[k, :2].max()),
+            "sigma_h": float(points.sigma_ground[k, 2]),
+        }
+        geometry = {"type": "Point", "coordinates": place[:2] if math.isnan(place[2]) else place}
+        features.append({"type": "Feature", "properties": properties, "geometry": geometry})
+    return json.dumps({"type": "FeatureCollection", "features": features}, indent=1, allow_nan=False) + "\n"
+
+
+def _qgis_text(points: Points, suffix: str) -> str:
+    lines = [f"#CRS: {_crs_text(points.crs)}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
+    for (column, row), (x, y, _) in zip(points.image.tolist(), points.ground.tolist(), strict=True):
+        lines.append(f"{x!r},{y!r},{column!r},{-row!r},1,0,0,0")
+    return "\n".join(lines) + "\n"
+
+
+def _crs_text(crs: pyproj.CRS) -> str:
+    authority = crs.to_authority(min_confidence=100)
+    return ":".join(authority) if authority else crs.to_wkt().replace("\n", " ")

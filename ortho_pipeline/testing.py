@@ -1,0 +1,222 @@
+"""The contract of sensor models and sensors, as checks that a test calls: ours, and those of plugin authors.
+
+::
+
+    def test_tinysat(tmp_path):
+        scene = check_sensor(next(iter(tinysat_plugin.ortho_sensors())), "tests/data/tinysat.tif")
+        assert scene.facts["band"] == 1
+
+Every check raises `AssertionError` with a text that says what the contract asks for.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ortho_pipeline.hookspecs import Scene, Sensor
+from ortho_pipeline.models import SensorModel, model_from_dict
+from ortho_pipeline.models.base import as_ground
+
+#: Ground to image to ground to image has to close within this (pixels).
+CLOSURE = 1e-5
+#: Partial derivatives have to agree with differences of the model to this part of their largest.
+PARTIALS = 1e-4
+
+
+def check_sensor_model(model: SensorModel, ground: ArrayLike) -> None:
+    """Check that a sensor model keeps the contract.
+
+    Shapes; N points as N single points; rows of NaN stay NaN and harm no other row; ground to image to ground closes;
+    `ground_partials` and `param_partials` predict a nudge; `with_params` and `to_dict` give the same model again; it
+    can be pickled.
+
+    Parameters
+    ----------
+    model : SensorModel
+    ground : (N, 3)
+        Points in the model's CRS that it is meant for, at different heights; at least 3.
+
+    Raises
+    ------
+    AssertionError
+    """
+    points = as_ground(ground)
+    assert len(points) >= 3, "give at least 3 ground points"
+    image = _check_mapping(model, points)
+    _check_closure(model, points, image)
+    _check_ground_partials(model, points)
+    _check_params(model, points, image)
+    _check_copies(model, points, image)
+
+
+def check_sensor(sensor: Sensor, path: str | PathLike[str], **options: Any) -> Scene:
+    """Check that a sensor recognises and opens `path`, and that every model of the scene keeps the contract.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    path : path
+        A file of this sensor.
+    **options
+        Options of the sensor; if there are some, the file need not be recognised without them.
+
+    Returns
+    -------
+    Scene
+        For checks of its facts.
+
+    Raises
+    ------
+    AssertionError
+    """
+    # Here, because models and estimation are tested without GDAL.
+    from ortho_pipeline.raster import open_dataset
+
+    assert sensor.name, "a sensor has a name"
+    assert sensor.name == sensor.name.lower().strip(), f"{sensor.name!r}: names are in lower case, without blanks"
+    assert sensor.description.strip(), "a sensor has a description"
+    assert all(text.strip() for text in sensor.options.values()), "every option has a line of help"
+    undeclared = set(options) - set(sensor.options)
+    assert not undeclared, f"the sensor does not declare the options {sorted(undeclared)}"
+    dataset = open_dataset(path)
+    recognised = sensor.recognises(dataset)
+    assert isinstance(recognised, bool), f"recognises returns True or False, not {recognised!r}"
+    assert recognised or options, f"the sensor does not recognise {path}"
+    scene = sensor.open_scene(dataset, **options)
+    _check_scene(sensor, scene, dataset)
+    return scene
+
+
+def _check_scene(sensor: Sensor, scene: Scene, dataset: Any) -> None:
+    assert isinstance(scene, Scene), f"open_scene returns a Scene, not {type(scene).__name__}"
+    assert scene.sensor == sensor.name, f"the scene says it is of sensor {scene.sensor!r}, not {sensor.name!r}"
+    size = (dataset.RasterXSize, dataset.RasterYSize)
+    assert (scene.width, scene.height) == size, f"the size is {(scene.width, scene.height)}, the file's is {size}"
+    assert scene.models, "a scene has at least one model"
+    assert scene.model_source, "a scene names the file or tag that its model comes from"
+    assert isinstance(scene.warnings, tuple), "warnings are a tuple of texts"
+    try:
+        json.dumps(dict(scene.facts), allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise AssertionError(f"facts must be plain JSON values: {error}") from error
+    for name, model in scene.models.items():
+        assert isinstance(model, SensorModel), f"model {name!r} is a {type(model).__name__}, no SensorModel"
+        check_sensor_model(model, _points_in(model))
+
+
+def _points_in(model: SensorModel) -> NDArray[np.float64]:
+    """Return 27 points in the inner part of a model's domain."""
+    centre, half = model.domain
+    signs = np.stack(np.meshgrid(*[(-0.7, 0.1, 0.8)] * 3), axis=-1).reshape(-1, 3)
+    return centre + signs * half
+
+
+def _check_mapping(model: SensorModel, ground: NDArray[np.float64]) -> NDArray[np.float64]:
+    image = model.ground_to_image(ground)
+    n = len(ground)
+    assert isinstance(image, np.ndarray), f"ground_to_image returns an array, not {type(image).__name__}"
+    assert image.shape == (n, 2), f"ground_to_image of {n} points returns ({n}, 2), not {image.shape}"
+    assert image.dtype == np.float64, f"image points are float64, not {image.dtype}"
+    assert np.isfinite(image).all(), f"{np.isnan(image).any(axis=1).sum()} of the points given do not project"
+    singles = np.concatenate([model.ground_to_image(point[None]) for point in ground])
+    worst = np.abs(singles - image).max()
+    assert worst < 1e-7, f"{n} points at once and one at a time differ by {worst:g} px"
+    assert model.ground_to_image(np.empty((0, 3))).shape == (0, 2), "no points give an empty (0, 2)"
+    holed = ground.copy()
+    for axis in range(3):
+        holed[axis, axis] = np.nan
+    result = model.ground_to_image(holed)
+    assert np.isnan(result[:3]).all(), "a point with a NaN in any coordinate projects to a row of NaN"
+    assert np.allclose(result[3:], image[3:], rtol=0, atol=1e-7), "a NaN in one point changes other points"
+    before = ground.copy()
+    model.ground_to_image(ground)
+    assert np.array_equal(before, ground), "ground_to_image changes its argument"
+    lo, hi = model.height_range
+    assert lo < hi, f"height_range goes from {lo} to {hi}"
+    assert lo <= model.reference_height <= hi, "reference_height lies within height_range"
+    return image
+
+
+def _check_closure(model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64]) -> None:
+    back = model.image_to_ground(image, ground[:, 2])
+    assert back.shape == ground.shape, f"image_to_ground returns {ground.shape}, not {back.shape}"
+    assert np.isfinite(back).all(), f"{np.isnan(back).any(axis=1).sum()} points have no inverse"
+    assert np.array_equal(back[:, 2], ground[:, 2]), "image_to_ground returns the height that it was given"
+    worst = np.abs(model.ground_to_image(back) - image).max()
+    assert worst < CLOSURE, f"ground to image to ground to image closes only to {worst:g} px, not {CLOSURE:g}"
+    # A second root of the same image point would close as well.
+    apart = np.abs((back - ground) / model.domain[1]).max()
+    assert apart < 1e-6, f"image_to_ground found another point, {apart:g} half-sizes of the domain away"
+    broken = image.copy()
+    broken[0, 0] = np.nan
+    result = model.image_to_ground(broken, ground[:, 2])
+    assert np.isnan(result[0]).all(), "an image point with a NaN has a row of NaN for its ground"
+    assert np.isfinite(result[1:]).all(), "a NaN in one image point harms the others"
+
+
+def _check_ground_partials(model: SensorModel, ground: NDArray[np.float64]) -> None:
+    partials = model.ground_partials(ground)
+    assert partials.shape == (len(ground), 2, 3), f"ground_partials returns (N, 2, 3), not {partials.shape}"
+    _, half = model.domain
+    for axis, step in enumerate(1e-4 * half):
+        nudge = np.zeros(3)
+        nudge[axis] = step
+        moved = (model.ground_to_image(ground + nudge) - model.ground_to_image(ground - nudge)) / 2
+        _assert_predicts(partials[:, :, axis] * step, moved, f"ground_partials along axis {axis}")
+
+
+def _check_params(model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64]) -> None:
+    params = np.asarray(model.params, dtype=np.float64)
+    n = len(model.param_names)
+    assert params.shape == (n,), f"params has the shape {params.shape}, but there are {n} param_names"
+    assert len(set(model.param_names)) == n, "param_names has a name twice"
+    same = model.with_params(params)
+    assert np.array_equal(same.params, params), "with_params(params) does not give the parameters back"
+    assert np.allclose(same.ground_to_image(ground), image, rtol=0, atol=1e-9), "with_params(params) is another model"
+    partials = model.param_partials(ground)
+    assert partials.shape == (len(ground), 2, n), f"param_partials returns (N, 2, {n}), not {partials.shape}"
+    for k, name in enumerate(model.param_names):
+        reach = np.abs(partials[:, :, k]).max()
+        assert reach > 0, f"the parameter {name!r} moves no point"
+        # A hundredth of a pixel: small enough to be linear, large enough to be above rounding.
+        step = np.zeros(n)
+        step[k] = 0.01 / reach
+        ahead, behind = model.with_params(params + step), model.with_params(params - step)
+        moved = (ahead.ground_to_image(ground) - behind.ground_to_image(ground)) / 2
+        _assert_predicts(partials[:, :, k] * step[k], moved, f"param_partials of {name!r}")
+    assert np.array_equal(model.params, params), "with_params changes the model itself"
+
+
+def _assert_predicts(predicted: NDArray[np.float64], moved: NDArray[np.float64], what: str) -> None:
+    miss = np.abs(predicted - moved).max()
+    # Differences of image coordinates of some 1e5 px carry rounding of 1e-9 px.
+    allowed = PARTIALS * np.abs(moved).max() + 1e-8
+    assert miss <= allowed, f"{what} misses a nudge by {miss:g} px (allowed {allowed:g})"
+
+
+def _check_copies(model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64]) -> None:
+    data = model.to_dict()
+    assert data.get("kind") == model.kind, f"to_dict has the kind {data.get('kind')!r}, the class {model.kind!r}"
+    try:
+        text = json.dumps(data, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise AssertionError(f"to_dict must be plain JSON values: {error}") from error
+    _check_copy(model_from_dict(json.loads(text)), model, ground, image, "to_dict")
+    try:
+        pickled = pickle.loads(pickle.dumps(model))
+    except (pickle.PickleError, AttributeError, TypeError) as error:
+        raise AssertionError(f"models go to other processes, so they can be pickled: {error}") from error
+    _check_copy(pickled, model, ground, image, "pickle")
+
+
+def _check_copy(
+    copy: SensorModel, model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64], how: str
+) -> None:
+    assert type(copy) is type(model), f"{how} gives a {type(copy).__name__} back"
+    assert np.array_equal(copy.ground_to_image(ground), image), f"{how} gives another model back"

@@ -1,0 +1,86 @@
+"""Sensor plugin for every product that comes with an RPC: TIFF tag, side-car, DIMAP, NITF, VRT, or a file given.
+
+It is a fallback: a plugin that knows the product itself goes first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from osgeo import gdal
+
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.rpc import has_rpc, rpc_of_dataset
+
+# What GDAL's readers of vendor metadata agree on, and what it is called here.
+IMAGERY = {"SATELLITEID": "satellite", "ACQUISITIONDATETIME": "acquired", "CLOUDCOVER": "cloud_cover_percent"}
+
+
+@hookimpl
+def ortho_sensors() -> Iterable[Sensor]:
+    """Offer the sensor ``rpc``."""
+    yield Sensor(
+        "rpc",
+        "any image with an RPC (tag, .RPB, _RPC.TXT, DIMAP, NITF, VRT)",
+        has_rpc,
+        open_scene,
+        options={"rpc": "which RPC to use: tag, sidecar, or an RPC file"},
+        fallback=True,
+    )
+
+
+def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
+    """Open an image with its RPC, or with the one given."""
+    model, source = rpc_of_dataset(dataset, rpc)
+    width, height = dataset.RasterXSize, dataset.RasterYSize
+    return Scene(
+        sensor="rpc",
+        path=dataset.GetDescription(),
+        width=width,
+        height=height,
+        models={"rpc": model},
+        model_source=source,
+        facts=_facts(dataset, model),
+        warnings=_warnings(dataset, model),
+    )
+
+
+def _facts(dataset: gdal.Dataset, model: RPC) -> dict[str, Any]:
+    imagery = dataset.GetMetadata("IMAGERY") or {}
+    facts: dict[str, Any] = {name: imagery[key] for key, name in IMAGERY.items() if imagery.get(key)}
+    # GDAL hands on 999, the vendors' word for a cloud cover that is not known.
+    if facts.get("cloud_cover_percent", "").strip() in ("999", "99.9"):
+        del facts["cloud_cover_percent"]
+    for name in ("err_bias", "err_rand"):
+        value = getattr(model, name)
+        if value is not None:
+            facts[f"rpc_{name}_m"] = value
+    facts["rpc_height_range_m"] = list(model.height_range)
+    return facts
+
+
+def _warnings(dataset: gdal.Dataset, model: RPC) -> tuple[str, ...]:
+    warnings = []
+    if dataset.GetGCPCount():
+        warnings.append(f"the file also has {dataset.GetGCPCount()} GCPs of its own, which GDAL programs prefer to RPC")
+    outside = _distance(model.col_off, model.col_scale, dataset.RasterXSize) > 0 or (
+        _distance(model.row_off, model.row_scale, dataset.RasterYSize) > 0
+    )
+    if outside:
+        warnings.append(
+            f"the RPC is for columns {_range(model.col_off, model.col_scale)} and rows"
+            f" {_range(model.row_off, model.row_scale)}, which does not meet this image of"
+            f" {dataset.RasterXSize} x {dataset.RasterYSize} pixels: is it a crop with the RPC of the whole?"
+        )
+    return tuple(warnings)
+
+
+def _distance(off: float, scale: float, size: int) -> float:
+    """Return by how far the interval off ± scale misses the interval from 0 to size."""
+    return max(off - abs(scale) - size, -(off + abs(scale)))
+
+
+def _range(off: float, scale: float) -> str:
+    return f"{off - abs(scale):.0f} to {off + abs(scale):.0f}"

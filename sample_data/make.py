@@ -1,0 +1,158 @@
+"""Make the sample data: a simulated satellite scene, its RPC, a DEM, ground control, and the truth behind them.
+
+Run ``python sample_data/make.py [FOLDER]``; without a folder the files of this one are written again. Everything comes
+from seeds, so that the pixels and numbers are the same every time.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+from osgeo import gdal, osr
+
+from ortho_pipeline.crs import Vertical
+from ortho_pipeline.files import whole_or_nothing, write_text
+from ortho_pipeline.landscape import Landscape, Terrain
+from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.points import Points, write_points
+from ortho_pipeline.rpc import RpcExport, fit_rpc, write_rpc_txt
+from ortho_pipeline.simulate import LineScanner, SimulatedPoints, render, simulate_points
+
+gdal.UseExceptions()
+osr.UseExceptions()
+
+#: Middle of the scene (degrees, degrees, ellipsoidal metres); the place is made up, its geoid is not.
+CENTRE = (33.35, 37.25, 850.0)
+MAP_CRS = "EPSG:32636"
+SIZE = 1000
+GSD = 2.5
+OFF_NADIR_DEG = 20.0
+HEIGHTS = (650.0, 1350.0)
+#: Ellipsoidal height of the lake and rise of the hills, metres.
+LAKE_LEVEL = 700.0
+RELIEF = 420.0
+SEEDS = {"terrain": 1, "landscape": 7, "image noise": 11, "points": 5}
+#: Measured minus predicted by the delivered RPC, in the middle of the image, pixels; and its growth per row.
+BIAS = {"col": 6.3, "row": -4.1, "col_per_row": 2.0e-4, "row_per_row": -1.2e-4}
+SIGMA_IMAGE = 0.15
+SIGMA_GROUND = 0.10
+NOISE_DN = 4.0
+DEM_STEP = 20.0
+DEM_MARGIN = 400.0
+EGM96 = "EPSG:5773"
+
+
+def main(folder: Path) -> None:
+    """Write all files of the sample into `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lon, lat, _ = CENTRE
+    x, y = pyproj.Transformer.from_crs("EPSG:4326", MAP_CRS, always_xy=True).transform(lon, lat)
+    terrain = Terrain(MAP_CRS, round(x, -2), round(y, -2), LAKE_LEVEL, RELIEF, SEEDS["terrain"])
+    camera = LineScanner.over(
+        *CENTRE, image_width=SIZE, image_height=SIZE, gsd=GSD, off_nadir_deg=OFF_NADIR_DEG, heights=HEIGHTS
+    )
+    image = render(
+        camera, terrain, Landscape(terrain, GSD, seed=SEEDS["landscape"]), noise_dn=NOISE_DN, seed=SEEDS["image noise"]
+    )
+    write_scene(image, folder / "scene.tif")
+    delivered = vendor_rpc(camera)
+    write_rpc_txt(delivered.rpc, folder / "scene_RPC.TXT")
+    write_dem(camera, terrain, folder / "dem.tif")
+    points = simulate_points(camera, terrain, sigma_image=SIGMA_IMAGE, sigma_ground=SIGMA_GROUND, seed=SEEDS["points"])
+    delivered_points = as_delivered(points.measured)
+    write_points(delivered_points, folder / "gcps.geojson")
+    write_points(delivered_points, folder / "gcps.csv")
+    truth = truth_of(camera, terrain, delivered, points)
+    write_text(folder / "truth.json", json.dumps(truth, indent=1) + "\n")
+
+
+def vendor_rpc(camera: LineScanner) -> RpcExport:
+    """Fit an RPC to the camera as a vendor would who knows its attitude badly."""
+    error = ImageCorrection(
+        camera,
+        "affine",
+        (SIZE / 2, SIZE / 2),
+        np.array([-BIAS["col"], 0.0, -BIAS["col_per_row"], -BIAS["row"], 0.0, -BIAS["row_per_row"]]),
+    )
+    centre, half = camera.domain
+    west, south, east, north = *(centre - 1.05 * half)[:2], *(centre + 1.05 * half)[:2]
+    return fit_rpc(error, (west, south, east, north), HEIGHTS)
+
+
+def as_delivered(measured: Points) -> Points:
+    """Return the points in map coordinates, with as many digits as a surveyor writes."""
+    mapped = measured.to_crs(MAP_CRS)
+    return replace(mapped, image=np.round(mapped.image, 2), ground=np.round(mapped.ground, 3))
+
+
+def write_scene(image: np.ndarray, path: Path) -> None:
+    """Write the image without any georeference: the RPC beside it is all there is."""
+    rows, cols = image.shape
+    options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9", "TILED=YES"]
+    with whole_or_nothing(path) as temporary:
+        dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), cols, rows, 1, gdal.GDT_UInt16, options)
+        dataset.GetRasterBand(1).WriteArray(image)
+        dataset = None
+
+
+def write_dem(camera: LineScanner, terrain: Terrain, path: Path) -> None:
+    """Write the terrain as a DEM of heights above the EGM96 geoid, which its compound CRS declares."""
+    centre, half = camera.domain
+    corners = [centre[:2] + half[:2] * (sx, sy) for sx in (-1, 1) for sy in (-1, 1)]
+    xy = terrain.xy(*np.array(corners).T)
+    west, south = np.floor((xy.min(axis=0) - DEM_MARGIN) / DEM_STEP) * DEM_STEP
+    cols, rows = np.ceil((xy.max(axis=0) + DEM_MARGIN - (west, south)) / DEM_STEP).astype(int).tolist()
+    north = south + rows * DEM_STEP
+    x, y = np.meshgrid(west + DEM_STEP * (np.arange(cols) + 0.5), north - DEM_STEP * (np.arange(rows) + 0.5))
+    posts = np.stack([x.ravel(), y.ravel()], axis=1)
+    lon, lat = pyproj.Transformer.from_crs(MAP_CRS, "EPSG:4326", always_xy=True).transform(*posts.T)
+    heights = terrain.heights(posts) - Vertical.parse("egm96").undulation(lon, lat)
+    options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9", "TILED=YES"]
+    system = osr.SpatialReference()
+    system.SetFromUserInput(f"{MAP_CRS}+{EGM96.split(':')[1]}")
+    with whole_or_nothing(path) as temporary:
+        dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), cols, rows, 1, gdal.GDT_Float32, options)
+        dataset.SetGeoTransform((west, DEM_STEP, 0.0, north, 0.0, -DEM_STEP))
+        dataset.SetProjection(system.ExportToWkt())
+        band = dataset.GetRasterBand(1)
+        band.SetNoDataValue(-32768.0)
+        # A centimetre is finer than any DEM, and packs four times better than full Float32 noise.
+        band.WriteArray(np.round(heights, 2).reshape(rows, cols).astype(np.float32))
+        dataset = None
+
+
+def truth_of(camera: LineScanner, terrain: Terrain, delivered: RpcExport, points: SimulatedPoints) -> dict[str, Any]:
+    """Collect all that an estimate from the sample can be compared with."""
+    return {
+        "about": "truth of the simulated sample; see README.md",
+        "camera": camera.to_dict(),
+        "terrain": {
+            "crs": terrain.crs,
+            "x0": terrain.x0,
+            "y0": terrain.y0,
+            "lake_level": terrain.lake_level,
+            "relief": terrain.relief,
+            "seed": terrain.seed,
+        },
+        "rpc": {
+            "bias_px": BIAS,
+            "bias_is": "true minus predicted by scene_RPC.TXT, in the middle of the image and its growth per row",
+            "fit_error_px": delivered.max_error_px,
+        },
+        "noise": {"image_dn": NOISE_DN, "points_image_px": SIGMA_IMAGE, "points_ground_m": SIGMA_GROUND},
+        "seeds": SEEDS,
+        "points": [
+            {"id": name, "image": image.tolist(), "lon_lat_h": ground.tolist()}
+            for name, image, ground in zip(points.measured.ids, points.true_image, points.true_ground, strict=True)
+        ],
+    }
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent)

@@ -1,0 +1,125 @@
+"""What the tests share: where the real scenes are, and a tiny scene whose every number is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from osgeo import gdal, osr
+
+from ortho_pipeline.models import RPC
+from ortho_pipeline.rpc import rpc_metadata
+
+ROOT = Path(__file__).resolve().parent.parent
+REAL = ROOT.parent / "shared" / "data"
+SAMPLE = ROOT / "sample_data"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    if REAL.is_dir():
+        return
+    skip = pytest.mark.skip(reason="the real scenes (../shared/data beside the checkout) are not on this machine")
+    for item in items:
+        if "realdata" in item.keywords:
+            item.add_marker(skip)
+
+
+@pytest.fixture(scope="session")
+def real() -> Path:
+    """Folder of the real scenes; tests that use it carry the marker `realdata`."""
+    return REAL
+
+
+@pytest.fixture(scope="session")
+def sample() -> Path:
+    """Folder of the simulated sample scene."""
+    return SAMPLE
+
+
+@dataclass(frozen=True)
+class Tiny:
+    """A 400 x 300 scene of 4.8 m pixels with an RPC, flat-ish DEM and points, in a folder of its own."""
+
+    folder: Path
+    model: RPC
+    bias: tuple[float, float] = (3.0, -2.0)
+    width: int = 400
+    height: int = 300
+
+    @property
+    def image(self) -> Path:
+        return self.folder / "tiny.tif"
+
+    @property
+    def dem(self) -> Path:
+        return self.folder / "dem.tif"
+
+    @property
+    def gcps(self) -> Path:
+        return self.folder / "gcps.csv"
+
+    def points(self, count: int, noise: float = 0.1) -> list[tuple[str, float, float, float, float, float]]:
+        """Return rows (id, col, row, lon, lat, h) of control points that carry the bias and `noise` pixels."""
+        random = np.random.default_rng(3)
+        ground = np.column_stack(
+            [
+                self.model.lon_off + 0.8 * self.model.lon_scale * random.uniform(-1, 1, count),
+                self.model.lat_off + 0.8 * self.model.lat_scale * random.uniform(-1, 1, count),
+                random.uniform(300, 700, count),
+            ]
+        )
+        image = self.model.ground_to_image(ground) + self.bias + random.normal(0, noise, (count, 2))
+        return [(f"p{i}", *image[i].tolist(), *ground[i].tolist()) for i in range(count)]
+
+    def write(self, path: Path, rows: Iterable[tuple[object, ...]], header: str = "id,col,row,x,y,h") -> Path:
+        """Write rows as CSV."""
+        path.write_text("\n".join([header, *(",".join(str(value) for value in row) for row in rows)]) + "\n")
+        return path
+
+    def write_dem(self, path: Path | None = None, share: float = 1.0) -> Path:
+        """Write a DEM of heights around 500 m in UTM 34S that covers the western `share` of scene and margin."""
+        step, columns, rows = 30.0, int(130 * share), 130
+        wgs84 = osr.SpatialReference()
+        wgs84.ImportFromEPSG(4326)
+        wgs84.SetAxisMappingStrategy(osr.OAMS_TRADITIONAL_GIS_ORDER)
+        utm = osr.SpatialReference()
+        utm.ImportFromEPSG(32734)
+        x, y, _ = osr.CoordinateTransformation(wgs84, utm).TransformPoint(self.model.lon_off, self.model.lat_off)
+        west, north = round(x) - 65 * step, round(y) + 65 * step
+        grid_x, grid_y = np.meshgrid(west + step * (np.arange(columns) + 0.5), north - step * (np.arange(rows) + 0.5))
+        dataset = gdal.GetDriverByName("GTiff").Create(str(path or self.dem), columns, rows, 1, gdal.GDT_Float32)
+        dataset.SetGeoTransform((west, step, 0, north, 0, -step))
+        dataset.SetSpatialRef(utm)
+        dataset.WriteArray((500 + 20 * np.sin(grid_x / 300) + 0 * grid_y).astype(np.float32))
+        dataset = None
+        return path or self.dem
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Tiny:
+    """Make the tiny scene in a folder of its own; the test may add to it."""
+    made = Tiny(tmp_path / "tiny", _tiny_model())
+    made.folder.mkdir()
+    _write_tiny_image(made)
+    made.write_dem()
+    made.write(made.gcps, made.points(12))
+    return made
+
+
+def _tiny_model() -> RPC:
+    one, zero = np.eye(20)[0], np.zeros(20)
+    col, row = zero.copy(), zero.copy()
+    col[[1, 3]], row[[2, 3]] = (1.0, 0.05), (-1.0, 0.02)
+    return RPC(200.0, 150.0, 20.0, -30.0, 500.0, 200.0, 150.0, 0.01, 0.0065, 500.0, col, one, row, one)
+
+
+def _write_tiny_image(made: Tiny) -> None:
+    row, col = np.mgrid[0 : made.height, 0 : made.width]
+    pixels = (1000 + 300 * np.sin(col / 7) * np.cos(row / 9)).astype(np.uint16)
+    dataset = gdal.GetDriverByName("GTiff").Create(str(made.image), made.width, made.height, 1, gdal.GDT_UInt16)
+    dataset.SetMetadata(rpc_metadata(made.model), "RPC")
+    dataset.WriteArray(pixels)
+    dataset = None

@@ -1,0 +1,174 @@
+"""The command line: names, exit codes, JSON, and a start that does not wait for heavy libraries."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+
+from ortho_pipeline import pipeline
+from ortho_pipeline.cli import cli
+from ortho_pipeline.errors import ModelError
+
+HEAVY = ("numba", "matplotlib", "scipy", "pyproj", "osgeo", "numpy")
+
+
+def run(*arguments: Any) -> Result:
+    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
+def fit_arguments(tiny: Any) -> list[Any]:
+    return [tiny.image, "--gcps", tiny.gcps, "--points-crs", "EPSG:4979", "--points-vertical", "ellipsoid"]
+
+
+def test_help_does_not_load_heavy_libraries():
+    code = (
+        "import sys; from click.testing import CliRunner; from ortho_pipeline.cli import cli; "
+        "r = CliRunner().invoke(cli, ['rectify', '--help']); assert r.exit_code == 0, r.output; "
+        f"print([name for name in {HEAVY!r} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_python_m_is_the_same_command():
+    done = subprocess.run(
+        [sys.executable, "-m", "ortho_pipeline", "--help"], capture_output=True, text=True, check=True
+    )
+    for command in ("sensors", "info", "fit", "rectify", "export", "doctor"):
+        assert f"\n  {command} " in done.stdout
+
+
+def test_importing_the_package_is_light():
+    code = f"import sys, ortho_pipeline; print([name for name in {HEAVY!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_every_public_name_is_there():
+    import ortho_pipeline
+
+    for name in dir(ortho_pipeline):
+        assert getattr(ortho_pipeline, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        _ = ortho_pipeline.nonsense
+
+
+@pytest.mark.parametrize("command", ["sensors", "doctor"])
+def test_lists_print_text_and_json(command):
+    assert "rpc" in run(command).output
+    document = json.loads(run(command, "--json").stdout)
+    assert document["schema_version"] == 1
+
+
+def test_doctor_names_versions_grids_and_plugins():
+    document = json.loads(run("doctor", "--json").stdout)
+    assert document["gdal"]["version"] == document["gdal"]["bindings"].split("-")[0]
+    assert {grid["datum"] for grid in document["grids"]} >= {"egm96", "egm2008"}
+    assert document["plugins"][0]["distribution"] == "ortho-pipeline"
+    assert document["plugins"][0]["version"]
+
+
+def test_info_says_where_the_model_was_read(tiny):
+    document = json.loads(run("info", tiny.image, "--json").stdout)
+    assert document["sensor"] == "rpc"
+    assert "tiny.tif" in document["model_source"]
+    assert document["gsd_m"] == pytest.approx(4.8, abs=0.05)
+    assert document["utm"] == "EPSG:32734"
+    assert document["model_source"] in run("info", tiny.image).output
+
+
+def test_fit_prints_the_documented_json(tiny):
+    done = run("fit", *fit_arguments(tiny), "--check", "ids:p1,p2", "--json")
+    assert done.exit_code == 0, done.stderr
+    document = json.loads(done.stdout)
+    expected = {
+        "schema_version", "sensor", "model", "model_source", "parameters", "points", "rmse", "raw_bias",
+        "redundancy", "sigma0", "rejected", "warnings",
+    }  # fmt: skip
+    assert set(document) == expected
+    assert document["model"] == "rpc+shift"
+    assert set(document["parameters"]) == {"col_shift", "row_shift"}
+    assert document["parameters"]["col_shift"].keys() == {"value", "sigma"}
+    assert [point["role"] for point in document["points"]].count("check") == 2
+    point = document["points"][0]
+    assert set(point) == {"id", "role", "used", "image", "predicted", "residual", "loo_residual"}
+    assert point["residual"][0] == pytest.approx(point["image"][0] - point["predicted"][0])
+    assert set(document["rmse"]) == {"control", "check", "loo"}
+    assert document["rmse"]["check"].keys() == {"col", "row", "total", "n"}
+    assert document["redundancy"] == 2 * 10 - 2
+
+
+def test_fit_prints_a_table_with_every_point(tiny):
+    output = run("fit", *fit_arguments(tiny)).stdout
+    for number in range(12):
+        assert f"\np{number} " in output
+    assert "RMSE control" in output
+    assert "measured minus predicted" in output
+
+
+def test_rectify_takes_the_names_of_gdalwarp(tiny, tmp_path):
+    out = tmp_path / "out"
+    done = run(
+        "rectify", *fit_arguments(tiny), "--dem", tiny.dem, "--dem-vertical", "ellipsoid", "-t_srs", "EPSG:32734",
+        "-tr", "10", "-te", "403000", "6679000", "404000", "6680000", "-r", "cubic", "-of", "GTiff",
+        "-co", "COMPRESS=LZW", "-o", out, "--json",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert set(document) == {"schema_version", "files", "report"}
+    from osgeo import gdal
+
+    ortho = gdal.Open(document["files"]["ortho"])
+    assert ortho.GetGeoTransform() == (403000, 10, 0, 6680000, 0, -10)
+    assert (ortho.RasterXSize, ortho.RasterYSize) == (100, 100)
+    assert ortho.GetMetadataItem("COMPRESSION", "IMAGE_STRUCTURE") == "LZW"
+
+
+@pytest.mark.parametrize("wrong", [["--demm", "x"], ["-co", "NOVALUE"], ["--res", "1"], ["--resampling", "sinc"]])
+def test_a_wrong_option_is_refused(tiny, tmp_path, wrong):
+    done = run("rectify", tiny.image, "-o", tmp_path / "out", "--height", "500", *wrong)
+    assert done.exit_code == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_creation_option_is_refused(tiny, tmp_path):
+    done = run("rectify", tiny.image, "-o", tmp_path / "out", "--height", "500", "-co", "KOMPRESS=LZW")
+    assert done.exit_code == 2
+    assert "KOMPRESS" in done.stderr
+    assert not list((tmp_path / "out").glob("*.tif")) if (tmp_path / "out").exists() else True
+
+
+def test_what_the_user_can_correct_is_exit_code_2_with_a_remedy(tiny, tmp_path):
+    done = run("rectify", tiny.image, "-o", tmp_path / "out", "--json")
+    assert done.exit_code == 2
+    assert "--height" in done.stderr
+    error = json.loads(done.stdout)["error"]
+    assert error["kind"] == "InputError"
+    assert error["field"] == "--dem"
+    assert error["remedy"]
+
+
+def test_a_missing_file_is_named():
+    done = run("info", "no/such/file.tif")
+    assert done.exit_code == 2
+    assert "no/such/file.tif" in done.stderr
+
+
+def test_failure_and_interruption_have_their_exit_codes(monkeypatch):
+    def fail() -> None:
+        raise ModelError("the mathematics failed")
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "doctor", fail)
+    assert run("doctor").exit_code == 1
+    monkeypatch.setattr(pipeline, "doctor", interrupt)
+    done = run("doctor")
+    assert done.exit_code == 130
+    assert "Interrupted" in done.stderr

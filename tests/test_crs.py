@@ -1,0 +1,265 @@
+"""CRS, height datums and transformations: field notes 1, 2, 10, 11."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+
+from ortho_pipeline import crs as module
+from ortho_pipeline.crs import GroundTransform, Vertical, declared_vertical, horizontal, parse_crs, utm_crs
+from ortho_pipeline.errors import CrsError, DatumError
+
+EGM96 = Path("/usr/share/proj/egm96_15.gtx")
+needs_egm96 = pytest.mark.skipif(not EGM96.is_file(), reason="Debian's proj-data (egm96_15.gtx) is not installed")
+
+# -- heights
+
+
+@needs_egm96
+def test_egm96_is_found_out_of_the_box() -> None:
+    # PROJ's own programs give 28.208 m here (EPSG:4326+5773 to EPSG:4979).
+    assert Vertical.parse("egm96").undulation([24.4], [-33.65])[0] == pytest.approx(28.208, abs=0.01)
+
+
+@needs_egm96
+def test_system_grids_are_found_in_a_fresh_process_and_other_threads() -> None:
+    code = "from ortho_pipeline.crs import Vertical; print(Vertical.parse('egm96').undulation([24.4], [-33.65])[0])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert float(done.stdout) == pytest.approx(28.208, abs=0.01)
+    seen: list[float] = []
+    thread = threading.Thread(target=lambda: seen.append(float(Vertical("EPSG:5773").undulation([24.4], [-33.65])[0])))
+    thread.start()
+    thread.join()
+    assert seen == [pytest.approx(28.208, abs=0.01)]
+
+
+@pytest.mark.parametrize("name", ["egm2008", "EPSG:3855", "EPSG:5703", "EPSG:5613"])
+def test_a_missing_grid_is_an_error_that_names_it_and_the_remedy(name: str) -> None:
+    grid = {"EPSG:5703": "us_noaa", "EPSG:5613": "se_lantmateriet"}.get(name, "us_nga_egm08_25.tif")
+    if any(list(Path(folder).glob(f"{grid}*")) for folder in module.add_system_grids()):
+        pytest.skip("the grid is installed here")
+    with pytest.raises(DatumError, match=grid) as caught:
+        Vertical.parse(name).undulation([-100.0], [40.0])
+    assert "proj-data" in str(caught.value)
+    assert "sync --file" in str(caught.value)
+
+
+def test_ellipsoid_needs_nothing() -> None:
+    assert Vertical.parse("ellipsoid").undulation([1.0, np.nan], [2.0, 3.0]) == pytest.approx(
+        [0.0, np.nan], nan_ok=True
+    )
+    assert Vertical.parse("EPSG:4979").is_ellipsoid
+
+
+@needs_egm96
+def test_grid_file_with_blanks_and_umlauts(tmp_path: Path) -> None:
+    folder = tmp_path / "größe und so"
+    folder.mkdir()
+    copy = folder / "my geoid.gtx"
+    shutil.copy(EGM96, copy)
+    assert Vertical.parse(str(copy)).undulation([24.4], [-33.65])[0] == pytest.approx(28.208, abs=0.01)
+    assert Vertical.parse("egm96_15.gtx").undulation([24.4], [-33.65])[0] == pytest.approx(28.208, abs=0.01)
+    shutil.copy(EGM96, folder / "a,b.gtx")
+    with pytest.raises(DatumError, match="comma"):
+        Vertical.parse(str(folder / "a,b.gtx"))
+
+
+@pytest.mark.parametrize("text", ["", "egm97", "EPSG:32735", "EPSG:999999", "EPSG:5715", "/nowhere/geoid.gtx", "28.2"])
+def test_what_is_no_height_datum(text: str) -> None:
+    with pytest.raises(DatumError):
+        Vertical.parse(text)
+
+
+def test_a_file_that_is_no_geoid(tmp_path: Path) -> None:
+    path = tmp_path / "notes.gtx"
+    path.write_text("this is no grid")
+    with pytest.raises(DatumError, match="not a geoid grid"):
+        Vertical.parse(str(path))
+
+
+@needs_egm96
+def test_undulation_goes_round_the_world() -> None:
+    egm96 = Vertical.parse("egm96")
+    assert egm96.undulation([190.0, -0.1], [10.0, 10.0]) == pytest.approx(
+        egm96.undulation([-170.0, 359.9], [10.0, 10.0])
+    )
+    # Across the antimeridian: no jump.
+    near = egm96.undulation([179.999, -179.999, 180.0], [10.0, 10.0, 10.0])
+    assert np.ptp(near) < 0.01
+    assert np.isnan(egm96.undulation([np.nan, 0.0, 0.0], [0.0, np.nan, 95.0])).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "certain", "unit"),
+    [
+        ("EPSG:4979", "ellipsoid", True, 1.0),
+        ("EPSG:32735+5773", "EPSG:5773", True, 1.0),
+        ("EPSG:4326+3855", "EPSG:3855", True, 1.0),
+        ("EPSG:4269+8228", "EPSG:8228", True, 0.3048),
+        ("+proj=utm +zone=31 +datum=WGS84 +geoidgrids=egm96_15.gtx +vunits=us-ft", "egm96_15.gtx", True, 1200 / 3937),
+    ],
+)
+def test_declared_vertical(text: str, name: str, certain: bool, unit: float) -> None:
+    declared = declared_vertical(parse_crs(text))
+    assert declared is not None
+    assert declared.vertical == Vertical(name)
+    assert declared.certain is certain
+    assert declared.metres_per_unit == pytest.approx(unit)
+
+
+def named_vertical(name: str) -> pyproj.CRS:
+    flat = parse_crs("EPSG:32735").to_wkt()
+    vertical = f'VERTCRS["{name}",VDATUM["unknown"],CS[vertical,1],AXIS["up",up,LENGTHUNIT["metre",1]]]'
+    return pyproj.CRS.from_wkt(f'COMPOUNDCRS["both",{flat},{vertical}]')
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [("EGM2008 height", "EPSG:3855"), ("EGM96 geoid", "EPSG:5773"), ("Ellipsoid", "ellipsoid"), ("my zero", None)],
+)
+def test_vertical_known_by_its_name_only(name: str, found: str | None) -> None:
+    declared = declared_vertical(named_vertical(name))
+    assert declared is not None
+    assert not declared.certain
+    assert declared.vertical == (None if found is None else Vertical(found))
+
+
+@pytest.mark.parametrize("text", ["EPSG:4326", "EPSG:32735"])
+def test_two_dimensions_declare_no_height(text: str) -> None:
+    assert declared_vertical(parse_crs(text)) is None
+
+
+def test_grids_for_the_doctor() -> None:
+    rows = {row["datum"]: row for row in module.grids()}
+    assert set(rows) == {"egm96", "egm2008", "egm84"}
+    assert rows["egm96"]["found"] is EGM96.is_file() or rows["egm96"]["found"]
+    info = module.proj_info()
+    assert info["network"] is False
+    assert info["search_path"]
+
+
+# -- systems
+
+
+def test_parse_and_horizontal() -> None:
+    assert horizontal("EPSG:4979").to_epsg() == 4326
+    assert horizontal("EPSG:32735+5773").to_epsg() == 32735
+    for text in ("", "EPSG:0", "no such thing", "x" * 5000):
+        with pytest.raises(CrsError):
+            parse_crs(text)
+    for text in ("EPSG:4978", "EPSG:5773"):
+        with pytest.raises(CrsError):
+            horizontal(text)
+
+
+@pytest.mark.parametrize(
+    ("lon", "lat", "code"),
+    [
+        (24.4, -33.65, 32735),
+        (-180.0, 1.0, 32601),
+        (180.0, 1.0, 32601),
+        (179.9, -1.0, 32760),
+        (5.0, 85.0, 5041),
+        (0.0, -89.0, 5042),
+    ],
+)
+def test_utm(lon: float, lat: float, code: int) -> None:
+    assert utm_crs(lon, lat).to_epsg() == code
+
+
+def test_utm_of_nowhere() -> None:
+    with pytest.raises(CrsError):
+        utm_crs(24.0, 95.0)
+
+
+# -- ground to ground
+
+
+@pytest.mark.parametrize("code", [4978, 4979, 32735, 2193, 3035, 31370, 27700, 2227, 5041])
+def test_there_and_back(code: int) -> None:
+    area = parse_crs(f"EPSG:{code}").area_of_use
+    lon, lat = 24.4, -33.65
+    if area is not None and code not in (4978, 4979, 32735):
+        lon, lat = 0.5 * (area.west + area.east) % 360, 0.5 * (area.south + area.north)
+        lon = 173.0 if code == 2193 else lon
+    ground = np.array([[lon, lat, 123.4], [lon + 0.01, lat - 0.01, 0.0]])
+    there = GroundTransform("EPSG:4979", f"EPSG:{code}")(ground)
+    back = GroundTransform(f"EPSG:{code}", "EPSG:4979")(there)
+    difference = back - ground
+    difference[:, 0] = (difference[:, 0] + 180) % 360 - 180
+    # Helmert transformations are inverted approximately: a tenth of a millimetre is PROJ's own closure.
+    assert np.abs(difference).max() < (1e-5 if code == 27700 else 1e-8) + 1e-8
+    if code != 4978:
+        assert there[:, 2] == pytest.approx(ground[:, 2], abs=1e-6)
+
+
+def test_heights_stay_wgs84_on_classical_ellipsoids() -> None:
+    # PROJ's 3D promotion would give the height above the Hayford ellipsoid, 44 m lower, that nobody measures.
+    assert GroundTransform("EPSG:4979", "EPSG:31370")([[4.4, 50.6, 100.0]])[0, 2] == 100.0
+    through = GroundTransform("EPSG:31370", "EPSG:4978")(
+        GroundTransform("EPSG:4979", "EPSG:31370")([[4.4, 50.6, 100.0]])
+    )
+    straight = GroundTransform("EPSG:4979", "EPSG:4978")([[4.4, 50.6, 100.0]])
+    assert through == pytest.approx(straight, abs=0.01)
+
+
+def test_a_bad_point_is_nan_and_spoils_no_other() -> None:
+    ground = [[24.4, -33.65, 100.0], [np.nan, 1, 1], [24.4, -33.65, np.inf], [0, 95, 0]]
+    out = GroundTransform("EPSG:4979", "EPSG:32735")(ground)
+    assert np.isfinite(out[0]).all()
+    assert np.isnan(out[1:]).all()
+    assert np.isnan(GroundTransform("EPSG:4979", "EPSG:32735")([[0, 95, 0]])).all()
+
+
+def test_identity_copies() -> None:
+    ground = np.array([[1.0, 2.0, 3.0]])
+    same = GroundTransform("EPSG:4979", "EPSG:4326")
+    assert same.is_identity
+    out = same(ground)
+    assert (out == ground).all()
+    out[0, 0] = 9
+    assert ground[0, 0] == 1.0
+
+
+def test_across_the_antimeridian() -> None:
+    ground = np.array([[179.999, -17.0, 5.0], [-179.999, -17.0, 5.0], [180.001, -17.0, 5.0]])
+    x = GroundTransform("EPSG:4979", "EPSG:32701")(ground)
+    assert np.ptp(x[:, 0]) < 300
+    assert x[1] == pytest.approx(x[2])
+
+
+def test_pickle_and_threads() -> None:
+    transform = pickle.loads(pickle.dumps(GroundTransform("EPSG:4979", "EPSG:32735")))
+    ground = np.column_stack([np.linspace(20, 28, 20000), np.linspace(-35, -30, 20000), np.zeros(20000)])
+    expected = transform(ground)
+    results: list[bool] = []
+    threads = [
+        threading.Thread(target=lambda: results.append(bool(np.array_equal(transform(ground), expected))))
+        for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert results == [True] * 4
+
+
+def test_no_way_between_unknown_datums() -> None:
+    local = 'ENGCRS["site",EDATUM["peg"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
+    with pytest.raises(CrsError):
+        GroundTransform(local, "EPSG:4979")
+
+
+def test_a_better_transformation_without_its_grid_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    if any((Path(folder) / "uk_os_OSTN15_NTv2_OSGBtoETRS.tif").is_file() for folder in module.add_system_grids()):
+        pytest.skip("the grid is installed here")
+    GroundTransform("EPSG:4979", "EPSG:27700")([[-2.0, 52.0, 0.0]])
+    assert "uk_os_OSTN15_NTv2_OSGBtoETRS.tif" in caplog.text

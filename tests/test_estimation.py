@@ -1,0 +1,264 @@
+"""Adjustment: truth that the estimator never sees, refits as the authority for leave-one-out, and the traps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyproj
+import pytest
+
+from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
+from ortho_pipeline.estimation import Prior, fit
+from ortho_pipeline.models import RPC, ImageCorrection
+from ortho_pipeline.points import Points
+
+TRUTH = {
+    "shift": [3.0, 0, 0, -2.0, 0, 0],
+    "shift-drift": [3.0, 0, 1e-3, -2.0, 0, -2e-3],
+    "affine": [3.0, 2e-3, 1e-3, -2.0, -1e-3, -2e-3],
+}
+
+
+@pytest.fixture(scope="module")
+def rpc() -> RPC:
+    one, zero = np.eye(20)[0], np.zeros(20)
+    col, row = zero.copy(), zero.copy()
+    col[[1, 3, 7]], row[[2, 3, 8]] = (1.0, 0.05, 2e-3), (-1.0, 0.02, 1e-3)
+    return RPC(500.0, 400.0, 20.0, -30.0, 500.0, 500.0, 400.0, 0.01, 0.0065, 300.0, col, one, row, one)
+
+
+def make_points(rpc, kind="shift", count=12, noise=0.3, seed=0, **changes) -> Points:
+    """Points whose image coordinates follow the true correction, with noise; sigma is stated as 1 px."""
+    random = np.random.default_rng(seed)
+    centre, half = rpc.domain
+    ground = centre + 0.9 * half * random.uniform(-1, 1, (count, 3))
+    true = ImageCorrection(rpc, kind, (500, 400), TRUTH[kind])
+    image = true.ground_to_image(ground) + random.normal(0, 1, (count, 2)) * noise
+    fields = {
+        "ids": tuple(f"p{i}" for i in range(count)), "image": image, "ground": ground,
+        "roles": np.full(count, "control"), "sigma_image": np.ones(count), "sigma_ground": np.zeros((count, 3)),
+        "crs": pyproj.CRS.from_epsg(4326), "source": "simulated",
+    }  # fmt: skip
+    return Points(**{**fields, **changes})
+
+
+def start(rpc, kind="shift") -> ImageCorrection:
+    return ImageCorrection.identity(rpc, kind, (500, 400))
+
+
+@pytest.mark.parametrize("kind", list(TRUTH))
+def test_noise_free_points_give_the_truth(rpc, kind):
+    found = fit(start(rpc, kind), make_points(rpc, kind, noise=0.0))
+    np.testing.assert_allclose(found.model.coefficients, TRUTH[kind], atol=1e-9)
+    assert np.abs(found.residuals).max() < 1e-8
+    assert found.rejected == ()
+
+
+@pytest.mark.parametrize("kind", list(TRUTH))
+def test_claimed_sigmas_are_honest(rpc, kind):
+    """Over 1,000 repeats (estimate - truth) / sigma has mean 0 and spread 1.
+
+    With r redundant observations sigma0 is estimated, so the ratio follows Student's t: spread sqrt(r / (r - 2)).
+    """
+    truth = np.array(TRUTH[kind])[start(rpc, kind)._free]
+    ratios = []
+    for seed in range(1000):
+        found = fit(start(rpc, kind), make_points(rpc, kind, count=20, seed=seed), robust=False)
+        ratios.append((found.values - truth) / found.sigmas)
+    redundancy = 40 - len(truth)
+    spread = np.std(ratios, axis=0) / np.sqrt(redundancy / (redundancy - 2))
+    assert ((spread > 0.93) & (spread < 1.07)).all(), spread
+    assert (np.abs(np.mean(ratios, axis=0)) < 0.11).all()
+
+
+def test_sigma0_is_the_noise_and_redundancy_is_counted(rpc):
+    found = fit(start(rpc, "affine"), make_points(rpc, "affine", count=400, noise=0.3))
+    assert found.redundancy == 800 - 6
+    # The standard error of sigma0 is sigma0 / sqrt(2 r) = 0.0075.
+    assert found.sigma0 == pytest.approx(0.3, abs=0.03)
+
+
+@pytest.mark.parametrize("kind", list(TRUTH))
+def test_leave_one_out_is_what_refits_give(rpc, kind):
+    points = make_points(rpc, kind, count=9)
+    found = fit(start(rpc, kind), points, robust=False)
+    for i in range(len(points)):
+        without = points.select(np.arange(len(points)) != i)
+        refit = fit(start(rpc, kind), without, robust=False)
+        expected = points.image[i] - refit.model.ground_to_image(points.ground[i : i + 1])[0]
+        np.testing.assert_allclose(found.loo_residuals[i], expected, atol=1e-8)
+    assert found.rmse("loo")["total"] > found.rmse("control")["total"]
+
+
+def test_check_points_take_no_part(rpc):
+    points = make_points(rpc, count=12)
+    roles = np.array(["check" if i % 3 == 0 else "control" for i in range(12)])
+    spoiled = points.image + 100.0 * (roles == "check")[:, None]
+    first = fit(start(rpc), points.with_roles(roles))
+    second = fit(start(rpc), make_points(rpc, count=12, roles=roles, image=spoiled))
+    np.testing.assert_array_equal(first.values, second.values)
+    assert first.rmse("check")["n"] == 4
+    assert second.rmse("check")["total"] > 100
+    assert np.isnan(first.loo_residuals[roles == "check"]).all()
+
+
+def test_order_of_points_does_not_matter(rpc):
+    points = make_points(rpc, "affine")
+    order = np.random.default_rng(1).permutation(len(points))
+    np.testing.assert_allclose(
+        fit(start(rpc, "affine"), points).values, fit(start(rpc, "affine"), points.select(order)).values, atol=1e-10
+    )
+
+
+def test_shifting_the_image_shifts_the_correction(rpc):
+    points = make_points(rpc)
+    moved = make_points(rpc, image=points.image + np.array([7.0, -5.0]))
+    np.testing.assert_allclose(fit(start(rpc), moved).values - fit(start(rpc), points).values, [7.0, -5.0], atol=1e-10)
+
+
+def test_weights_follow_the_stated_sigmas(rpc):
+    points = make_points(rpc, noise=0.0)
+    image = points.image.copy()
+    image[0] += 3.0
+    sigma = np.ones(12)
+    sigma[0] = 10.0
+    found = fit(start(rpc), make_points(rpc, noise=0.0, image=image, sigma_image=sigma), robust=False)
+    # Weighted mean of eleven zeros of weight 1 and one 3 of weight 1/100.
+    assert found.values[0] - 3.0 == pytest.approx(3.0 * 0.01 / 11.01, abs=1e-9)
+
+
+def test_errors_of_the_ground_count_in_metres(rpc):
+    """One metre is 1 / 96486 of a degree of longitude here: the sigma in pixels follows from the model's slopes."""
+    sigma = np.zeros((12, 3))
+    sigma[0, 0] = 50.0
+    points = make_points(rpc, noise=0.0, sigma_ground=sigma)
+    image = points.image.copy()
+    image[0, 0] += 3.0
+    found = fit(start(rpc), make_points(rpc, noise=0.0, image=image, sigma_ground=sigma), robust=False)
+    px_per_metre = rpc.ground_partials(points.ground[:1])[0, 0, 0] / 96_486
+    weight = 1 / (1 + (50 * px_per_metre) ** 2)
+    assert found.values[0] - 3.0 == pytest.approx(3.0 * weight / (11 + weight), rel=1e-3)
+
+
+def test_priors_are_observations(rpc):
+    points = make_points(rpc, count=4)
+    free = fit(start(rpc), points, robust=False)
+    tight = fit(start(rpc), points, priors={"col_shift": Prior(0.0, 1e-6)}, robust=False)
+    assert abs(tight.values[0]) < 1e-9
+    assert tight.values[1] == pytest.approx(free.values[1], abs=1e-9)
+    equal = fit(start(rpc), points, priors={"col_shift": Prior(0.0, 0.5)}, robust=False)
+    # Four observations of sigma 1 against one of sigma 0.5: equal weights.
+    assert equal.values[0] == pytest.approx(free.values[0] / 2, abs=1e-9)
+    assert equal.redundancy == free.redundancy + 1
+
+
+def test_a_prior_for_nothing_is_refused(rpc):
+    with pytest.raises(InputError, match="col_shfit"):
+        fit(start(rpc), make_points(rpc), priors={"col_shfit": Prior(0, 1)})
+    with pytest.raises(InputError):
+        Prior(0.0, 0.0)
+
+
+# -- gross errors ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "count"), [("shift", 5), ("shift", 12), ("shift-drift", 9), ("affine", 12)])
+def test_a_gross_error_is_found_and_named(rpc, kind, count):
+    points = make_points(rpc, kind, count=count, noise=0.1)
+    for bad in range(count):
+        image = points.image.copy()
+        image[bad] += (140.0, -140.0)
+        found = fit(start(rpc, kind), make_points(rpc, kind, count=count, noise=0.1, image=image))
+        assert [name for name, _ in found.rejected] == [f"p{bad}"]
+        # 140 px in both axes are 198 px; the noise adds less than one.
+        assert 197 < float(found.rejected[0][1].split(":")[1].split()[0]) < 199
+        others = fit(start(rpc, kind), points.select(np.arange(count) != bad), robust=False)
+        np.testing.assert_allclose(found.values, others.values, atol=1e-9)
+        assert not found.used[bad]
+
+
+def test_gross_errors_that_agree_with_each_other_are_found(rpc):
+    points = make_points(rpc, count=20, noise=0.1)
+    image = points.image.copy()
+    image[:5] += (30.0, 10.0)
+    found = fit(start(rpc), make_points(rpc, count=20, noise=0.1, image=image))
+    assert [name for name, _ in found.rejected] == [f"p{i}" for i in range(5)]
+
+
+def test_more_than_a_third_is_never_rejected(rpc):
+    points = make_points(rpc, count=10, noise=0.1)
+    image = points.image.copy()
+    image[:4] += np.array([[50.0, 0], [-70, 20], [10, 90], [-30, -60]])
+    with pytest.raises(DegeneratePoints, match="p0, p1, p2, p3"):
+        fit(start(rpc), make_points(rpc, count=10, noise=0.1, image=image))
+
+
+def test_good_points_are_kept(rpc):
+    """A clean set may lose a point with a chance of 0.1 %: hardly ever among 300."""
+    lost = 0
+    for seed in range(300):
+        kind = list(TRUTH)[seed % 3]
+        lost += len(fit(start(rpc, kind), make_points(rpc, kind, count=8 + seed % 7, seed=seed)).rejected)
+    assert lost <= 2
+
+
+# -- too little ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "count"), [("shift", 0), ("shift-drift", 1), ("affine", 2)])
+def test_too_few_points(rpc, kind, count):
+    with pytest.raises(TooFewPoints) as caught:
+        fit(start(rpc, kind), make_points(rpc, kind, count=count))
+    assert "at least" in caught.value.remedy
+
+
+def test_no_redundancy_is_reported_and_has_no_sigma0(rpc):
+    found = fit(start(rpc), make_points(rpc, count=1))
+    assert found.redundancy == 0
+    assert found.sigma0 is None
+    assert found.rmse("loo") is None
+    np.testing.assert_allclose(found.sigmas, [1.0, 1.0])  # the stated sigma of the point, nothing better
+
+
+def test_points_on_a_line_do_not_determine_an_affine(rpc):
+    points = make_points(rpc, count=8)
+    along = np.linspace(-0.5, 0.5, 8)[:, None]
+    centre, half = rpc.domain
+    ground = centre + half * [1, 1, 0] * along
+    true = ImageCorrection(rpc, "affine", (500, 400), TRUTH["affine"])
+    with pytest.raises(DegeneratePoints, match="do not determine"):
+        fit(start(rpc, "affine"), make_points(rpc, count=8, ground=ground, image=true.ground_to_image(ground)))
+    assert fit(start(rpc), points).redundancy == 14
+
+
+def test_the_same_point_many_times_does_not_determine_a_drift(rpc):
+    ground = np.tile(rpc.domain[0], (6, 1))
+    image = np.tile(rpc.ground_to_image(ground[:1]), (6, 1)) + np.random.default_rng(0).normal(0, 0.3, (6, 2))
+    with pytest.raises(DegeneratePoints, match="condition"):
+        fit(start(rpc, "shift-drift"), make_points(rpc, count=6, ground=ground, image=image))
+
+
+def test_points_without_a_projection_are_left_out_and_said(rpc):
+    points = make_points(rpc)
+    ground = points.ground.copy()
+    ground[3, 2] = np.nan
+    ground[5, 0] += 90.0
+    found = fit(start(rpc), make_points(rpc, ground=ground))
+    assert "p3, p5" in found.warnings[0]
+    assert found.used.sum() == 10
+
+
+def test_a_model_without_parameters_is_evaluated(rpc):
+    points = make_points(rpc, noise=0.0)
+    found = fit(start(rpc, "none"), points)
+    np.testing.assert_allclose(found.residuals, np.tile([3.0, -2.0], (12, 1)), atol=1e-9)
+    assert found.redundancy == 24
+    assert found.raw_bias["col"] == pytest.approx(3.0)
+
+
+def test_document(rpc):
+    found = fit(start(rpc), make_points(rpc, count=5), name="rpc+shift").to_json()
+    assert found["model"] == "rpc+shift"
+    assert set(found["parameters"]) == {"col_shift", "row_shift"}
+    assert set(found["points"][0]) == {"id", "role", "used", "image", "predicted", "residual", "loo_residual"}
+    assert set(found["rmse"]["loo"]) == {"col", "row", "total", "n"}
+    assert found["rmse"]["check"] is None

@@ -1,0 +1,277 @@
+"""The host: discovery, recognition, and what it refuses."""
+
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import ortho_rpc
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError, PluginError
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.models import RPC, SensorModel
+from ortho_pipeline.plugins import Host
+from ortho_pipeline.rpc import rpc_metadata, write_rpc_txt
+
+gdal.UseExceptions()
+
+PLUGIN = """
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+
+@hookimpl
+def ortho_sensors():
+    yield Sensor({name!r}, "a test", lambda dataset: False, lambda dataset: None)
+"""
+
+
+def make_rpc(**changes) -> RPC:
+    linear = np.zeros((4, 20))
+    linear[0, [1, 3]] = 1.0, 0.1
+    linear[2, 2] = -1.0
+    linear[1, 0] = linear[3, 0] = 1.0
+    fields = {
+        "col_off": 10.5, "row_off": 8.5, "lon_off": 24.4, "lat_off": -33.6, "h_off": 700.0, "col_scale": 10.0,
+        "row_scale": 8.0, "lon_scale": 0.1, "lat_scale": 0.08, "h_scale": 500.0, "col_num": linear[0],
+        "col_den": linear[1], "row_num": linear[2], "row_den": linear[3],
+    }  # fmt: skip
+    return RPC(**(fields | changes))
+
+
+def make_image(path: Path, rpc: RPC | None = None) -> Path:
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), 20, 16)
+    if rpc is not None:
+        dataset.SetMetadata(rpc_metadata(rpc), "RPC")
+    return path
+
+
+def make_sensor(name="alpha", recognises=lambda dataset: True, open_scene=None, **fields) -> Sensor:
+    def opened(dataset, **options):
+        size = dataset.RasterXSize, dataset.RasterYSize
+        return Scene(name, dataset.GetDescription(), *size, {"rpc": make_rpc()}, "here", facts=options)
+
+    return Sensor(name, "a test", recognises, open_scene or opened, **fields)
+
+
+def make_plugin(*sensors, name="plugin", hook="ortho_sensors") -> types.ModuleType:
+    module = types.ModuleType(name)
+
+    @hookimpl
+    def function():
+        return sensors
+
+    setattr(module, hook, function)
+    return module
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Return a function that installs a distribution with one plugin module."""
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    modules = []
+
+    def installed(distribution, module, source, entry=None):
+        info = tmp_path / "site" / f"{distribution.replace('-', '_')}-1.2.dist-info"
+        info.mkdir(parents=True)
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.2\n")
+        (info / "entry_points.txt").write_text(f"[ortho_pipeline]\n{entry or module} = {module}\n")
+        (tmp_path / "site" / f"{module}.py").write_text(source)
+        modules.append(module)
+
+    yield installed
+    for module in modules:
+        sys.modules.pop(module, None)
+
+
+def test_discover_finds_the_bundled_plugin():
+    host = Host.discover()
+    assert host is Host.discover()
+    assert host.sensors["rpc"].fallback
+    assert host.provenance("rpc").distribution == "ortho-pipeline"
+
+
+def test_installed_plugin_is_found_with_distribution_and_version(install):
+    install("third-party", "third_party_plugin", PLUGIN.format(name="third"))
+    host = Host(installed=True)
+    assert "third" in host.sensors
+    assert str(host.provenance("third")) == "third-party 1.2"
+    assert host.provenance("third").to_json()["module"] == "third_party_plugin"
+    assert any(origin.distribution == "third-party" for origin in host.plugins())
+
+
+@pytest.mark.parametrize("source", ["import no_such_module_here", "def broken(:", "raise KeyError('x')", "1 / 0"])
+def test_plugin_that_fails_to_import_is_left_out_with_a_warning(install, caplog, source):
+    install("third-party", "third_party_plugin", source)
+    host = Host(installed=True)
+    assert [broken.distribution for broken in host.broken] == ["third-party"]
+    assert "third-party 1.2" in caplog.text
+    assert host.broken[0].error.split(":")[0] in caplog.text
+    assert "rpc" in host.sensors
+
+
+def test_bundled_name_cannot_be_shadowed(install):
+    install("third-party", "third_party_plugin", PLUGIN.format(name="rpc"))
+    with pytest.raises(PluginError, match="belongs to ortho-pipeline"):
+        Host(installed=True)
+
+
+def test_name_of_a_broken_bundled_plugin_stays_reserved(install):
+    install("ortho-pipeline", "bundled_plugin_that_fails", "1 / 0", entry="rpc")
+    install("third-party", "third_party_plugin", PLUGIN.format(name="rpc"))
+    with pytest.raises(PluginError, match="belongs to ortho-pipeline"):
+        Host(installed=True)
+
+
+def test_two_sensors_of_one_name_are_an_error():
+    with pytest.raises(PluginError, match="two plugins offer 'alpha': one and two"):
+        Host([make_plugin(make_sensor(), name="one"), make_plugin(make_sensor(), name="two")])
+    with pytest.raises(PluginError, match="two plugins offer 'alpha'"):
+        Host([make_plugin(make_sensor(), make_sensor())])
+
+
+def test_misspelt_hook_is_an_error():
+    with pytest.raises(PluginError, match="ortho_sensor'"):
+        Host([make_plugin(make_sensor(), hook="ortho_sensor")])
+
+
+def test_hook_without_marker_or_with_other_arguments_is_an_error():
+    module = types.ModuleType("unmarked")
+    module.ortho_sensors = lambda: []
+    with pytest.raises(PluginError, match="not marked with @hookimpl"):
+        Host([module])
+    module = types.ModuleType("arguments")
+
+    @hookimpl
+    def ortho_sensors(dataset):
+        return []
+
+    module.ortho_sensors = ortho_sensors
+    with pytest.raises(PluginError, match="dataset"):
+        Host([module])
+
+
+@pytest.mark.parametrize(
+    ("offered", "message"),
+    [
+        (["alpha"], "returned str instead of Sensor"),
+        ([make_sensor(name=" a ")], "no name"),
+        ([make_sensor(recognises=None)], "must be callable"),
+        ([make_sensor(options={"band": 3})], "options"),
+    ],
+)
+def test_wrong_type_of_sensor_is_an_error(offered, message):
+    with pytest.raises(PluginError, match=message):
+        Host([make_plugin(*offered)])
+
+
+def test_hook_that_raises_names_its_plugin():
+    module = types.ModuleType("raising")
+
+    @hookimpl
+    def ortho_sensors():
+        raise RuntimeError("no luck")
+
+    module.ortho_sensors = ortho_sensors
+    with pytest.raises(PluginError, match=r"raising: ortho_sensors failed \(RuntimeError: no luck\)"):
+        Host([module])
+
+
+def test_model_families_are_collected():
+    module = types.ModuleType("families")
+    module.ortho_models = hookimpl(lambda: {"mine": RPC})
+    assert Host([module]).models == {"mine": RPC}
+    module.ortho_models = hookimpl(lambda: {"mine": int})
+    with pytest.raises(PluginError, match="SensorModel"):
+        Host([module])
+    module.ortho_models = hookimpl(lambda: {"rpc": SensorModel})
+    with pytest.raises(PluginError, match="'rpc', but that name is taken"):
+        Host([module])
+
+
+def test_recognises_one_none_or_several(tmp_path):
+    image = make_image(tmp_path / "a.tif")
+    alpha, beta = make_sensor("alpha"), make_sensor("beta")
+    nobody = make_sensor("nobody", recognises=lambda dataset: False)
+    assert Host([make_plugin(alpha, nobody)]).open_scene(image).sensor == "alpha"
+    with pytest.raises(InputError, match=r"alpha, beta(.|\n)*--sensor"):
+        Host([make_plugin(alpha, beta)]).open_scene(image)
+    with pytest.raises(InputError, match=r"no sensor recognises it \(installed: nobody\)(.|\n)*--sensor"):
+        Host([make_plugin(nobody)]).open_scene(image)
+    assert Host([make_plugin(alpha, beta)]).open_scene(image, "beta").sensor == "beta"
+    with pytest.raises(InputError, match=r"no sensor 'gamma' \(installed: alpha, beta\)"):
+        Host([make_plugin(alpha, beta)]).open_scene(image, "gamma")
+
+
+def test_fallback_is_asked_last(tmp_path):
+    image = make_image(tmp_path / "a.tif", make_rpc())
+    assert Host([ortho_rpc, make_plugin(make_sensor("special"))]).open_scene(image).sensor == "special"
+    nobody = make_sensor("nobody", recognises=lambda dataset: False)
+    assert Host([ortho_rpc, make_plugin(nobody)]).open_scene(image).sensor == "rpc"
+
+
+def test_undeclared_option_is_refused(tmp_path):
+    image = make_image(tmp_path / "a.tif")
+    host = Host([make_plugin(make_sensor(options={"band": "which band"}))])
+    assert host.open_scene(image, options={"band": "2"}).facts == {"band": "2"}
+    with pytest.raises(InputError, match=r"no option 'bannd' \(its options: band\)"):
+        host.open_scene(image, options={"bannd": "2"})
+
+
+def test_recogniser_and_opener_that_raise_name_their_plugin(tmp_path):
+    def fail(dataset):
+        raise ZeroDivisionError("oops")
+
+    def bad_product(dataset):
+        raise InputError("the band is missing")
+
+    image = make_image(tmp_path / "a.tif")
+    with pytest.raises(PluginError, match=r"'alpha' of plugin plugin failed while looking(.|\n)*oops"):
+        Host([make_plugin(make_sensor(recognises=fail))]).open_scene(image)
+    with pytest.raises(PluginError, match=r"'alpha' of plugin plugin failed to open(.|\n)*oops"):
+        Host([make_plugin(make_sensor(open_scene=fail))]).open_scene(image)
+    with pytest.raises(InputError, match="the band is missing"):
+        Host([make_plugin(make_sensor(open_scene=bad_product))]).open_scene(image)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        None,
+        Scene("beta", "a.tif", 20, 16, {"rpc": make_rpc()}, "x"),
+        Scene("alpha", "a.tif", 20, 16, {}, "x"),
+        Scene("alpha", "a.tif", 20, 16, {"rpc": 3}, "x"),
+        Scene("alpha", "a.tif", 0, 16, {"rpc": make_rpc()}, "x"),
+    ],
+)
+def test_wrong_scene_is_an_error(tmp_path, scene):
+    host = Host([make_plugin(make_sensor(open_scene=lambda dataset: scene))])
+    with pytest.raises(PluginError, match="alpha"):
+        host.open_scene(make_image(tmp_path / "a.tif"))
+
+
+def test_rpc_sensor_opens_a_tagged_file(tmp_path):
+    image = make_image(tmp_path / "a.tif", make_rpc(err_bias=3.0))
+    scene = Host([ortho_rpc]).open_scene(image)
+    assert (scene.width, scene.height, scene.path) == (20, 16, image)
+    assert scene.model_source == f"{image} (TIFF tag)"
+    assert scene.facts["rpc_err_bias_m"] == 3.0
+    assert scene.model.col_off == 10.5
+    assert scene.warnings == ()
+
+
+def test_rpc_option_is_enough_for_a_file_without_rpc(tmp_path):
+    image = make_image(tmp_path / "a.tif")
+    write_rpc_txt(make_rpc(), tmp_path / "elsewhere.txt")
+    host = Host([ortho_rpc, make_plugin(make_sensor("nobody", recognises=lambda dataset: False))])
+    scene = host.open_scene(image, options={"rpc": str(tmp_path / "elsewhere.txt")})
+    assert (scene.sensor, scene.model_source) == ("rpc", str(tmp_path / "elsewhere.txt"))
+    with pytest.raises(InputError, match="no sensor recognises it"):
+        host.open_scene(image)
+    with pytest.raises(InputError, match="no sensor recognises it"):
+        host.open_scene(image, options={"rpcc": "x"})
+
+
+def test_rpc_sensor_warns_of_a_crop_with_the_rpc_of_the_whole(tmp_path):
+    scene = Host([ortho_rpc]).open_scene(make_image(tmp_path / "a.tif", make_rpc(col_off=5000.0)))
+    assert "crop" in scene.warnings[0]

@@ -1,0 +1,380 @@
+"""The report: its numbers, its words, and a page that needs nothing else and believes nobody."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import struct
+import subprocess
+import sys
+import zlib
+from html.parser import HTMLParser
+from typing import Any
+
+import numpy as np
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline import report
+from ortho_pipeline.estimation import Fit, fit
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.landscape import Terrain
+from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.points import Points
+from ortho_pipeline.simulate import LineScanner, simulate_points
+
+CAMERA = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(650.0, 1350.0))
+TERRAIN = Terrain("EPSG:32636", 531100.0, 4122700.0)
+BIAS = np.array([6.3, -4.1])
+HOSTILE = '<script>alert("x")</script>'
+
+
+def points(control: int = 12, check: int = 6, **noise: float) -> Points:
+    made = simulate_points(CAMERA, TERRAIN, control=control, check=check, seed=5, **noise).measured
+    return dataclasses.replace(made, image=made.image + BIAS)
+
+
+def adjusted(measured: Points, correction: str = "shift") -> Fit:
+    return fit(ImageCorrection(CAMERA, correction, (500.0, 500.0), np.zeros(6)), measured, name=f"camera+{correction}")
+
+
+def as_delivered(measured: Points) -> Fit:
+    """What the points say about the camera when nothing is adjusted."""
+    predicted = CAMERA.ground_to_image(measured.ground)
+    residuals = measured.image - predicted
+    return Fit(
+        model=ImageCorrection(CAMERA, "none", (500.0, 500.0), np.zeros(6)),
+        model_name="camera",
+        covariance=np.zeros((0, 0)),
+        points=measured,
+        used=measured.control,
+        predicted=predicted,
+        residuals=residuals,
+        loo_residuals=residuals,
+        raw_residuals=residuals,
+        redundancy=2 * int(measured.control.sum()),
+        sigma0=None,
+    )
+
+
+def no_points() -> Points:
+    return points().select(np.zeros(18, dtype=bool))
+
+
+def document(result: Fit, **more: Any) -> dict[str, Any]:
+    model = result.model
+    scene = Scene("simulated", "folder/scene.tif", 1000, 1000, {"camera": model}, "from a seed", {"sun": float("nan")})
+    return report.build_report(scene=scene, fit=result, **more)
+
+
+def renamed(measured: Points, index: int, name: str) -> Points:
+    ids = list(measured.ids)
+    ids[index] = name
+    return dataclasses.replace(measured, ids=tuple(ids))
+
+
+class FakeSurface:
+    """The terrain, lower or higher by a constant."""
+
+    constant_height = None
+    provenance: dict[str, Any] = {"path": "dem.tif", "crs": "WGS 84", "vertical_label": "EGM96", "fill": "error"}  # noqa: RUF012
+
+    def __init__(self, offset: float) -> None:
+        self.offset = offset
+
+    def heights(self, xy: np.ndarray, crs: Any) -> np.ndarray:
+        return TERRAIN(xy[:, 0], xy[:, 1]) + self.offset
+
+
+# -- numbers ---------------------------------------------------------------------------------------------------------
+
+
+def test_report_is_json_without_nan(tmp_path):
+    made = document(adjusted(points()), warnings=["look here"], provenance={"image": {"path": "scene.tif"}})
+    report.write_report_json(made, tmp_path / "r.json")
+    again = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"), parse_constant=pytest.fail)
+    assert again == made
+    assert again["schema_version"] == 1
+    assert again["scene"]["facts"] == {"sun": None}
+    assert again["warnings"] == ["look here"]
+
+
+def test_raw_bias_is_measured_minus_delivered():
+    raw = document(adjusted(points()))["adjustment"]["raw_bias"]
+    assert (raw["col"], raw["row"]) == pytest.approx(BIAS, abs=0.2)
+
+
+def test_metres_are_pixels_times_their_size():
+    made = document(adjusted(points()))
+    assert made["scene"]["ground_pixel_m"] == pytest.approx([2.5, 2.5], rel=0.02)
+    for which in ("control", "check", "loo"):
+        pixels, metres = made["adjustment"]["rmse"][which], made["rmse_m"][which]
+        assert metres["n"] == pixels["n"]
+        assert metres["total"] == pytest.approx(2.5 * pixels["total"], rel=0.1)
+
+
+def test_metres_say_where_the_ortho_shows_the_point():
+    """A point measured one pixel to the east is shown one pixel to the east."""
+    measured = points(check=1, sigma_image=1e-6, sigma_ground=0.0)
+    index = int(np.flatnonzero(measured.check)[0])
+    image = measured.image.copy()
+    image[index] += (1.0, 0.0)
+    result = adjusted(dataclasses.replace(measured, image=image))
+    shown = CAMERA.image_to_ground(image[index : index + 1] - BIAS, measured.ground[index, 2])
+    east, north = (TERRAIN.xy(*shown.T[:2]) - TERRAIN.xy(*measured.ground[index : index + 1, :2].T))[0]
+    said = document(result)["adjustment"]["points"][index]["residual_m"]
+    # The map is turned against north by the convergence of meridians, 0.2 degrees there.
+    assert said == pytest.approx((east, north), abs=0.02)
+
+
+def test_relief_displacement_is_that_of_the_camera():
+    scene = document(adjusted(points()))["scene"]
+    low, high = (TERRAIN.xy(*CAMERA.image_to_ground([[500.0, 500.0]], h).T[:2])[0] for h in (1100.0, 1000.0))
+    east, north = (high - low) / 100
+    assert scene["lean_m_per_m"] == pytest.approx(np.hypot(east, north), rel=0.01)
+    assert scene["lean_azimuth_deg"] == pytest.approx(np.degrees(np.arctan2(east, north)) % 360, abs=1.0)
+
+
+def test_residuals_geojson_is_flat_and_in_lon_lat():
+    measured = points()
+    image = measured.image.copy()
+    image[3] += (50.0, 20.0)
+    result = adjusted(dataclasses.replace(measured, image=image))
+    features = report.residuals_geojson(result)["features"]
+    json.dumps(features, allow_nan=False)
+    assert len(features) == 18
+    for i, feature in enumerate(features):
+        assert feature["geometry"]["coordinates"] == pytest.approx(measured.ground[i].tolist(), abs=1e-9)
+        said = feature["properties"]
+        assert not any(isinstance(value, list | dict) for value in said.values())
+        assert (said["res_col"], said["res_row"]) == pytest.approx(result.residuals[i])
+    assert features[3]["properties"]["rejected"]
+    assert features[3]["properties"]["loo_col"] is None
+    assert features[3]["properties"]["length_m"] == pytest.approx(2.5 * np.hypot(50, 20), rel=0.05)
+
+
+# -- words -----------------------------------------------------------------------------------------------------------
+
+
+def test_headline_prefers_check_points():
+    head = document(adjusted(points()))["headline"]
+    assert re.fullmatch(r"0\.\d\d px", head["figure"])
+    assert head["metres"].endswith(" m")
+    assert "6 check points" in head["what"]
+    assert any("30 check points" in note for note in head["notes"])
+
+
+def test_headline_with_enough_check_points_makes_no_excuse():
+    head = document(adjusted(points(control=10, check=30)))["headline"]
+    assert not any("ewer than" in note for note in head["notes"])
+
+
+def test_headline_without_check_points_leaves_one_out():
+    made = document(adjusted(points(check=0)))
+    assert "left out in turn" in made["headline"]["what"]
+    assert made["headline"]["figure"] == f"{made['adjustment']['rmse']['loo']['total']:.2f} px"
+
+
+def test_headline_without_redundancy_gives_no_figure():
+    head = document(adjusted(points(control=1, check=0)))["headline"]
+    assert head["figure"] == "Not tested"
+    assert any(note.startswith("No redundancy") for note in head["notes"])
+
+
+def test_headline_without_points_says_so():
+    made = document(as_delivered(no_points()))
+    assert made["headline"]["figure"] == "Not tested"
+    assert "no ground control" in made["headline"]["what"]
+    assert "Not tested" in report.summary_text(made)
+    assert report.plot_residuals(made) == ""
+
+
+def test_headline_of_a_model_as_delivered():
+    head = document(as_delivered(points(check=0)))["headline"]
+    assert float(head["figure"].removesuffix(" px")) == pytest.approx(np.hypot(*BIAS), abs=0.2)
+    assert "as delivered" in head["what"]
+
+
+@pytest.mark.parametrize(("offset", "warned"), [(33.6, True), (0.0, False), (-33.6, True)])
+def test_other_height_datum_of_the_points_is_seen(offset, warned):
+    made = document(adjusted(points()), surface=FakeSurface(offset), coverage=1.0)
+    assert made["heights"]["median_m"] == pytest.approx(-offset, abs=0.2)
+    found = [text for text in made["warnings"] if "datum" in text]
+    assert bool(found) is warned
+    if warned:
+        assert ("below" if offset > 0 else "above") in found[0]
+        assert "13.7 m" in found[0]
+
+
+def test_summary_fits_a_screen():
+    measured = points()
+    image = measured.image.copy()
+    image[3] += (50.0, 20.0)
+    made = document(
+        adjusted(dataclasses.replace(measured, image=image)),
+        surface=FakeSurface(0.0),
+        coverage=0.9996,
+        warnings=["Mind it"],
+    )
+    text = report.summary_text(made)
+    assert len(text.splitlines()) <= 24
+    for part in ("scene.tif", "raw bias", "column +6.3", measured.ids[3], "99.9 % of the scene", "Mind it"):
+        assert part in text
+
+
+# -- page ------------------------------------------------------------------------------------------------------------
+
+
+class Loads(HTMLParser):
+    """Collects whatever a page could load or run."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.tags: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.found += [value or "" for name, value in attrs if name in {"src", "href", "xlink:href", "srcset", "data"}]
+
+
+@pytest.fixture
+def page(tmp_path) -> str:
+    measured = renamed(renamed(points(), 3, HOSTILE), 1, "O'Hara & <b>Söhne</b>")
+    image = measured.image.copy()
+    image[3] += (50.0, 20.0)
+    made = document(
+        adjusted(dataclasses.replace(measured, image=image)),
+        surface=FakeSurface(0.0),
+        coverage=1.0,
+        provenance={"image": {"path": HOSTILE, "sha256": "ab" * 32}, "empty": None},
+        warnings=[f"{HOSTILE} was left out"],
+    )
+    png = report.preview_png(_raster(tmp_path / "ortho.tif"))
+    report.write_report_html(made, tmp_path / "r.html", ortho=png)
+    return (tmp_path / "r.html").read_text(encoding="utf-8")
+
+
+def _raster(path: Any, bands: int = 1) -> str:
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), 300, 200, bands, gdal.GDT_UInt16)
+    values = np.add.outer(np.arange(200), np.arange(300)).astype(np.uint16)
+    for k in range(bands):
+        dataset.GetRasterBand(k + 1).WriteArray(values)
+        dataset.GetRasterBand(k + 1).SetNoDataValue(0)
+    del dataset
+    return str(path)
+
+
+def test_page_needs_nothing_else(page):
+    loads = Loads()
+    loads.feed(page)
+    assert all(value.startswith("data:image/png;base64,") for value in loads.found)
+    assert len(loads.found) == 1
+    assert not {"script", "link", "iframe", "object"} & set(loads.tags)
+    assert "@import" not in page
+    assert "url(" not in page
+    # The name of the SVG vocabulary is not loaded by anything.
+    assert re.findall(r"https?://[^\"'\s]*", page) == ["http://www.w3.org/2000/svg"]
+
+
+def test_page_escapes_what_others_wrote(page):
+    assert "<script" not in page
+    assert "&lt;script&gt;" in page
+    assert "<b>S" not in page
+    assert "O&#39;Hara &amp; &lt;b&gt;" in page
+
+
+def test_page_has_the_numbers(page):
+    for text in (
+        "6 check points",
+        "+6.3",
+        "gross error",
+        "ab" * 32,
+        "redundancy 20",
+        "col_shift",
+        "100 % of the scene",
+    ):
+        assert text in page
+    assert not re.search(r"\bnan\b", page, re.IGNORECASE)
+    assert "None" not in page
+
+
+def test_page_without_optional_parts(tmp_path):
+    made = document(as_delivered(no_points()))
+    report.write_report_html(made, tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Not tested" in page
+    assert "<svg" not in page
+    assert "<img" not in page
+
+
+# -- figures ---------------------------------------------------------------------------------------------------------
+
+
+def test_plot_tells_the_points_apart_and_has_a_scale():
+    measured = points()
+    image = measured.image.copy()
+    image[3] += (200.0, 0.0)
+    result = adjusted(dataclasses.replace(measured, image=image))
+    drawn = report.plot_residuals(document(result))
+    assert drawn.count("<circle") == 11 + 1  # the legend has one of each
+    assert drawn.count('<rect class="check"') == 6 + 1
+    assert drawn.count('<path class="out"') == 1 + 1
+    assert re.search(r">0\.\d+ px</text>", drawn)
+    for name in measured.ids:
+        assert f">{name}</text>" in drawn
+
+
+def test_plot_keeps_points_outside_of_the_image_in_view():
+    measured = points(check=0, sigma_image=0.1)
+    ground = CAMERA.image_to_ground([[-400.0, 1500.0]], 900.0)
+    image = measured.image.copy()
+    image[0] = BIAS + np.array([-400.0, 1500.0])
+    moved = measured.ground.copy()
+    moved[0] = ground[0]
+    drawn = report.plot_residuals(document(adjusted(dataclasses.replace(measured, image=image, ground=moved))))
+    view = re.search(r'viewBox="0 0 (\d+) (\d+)"', drawn)
+    assert view
+    width, height = map(float, view.groups())
+    for cx, cy in re.findall(r'cx="([-\d.]+)" cy="([-\d.]+)"', drawn):
+        assert 0 < float(cx) < width
+        assert 0 < float(cy) < height
+
+
+def test_plot_of_a_perfect_point_has_no_arrow():
+    made = document(adjusted(points(control=1, check=0)))
+    made["adjustment"]["points"][0]["residual"] = [0.0, 0.0]
+    assert "<line" not in report.plot_residuals(made)
+
+
+@pytest.mark.parametrize(("bands", "colour_type"), [(1, 4), (2, 4), (3, 6), (4, 6)])
+def test_preview_is_a_png_with_transparent_nodata(tmp_path, bands, colour_type):
+    png = report.preview_png(_raster(tmp_path / "o.tif", bands), side=100)
+    assert png.startswith(b"\x89PNG\r\n\x1a\n")
+    assert struct.unpack(">II", png[16:24]) == (100, 67)
+    assert png[25] == colour_type
+    gdal.FileFromMemBuffer("/vsimem/preview.png", png)
+    decoded = gdal.Open("/vsimem/preview.png").ReadAsArray()
+    assert decoded.shape[0] == (2 if colour_type == 4 else 4)
+    assert decoded[0, -1, -1] == 255
+    assert decoded[-1, 10, 10] == 255
+    gdal.Unlink("/vsimem/preview.png")
+
+
+def test_preview_of_an_empty_ortho(tmp_path):
+    path = str(tmp_path / "empty.tif")
+    dataset = gdal.GetDriverByName("GTiff").Create(path, 5, 4, 1, gdal.GDT_Float32)
+    dataset.GetRasterBand(1).Fill(float("nan"))
+    dataset.GetRasterBand(1).SetNoDataValue(float("nan"))
+    del dataset
+    png = report.preview_png(path)
+    start = png.index(b"IDAT") + 4
+    pixels = zlib.decompress(png[start : start + struct.unpack(">I", png[start - 8 : start - 4])[0]])
+    assert set(pixels) <= {0, 2}
+
+
+def test_import_is_light():
+    code = "import sys, ortho_pipeline.report; print(int(any(m.split('.')[0] == 'matplotlib' for m in sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "0"

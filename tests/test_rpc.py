@@ -1,0 +1,692 @@
+"""RPC in and out, with GDAL's transformer and real products as the authorities."""
+
+import math
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pyproj
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline import rpc as rpc_module
+from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.models import RPC, ImageCorrection
+from ortho_pipeline.models.base import SensorModel, as_ground
+from ortho_pipeline.rpc import (
+    export_rpc,
+    fit_rpc,
+    read_rpc,
+    rpc_metadata,
+    rpc_of_dataset,
+    write_rpb,
+    write_rpc_txt,
+    write_tagged_copy,
+    write_vrt,
+)
+
+gdal.UseExceptions()
+
+REAL = Path(__file__).resolve().parents[1].parent / "shared" / "data"
+QUICKBIRD = "orthority/rpc/qb2_basic1b.tif"
+CORRECTIONS = {
+    "shift": (3.0, 0.0, 0.0, -2.1, 0.0, 0.0),
+    "scale": (3.0, 2e-4, 0.0, -2.1, 0.0, -3e-4),
+    "cross": (3.0, 2e-4, 1e-4, -2.1, -2e-4, -3e-4),
+}
+
+
+def real(path: str) -> Path:
+    if not (REAL / path).exists():
+        pytest.skip(f"the real data are not there: {path}")
+    return REAL / path
+
+
+def make_rpc(seed=5, **changes) -> RPC:
+    rng = np.random.default_rng(seed)
+    num, den = rng.normal(0, 1e-3, (2, 20)), rng.normal(0, 1e-4, (2, 20))
+    num[0, 1], num[1, 2], num[0, 3], num[1, 3] = 1.0, -1.05, 0.1, 0.02
+    den[:, 0] = 1.0
+    fields = {
+        "col_off": 425.25, "row_off": 725.5 + 1 / 3, "lon_off": 24.4057, "lat_off": -33.6726, "h_off": 703.0,
+        "col_scale": 1377.6, "row_scale": 1210.0, "lon_scale": 0.0995, "lat_scale": 0.0737, "h_scale": 501.0,
+        "col_num": num[0], "col_den": den[0], "row_num": num[1], "row_den": den[1], "err_bias": 12.15,
+    }  # fmt: skip
+    return RPC(**(fields | changes))
+
+
+def in_box(rpc: RPC, n=10_000, seed=1) -> np.ndarray:
+    centre, half = rpc.domain
+    return centre + np.random.default_rng(seed).uniform(-1, 1, (n, 3)) * half
+
+
+def gdal_project(dataset, ground) -> np.ndarray:
+    transformer = gdal.Transformer(dataset, None, ["METHOD=RPC", "RPC_HEIGHT=0"])
+    points, good = transformer.TransformPoints(1, ground.tolist())
+    assert all(good)
+    return np.array(points)[:, :2]
+
+
+def make_image(path: Path, rpc: RPC | None = None, **creation) -> Path:
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), 40, 30, 2, gdal.GDT_UInt16, **creation)
+    data = np.random.default_rng(0).integers(1, 2000, (2, 30, 40))
+    for band in (1, 2):
+        dataset.GetRasterBand(band).WriteArray(data[band - 1])
+        dataset.GetRasterBand(band).SetNoDataValue(0)
+    if rpc is not None:
+        dataset.SetMetadata(rpc_metadata(rpc), "RPC")
+    return path
+
+
+def same(a: RPC, b: RPC) -> bool:
+    first, second = a.to_dict(), b.to_dict()
+    return all(first[key] == second[key] for key in first)
+
+
+# -- conventions -----------------------------------------------------------------------------------------------------
+
+
+def test_own_offsets_give_half_a_pixel_more():
+    num, den = np.eye(20)[1], np.eye(20)[0]
+    rpc = make_rpc(col_num=num, col_den=den, row_num=np.eye(20)[2], row_den=den)
+    fields = rpc_metadata(rpc)
+    image = rpc.ground_to_image([[rpc.lon_off, rpc.lat_off, rpc.h_off]])[0]
+    assert image.tolist() == [float(fields["SAMP_OFF"]) + 0.5, float(fields["LINE_OFF"]) + 0.5]
+
+
+def test_raw_rpc_agrees_with_gdal(tmp_path):
+    rpc = make_rpc()
+    dataset = gdal.Open(str(make_image(tmp_path / "a.tif")))
+    dataset.SetMetadata(rpc_metadata(rpc), "RPC")
+    ground = in_box(rpc)
+    image = rpc.ground_to_image(ground)
+    assert np.abs(image - gdal_project(dataset, ground)).max() < 1e-7
+    closed = rpc.ground_to_image(rpc.image_to_ground(image, ground[:, 2])) - image
+    assert np.isfinite(closed).all()
+    assert np.abs(closed).max() < 1e-5
+
+
+def test_crop_and_scale_move_the_model_as_the_pixels():
+    rpc = make_rpc()
+    ground = in_box(rpc, 100)
+    image = rpc.ground_to_image(ground)
+    assert np.allclose(rpc.shifted(100, 250).ground_to_image(ground), image - [100, 250], rtol=0, atol=1e-9)
+    assert np.allclose(rpc.scaled(4.0).ground_to_image(ground), image / 4, rtol=0, atol=1e-9)
+    samp_off = float(rpc_metadata(rpc)["SAMP_OFF"])
+    assert float(rpc_metadata(rpc.scaled(4.0))["SAMP_OFF"]) == pytest.approx((samp_off + 0.5) / 4 - 0.5, abs=1e-12)
+
+
+# -- files -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("writer", "name"), [(write_rpc_txt, "a_RPC.TXT"), (write_rpb, "a.RPB")])
+def test_text_is_read_again_to_the_last_bit(tmp_path, writer, name):
+    for seed in range(20):
+        rpc = make_rpc(seed, err_rand=None if seed % 2 else 1 / 3, col_off=seed * 7001.1 + 1.1)
+        writer(rpc, tmp_path / name)
+        assert same(read_rpc(tmp_path / name), rpc)
+
+
+@pytest.mark.parametrize("correction", ["shift", "scale"])
+@pytest.mark.parametrize("how", ["txt", "rpb", "tag", "vrt"])
+def test_gdal_reads_what_was_exported(tmp_path, how, correction):
+    rpc = make_rpc()
+    adjusted = ImageCorrection(rpc, "affine", (400.0, 700.0), np.array(CORRECTIONS[correction]))
+    exported = export_rpc(adjusted)
+    assert exported.exact
+    image = make_image(tmp_path / "a.tif", rpc if how in ("tag", "vrt") else None)
+    if how == "txt":
+        write_rpc_txt(exported.rpc, tmp_path / "a_RPC.TXT")
+    elif how == "rpb":
+        write_rpb(exported.rpc, tmp_path / "a.RPB")
+    else:
+        (tmp_path / "out").mkdir()
+        image = tmp_path / "out" / f"b.{'tif' if how == 'tag' else 'vrt'}"
+        write = write_tagged_copy if how == "tag" else write_vrt
+        write(gdal.Open(str(tmp_path / "a.tif")), exported.rpc, image)
+    ground = in_box(rpc, 2000)
+    dataset = gdal.Open(str(image))
+    assert np.abs(gdal_project(dataset, ground) - adjusted.ground_to_image(ground)).max() < 1e-6
+    source = {"txt": "a_RPC.TXT", "rpb": "a.RPB", "tag": "b.tif (TIFF tag)", "vrt": "b.vrt (VRT metadata)"}[how]
+    assert rpc_of_dataset(dataset)[1].endswith(source)
+
+
+def with_gcps(path: Path, rpc: RPC) -> gdal.Dataset:
+    dataset = gdal.Open(str(make_image(path, rpc)))
+    wkt = pyproj.CRS("EPSG:4326").to_wkt("WKT1_GDAL")
+    view = gdal.GetDriverByName("MEM").CreateCopy("", dataset)
+    view.SetGCPs([gdal.GCP(24.0 + c, -33.0 - r, 0, c, r) for c, r in ((0, 0), (40, 0), (0, 30))], wkt)
+    final = path.with_name("gcps.tif")
+    gdal.GetDriverByName("GTiff").CreateCopy(str(final), view)
+    return gdal.Open(str(final))
+
+
+def test_gcps_that_would_beat_the_rpc_are_left_out(tmp_path):
+    rpc = make_rpc()
+    dataset = with_gcps(tmp_path / "a.tif", rpc)
+    assert dataset.GetGCPCount() == 3
+    write_vrt(dataset, rpc, tmp_path / "b.vrt")
+    write_tagged_copy(dataset, rpc, tmp_path / "c.tif")
+    ground = in_box(rpc, 50)
+    for name in ("b.vrt", "c.tif"):
+        written = gdal.Open(str(tmp_path / name))
+        assert written.GetGCPCount() == 0
+        points, _ = gdal.Transformer(written, None, []).TransformPoints(1, ground[:, :2].tolist())
+        flat = np.column_stack([ground[:, :2], np.zeros(50)])
+        assert np.abs(np.array(points)[:, :2] - rpc.ground_to_image(flat)).max() < 1e-6
+
+
+def test_vrt_finds_its_source_when_the_folder_moves(tmp_path):
+    (tmp_path / "one" / "out").mkdir(parents=True)
+    rpc = make_rpc()
+    write_vrt(gdal.Open(str(make_image(tmp_path / "one" / "ä b.tif"))), rpc, tmp_path / "one" / "out" / "b.vrt")
+    (tmp_path / "one").rename(tmp_path / "two")
+    dataset = gdal.Open(str(tmp_path / "two" / "out" / "b.vrt"))
+    assert dataset.ReadAsArray().max() > 0
+    assert same(rpc_of_dataset(dataset)[0], rpc)
+
+
+def test_tagged_copy_keeps_pixels_nodata_mask_and_colours(tmp_path):
+    source = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), 40, 30, 3, gdal.GDT_Byte)
+    data = np.random.default_rng(0).integers(0, 255, (3, 30, 40), dtype=np.uint8)
+    colours = (gdal.GCI_BlueBand, gdal.GCI_GreenBand, gdal.GCI_RedBand)
+    for band, colour in enumerate(colours, 1):
+        source.GetRasterBand(band).WriteArray(data[band - 1])
+        source.GetRasterBand(band).SetColorInterpretation(colour)
+    source.CreateMaskBand(gdal.GMF_PER_DATASET)
+    mask = np.zeros((30, 40), np.uint8)
+    mask[5:20] = 255
+    source.GetRasterBand(1).GetMaskBand().WriteArray(mask)
+    source = None
+    write_tagged_copy(gdal.Open(str(tmp_path / "a.tif")), make_rpc(), tmp_path / "b.tif")
+    copy = gdal.Open(str(tmp_path / "b.tif"))
+    assert np.array_equal(copy.ReadAsArray(), data)
+    assert np.array_equal(copy.GetRasterBand(1).GetMaskBand().ReadAsArray(), mask)
+    assert tuple(copy.GetRasterBand(band).GetColorInterpretation() for band in (1, 2, 3)) == colours
+    assert sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("b")) == ["b.tif"]
+    write_tagged_copy(gdal.Open(str(make_image(tmp_path / "c.tif"))), make_rpc(), tmp_path / "d.tif")
+    assert gdal.Open(str(tmp_path / "d.tif")).GetRasterBand(2).GetNoDataValue() == 0
+
+
+def test_tagged_copy_refuses_a_side_car_that_would_win(tmp_path):
+    write_rpc_txt(make_rpc(), tmp_path / "b_RPC.TXT")
+    with pytest.raises(InputError, match=r"b_RPC\.TXT"):
+        write_tagged_copy(gdal.Open(str(make_image(tmp_path / "a.tif"))), make_rpc(), tmp_path / "b.tif")
+    assert not (tmp_path / "b.tif").exists()
+
+
+# -- which RPC it is -------------------------------------------------------------------------------------------------
+
+
+def test_side_car_that_agrees_with_the_tag_wins_and_is_named(tmp_path):
+    rpc = make_rpc()
+    image = make_image(tmp_path / "a.tif", rpc)
+    write_rpc_txt(rpc.shifted(0.5, 0.5), tmp_path / "a_RPC.TXT")
+    found, source = rpc_of_dataset(gdal.Open(str(image)))
+    assert same(found, rpc.shifted(0.5, 0.5))
+    assert source == str(tmp_path / "a_RPC.TXT")
+
+
+def test_stale_side_car_is_an_error_with_a_choice(tmp_path):
+    rpc = make_rpc()
+    image = make_image(tmp_path / "a.tif", rpc)
+    write_rpb(rpc.shifted(3.0, 0.0), tmp_path / "a.RPB")
+    dataset = gdal.Open(str(image))
+    with pytest.raises(InputError, match=r"a\.RPB differ by 3\.0 px(.|\n)*--rpc tag, --rpc sidecar, or --rpc FILE"):
+        rpc_of_dataset(dataset)
+    assert rpc_of_dataset(dataset, "tag")[0].col_off == pytest.approx(rpc.col_off, abs=1e-9)
+    assert rpc_of_dataset(dataset, "tag")[1] == f"{image} (TIFF tag)"
+    assert same(rpc_of_dataset(dataset, "sidecar")[0], rpc.shifted(3.0, 0.0))
+    write_rpc_txt(rpc.shifted(9.0, 9.0), tmp_path / "other.txt")
+    found, source = rpc_of_dataset(dataset, tmp_path / "other.txt")
+    assert same(found, rpc.shifted(9.0, 9.0))
+    assert source == str(tmp_path / "other.txt")
+
+
+def test_choice_that_is_not_there_is_an_error(tmp_path):
+    dataset = gdal.Open(str(make_image(tmp_path / "a.tif", make_rpc())))
+    with pytest.raises(InputError, match="no RPC side-car"):
+        rpc_of_dataset(dataset, "sidecar")
+    with pytest.raises(InputError, match="cannot be read"):
+        rpc_of_dataset(dataset, "nowhere.txt")
+    bare = gdal.Open(str(make_image(tmp_path / "bare.tif")))
+    with pytest.raises(InputError, match="there is no RPC tag"):
+        rpc_of_dataset(bare, "tag")
+    with pytest.raises(InputError, match="there is no RPC\n"):
+        rpc_of_dataset(bare)
+
+
+def test_damaged_metadata_name_file_and_field(tmp_path):
+    dataset = gdal.Open(str(make_image(tmp_path / "a.tif")))
+    dataset.SetMetadata(rpc_metadata(make_rpc()) | {"LAT_SCALE": "0"}, "RPC")
+    with pytest.raises(InputError, match=r"LAT_SCALE: an RPC scale cannot be zero"):
+        rpc_of_dataset(dataset)
+
+
+# -- damaged and odd files -------------------------------------------------------------------------------------------
+
+
+def text_of(rpc: RPC, tmp_path: Path, writer=write_rpc_txt) -> str:
+    writer(rpc, tmp_path / "written.txt")
+    return (tmp_path / "written.txt").read_text()
+
+
+def test_spellings_of_rpc_text(tmp_path):
+    rpc = make_rpc()
+    text = text_of(rpc, tmp_path)
+    variants = {
+        "crcrlf": text.replace("\n", "\r\r\n"),
+        "lower": text.lower(),
+        "tabs": text.replace(": ", ":\t  "),
+        "no units": text.replace(" pixels", "").replace(" degrees", ""),
+        "bom": "\ufeff" + text,
+        "plus": text.replace(": 1377.6", ": +001377.60"),
+        "comment": "# Orbital, März 2005\n" + text,
+        "fortran": text.replace("e-0", "D-0"),
+        "three digits": text.replace("e-0", "e-00"),
+    }
+    for name, variant in variants.items():
+        path = tmp_path / f"{name}.txt"
+        path.write_bytes(variant.encode("latin-1" if name == "comment" else "utf-8"))
+        assert same(read_rpc(path), rpc), name
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        ("LINE_SCALE: 1210.0", "LINE_SCALE: 0", "LINE_SCALE"),
+        ("LINE_SCALE: 1210.0", "LINE_SCALE: nan", "LINE_SCALE"),
+        ("LINE_SCALE: 1210.0", "LINE_SCALE: 1e400", "LINE_SCALE"),
+        ("LINE_SCALE: 1210.0", "LINE_SCALE: inf", "LINE_SCALE"),
+        ("LINE_SCALE: 1210.0", "LINE_SCALE: 1210,0", "LINE_SCALE"),
+        ("LINE_SCALE: 1210.0", "LINE_SCALE: 1_210", "LINE_SCALE"),
+        ("LINE_SCALE: 1210.0", "LINE_SCALE:", "LINE_SCALE"),
+        ("LINE_SCALE: 1210.0", "LINE_SCALE: 1210\nLINE_SCALE: 1211", "LINE_SCALE"),
+        ("LAT_OFF: -33.6726", "LAT_OFF: -133.6726", "LAT_OFF"),
+        ("LINE_DEN_COEFF_1: 1.0", "LINE_DEN_COEFF_1: 0.0", "LINE_DEN_COEFF"),
+        ("LINE_DEN_COEFF_1: 1.0", "LINE_DEN_COEFF_21: 1.0", "LINE_DEN_COEFF_1"),
+    ],
+)
+def test_wrong_field_is_named(tmp_path, old, new, field):
+    text = text_of(make_rpc(), tmp_path)
+    assert old in text
+    (tmp_path / "bad_RPC.TXT").write_text(text.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        read_rpc(tmp_path / "bad_RPC.TXT")
+    assert field in caught.value.field
+    assert caught.value.file.endswith("bad_RPC.TXT")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"FAKE\n",
+        b"\0" * 100,
+        "LINE_OFF: 1".encode("utf-16"),
+        b"LINE_OFF: 1\nSAMP_OFF: 2\0",
+        b"<" * 1000,
+        b"<a>" * 100_000,
+        b"lineNumCoef = (" * 100_000,
+        b"lineNumCoef = " + b"1 " * 2_000_000,
+        b"LINE_OFF: " + b"9" * 4_000_000,
+        b"x" * 10_000_000,
+        b'<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>',
+    ],
+)
+def test_hostile_file_is_a_typed_error(tmp_path, data):
+    for suffix in ("_RPC.TXT", ".RPB", ".XML", ".geom"):
+        path = tmp_path / f"bad{suffix}"
+        path.write_bytes(data)
+        with pytest.raises(InputError):
+            read_rpc(path)
+    with pytest.raises(InputError):
+        read_rpc(tmp_path)
+    with pytest.raises(InputError):
+        read_rpc(tmp_path / "missing.txt")
+
+
+def test_rpc00a_is_refused(tmp_path):
+    text = text_of(make_rpc(), tmp_path, write_rpb)
+    (tmp_path / "a.RPB").write_text(text.replace("RPC00B", "RPC00A"))
+    with pytest.raises(InputError, match="only RPC00B"):
+        read_rpc(tmp_path / "a.RPB")
+
+
+def dimap_of(rpc: RPC, profile: str, origin: int) -> str:
+    fields = rpc_metadata(rpc)
+    inverse, validity = [], []
+    for key, value in fields.items():
+        if "COEFF" in key:
+            inverse += [f"<{key}_{n}>{v}</{key}_{n}>" for n, v in enumerate(value.split(), 1)]
+        elif not key.startswith("ERR"):
+            moved = repr(float(value) + origin) if key in ("LINE_OFF", "SAMP_OFF") else value
+            validity.append(f"<{key}>{moved}</{key}>")
+    return (
+        '<?xml version="1.0" encoding="ISO-8859-1"?>\n<Dimap_Document><Metadata_Identification>'
+        f"<METADATA_PROFILE>{profile}</METADATA_PROFILE></Metadata_Identification><Rational_Function_Model><Global_RFM>"
+        f"<Direct_Model><SAMP_NUM_COEFF_1>7</SAMP_NUM_COEFF_1></Direct_Model><Inverse_Model>{''.join(inverse)}"
+        f"</Inverse_Model><RFM_Validity>{''.join(validity)}</RFM_Validity></Global_RFM></Rational_Function_Model>"
+        "</Dimap_Document>"
+    )
+
+
+@pytest.mark.parametrize(("profile", "origin"), [("PHR_SENSOR", 1), ("S6_SENSOR", 1), ("PNEO_SENSOR", 0)])
+def test_origin_of_dimap_goes_by_the_satellite(tmp_path, profile, origin):
+    rpc = make_rpc(err_bias=None, row_off=725.5)
+    (tmp_path / "RPC_a.XML").write_text(dimap_of(rpc, profile, origin))
+    found = read_rpc(tmp_path / "RPC_a.XML")
+    assert np.allclose(found.ground_to_image(in_box(rpc, 20)), rpc.ground_to_image(in_box(rpc, 20)), atol=1e-9)
+
+
+def test_mutated_files_give_typed_errors_or_finite_models(tmp_path):
+    rng = np.random.default_rng(45)
+    rpc = make_rpc()
+    seeds = {
+        "_RPC.TXT": text_of(rpc, tmp_path).encode(),
+        ".RPB": text_of(rpc, tmp_path, write_rpb).encode(),
+        ".XML": dimap_of(rpc, "PHR_SENSOR", 1).encode(),
+    }
+    splices = [
+        b"nan",
+        b"1e400",
+        b"-inf",
+        b"0",
+        b"\0",
+        b":",
+        b"=",
+        b"(",
+        b")",
+        b";",
+        b"<",
+        b">",
+        b"\xff",
+        b",",
+        b"\n",
+        b"e",
+    ]
+    corners = np.array([rpc.domain[0] + np.array(s) * rpc.domain[1] for s in ((-1, -1, -1), (0, 0, 0), (1, 1, 1))])
+    accepted = 0
+    for number in range(4000):
+        suffix = list(seeds)[number % 3]
+        path = tmp_path / f"m{suffix}"
+        path.write_bytes(mutate(seeds[suffix], rng, splices))
+        try:
+            with np.errstate(all="ignore"):
+                model = read_rpc(path)
+                image = model.ground_to_image(corners)
+        except OrthoError:
+            continue
+        accepted += 1
+        numbers = [v for value in model.to_dict().values() for v in np.atleast_1d(value) if not isinstance(v, str)]
+        assert all(v is None or math.isfinite(v) for v in numbers)
+        assert image.shape == (3, 2)
+    assert 100 < accepted < 3000
+
+
+def mutate(data: bytes, rng: np.random.Generator, splices: list[bytes]) -> bytes:
+    at = int(rng.integers(len(data)))
+    length = int(rng.integers(1, 40))
+    kind = rng.integers(5)
+    if kind == 0:
+        return data[:at]
+    if kind == 1:
+        return data[:at] + bytes(rng.integers(0, 256, length, dtype=np.uint8)) + data[at + length :]
+    if kind == 2:
+        return data[:at] + data[at + length :]
+    if kind == 3:
+        return data[:at] + data[at : at + length] * 3 + data[at + length :]
+    return data[:at] + splices[rng.integers(len(splices))] + data[at + int(rng.integers(4)) :]
+
+
+# -- RPC of other models ---------------------------------------------------------------------------------------------
+
+
+def corrected(rpc: RPC, name: str) -> ImageCorrection:
+    return ImageCorrection(rpc, "affine", (400.0, 700.0), np.array(CORRECTIONS[name]))
+
+
+@pytest.mark.parametrize("name", ["shift", "scale", "cross"])
+def test_correction_is_folded_exactly_where_it_can_be(name):
+    rpc = make_rpc()
+    if name == "cross":
+        rpc = make_rpc(row_den=rpc.col_den)
+    exported = export_rpc(corrected(rpc, name))
+    assert exported.exact
+    assert exported.max_error_px == 0.0
+    ground = in_box(rpc, 1000)
+    expected = corrected(rpc, name).ground_to_image(ground)
+    assert np.abs(exported.rpc.ground_to_image(ground) - expected).max() < 1e-8
+
+
+def test_cross_term_with_two_denominators_is_fitted_and_says_how_well():
+    rpc = make_rpc()
+    model = corrected(rpc, "cross")
+    exported = export_rpc(model)
+    assert not exported.exact
+    ground = in_box(rpc, 1000)
+    seen = np.abs(exported.rpc.ground_to_image(ground) - model.ground_to_image(ground)).max()
+    assert seen <= 1.2 * exported.max_error_px
+    assert exported.max_error_px < 1e-4
+
+
+def test_correction_of_a_correction_is_folded():
+    rpc = make_rpc()
+    model = ImageCorrection(corrected(rpc, "scale"), "shift", (0.0, 0.0), np.array(CORRECTIONS["shift"]))
+    exported = export_rpc(model)
+    ground = in_box(rpc, 100)
+    assert exported.exact
+    assert np.abs(exported.rpc.ground_to_image(ground) - model.ground_to_image(ground)).max() < 1e-8
+    assert export_rpc(rpc).rpc is rpc
+
+
+@dataclass(frozen=True, eq=False)
+class Frame(SensorModel):
+    """A frame camera over a UTM zone, looking down with a tilt, with radial distortion."""
+
+    kind: ClassVar[str] = "test-frame"
+    height: float = 680_000.0
+    focal: float = 68_000.0
+    distortion: float = 0.0
+
+    @property
+    def crs(self):
+        return "EPSG:32735"
+
+    @property
+    def domain(self):
+        return np.array([260_000.0, 6_270_000.0, 800.0]), np.array([10_000.0, 10_000.0, 800.0])
+
+    def ground_to_image(self, ground):
+        ground = as_ground(ground)
+        # Onto the tangent plane of the ellipsoid, as a camera sees the curved Earth.
+        (x, y, h), (x0, y0, _) = ground.T, self.domain[0]
+        x, y = x - x0, y - y0
+        depth = self.height - h + (x**2 + y**2) / (2 * 6_371_000.0)
+        tilted = np.array([x + 0.2 * depth, y, depth - 0.2 * x])
+        plane = self.focal * tilted[:2] / tilted[2]
+        radial = 1 + self.distortion * (((plane - [[self.focal * 0.2], [0]]) / 1000.0) ** 2).sum(axis=0)
+        return (plane * radial * [[1], [-1]]).T
+
+
+@pytest.mark.parametrize("distortion", [0.0, 1e-4])
+def test_rpc_stands_for_a_frame_camera_in_another_crs(distortion):
+    model = Frame(distortion=distortion)
+    exported = export_rpc(model)
+    assert exported.max_error_px < 0.005
+    assert not exported.exact
+    centre, half = model.domain
+    ground = centre + np.random.default_rng(2).uniform(-1, 1, (500, 3)) * half
+    to_geographic = pyproj.Transformer.from_crs("EPSG:32735", "EPSG:4326", always_xy=True)
+    lon, lat = to_geographic.transform(ground[:, 0], ground[:, 1])
+    image = exported.rpc.ground_to_image(np.column_stack([lon, lat, ground[:, 2]]))
+    assert np.abs(image - model.ground_to_image(ground)).max() < 0.005
+
+
+class Wavy(Frame):
+    """A frame camera with an attitude jitter that no rational function follows."""
+
+    kind: ClassVar[str] = "test-wavy"
+    amplitude: ClassVar[float] = 0.05
+
+    def ground_to_image(self, ground):
+        image = super().ground_to_image(ground)
+        image[:, 0] += self.amplitude * np.sin(image[:, 1] / 40)
+        return image
+
+
+def test_poor_fit_warns_or_is_refused(monkeypatch, caplog):
+    poor = export_rpc(Wavy())
+    assert 0.02 < poor.max_error_px < 0.1
+    assert "only to" in poor.warnings[0]
+    assert "only to" in caplog.text
+    monkeypatch.setattr(Wavy, "amplitude", 1.0)
+    with pytest.raises(InputError, match="stands for this model only to"):
+        export_rpc(Wavy())
+    assert export_rpc(Wavy(), force=True).max_error_px > 0.5
+
+
+@pytest.mark.parametrize(
+    ("box", "heights"),
+    [
+        ((24, -34, 24, -33), (0, 100)),
+        ((25, -34, 24, -33), (0, 100)),
+        ((24, -34, 25, -33), (100, 0)),
+        ((24, math.nan, 25, -33), (0, 100)),
+        ((44, -34, 45, -33), (0, 100)),
+    ],
+)
+def test_empty_or_outlying_box_is_refused(box, heights):
+    with pytest.raises(InputError, match="box"):
+        fit_rpc(make_rpc(), box, heights)
+
+
+def test_flat_height_range_and_antimeridian_are_fitted():
+    rpc = make_rpc(lon_off=179.99)
+    lo_box = (179.93, -33.70, 180.05, -33.62)
+    exported = fit_rpc(rpc, lo_box, (700.0, 700.0))
+    assert exported.max_error_px < 1e-4
+    ground = np.array([[-179.97, -33.66, 700.5], [179.95, -33.66, 700.5]])
+    assert np.abs(exported.rpc.ground_to_image(ground) - rpc.ground_to_image(ground)).max() < 1e-4
+    assert export_rpc(corrected(rpc, "cross")).max_error_px < 1e-4
+
+
+# -- real products ---------------------------------------------------------------------------------------------------
+
+RPC_FILES = [
+    "gdal/gcore/data/md_ov_rpc.txt", "gdal/gcore/data/md_ge_rgb_0010000_rpc.txt", "gdal/gcore/data/md_dg.RPB",
+    "gdal/gcore/data/md_dg_2.XML", "gdal/gcore/data/md_eros.rpc", "gdal/gcore/data/md_kompsat.rpc",
+]  # fmt: skip
+ALL_RPC = [
+    *RPC_FILES, QUICKBIRD, "gdal/gcore/data/test_rpc.txt", "gdal/gcore/data/rpc.vrt", "rpcm/rpc_IKONOS.txt",
+    "rpcm/rpc_PLANET_L1A.txt", "rpcm/rpc_PLEIADES.xml", "rpcm/rpc_SPOT6.xml", "shareloc/rpc/wv3_20.NTF",
+    "shareloc/rpc/phr_oise/RPC_PHR1A_P_202503191043438_SEN_7342362101-1.XML", "otb/ikonos/ikonos-1.geom",
+    "otb/QB/qb-1.geom", "otb/geoeye1/geoeye1-1.geom", "otb/pleiades/pleiades-1.geom",
+]  # fmt: skip
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("path", RPC_FILES)
+def test_readers_agree_with_gdals(path):
+    found = read_rpc(real(path))
+    images = {"md_ov_rpc.txt": "md_ov.tif", "md_ge_rgb_0010000_rpc.txt": "md_ge_rgb_0010000.tif"}
+    image = images.get(Path(path).name, Path(path).with_suffix(".tif").name)
+    by_gdal, source = rpc_of_dataset(gdal.Open(str(real(path).with_name(image))))
+    assert same(found, by_gdal)
+    assert source == str(real(path))
+
+
+@pytest.mark.realdata
+def test_dimap_reader_agrees_with_gdals(tmp_path):
+    for number, path in enumerate(("shareloc/rpc", "rpcm", "gdal/gdrivers/data/jpeg2000")):
+        names = ["RPC_PHR1B_P_201709281038393_SEN_PRG_FC_178609-001.XML", "rpc_PLEIADES.xml", "RPC_md_ple.XML"]
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        shutil.copy(real(f"{path}/{names[number]}"), folder / "RPC_abcdef.XML")
+        # The reader of GDAL wants the file of metadata as well.
+        shutil.copy(real("gdal/gdrivers/data/jpeg2000/DIM_md_ple.XML"), folder / "DIM_abcdef.XML")
+        make_image(folder / "IMG_abcdef_R1C1.tif")
+        dataset = gdal.Open(str(folder / "IMG_abcdef_R1C1.tif"))
+        found, source = rpc_of_dataset(dataset)
+        assert source == str(folder / "RPC_abcdef.XML")
+        mine = read_rpc(folder / "RPC_abcdef.XML")
+        ground = in_box(mine, 100)
+        assert np.abs(found.ground_to_image(ground) - mine.ground_to_image(ground)).max() < 1e-7
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("path", ALL_RPC)
+def test_real_rpcs_agree_with_gdal_close_and_are_refitted(path, tmp_path):
+    rpc = read_rpc(real(path))
+    dataset = gdal.Open(str(make_image(tmp_path / "a.tif")))
+    dataset.SetMetadata(rpc_metadata(rpc), "RPC")
+    ground = in_box(rpc)
+    image = rpc.ground_to_image(ground)
+    assert np.abs(image - gdal_project(dataset, ground)).max() < 1e-7
+    back = rpc.image_to_ground(image, ground[:, 2])
+    closed = rpc.ground_to_image(back) - image
+    # This one, altered by its publisher, folds over in a part of its box, so that two grounds have one image.
+    assert np.isfinite(closed).all() or path.endswith("md_eros.rpc")
+    assert np.nanmax(np.abs(closed)) < 1e-5
+    box, heights = rpc_module._domain_box(rpc)
+    assert fit_rpc(rpc, box, heights).max_error_px < 1e-4
+
+
+@pytest.mark.realdata
+def test_orbview3_corners():
+    rpc = read_rpc(real("gdal/gcore/data/md_ov_rpc.txt"))
+    corners, fields = [], {}
+    for line in real("gdal/gcore/data/md_ov.pvl").read_text().splitlines():
+        key, _, value = line.strip().rstrip(";").partition("=")
+        fields[key.strip()] = value.strip()
+        if key.strip() == "height":
+            corners.append([float(fields[name]) for name in ("longitude", "latitude", "height")])
+    expected = [(0.5, 0.5), (8015.5, 0.5), (8015.5, 27481.5), (0.5, 27481.5)]
+    image = rpc.ground_to_image(corners[:4])
+    distance = np.abs(image[:, None] - np.array(expected)).max(axis=2).min(axis=1)
+    assert len(corners) >= 4
+    assert distance.max() < 0.003
+
+
+@pytest.mark.realdata
+def test_ikonos_geo_corner():
+    rpc = read_rpc(real("gdal/gcore/data/md_ge_rgb_0010000_rpc.txt"))
+    to_geographic = pyproj.Transformer.from_crs("EPSG:32631", "EPSG:4326", always_xy=True)
+    lon, lat = to_geographic.transform([445950.21, 446950.21], [5417803.74, 5416803.74])
+    image = rpc.ground_to_image(np.column_stack([lon, lat, [85.9509811401441] * 2]))
+    assert np.abs(image[0] - 0.5).max() < 0.005
+    assert np.abs(image[1] - image[0] - 1000).max() < 0.02
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(("name", "half"), [("ikonos/ikonos-1", 0.0), ("QB/qb-1", 0.0), ("pleiades/pleiades-1", -0.5)])
+def test_otb_localisations_are_reproduced(name, half):
+    # That program counts from the corner too, except for Pleiades, where it takes over the vendor's count from 1.
+    rpc = read_rpc(real(f"otb/{name}.geom"))
+    table = np.loadtxt(real(f"otb/{name}.gcp2"), comments="#")
+    offset = rpc.ground_to_image(table[:, 2:5]) - table[:, :2]
+    assert np.abs(offset - half).max() < 1e-6
+
+
+@pytest.mark.realdata
+def test_pleiades_parallax():
+    left = read_rpc(real("shareloc/rpc/phr_ventoux/left_image.geom"))
+    right = read_rpc(real("shareloc/rpc/phr_ventoux/right_image.geom"))
+    for height, row, col in ((0, 5195.7, 4906.5), (700, 4727.7, 5034.3), (1500, 4192.9, 5180.4)):
+        image = right.ground_to_image(left.image_to_ground([[5000.0, 5000.0]], height))[0]
+        assert np.abs(image - [col, row]).max() < 0.1
+
+
+@pytest.mark.realdata
+def test_quickbird_bias_is_what_was_measured():
+    import json
+
+    rpc, source = rpc_of_dataset(gdal.Open(str(real(QUICKBIRD))))
+    assert source.endswith("qb2_basic1b.tif (TIFF tag)")
+    features = json.loads(real("orthority/rpc/gcps.geojson").read_text())["features"]
+    ground = np.array([feature["geometry"]["coordinates"] for feature in features])
+    measured = np.array([feature["properties"]["ji"] for feature in features]) + 0.5
+    bias = measured - rpc.ground_to_image(ground)
+    assert np.abs(bias - np.array([-3.0, -2.11])).max() < 0.12
