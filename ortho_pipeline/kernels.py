@@ -15,8 +15,11 @@ import numba
 import numpy as np
 
 NEAREST, BILINEAR, CUBIC, LANCZOS, AVERAGE = range(5)
-# Unsigned indices spare the compiled code a test for Python's negative ones in every access.
-_ONE, _TWO = np.uint64(1), np.uint64(2)
+# Unsigned indices spare the compiled code a test for Python's negative ones in every access; they are made by way of
+# int32, which processors convert from and to floating point in one instruction.
+_ONE, _TWO = np.uint32(1), np.uint32(2)
+#: From this many output pixels per DEM sample on, pixels are taken together that lie between the same samples.
+_RUN = 6.0
 
 _jit = numba.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 _inline = numba.njit(nogil=True, cache=True, inline="always", boundscheck=False, error_model="numpy")
@@ -41,18 +44,18 @@ def block_coordinates(
     cubic_dem: bool,
     middle: float,
     half: float,
+    ticks: Any,
     columns: Any,
     rows: Any,
 ) -> None:
     """Fill `columns` and `rows` with the image coordinates of output pixels left…right of one row of a block.
 
-    `row`, `left`, `right` count from the block's first pixel; NaN where there is no height or no projection.
+    `row`, `left`, `right` count from the block's first pixel; `ticks` are the places of the block's columns between
+    lattice nodes, 0 to 1. NaN where there is no height or no projection.
     """
     levels = nodes.shape[2]
-    inverse = 1.0 / spacing
     cell_row = row // spacing
-    ty = (row - cell_row * spacing) * inverse
-    dem_rows, dem_columns = heights.shape
+    ty = (row - cell_row * spacing) / spacing
     start, slope = np.empty(2 * levels), np.empty(2 * levels)
     for cell in range(left // spacing, (right - 1) // spacing + 1):
         for k in range(levels):
@@ -60,70 +63,82 @@ def block_coordinates(
                 begin = _between(nodes[cell_row, cell, k, axis], nodes[cell_row + 1, cell, k, axis], ty)
                 end = _between(nodes[cell_row, cell + 1, k, axis], nodes[cell_row + 1, cell + 1, k, axis], ty)
                 start[2 * k + axis], slope[2 * k + axis] = begin, end - begin
-        u0 = _between(dem_nodes[cell_row, cell, 0], dem_nodes[cell_row + 1, cell, 0], ty) - dem_left
-        v0 = _between(dem_nodes[cell_row, cell, 1], dem_nodes[cell_row + 1, cell, 1], ty) - dem_top
-        u1 = _between(dem_nodes[cell_row, cell + 1, 0], dem_nodes[cell_row + 1, cell + 1, 0], ty) - dem_left
-        v1 = _between(dem_nodes[cell_row, cell + 1, 1], dem_nodes[cell_row + 1, cell + 1, 1], ty) - dem_top
-        du, dv = u1 - u0, v1 - v0
-        # Coordinates are linear along a row of a cell, so its two ends tell whether all of it lies within the DEM.
-        within = (
-            min(u0, u1) >= 0.0 and max(u0, u1) < dem_columns - 1 and min(v0, v1) >= 0.0 and max(v0, v1) < dem_rows - 1
-        )
+        u0 = _between(dem_nodes[cell_row, cell, 0], dem_nodes[cell_row + 1, cell, 0], ty)
+        v0 = _between(dem_nodes[cell_row, cell, 1], dem_nodes[cell_row + 1, cell, 1], ty)
+        du = _between(dem_nodes[cell_row, cell + 1, 0], dem_nodes[cell_row + 1, cell + 1, 0], ty) - u0
+        dv = _between(dem_nodes[cell_row, cell + 1, 1], dem_nodes[cell_row + 1, cell + 1, 1], ty) - v0
         first, last = max(left, cell * spacing), min(right, (cell + 1) * spacing)
-        # First the heights, kept in `columns`; then both coordinates: two simple loops are faster than one long one.
-        for column in range(first, last):
-            tx = (column - cell * spacing) * inverse
-            u, v = u0 + du * tx, v0 + dv * tx
-            if within and not cubic_dem:
-                columns[column - left] = _dem_height_within(heights, u, v)
-            else:
-                columns[column - left] = _dem_height_at(heights, u, v, cubic_dem)
+        tx, cols, lines = ticks[first:last], columns[first - left : last - left], rows[first - left : last - left]
+        # First the heights, kept in `cols`; then both coordinates: two simple loops are faster than one long one.
+        _row_heights(heights, u0, du, v0, dv, dem_left, dem_top, cubic_dem, spacing, tx, cols)
         if levels == 3:
-            _quadratic(start, slope, cell * spacing, first, last, left, inverse, middle, half, columns, rows)
+            _quadratic(start, slope, middle, 1.0 / half, tx, cols, lines)
             continue
-        for column in range(first, last):
-            tx = (column - cell * spacing) * inverse
-            t = (columns[column - left] - middle) / half
+        for k in range(tx.size):
+            t = (cols[k] - middle) / half
             col = line = 0.0
-            for k in range(levels - 1, -1, -1):
-                col = col * t + (start[2 * k] + slope[2 * k] * tx)
-                line = line * t + (start[2 * k + 1] + slope[2 * k + 1] * tx)
-            columns[column - left] = col
-            rows[column - left] = line
+            for power in range(levels - 1, -1, -1):
+                col = col * t + (start[2 * power] + slope[2 * power] * tx[k])
+                line = line * t + (start[2 * power + 1] + slope[2 * power + 1] * tx[k])
+            cols[k], lines[k] = col, line
 
 
 @_inline
-def _quadratic(start, slope, origin, first, last, left, inverse, middle, half, columns, rows):
-    """Turn heights in `columns` into image coordinates by the quadratics of one row of a cell."""
+def _quadratic(start, slope, middle, scale, tx, cols, lines):
+    """Turn heights in `cols` into image coordinates by the quadratics of one row of a cell."""
     c0, c1, c2, r0, r1, r2 = start[0], start[2], start[4], start[1], start[3], start[5]
     dc0, dc1, dc2, dr0, dr1, dr2 = slope[0], slope[2], slope[4], slope[1], slope[3], slope[5]
-    for column in range(first, last):
-        tx = (column - origin) * inverse
-        t = (columns[column - left] - middle) / half
-        columns[column - left] = ((c2 + dc2 * tx) * t + (c1 + dc1 * tx)) * t + (c0 + dc0 * tx)
-        rows[column - left] = ((r2 + dr2 * tx) * t + (r1 + dr1 * tx)) * t + (r0 + dr0 * tx)
+    for k in range(tx.size):
+        t = (cols[k] - middle) * scale
+        cols[k] = ((c2 + dc2 * tx[k]) * t + (c1 + dc1 * tx[k])) * t + (c0 + dc0 * tx[k])
+        lines[k] = ((r2 + dr2 * tx[k]) * t + (r1 + dr1 * tx[k])) * t + (r0 + dr0 * tx[k])
 
 
 @_inline
-def _dem_height_within(heights, u, v):
-    """Interpolate the DEM bilinearly at (u, v), which lies between samples of its window."""
-    i, j = np.uint64(u), np.uint64(v)
-    fu, fv = u - i, v - j
-    upper = heights[j, i] + (heights[j, i + _ONE] - heights[j, i]) * fu
-    lower = heights[j + _ONE, i] + (heights[j + _ONE, i + _ONE] - heights[j + _ONE, i]) * fu
-    height = upper + (lower - upper) * fv
-    return height if height == height else _dem_height(heights, int(i), int(j), fu, fv, False)
+def _row_heights(heights, u0, du, v0, dv, dem_left, dem_top, cubic_dem, spacing, tx, out):
+    """Fill `out` with the heights at (u0 + du tx, v0 + dv tx), DEM coordinates that are linear along a row of a cell.
+
+    Fractions are taken of the coordinates in the whole DEM, not in its window: the last bit must not depend on how
+    large a window the memory allows.
+    """
+    dem_rows, dem_columns = heights.shape
+    count = tx.size
+    if cubic_dem or max(abs(du), abs(dv)) * _RUN > spacing:
+        for k in range(count):
+            out[k] = _dem_height_at(heights, u0 + du * tx[k], v0 + dv * tx[k], dem_left, dem_top, cubic_dem)
+        return
+    # A coarse DEM: many pixels lie between the same four samples, and need only one look at them.
+    k = 0
+    while k < count:
+        west, north = np.floor(u0 + du * tx[k]), np.floor(v0 + dv * tx[k])
+        end = k + 1
+        while end < count and np.floor(u0 + du * tx[end]) == west and np.floor(v0 + dv * tx[end]) == north:
+            end += 1
+        i, j = int(west) - dem_left, int(north) - dem_top
+        smooth = 0 <= i < dem_columns - 1 and 0 <= j < dem_rows - 1
+        if smooth:
+            h00, h10, h01 = heights[j, i], heights[j, i + 1] - heights[j, i], heights[j + 1, i] - heights[j, i]
+            h11 = heights[j + 1, i + 1] - heights[j + 1, i] - h10
+            smooth = h11 + h01 == h11 + h01  # no void among them
+        if smooth:
+            for m in range(k, end):
+                fu, fv = u0 + du * tx[m] - west, v0 + dv * tx[m] - north
+                out[m] = (h00 + h10 * fu) + (h01 + h11 * fu) * fv
+        else:
+            for m in range(k, end):
+                out[m] = _dem_height_at(heights, u0 + du * tx[m], v0 + dv * tx[m], dem_left, dem_top, False)
+        k = end
 
 
-@_inline
-def _dem_height_at(heights, u, v, cubic_dem):
-    """Interpolate the DEM at sample coordinates (u, v) of its window; NaN outside of it."""
+@_jit
+def _dem_height_at(heights, u, v, dem_left, dem_top, cubic_dem):
+    """Interpolate the DEM at sample coordinates (u, v); NaN outside of its window."""
     rows, columns = heights.shape
-    if not (0.0 <= u <= columns - 1 and 0.0 <= v <= rows - 1):
+    if not (dem_left <= u <= dem_left + columns - 1 and dem_top <= v <= dem_top + rows - 1):
         return np.nan
     # The last sample itself is still covered.
-    i, j = min(int(u), columns - 2), min(int(v), rows - 2)
-    return _dem_height(heights, i, j, u - i, v - j, cubic_dem)
+    i, j = min(int(np.floor(u)), dem_left + columns - 2), min(int(np.floor(v)), dem_top + rows - 2)
+    return _dem_height(heights, i - dem_left, j - dem_top, u - i, v - j, cubic_dem)
 
 
 @_inline
@@ -271,6 +286,9 @@ def warp_block(
     """
     first_row, last_row, first, last = block[0], block[1], block[2], block[3]
     columns, rows = np.empty(last - first), np.empty(last - first)
+    ticks = np.empty(last)
+    for k in range(first, last):
+        ticks[k] = (k % spacing) / spacing
     bands, window_height, window_width = source.shape
     # Points within these bounds have all neighbours both in the source and in the window.
     low_col = left + reach if left > 0 else reach
@@ -291,38 +309,56 @@ def warp_block(
             cubic_dem,
             middle,
             half,
+            ticks,
             columns,
             rows,
         )
-        inside = not masked
-        for k in range(last - first):
+        line, count = row - first_row, last - first
+        # Between `begin` and `end` no neighbour is missing; the rest of the row is done with care.
+        begin, end = 0, 0 if masked else count
+        while begin < end and not (low_col <= columns[begin] < high_col and low_row <= rows[begin] < high_row):
+            begin += 1
+        while end > begin and not (low_col <= columns[end - 1] < high_col and low_row <= rows[end - 1] < high_row):
+            end -= 1
+        inside = True
+        for k in range(begin, end):
             inside &= (columns[k] >= low_col) & (columns[k] < high_col) & (rows[k] >= low_row) & (rows[k] < high_row)
-        line = row - first_row
-        if inside:
-            for band in range(bands):
-                if kernel == NEAREST:
-                    _row_nearest(source[band], columns, rows, left, top, out[band, line])
-                elif kernel == BILINEAR:
-                    _row_bilinear(source[band], columns, rows, left, top, integer, out[band, line])
-                elif kernel == CUBIC:
-                    _row_cubic(source[band], columns, rows, left, top, low, high, integer, out[band, line])
-                elif kernel == LANCZOS:
-                    _row_lanczos(source[band], columns, rows, left, top, low, high, integer, out[band, line])
-                else:
-                    _row_average(source[band], columns, rows, left, top, box, integer, out[band, line])
-            out_valid[line] = True
-        else:
-            short += _row_with_edges(
-                kernel, source, valid, masked, columns, rows, left, top, full_width, full_height, low, high, integer,
-                fill, out[:, line], out_valid[line], reach, box
+        if not inside:
+            begin, end = count, count
+        for band in range(bands if end > begin else 0):
+            _row_inside(
+                kernel, source[band], columns[begin:end], rows[begin:end], left, top, low, high, integer, box,
+                out[band, line, begin:end]
             )  # fmt: skip
+        out_valid[line, begin:end] = True
+        for start, stop in ((0, begin), (end, count)):
+            if stop > start:
+                short += _row_with_edges(
+                    kernel, source, valid, masked, columns[start:stop], rows[start:stop], left, top, full_width,
+                    full_height, low, high, integer, fill, out[:, line, start:stop], out_valid[line, start:stop],
+                    reach, box
+                )  # fmt: skip
     return short
+
+
+@_inline
+def _row_inside(kernel, source, columns, rows, left, top, low, high, integer, box, out):
+    if kernel == NEAREST:
+        _row_nearest(source, columns, rows, left, top, out)
+    elif kernel == BILINEAR:
+        _row_bilinear(source, columns, rows, left, top, integer, out)
+    elif kernel == CUBIC:
+        _row_cubic(source, columns, rows, left, top, low, high, integer, out)
+    elif kernel == LANCZOS:
+        _row_lanczos(source, columns, rows, left, top, low, high, integer, out)
+    else:
+        _row_average(source, columns, rows, left, top, box, integer, out)
 
 
 @_inline
 def _row_nearest(source, columns, rows, left, top, out):
     for k in range(columns.size):
-        out[k] = source[np.uint64(rows[k] - top), np.uint64(columns[k] - left)]
+        out[k] = source[np.uint32(np.int32(rows[k] - top)), np.uint32(np.int32(columns[k] - left))]
 
 
 @_inline
@@ -331,8 +367,9 @@ def _row_bilinear(source, columns, rows, left, top, integer, out):
     rounding = 0.5 if integer else 0.0
     for k in range(columns.size):
         x, y = columns[k] - x0, rows[k] - y0
-        i, j = np.uint64(x), np.uint64(y)
-        fx, fy = x - i, y - j
+        across, down = np.int32(x), np.int32(y)
+        fx, fy = x - across, y - down
+        i, j = np.uint32(across), np.uint32(down)
         upper = source[j, i] * (1.0 - fx) + source[j, i + _ONE] * fx
         lower = source[j + _ONE, i] * (1.0 - fx) + source[j + _ONE, i + _ONE] * fx
         value = upper * (1.0 - fy) + lower * fy + rounding
@@ -344,9 +381,10 @@ def _row_cubic(source, columns, rows, left, top, low, high, integer, out):
     x0, y0 = left + 0.5, top + 0.5
     for k in range(columns.size):
         x, y = columns[k] - x0, rows[k] - y0
-        i, j = np.uint64(x), np.uint64(y)
-        a0, a1, a2, a3 = cubic_weights(x - i)
-        b0, b1, b2, b3 = cubic_weights(y - j)
+        across, down = np.int32(x), np.int32(y)
+        a0, a1, a2, a3 = cubic_weights(x - across)
+        b0, b1, b2, b3 = cubic_weights(y - down)
+        i, j = np.uint32(across), np.uint32(down)
         value = (
             b0 * _cubic_line(source[j - _ONE], i, a0, a1, a2, a3)
             + b1 * _cubic_line(source[j], i, a0, a1, a2, a3)
@@ -393,12 +431,13 @@ def _lanczos_weights(f):
 @_inline
 def _lanczos(source, x, y):
     """Value at (x, y), counted from the centre of the window's first pixel; the 6 x 6 neighbours have to be there."""
-    i, j = np.uint64(x), np.uint64(y)
-    a0, a1, a2, a3, a4, a5 = _lanczos_weights(x - i)
-    weights = _lanczos_weights(y - j)
+    across, down = np.int32(x), np.int32(y)
+    a0, a1, a2, a3, a4, a5 = _lanczos_weights(x - across)
+    weights = _lanczos_weights(y - down)
+    i, j = np.uint32(across), np.uint32(down)
     total = 0.0
     for b in range(6):
-        line = source[j - _TWO + np.uint64(b)]
+        line = source[j - _TWO + np.uint32(b)]
         total += weights[b] * (
             a0 * line[i - _TWO]
             + a1 * line[i - _ONE]

@@ -57,6 +57,18 @@ class Block:
     box: tuple[float, float] = (1.0, 1.0)  # source columns and rows under one output pixel
     window: tuple[int, int, int, int] | None = None  # source pixels left, top, right, bottom
 
+    @property
+    def lattice(self) -> Array:
+        """Coefficients ``(ny, nx, levels, 2)`` of the image coordinates at the nodes."""
+        assert self.nodes is not None
+        return self.nodes
+
+    @property
+    def dem_lattice(self) -> Array:
+        """DEM coordinates ``(ny, nx, 2)`` of the nodes."""
+        assert self.dem_nodes is not None
+        return self.dem_nodes
+
 
 class _Exact:
     """The exact geometry of an output grid: pixels and heights to source image and DEM coordinates."""
@@ -108,16 +120,17 @@ def _levels(count: int) -> Array:
     return -np.cos(np.pi * np.arange(count) / (count - 1))
 
 
-def _scatter(block: tuple[int, int]) -> tuple[Array, Array, Array]:
-    """Return `VERIFIED` points (column, row offsets in the block, normalised height), other ones in each block.
+def _scatter(blocks: list[Block]) -> tuple[Array, Array, Array]:
+    """Return `VERIFIED` points of each block ``(blocks, n)``: column and row offsets, normalised height.
 
-    A low-discrepancy sequence, started at a place that depends on the block: spread more evenly than random points, and
-    the same in every run.
+    A low-discrepancy sequence (Roberts' R3), started at a place that depends on the block: spread more evenly than
+    random points, other ones in each block, and the same in every run.
     """
-    steps = np.array([0.8191725133961645, 0.6710436067037893, 0.5497004779019703])  # R3 sequence
-    start = np.array([0.5, 0.25, 0.75]) + np.array([block[0] * 0.7548776662, block[1] * 0.5698402910, sum(block) * 0.3])
-    points = np.remainder(start + np.arange(VERIFIED)[:, None] * steps, 1.0)
-    return points[:, 0] * (BLOCK - 1), points[:, 1] * (BLOCK - 1), 2 * points[:, 2] - 1
+    place = np.array([(block.row, block.column) for block in blocks], dtype=float)
+    steps = np.array([0.8191725133961645, 0.6710436067037893, 0.5497004779019703])
+    start = np.stack([0.5 + 0.7548776662 * place[:, 0], 0.25 + 0.5698402910 * place[:, 1], 0.3 * place.sum(axis=1)], 1)
+    points = np.remainder(start[:, None, :] + np.arange(VERIFIED)[:, None] * steps, 1.0)
+    return points[..., 0] * (BLOCK - 1), points[..., 1] * (BLOCK - 1), 2 * points[..., 2] - 1
 
 
 class Lattices:
@@ -235,8 +248,7 @@ class Lattices:
 
     def _verify(self, blocks: list[Block]) -> Array:
         """Return the worst error (source px) of each block's lattice at its verification points ``(blocks,)``."""
-        scattered = np.array([_scatter((block.row, block.column)) for block in blocks])
-        columns, rows, t = scattered[:, 0], scattered[:, 1], scattered[:, 2]
+        columns, rows, t = _scatter(blocks)
         corner_columns = np.array([block.column for block in blocks])[:, None] * BLOCK + 0.5
         corner_rows = np.array([block.row for block in blocks])[:, None] * BLOCK + 0.5
         middle = np.array([block.middle for block in blocks])[:, None]
@@ -244,20 +256,13 @@ class Lattices:
         output = columns + corner_columns, rows + corner_rows
         exact = self._exact.image(*output, (middle + half * t)[:, :, None])[:, :, 0]
         exact_uv = self._exact.dem(*output)
-        errors = np.zeros(len(blocks))
-        for k, block in enumerate(blocks):
-            image, uv, parallax = _interpolate(block, columns[k], rows[k], t[k])
-            errors[k] = self._misfit(image, exact[k], uv, exact_uv[k], parallax)
-        return errors
-
-    def _misfit(self, image: Array, exact: Array, uv: Array, exact_uv: Array, parallax: Array) -> float:
-        size = self._size
+        image, uv, parallax = _interpolate(blocks, columns, rows, t)
         with np.errstate(invalid="ignore"):
-            inside = [((points >= -2) & (points <= size + 2)).all(axis=1) for points in (image, exact)]
-            error = np.hypot(*(image - exact).T) + parallax * np.abs(uv - exact_uv).sum(axis=1)
-        counts = inside[0] | inside[1]
+            inside = [((points >= -2) & (points <= self._size + 2)).all(axis=2) for points in (image, exact)]
+            errors = np.hypot(*np.moveaxis(image - exact, 2, 0)) + parallax * np.abs(uv - exact_uv).sum(axis=2)
         # A point that one of them puts into the image and the other nowhere is infinitely wrong.
-        return float(np.where(np.isnan(error), np.inf, error)[counts].max(initial=0.0))
+        errors[np.isnan(errors)] = np.inf
+        return np.where(inside[0] | inside[1], errors, 0.0).max(axis=1)
 
 
 class Terrain:
@@ -325,30 +330,32 @@ class Terrain:
         return True
 
 
-def _interpolate(block: Block, columns: Array, rows: Array, t: Array) -> tuple[Array, Array, Array]:
-    """Return what the kernel gets from a lattice: image points, DEM points, parallax (px over the block's heights)."""
-    assert block.nodes is not None
-    assert block.dem_nodes is not None
-    i, j = (columns // block.spacing).astype(int), (rows // block.spacing).astype(int)
-    fx, fy = columns / block.spacing - i, rows / block.spacing - j
+def _interpolate(blocks: list[Block], columns: Array, rows: Array, t: Array) -> tuple[Array, Array, Array]:
+    """Return what the kernel gets from lattices of one spacing at points ``(blocks, n)`` of each.
+
+    Image points ``(blocks, n, 2)``, DEM points ``(blocks, n, 2)``, parallax ``(blocks, n)`` over a block's heights.
+    """
+    spacing, which = blocks[0].spacing, np.arange(len(blocks))[:, None]
+    i, j = (columns // spacing).astype(int), (rows // spacing).astype(int)
+    fx, fy = columns / spacing - i, rows / spacing - j
 
     def plan(nodes: Array) -> Array:
-        weight = fx.reshape(-1, *[1] * (nodes.ndim - 2)), fy.reshape(-1, *[1] * (nodes.ndim - 2))
-        upper = nodes[j, i] * (1 - weight[0]) + nodes[j, i + 1] * weight[0]
-        lower = nodes[j + 1, i] * (1 - weight[0]) + nodes[j + 1, i + 1] * weight[0]
-        return upper * (1 - weight[1]) + lower * weight[1]
+        shape = (*fx.shape, *[1] * (nodes.ndim - 3))
+        across, down = fx.reshape(shape), fy.reshape(shape)
+        upper = nodes[which, j, i] * (1 - across) + nodes[which, j, i + 1] * across
+        lower = nodes[which, j + 1, i] * (1 - across) + nodes[which, j + 1, i + 1] * across
+        return upper * (1 - down) + lower * down
 
-    coefficients = plan(block.nodes)
-    powers = t[:, None] ** np.arange(coefficients.shape[1])
-    image = np.einsum("nk,nka->na", powers, coefficients)
-    parallax = 2 * np.hypot(*coefficients[:, 1].T)
-    return image, plan(block.dem_nodes), parallax
+    coefficients = plan(np.stack([block.lattice for block in blocks]))
+    powers = t[:, :, None] ** np.arange(coefficients.shape[2])
+    image = np.einsum("bnk,bnka->bna", powers, coefficients)
+    parallax = 2 * np.hypot(coefficients[:, :, 1, 0], coefficients[:, :, 1, 1])
+    return image, plan(np.stack([block.dem_lattice for block in blocks])), parallax
 
 
 def _box(block: Block) -> tuple[float, float]:
     """Return how many columns and rows of the source one output pixel covers in the mean over a block, at least 1."""
-    assert block.nodes is not None
-    level = block.nodes[:, :, 0]
+    level = block.lattice[:, :, 0]
     across = np.abs(np.diff(level, axis=1)) / block.spacing
     down = np.abs(np.diff(level, axis=0)) / block.spacing
     finite = [part[np.isfinite(part).all(axis=2)] for part in (across, down)]
