@@ -1,0 +1,334 @@
+"""Orthorectification speed beside GDAL (and OTB where it is installed), in one run, alternating.
+
+    python benchmarks/warp.py                  the 12000 x 12000 job, three rounds: a table
+    python benchmarks/warp.py --scaling        time and memory from 1000² to 24000²
+    python benchmarks/warp.py --kernels        by kernel, number of bands and sensor model
+    python benchmarks/warp.py --accuracy       every output pixel of a ramp against an independent exact evaluation
+
+Every figure is of a whole process: wall time, CPU time, peak memory. Outputs are uncompressed tiled GeoTIFFs. What
+machines do at one moment differs from the next, so programs take turns and only ratios within a round count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import pyproj
+from osgeo import gdal, osr
+
+from ortho_pipeline.models import RPC
+from ortho_pipeline.rpc import rpc_metadata
+
+gdal.UseExceptions()
+
+LON, LAT, HEIGHT = 24.4, -33.65, 700.0
+GSD = 0.5
+DEM_STEP = 30.0
+UTM = 32735
+TILED = ("TILED=YES", "BLOCKXSIZE=512", "BLOCKYSIZE=512", "BIGTIFF=IF_SAFER")
+
+
+@dataclass
+class Job:
+    """A scene of `side` x `side` pixels and the output grid that holds it."""
+
+    folder: Path
+    side: int
+    bands: int = 1
+    kind: str = "uint16"
+
+    @property
+    def image(self) -> Path:
+        return self.folder / f"scene_{self.side}_{self.bands}_{self.kind}.tif"
+
+    @property
+    def dem(self) -> Path:
+        return self.folder / f"dem_{self.side}.tif"
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        x, y = pyproj.Transformer.from_crs(4326, UTM, always_xy=True).transform(LON, LAT)
+        reach = round(self.side * GSD / 2 * 1.0535)
+        return round(x) - reach, round(y) - reach, round(x) + reach, round(y) + reach
+
+    @property
+    def megapixels(self) -> float:
+        xmin, ymin, xmax, ymax = self.extent
+        return (xmax - xmin) * (ymax - ymin) / GSD**2 / 1e6
+
+    def model(self) -> RPC:
+        """An RPC with all its terms at work, some 20 degrees off nadir."""
+        half, random = self.side / 2, np.random.default_rng(0)
+        scale = half * 1.05
+        tilt = 0.36 * 500 / GSD / scale
+        cubic = random.normal(0, 2e-5, (2, 10))
+        zeros = [0.0] * 16
+        return RPC(
+            half, half, LON, LAT, HEIGHT, scale, scale, scale * GSD / 92_800, scale * GSD / 110_900, 500.0,
+            [0.002, 1.0, 0.05, 0.9 * tilt, 1e-3, 4e-4, -3e-4, -6e-4, -5e-4, 8e-6, *cubic[0]],
+            [1.0, -1.4e-3, -1.1e-3, -5e-4, *zeros],
+            [-0.003, 0.04, -1.0, 0.4 * tilt, -1.5e-3, 2e-5, 3e-4, 4e-4, 3e-4, -3e-6, *cubic[1]],
+            [1.0, -1.7e-3, -2e-3, 3e-4, *zeros],
+        )  # fmt: skip
+
+    def make(self, *, sparse: bool = False) -> Job:
+        """Write scene and DEM, unless they are there."""
+        if not self.image.exists():
+            self._write_image(sparse)
+        if not self.dem.exists():
+            self._write_dem()
+        return self
+
+    def _write_image(self, sparse: bool) -> None:
+        kind = {"uint16": gdal.GDT_UInt16, "ramp": gdal.GDT_Float32}[self.kind]
+        bands = 2 if self.kind == "ramp" else self.bands
+        options = [*TILED, "SPARSE_OK=TRUE"] if sparse else list(TILED)
+        dataset = gdal.GetDriverByName("GTiff").Create(str(self.image), self.side, self.side, bands, kind, options)
+        dataset.SetMetadata(rpc_metadata(self.model()), "RPC")
+        columns, random = np.arange(self.side), np.random.default_rng(1)
+        for top in range(0, 0 if sparse else self.side, 512):
+            rows = np.arange(top, min(top + 512, self.side))[:, None]
+            if self.kind == "ramp":
+                dataset.GetRasterBand(1).WriteArray(np.broadcast_to(columns + 0.5, (len(rows), self.side)), 0, top)
+                dataset.GetRasterBand(2).WriteArray(np.broadcast_to(rows + 0.5, (len(rows), self.side)), 0, top)
+                continue
+            field = 1000 + 400 * np.sin(columns / 37) * np.cos(rows / 53) + 200 * np.sin((columns + 2 * rows) / 7)
+            for band in range(bands):
+                noise = random.normal(0, 20, field.shape)
+                dataset.GetRasterBand(band + 1).WriteArray((field + noise).astype(np.uint16), 0, top)
+
+    def _write_dem(self) -> None:
+        xmin, _, xmax, ymax = self.extent
+        margin = 20 * DEM_STEP
+        count = int((xmax - xmin + 2 * margin) / DEM_STEP)
+        reference = osr.SpatialReference()
+        reference.ImportFromEPSG(UTM)
+        dataset = gdal.GetDriverByName("GTiff").Create(str(self.dem), count, count, 1, gdal.GDT_Float32)
+        dataset.SetSpatialRef(reference)
+        dataset.SetGeoTransform((xmin - margin, DEM_STEP, 0, ymax + margin, 0, -DEM_STEP))
+        y, x = np.mgrid[:count, :count]
+        rough = 200 * np.sin(x / 20) * np.cos(y / 27) + 60 * np.sin(x / 3.1 + y / 5)
+        noise = np.random.default_rng(2).normal(0, 8, x.shape)
+        dataset.WriteArray((HEIGHT + rough + noise).astype(np.float32))
+
+
+@dataclass
+class Run:
+    """What one process took; CPU and wall in seconds, memory in MB."""
+
+    wall: float
+    cpu: float
+    memory: float
+
+
+def measure(command: list[str]) -> Run:
+    """Run a program; its own resource usage comes from the kernel when it ends."""
+    begin = time.perf_counter()
+    with tempfile.TemporaryFile() as log:
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        _, status, usage = os.wait4(process.pid, 0)
+        wall = time.perf_counter() - begin
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            log.seek(0)
+            raise SystemExit(f"{' '.join(command)} failed:\n{log.read().decode(errors='replace')}")
+    return Run(wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
+
+
+def ours(job: Job, out: Path, kernel: str = "bilinear", *extra: str) -> list[str]:
+    """`ortho rectify`, with everything that it writes besides the ortho."""
+    shutil.rmtree(out, ignore_errors=True)
+    return [
+        sys.executable, "-m", "ortho_pipeline", "rectify", str(job.image), "--dem", str(job.dem),
+        "--dem-vertical", "ellipsoid", "-t_srs", f"EPSG:{UTM}", "-te", *map(str, job.extent), "-tr", str(GSD),
+        "-r", kernel, "--format", "GTiff", "-o", str(out), *extra,
+    ]  # fmt: skip
+
+
+def gdalwarp(job: Job, out: Path, kernel: str, *extra: str) -> list[str]:
+    """`gdalwarp` with the same grid, two threads, and values that do not depend on its chunks."""
+    out.unlink(missing_ok=True)
+    create = [part for option in TILED for part in ("-co", option)]
+    return [
+        "gdalwarp", "-q", "-rpc", "-to", "METHOD=RPC", "-to", f"RPC_DEM={job.dem}", "-t_srs", f"EPSG:{UTM}",
+        "-te", *map(str, job.extent), "-tr", str(GSD), str(GSD), "-r", kernel, "-multi", "-wo", "NUM_THREADS=2",
+        "-wo", "XSCALE=1", "-wo", "YSCALE=1", *create, *extra, str(job.image), str(out),
+    ]  # fmt: skip
+
+
+def copy(source: Path, out: Path) -> list[str]:
+    """A plain copy of as many output pixels: the practical limit."""
+    out.unlink(missing_ok=True)
+    create = [part for option in TILED for part in ("-co", option)]
+    return ["gdal_translate", "-q", *create, str(source), str(out)]
+
+
+def otb(job: Job, out: Path) -> list[str] | None:
+    """OTB's OrthoRectification with its default grid, where OTB is installed."""
+    if shutil.which("otbcli_OrthoRectification") is None:
+        return None
+    xmin, _, _, ymax = job.extent
+    size = round(job.megapixels**0.5 * 1000)
+    return [
+        "otbcli_OrthoRectification", "-io.in", str(job.image), "-io.out", str(out), "uint16", "-map", "epsg",
+        "-map.epsg.code", str(UTM), "-elev.dem", str(job.dem.parent), "-outputs.mode", "manual",
+        "-outputs.ulx", str(xmin), "-outputs.uly", str(ymax), "-outputs.spacingx", str(GSD),
+        "-outputs.spacingy", str(-GSD), "-outputs.sizex", str(size), "-outputs.sizey", str(size),
+        "-interpolator", "linear",
+    ]  # fmt: skip
+
+
+def headline(job: Job, rounds: int) -> dict[str, list[Run]]:
+    """Alternate all programs; the first call of ours, which may compile, is not counted."""
+    folder, runs = job.folder, {}
+    measure(ours(job, folder / "warm", "bilinear"))
+    measure(ours(job, folder / "warm", "cubic"))
+    reference = folder / "warm" / f"{job.image.stem}_ortho.tif"
+    for number in range(rounds):
+        turn = {
+            "ortho rectify, bilinear": ours(job, folder / "ours", "bilinear"),
+            "gdal_translate (copy)": copy(reference, folder / "copy.tif"),
+            "gdalwarp exact, bilinear": gdalwarp(job, folder / "exact.tif", "bilinear", "-et", "0"),
+            "ortho rectify, cubic": ours(job, folder / "ours_cubic", "cubic"),
+            "gdalwarp exact, cubic": gdalwarp(job, folder / "exact_cubic.tif", "cubic", "-et", "0"),
+            "gdalwarp -et 0.125": gdalwarp(job, folder / "fast.tif", "bilinear", "-et", "0.125"),
+            "OTB OrthoRectification": otb(job, folder / "otb.tif"),
+        }
+        for name, command in turn.items():
+            if command is not None:
+                runs.setdefault(name, []).append(measure(command))
+        walls = ", ".join(f"{name} {found[-1].wall:.2f} s" for name, found in runs.items())
+        print(f"round {number + 1}: {walls}", file=sys.stderr)
+    return runs
+
+
+def table(runs: dict[str, list[Run]], megapixels: float, base: str) -> str:
+    """Return medians, and ratios of wall and CPU time to `base` within each round with their range."""
+    lines = [
+        "| program | wall s | CPU s | memory MB | Mpx/s | wall ratio | CPU ratio |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, found in runs.items():
+        median = [statistics.median(getattr(run, part) for run in found) for part in ("wall", "cpu", "memory")]
+        ratios = []
+        for part in ("wall", "cpu"):
+            pairs = zip(found, runs[base], strict=True)
+            values = sorted(getattr(one, part) / getattr(other, part) for one, other in pairs)
+            ratios.append(f"{statistics.median(values):.2f} ({values[0]:.2f}-{values[-1]:.2f})")
+        speed = megapixels / median[0]
+        lines.append(
+            f"| {name} | {median[0]:.2f} | {median[1]:.2f} | {median[2]:.0f} | {speed:.1f} | {ratios[0]} | {ratios[1]} |"
+        )
+    return "\n".join(lines)
+
+
+def scaling(folder: Path) -> dict[str, list[Run]]:
+    """Whole processes from 1000² to 24000² source pixels; the largest source is sparse."""
+    runs = {}
+    for side in (1000, 2000, 4000, 8000, 12000, 24000):
+        job = Job(folder, side).make(sparse=side > 12000)
+        runs[f"{side}"] = [measure(ours(job, folder / "ours")) for _ in range(3)]
+        best = min(runs[f"{side}"], key=lambda run: run.wall)
+        print(f"{side:6d}²  {best.wall:7.2f} s  {best.wall / job.megapixels * 1e3:6.1f} ns/px  {best.memory:5.0f} MB")
+    return runs
+
+
+def kernels(folder: Path) -> dict[str, list[Run]]:
+    """By kernel, and by number of bands."""
+    job, runs = Job(folder, 8000).make(), {}
+    for kernel in ("nearest", "bilinear", "cubic", "lanczos", "average"):
+        runs[kernel] = [measure(ours(job, folder / "ours", kernel)) for _ in range(3)]
+    for bands in (1, 4, 8):
+        many = Job(folder, 4000, bands).make()
+        runs[f"{bands} bands of 4000²"] = [measure(ours(many, folder / "ours")) for _ in range(3)]
+    for name, found in runs.items():
+        best = min(found, key=lambda run: run.wall)
+        print(f"{name:18s} {best.wall:7.2f} s wall {best.cpu:7.2f} s CPU {best.memory:5.0f} MB")
+    return runs
+
+
+def accuracy(folder: Path, side: int) -> dict[str, float]:
+    """Warp a ramp; compare every output pixel with pyproj, a DEM interpolated here, and the RPC in plain NumPy."""
+    job = Job(folder, side, kind="ramp").make()
+    measure(ours(job, folder / "ramp"))
+    ortho = gdal.Open(str(folder / "ramp" / f"{job.image.stem}_ortho.tif"))
+    dem = gdal.Open(str(job.dem))
+    heights, (left, step, _, top, _, _) = dem.ReadAsArray().astype(float), dem.GetGeoTransform()
+    xmin, _, _, ymax = job.extent
+    model, to_lonlat = job.model(), pyproj.Transformer.from_crs(UTM, 4326, always_xy=True)
+    worst, squares, count, margin = 0.0, 0.0, 0, 2.0
+    x = xmin + (np.arange(ortho.RasterXSize) + 0.5) * GSD
+    for row in range(ortho.RasterYSize):
+        found = ortho.ReadAsArray(0, row, ortho.RasterXSize, 1)[:, 0].astype(float)
+        y = np.full(x.size, ymax - (row + 0.5) * GSD)
+        u, v = (x - left) / step - 0.5, (top - y) / step - 0.5
+        i, j = np.floor(u).astype(int), np.floor(v).astype(int)
+        upper = heights[j, i] * (1 - u + i) + heights[j, i + 1] * (u - i)
+        lower = heights[j + 1, i] * (1 - u + i) + heights[j + 1, i + 1] * (u - i)
+        lon, lat = to_lonlat.transform(x, y)
+        exact = model.ground_to_image(np.stack([lon, lat, upper * (1 - v + j) + lower * (v - j)], axis=1)).T
+        use = ((exact > margin) & (exact < side - margin)).all(axis=0)
+        error = np.abs(found - exact).max(axis=0)[use]
+        worst, squares, count = max(worst, error.max(initial=0.0)), squares + (error**2).sum(), count + error.size
+    result = {"pixels": count, "max_px": worst, "rms_px": (squares / count) ** 0.5}
+    print(f"{count / 1e6:.1f} Mpx: at most {worst:.5f} px, RMS {result['rms_px']:.5f} px from the exact geometry")
+    return result
+
+
+def machine() -> dict[str, str]:
+    """Describe the machine without naming it."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    cpu = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "")
+    return {
+        "cpu": f"{os.cpu_count()} x {cpu}",
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "gdal": gdal.VersionInfo("RELEASE_NAME"),
+        "numpy": np.__version__,
+    }
+
+
+def main() -> None:
+    """Parse the options and run."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--side", type=int, default=12000)
+    parser.add_argument("--folder", type=Path, help="where scenes are kept between runs (default: a temporary one)")
+    parser.add_argument("--json", type=Path, help="write all runs there")
+    for option in ("scaling", "kernels", "accuracy"):
+        parser.add_argument(f"--{option}", action="store_true")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="ortho_bench_") as temporary:
+        folder = arguments.folder or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        document: dict[str, object] = {"machine": machine()}
+        if arguments.scaling:
+            document["scaling"] = {name: [asdict(run) for run in runs] for name, runs in scaling(folder).items()}
+        elif arguments.kernels:
+            document["kernels"] = {name: [asdict(run) for run in runs] for name, runs in kernels(folder).items()}
+        elif arguments.accuracy:
+            document["accuracy"] = accuracy(folder, arguments.side)
+        else:
+            job = Job(folder, arguments.side).make()
+            runs = headline(job, arguments.rounds)
+            print(f"{job.side} x {job.side} UInt16, {job.megapixels:.0f} Mpx out; {document['machine']}\n")
+            print(table(runs, job.megapixels, "ortho rectify, bilinear"))
+            document["headline"] = {name: [asdict(run) for run in found] for name, found in runs.items()}
+        if arguments.json:
+            arguments.json.write_text(json.dumps(document, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
