@@ -101,8 +101,8 @@ class Job:
         for top in range(0, 0 if sparse else self.side, 512):
             rows = np.arange(top, min(top + 512, self.side))[:, None]
             if self.kind == "ramp":
-                dataset.GetRasterBand(1).WriteArray(np.broadcast_to(columns + 0.5, (len(rows), self.side)), 0, top)
-                dataset.GetRasterBand(2).WriteArray(np.broadcast_to(rows + 0.5, (len(rows), self.side)), 0, top)
+                for band, ramp in enumerate((columns + 0.5 + 0 * rows, rows + 0.5 + 0 * columns)):
+                    dataset.GetRasterBand(band + 1).WriteArray(ramp, 0, top)
                 continue
             field = 1000 + 400 * np.sin(columns / 37) * np.cos(rows / 53) + 200 * np.sin((columns + 2 * rows) / 7)
             for band in range(bands):
@@ -229,7 +229,7 @@ def table(runs: dict[str, list[Run]], megapixels: float, base: str) -> str:
             ratios.append(f"{statistics.median(values):.2f} ({values[0]:.2f}-{values[-1]:.2f})")
         speed = megapixels / median[0]
         lines.append(
-            f"| {name} | {median[0]:.2f} | {median[1]:.2f} | {median[2]:.0f} | {speed:.1f} | {ratios[0]} | {ratios[1]} |"
+            f"| {name} | {median[0]:.2f} | {median[1]:.2f} | {median[2]:.0f} | {speed:.1f} | {' | '.join(ratios)} |"
         )
     return "\n".join(lines)
 
