@@ -88,7 +88,7 @@ class Job:
         if not self.image.exists():
             self._write_image(sparse)
         if not self.dem.exists():
-            self._write_dem()
+            self.write_dem()
         return self
 
     def _write_image(self, sparse: bool) -> None:
@@ -109,7 +109,8 @@ class Job:
                 noise = random.normal(0, 20, field.shape)
                 dataset.GetRasterBand(band + 1).WriteArray((field + noise).astype(np.uint16), 0, top)
 
-    def _write_dem(self) -> None:
+    def write_dem(self) -> None:
+        """Write a rough DEM of ellipsoidal heights."""
         xmin, _, xmax, ymax = self.extent
         margin = 20 * DEM_STEP
         count = int((xmax - xmin + 2 * margin) / DEM_STEP)

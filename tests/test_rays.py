@@ -1,0 +1,91 @@
+"""Many rays at once, by way of the lattice, against the same rays followed one by one with the exact model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline import rays
+from ortho_pipeline.dem import Surface
+from ortho_pipeline.models import RPC
+from ortho_pipeline.rays import MANY, intersect
+
+
+@pytest.fixture(scope="module")
+def model() -> RPC:
+    """Three metres a pixel, 35 degrees off nadir."""
+    one, zero = np.eye(20)[0], np.zeros(20)
+    col, row = zero.copy(), zero.copy()
+    col[[1, 3, 7]], row[[2, 3, 8]] = (1.0, 0.25, 2e-4), (-1.0, 0.08, 1e-4)
+    return RPC(300.0, 300.0, 20.0, -30.0, 500.0, 300.0, 300.0, 0.01, 0.0085, 300.0, col, one, row, one)
+
+
+def rough(x, y):
+    ridge = 150 * np.exp(-(((x - x.mean()) / 120) ** 2))
+    return 450 + 40 * np.sin(x / 170) * np.cos(y / 230) + ridge + np.random.default_rng(0).normal(0, 2, x.shape)
+
+
+@pytest.fixture
+def surface(tmp_path: Path, model) -> Surface:
+    path, step, count = tmp_path / "dem.tif", 30.0, 130
+    east, north = pyproj.Transformer.from_crs(4326, 32734, always_xy=True).transform(model.lon_off, model.lat_off)
+    left, top = east - count / 2 * step, north + count / 2 * step
+    x, y = np.meshgrid(left + step * (np.arange(count) + 0.5), top - step * (np.arange(count) + 0.5))
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), count, count, 1, gdal.GDT_Float64)
+    dataset.SetProjection(pyproj.CRS.from_epsg(32734).to_wkt())
+    dataset.SetGeoTransform((left, step, 0, top, 0, -step))
+    dataset.WriteArray(rough(x, y))
+    dataset = None
+    return Surface.open(path, "ellipsoid", fill="mask")
+
+
+def image_points(count: int = MANY) -> np.ndarray:
+    image = np.random.default_rng(1).uniform(20, 580, (count, 2))
+    image[::500] = np.nan
+    image[1::500] += 5000.0  # far off the DEM
+    return image
+
+
+def test_many_rays_are_the_rays_one_by_one(model, surface, monkeypatch):
+    # Without the points far away the lattice is dense enough for these few points.
+    image = image_points()
+    image[1::500] = np.nan
+    used = []
+    original = rays._march_many
+    monkeypatch.setattr(rays, "_march_many", lambda *given: used.append(original(*given)) or used[-1])
+    many = intersect(model, image, surface)
+    assert used[0] is not None
+    few = np.concatenate([intersect(model, part, surface) for part in np.array_split(image, 4)])
+    np.testing.assert_array_equal(np.isnan(many), np.isnan(few))
+    # Both stop within 1 mm of the terrain in height; on a ray 35 degrees off nadir over slopes of 1.3 that is 1 cm.
+    good = np.isfinite(many[:, 0])
+    assert good.mean() > 0.99
+    assert np.abs(many - few)[good, 2].max() < 0.02
+    # The answer lies on the ray and on the terrain.
+    assert np.abs(model.ground_to_image(many[good]) - image[good]).max() < 1e-6
+    assert np.abs(surface.heights(many[good, :2], model.crs) - many[good, 2]).max() < 0.01
+
+
+def test_points_far_apart_fall_back_to_the_exact_way(model, surface):
+    image = image_points()
+    ground = intersect(model, image, surface)
+    assert np.isnan(ground[::500]).all()
+    assert np.isnan(ground[1::500]).all()
+    assert np.isfinite(ground[2::500]).all()
+
+
+def test_the_surface_may_be_in_any_crs(tmp_path, model, surface):
+    """The same terrain in geographic coordinates: a plane, which both CRSs hold exactly enough."""
+    path = tmp_path / "plane.tif"
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), 100, 100, 1, gdal.GDT_Float64)
+    dataset.SetProjection(pyproj.CRS.from_epsg(4326).to_wkt())
+    dataset.SetGeoTransform((19.98, 0.0004, 0, -29.98, 0, -0.0004))
+    dataset.WriteArray(np.full((100, 100), 512.5))
+    dataset = None
+    image = np.random.default_rng(2).uniform(100, 500, (MANY, 2))
+    ground = intersect(model, image, Surface.open(path, "ellipsoid"))
+    np.testing.assert_allclose(ground, model.image_to_ground(image, 512.5), atol=2e-8)
