@@ -86,6 +86,20 @@ class _Exact:
         low, high = (self._to_model(np.stack([x, y, np.full(3, height)], axis=1)) for height in (0.0, 5000.0))
         return bool(np.array_equal(low[:, :2], high[:, :2]) and (low[:, 2] == 0).all() and (high[:, 2] == 5000).all())
 
+    def domain(self) -> tuple[float, float, float, float]:
+        """Output pixels (left, top, right, bottom) under the box in which the model is meant to be used."""
+        centre, half = self._model.domain
+        steps = np.linspace(-1.0, 1.0, 33)
+        x, y = np.meshgrid(centre[0] + half[0] * steps, centre[1] + half[1] * steps)
+        box = np.stack([x.ravel(), y.ravel(), np.full(x.size, centre[2])], axis=1)
+        ground = GroundTransform(self._model.crs, self._grid.crs)(box)
+        ground = ground[np.isfinite(ground).all(axis=1)]
+        if not len(ground):
+            return -np.inf, -np.inf, np.inf, np.inf
+        columns = (ground[:, 0] - self._grid.left) / self._grid.dx
+        rows = (self._grid.top - ground[:, 1]) / self._grid.dy
+        return float(columns.min()), float(rows.min()), float(columns.max()), float(rows.max())
+
     def image(self, columns: Array, rows: Array, heights: Array) -> Array:
         """Source image points ``(..., levels, 2)`` of output positions ``(...)`` at heights ``(..., levels)``."""
         x, y = self._grid.xy(columns, rows)
@@ -159,6 +173,7 @@ class Lattices:
     ) -> None:
         self._exact = _Exact(model, surface, grid)
         self._size = np.array(size)
+        self._domain = self._exact.domain()
         self._tolerance, self._reach, self._averages = tolerance, reach, averages
         self._lock = threading.Lock()
         self.worst, self.finest, self.refined = 0.0, REFINEMENTS[0][0], 0
@@ -262,7 +277,16 @@ class Lattices:
             errors = np.hypot(*np.moveaxis(image - exact, 2, 0)) + parallax * np.abs(uv - exact_uv).sum(axis=2)
         # A point that one of them puts into the image and the other nowhere is infinitely wrong.
         errors[np.isnan(errors)] = np.inf
-        return np.where(inside[0] | inside[1], errors, 0.0).max(axis=1)
+        worst = np.where(inside[0] | inside[1], errors, 0.0).max(axis=1)
+        for k, block in enumerate(blocks):
+            if block.spacing > 1 and self._in_domain(block) and np.isnan(block.lattice).any():
+                worst[k] = np.inf  # the scene may hide between nodes that lie outside of the model's domain
+        return worst
+
+    def _in_domain(self, block: Block) -> bool:
+        left, top, right, bottom = self._domain
+        column, row = block.column * BLOCK, block.row * BLOCK
+        return left < column + BLOCK and right > column and top < row + BLOCK and bottom > row
 
 
 class Terrain:

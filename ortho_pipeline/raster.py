@@ -192,33 +192,21 @@ class Grid:
         return self.left + np.asarray(columns) * self.dx, self.top - np.asarray(rows) * self.dy
 
 
-class RasterSource:
-    """A raster that several threads read windows of.
+class _RasterFile:
+    """One file of a `RasterSource`, with a GDAL handle for each thread."""
 
-    Attributes
-    ----------
-    width, height, count : int
-    dtype : numpy.dtype
-        Common type of all bands.
-    nodata : tuple of float or None, per band
-    validity : {'all', 'nodata', 'mask', 'alpha'}
-        How the raster says which of its pixels are valid. NaN is never valid.
-    """
-
-    def __init__(self, path: str | os.PathLike[str], *, allow_network: bool = False) -> None:
+    def __init__(self, path: str | os.PathLike[str], allow_network: bool) -> None:
         self.path = os.fspath(path)
         self._allow_network = allow_network
         self._local = threading.local()
         dataset = self.dataset
         self.width, self.height, self.count = dataset.RasterXSize, dataset.RasterYSize, dataset.RasterCount
-        bands = [dataset.GetRasterBand(i + 1) for i in range(self.count)]
-        types = {gdal.GetDataTypeName(band.DataType) for band in bands}
+        bands = self.bands
         if any(gdal.DataTypeIsComplex(band.DataType) for band in bands):
             raise InputError(
                 "complex pixels are not resampled", file=self.path, remedy="split them into real bands first"
             )
         self.dtype = np.result_type(*(_numpy_type(band.DataType) for band in bands))
-        self.type_names = sorted(types)
         self.nodata = tuple(_nodata(band, self.dtype) for band in bands)
         self.palette = any(band.GetColorTable() is not None for band in bands)
         flags = bands[0].GetMaskFlags()
@@ -236,11 +224,14 @@ class RasterSource:
             self._local.dataset = open_dataset(self.path, allow_network=self._allow_network)
         return self._local.dataset
 
-    def read(self, left: int, top: int, width: int, height: int) -> NDArray[Any]:
-        """Return the pixels ``(count, height, width)`` of a window that lies inside the raster."""
-        pixels = np.empty((self.count, height, width), dtype=self.dtype)
-        self._io(self.dataset.ReadAsArray, left, top, width, height, buf_obj=pixels)
-        return pixels
+    @property
+    def bands(self) -> list[gdal.Band]:
+        """The GDAL bands of the calling thread."""
+        return [self.dataset.GetRasterBand(i + 1) for i in range(self.dataset.RasterCount)]
+
+    def read(self, left: int, top: int, out: NDArray[Any]) -> None:
+        """Fill `out` ``(count, height, width)`` with a window that lies inside the raster."""
+        self._io(self.dataset.ReadAsArray, left, top, out.shape[2], out.shape[1], buf_obj=out)
 
     def read_valid(self, left: int, top: int, pixels: NDArray[Any]) -> NDArray[np.bool_] | None:
         """Return which of the `pixels` of a window ``(count, h, w)`` are valid; None where all are."""
@@ -252,7 +243,7 @@ class RasterSource:
                 if value is not None and not math.isnan(value):
                     np.not_equal(pixels[band], pixels.dtype.type(value), out=valid[band])
         elif self.validity in ("mask", "alpha"):
-            mask = self._io(self.dataset.GetRasterBand(1).GetMaskBand().ReadAsArray, left, top, width, height)
+            mask = self._io(self.bands[0].GetMaskBand().ReadAsArray, left, top, width, height)
             valid = np.broadcast_to(mask != 0, pixels.shape).copy()
         if pixels.dtype.kind == "f":
             numbers = ~np.isnan(pixels)
@@ -269,6 +260,85 @@ class RasterSource:
                 file=self.path,
                 remedy="the file is cut off or damaged: copy it again",
             ) from error
+
+
+class RasterSource:
+    """A raster that several threads read windows of; it may lie in several files, a band or some in each.
+
+    Images of one scene that have the same size (a file for each band, as vendors deliver them) are one source: their
+    bands share one pass through the geometry.
+
+    Parameters
+    ----------
+    path, *others : path
+        The files, in the order of their bands.
+
+    Attributes
+    ----------
+    width, height, count : int
+    dtype : numpy.dtype
+        Common type of all bands.
+    nodata : tuple of float or None, per band
+    validity : {'all', 'nodata', 'mask', 'alpha'}
+        How the raster says which of its pixels are valid. NaN is never valid.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be used, or is not as large as the first.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], *others: str | os.PathLike[str], allow_network: bool = False
+    ) -> None:
+        self._files = [_RasterFile(name, allow_network) for name in (path, *others)]
+        first = self._files[0]
+        self.path, self.width, self.height = first.path, first.width, first.height
+        for file in self._files:
+            if (file.width, file.height) != (self.width, self.height):
+                raise InputError(
+                    f"{file.width} x {file.height} pixels, but {self.path} has {self.width} x {self.height}",
+                    file=file.path,
+                    remedy="rectify images of different sizes one by one",
+                )
+        self.count = sum(file.count for file in self._files)
+        self.dtype = np.result_type(*(file.dtype for file in self._files))
+        self.nodata = tuple(value for file in self._files for value in file.nodata)
+        self.palette = any(file.palette for file in self._files)
+        kinds = {file.validity for file in self._files}
+        self.validity = kinds.pop() if len(kinds) == 1 else "mask"
+
+    @property
+    def dataset(self) -> gdal.Dataset:
+        """The GDAL dataset of the first file for the calling thread."""
+        return self._files[0].dataset
+
+    @property
+    def bands(self) -> list[gdal.Band]:
+        """The GDAL bands of the calling thread."""
+        return [band for file in self._files for band in file.bands]
+
+    def read(self, left: int, top: int, width: int, height: int) -> NDArray[Any]:
+        """Return the pixels ``(count, height, width)`` of a window that lies inside the raster."""
+        pixels, start = np.empty((self.count, height, width), dtype=self.dtype), 0
+        for file in self._files:
+            file.read(left, top, pixels[start : start + file.count])
+            start += file.count
+        return pixels
+
+    def read_valid(self, left: int, top: int, pixels: NDArray[Any]) -> NDArray[np.bool_] | None:
+        """Return which of the `pixels` of a window ``(count, h, w)`` are valid; None where all are."""
+        if len(self._files) == 1:
+            return self._files[0].read_valid(left, top, pixels)
+        valid, start = None, 0
+        for file in self._files:
+            stop = start + file.count
+            part = file.read_valid(left, top, pixels[start:stop])
+            if part is not None:
+                valid = np.ones(pixels.shape, dtype=bool) if valid is None else valid
+                valid[start:stop] = part
+            start = stop
+        return valid
 
 
 def _numpy_type(gdal_type: int) -> np.dtype[Any]:
@@ -309,8 +379,7 @@ class Profile:
         Nodata stays nodata (one value for all bands, as GeoTIFF has it), alpha stays alpha; everything else gets a
         mask, because no pixel value may be given a meaning that it did not have.
         """
-        bands = [source.dataset.GetRasterBand(i + 1) for i in range(source.count)]
-        values = set(source.nodata)
+        bands, values = source.bands, set(source.nodata)
         if source.validity == "nodata" and len(values) == 1:
             validity, nodata = "nodata", source.nodata[0]
         else:
@@ -501,93 +570,3 @@ def _creation_options(driver: str, given: dict[str, str], threads: int) -> dict[
             defaults.pop("PREDICTOR")
             defaults.pop("LEVEL")
     return defaults | given
-
-
-def warp_with_gdal(
-    source: RasterSource,
-    rpc: Mapping[str, str],
-    heights: tuple[NDArray[np.float64], Sequence[float], pyproj.CRS] | float,
-    grid: Grid,
-    path: str | os.PathLike[str],
-    *,
-    resampling: str = "bilinear",
-    driver: str = "COG",
-    creation_options: Mapping[str, str] | None = None,
-    memory: int = 512_000_000,
-    threads: int = 1,
-    progress: Any = None,
-) -> int:
-    """Write the orthoimage of `source` by GDAL's own warper, exactly; return how many pixels are valid.
-
-    Parameters
-    ----------
-    rpc : mapping
-        GDAL's ``RPC`` metadata domain; it takes the place of the source's own, and of its GCPs.
-    heights : (array (rows, columns), geotransform, crs) or float
-        Ellipsoidal heights of the surface with NaN for voids, or one height.
-    """
-    view = gdal.GetDriverByName("VRT").CreateCopy("", source.dataset)
-    view.SetGCPs([], "")
-    view.SetMetadata(dict(rpc), "RPC")
-    profile = Profile.of(source)
-    dem = f"/vsimem/ortho_dem_{os.getpid()}_{threading.get_ident()}.tif"
-    options = ["METHOD=RPC"]  # GDAL would otherwise prefer GCPs
-    if isinstance(heights, tuple):
-        _write_dem(dem, *heights)
-        options += [f"RPC_DEM={dem}", "RPC_DEMINTERPOLATION=bilinear", "RPC_DEM_APPLY_VDATUM_SHIFT=NO"]
-    else:
-        options += [f"RPC_HEIGHT={heights!r}"]
-    writer = RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads)
-    with writer, writer.disk_errors():
-        target = writer.path.with_name(f".{writer.path.stem}.gdal.part.tif")
-        try:
-            _warp_exactly(view, target, source, profile, grid, options, resampling, memory, threads, progress)
-            return writer.copy(target)
-        finally:
-            target.unlink(missing_ok=True)
-            gdal.Unlink(dem)
-
-
-def _write_dem(path: str, heights: NDArray[np.float64], geotransform: Sequence[float], crs: pyproj.CRS) -> None:
-    rows, columns = heights.shape
-    dataset = gdal.GetDriverByName("GTiff").Create(path, columns, rows, 1, gdal.GDT_Float64)
-    dataset.SetProjection(crs.to_wkt())
-    dataset.SetGeoTransform(tuple(geotransform))
-    dataset.GetRasterBand(1).SetNoDataValue(-1e6)
-    dataset.GetRasterBand(1).WriteArray(np.where(np.isnan(heights), -1e6, heights))
-
-
-def _warp_exactly(
-    view: gdal.Dataset,
-    target: Path,
-    source: RasterSource,
-    profile: Profile,
-    grid: Grid,
-    transformer_options: list[str],
-    resampling: str,
-    memory: int,
-    threads: int,
-    progress: Any,
-) -> None:
-    callback = None if progress is None else (lambda share, *_: progress(share) or 1)
-    gdal.Warp(
-        str(target),
-        view,
-        format="GTiff",
-        outputBounds=grid.extent,
-        width=grid.width,
-        height=grid.height,
-        dstSRS=grid.crs.to_wkt(),
-        transformerOptions=transformer_options,
-        errorThreshold=0,
-        resampleAlg=resampling,
-        dstAlpha=profile.validity == "mask",
-        dstNodata=profile.nodata,
-        multithread=threads > 1,
-        warpMemoryLimit=memory // 2,
-        # Without these two the values depend on how the warper cuts the image into chunks.
-        warpOptions=["XSCALE=1", "YSCALE=1", f"NUM_THREADS={threads}", "INIT_DEST=0" if profile.nodata is None else
-                     "INIT_DEST=NO_DATA"],
-        creationOptions=["TILED=YES", "BIGTIFF=IF_SAFER"],
-        callback=callback,
-    )  # fmt: skip

@@ -22,9 +22,10 @@ from ortho_pipeline import kernels
 from ortho_pipeline.crs import GroundTransform
 from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.gdal_engine import warp_with_gdal
 from ortho_pipeline.lattice import BLOCK, Block, Lattices, Terrain
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.raster import Grid, Profile, RasterSource, RasterWriter, limit_cache, warp_with_gdal
+from ortho_pipeline.raster import Grid, Profile, RasterSource, RasterWriter, limit_cache
 
 #: Side of a tile, the piece of work of a thread.
 TILE = 4 * BLOCK

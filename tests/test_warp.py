@@ -292,6 +292,16 @@ def test_lattice_is_refined_until_it_holds_the_tolerance(scene, tmp_path):
     assert result.refined_blocks > 0
 
 
+def test_a_scene_smaller_than_a_lattice_cell_is_found(scene, tmp_path):
+    """An overview of 10 m pixels in a wide grid: the scene lies between nodes that the model cannot project."""
+    source, wide = RasterSource(scene.write(np.full((1, HEIGHT, WIDTH), 5, np.uint8))), 10.0
+    grid = Grid.of_extent(UTM, (EAST - 3000, NORTH - 2500, EAST + 2600, NORTH + 2100), (wide, wide))
+    result = rectify(scene.model, source, Surface.constant(700.0), grid, tmp_path / "o.tif", driver="GTiff")
+    # 700 x 620 pixels of half a metre, to half an output pixel all around.
+    expected = WIDTH * HEIGHT * GSD**2 / wide**2
+    assert result.valid_pixels == pytest.approx(expected, rel=0.06)
+
+
 def test_a_tolerance_that_cannot_be_held_is_an_error_and_leaves_no_file(scene, tmp_path):
     with pytest.raises(ModelError, match="cannot hold"):
         rectify(
@@ -552,3 +562,103 @@ def test_non_square_pixels(scene, tmp_path):
     rectify(scene.model, RasterSource(scene.write(ramps())), scene.surface(), grid, tmp_path / "o.tif", driver="GTiff")
     exact = exact_image(scene.model, tmp_path / "dem.tif", grid)
     assert np.abs(read(tmp_path / "o.tif")[0] - exact)[:, inner(exact)].max() < 0.01
+
+
+# -- several files, large files --------------------------------------------------------------------------------------
+
+
+def test_a_file_for_each_band_is_one_source(scene, tmp_path):
+    pixels = texture(bands=3)
+    together = scene.write(pixels, "all.tif")
+    apart = [scene.write(pixels[k : k + 1], f"band{k}.tif") for k in range(3)]
+    for name, source in (("all", RasterSource(together)), ("apart", RasterSource(*apart))):
+        rectify(scene.model, source, scene.surface(), grid_of(), tmp_path / f"o_{name}.tif", driver="GTiff")
+    np.testing.assert_array_equal(read(tmp_path / "o_all.tif")[0], read(tmp_path / "o_apart.tif")[0])
+
+
+def test_validity_of_files_is_kept_apart(scene, tmp_path):
+    pixels = np.full((1, HEIGHT, WIDTH), 9, np.uint8)
+    holes = pixels.copy()
+    holes[:, 250:350, 300:400] = 0
+    source = RasterSource(scene.write(pixels, "full.tif"), scene.write(holes, "holes.tif", nodata=0))
+    rectify(scene.model, source, scene.surface(), grid_of(200.0), tmp_path / "o.tif", driver="GTiff")
+    (full, part), valid = read(tmp_path / "o.tif")
+    assert valid.all()  # some band has a value everywhere
+    assert set(np.unique(full)) == {9}
+    assert set(np.unique(part)) == {0, 9}
+
+
+def test_files_of_different_sizes_are_no_source(scene):
+    with pytest.raises(InputError, match="one by one"):
+        RasterSource(scene.write(texture(), "a.tif"), scene.write(texture()[:, :-1], "b.tif"))
+
+
+def test_a_sparse_source_of_70000_pixels_a_side_in_little_memory(tmp_path):
+    """A header of 9.8 GB of pixels: only the windows are read, and of the output only what the grid asks for."""
+    side = 70_000
+    path = tmp_path / "huge.tif"
+    options = ["SPARSE_OK=TRUE", "TILED=YES", "BIGTIFF=YES"]
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), side, side, 1, gdal.GDT_UInt16, options)
+    dataset.GetRasterBand(1).WriteArray(np.full((512, 512), 77, np.uint16), side // 2 - 256, side // 2 - 256)
+    dataset = None
+    half = side / 2
+    one, zero = np.eye(20)[0], np.zeros(20)
+    col, row = zero.copy(), zero.copy()
+    col[1], row[2] = 1.0, -1.0
+    scales = half, half, half * GSD / 92_800, half * GSD / 110_900, 500.0
+    model = RPC(half, half, *CENTRE, 700.0, *scales, col, one, row, one)
+    grid = Grid.of_extent(UTM, (EAST - 400, NORTH - 400, EAST + 400, NORTH + 400), (GSD, GSD))
+    result = rectify(model, RasterSource(path), Surface.constant(700.0), grid, tmp_path / "o.tif", driver="GTiff")
+    pixels, _ = read(tmp_path / "o.tif")
+    assert result.valid_pixels == grid.width * grid.height
+    # 512 x 512 source pixels of 77, seen through a slightly rotated grid of the same resolution.
+    assert (pixels == 77).sum() == pytest.approx(512**2, rel=0.01)
+
+
+def test_an_output_that_may_exceed_4_gb_is_a_bigtiff(scene, tmp_path):
+    """BIGTIFF=IF_SAFER by default: GDAL decides by the size of the raster, without compression known."""
+    import struct
+
+    def version(path: Path) -> int:
+        return struct.unpack("<H", path.read_bytes()[2:4])[0]
+
+    source = RasterSource(scene.write(texture()))
+    small = grid_of(20.0)
+    large = Grid(UTM, EAST, NORTH, GSD, GSD, 60_000, 40_000)  # 4.8 GB, none of it over the scene
+    from ortho_pipeline.raster import Profile, RasterWriter
+
+    for grid, expected in ((small, 42), (large, 43)):
+        with RasterWriter(tmp_path / "o.tif", grid, Profile.of(source), driver="GTiff") as writer:
+            writer.write(0, 0, np.zeros((1, 40, 40), np.uint16), np.ones((40, 40), bool))
+        assert version(tmp_path / "o.tif") == expected
+
+
+def test_strong_downsampling_stays_within_the_memory(scene, tmp_path):
+    """An output pixel of 60 source pixels: a block would see 15,000² of them; it is made cell by cell."""
+    path, step = scene.write(texture(np.float32)), 30.0
+    outputs = []
+    for memory in (512_000_000, 200_000):
+        rectify(
+            scene.model, RasterSource(path), Surface.constant(700.0), grid_of(300.0, step), tmp_path / "o.tif",
+            resampling="average", memory=memory, driver="GTiff",
+        )  # fmt: skip
+        outputs.append(read(tmp_path / "o.tif"))
+    np.testing.assert_array_equal(outputs[0][0], outputs[1][0])
+    assert outputs[0][1].all()
+
+
+def test_a_crop_of_the_image_gives_a_crop_of_the_ortho(scene, tmp_path):
+    """Field practice: the model of the whole image, shifted, for a tile of it."""
+    pixels = texture(np.float32)
+    crop = pixels[:, 100:500, 150:600]
+    surface, grid = scene.surface(), grid_of(160.0)
+    rectify(scene.model, RasterSource(scene.write(pixels)), surface, grid, tmp_path / "whole.tif", driver="GTiff")
+    rectify(
+        scene.model.shifted(150, 100), RasterSource(scene.write(crop, "crop.tif")), surface, grid,
+        tmp_path / "crop_o.tif", driver="GTiff",
+    )  # fmt: skip
+    (whole, valid), (part, part_valid) = read(tmp_path / "whole.tif"), read(tmp_path / "crop_o.tif")
+    use = valid & part_valid
+    assert use.mean() > 0.9
+    # Values are the same but where the crop ends; positions differ in the last bit.
+    assert np.quantile(np.abs(whole - part)[0][use], 0.99) < 1e-3
