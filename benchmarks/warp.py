@@ -28,8 +28,12 @@ import numpy as np
 import pyproj
 from osgeo import gdal, osr
 
-from ortho_pipeline.models import RPC
+from ortho_pipeline.dem import Surface
+from ortho_pipeline.models import RPC, SensorModel
+from ortho_pipeline.models.rational import RPC_TERMS
+from ortho_pipeline.raster import Grid, RasterSource
 from ortho_pipeline.rpc import rpc_metadata
+from ortho_pipeline.warp import rectify
 
 gdal.UseExceptions()
 
@@ -235,28 +239,79 @@ def table(runs: dict[str, list[Run]], megapixels: float, base: str) -> str:
     return "\n".join(lines)
 
 
+def alone(job: Job, model: SensorModel | None = None, kernel: str = "bilinear") -> float:
+    """Return the seconds of the warp alone, in this process, with kernels loaded: no start-up, no report."""
+    surface, (xmin, ymin, xmax, ymax) = Surface.open(job.dem, "ellipsoid"), job.extent
+    grid = Grid.of_extent(pyproj.CRS.from_epsg(UTM), (xmin, ymin, xmax, ymax), (GSD, GSD))
+    out = job.folder / "alone.tif"
+    result = rectify(
+        model or job.model(), RasterSource(job.image), surface, grid, out, resampling=kernel, driver="GTiff"
+    )
+    out.unlink()
+    return result.seconds
+
+
 def scaling(folder: Path) -> dict[str, list[Run]]:
-    """Whole processes from 1000² to 24000² source pixels; the largest source is sparse."""
-    runs = {}
+    """From 1000² to 24000² source pixels; the largest source is sparse."""
+    runs: dict[str, list[Run]] = {}
+    alone(Job(folder, 1000).make())
+    print("  source     Mpx out   warp alone   whole process   peak memory")
     for side in (1000, 2000, 4000, 8000, 12000, 24000):
         job = Job(folder, side).make(sparse=side > 12000)
+        warp = statistics.median(alone(job) for _ in range(3))
         runs[f"{side}"] = [measure(ours(job, folder / "ours")) for _ in range(3)]
-        best = min(runs[f"{side}"], key=lambda run: run.wall)
-        print(f"{side:6d}²  {best.wall:7.2f} s  {best.wall / job.megapixels * 1e3:6.1f} ns/px  {best.memory:5.0f} MB")
+        wall = statistics.median(run.wall for run in runs[f"{side}"])
+        memory = max(run.memory for run in runs[f"{side}"])
+        print(
+            f"{side:6d}²  {job.megapixels:9.1f}   {warp / job.megapixels * 1e3:5.1f} ns/px   {wall:8.2f} s"
+            f"   {memory:10.0f} MB"
+        )
     return runs
 
 
+class PlainNumPy(SensorModel):
+    """The RPC as a plugin author might write it: plain NumPy, nothing overridden."""
+
+    kind = "benchmark_plain_numpy"
+
+    def __init__(self, rpc: RPC) -> None:
+        object.__setattr__(self, "rpc", rpc)
+
+    @property
+    def crs(self) -> str:
+        return self.rpc.crs
+
+    @property
+    def domain(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.rpc.domain
+
+    def ground_to_image(self, ground: np.ndarray) -> np.ndarray:
+        rpc = self.rpc
+        lon, lat, h = ((np.asarray(ground) - rpc.domain[0]) / rpc.domain[1]).T
+        terms = [lon**a * lat**b * h**c for a, b, c in RPC_TERMS]
+        sums = [
+            sum(value * term for value, term in zip(part, terms, strict=True))
+            for part in (rpc.col_num, rpc.col_den, rpc.row_num, rpc.row_den)
+        ]
+        col = sums[0] / sums[1] * rpc.col_scale + rpc.col_off
+        return np.stack([col, sums[2] / sums[3] * rpc.row_scale + rpc.row_off], axis=1)
+
+
 def kernels(folder: Path) -> dict[str, list[Run]]:
-    """By kernel, and by number of bands."""
+    """By kernel, number of bands and sensor model: the warp alone."""
     job, runs = Job(folder, 8000).make(), {}
-    for kernel in ("nearest", "bilinear", "cubic", "lanczos", "average"):
-        runs[kernel] = [measure(ours(job, folder / "ours", kernel)) for _ in range(3)]
-    for bands in (1, 4, 8):
-        many = Job(folder, 4000, bands).make()
-        runs[f"{bands} bands of 4000²"] = [measure(ours(many, folder / "ours")) for _ in range(3)]
-    for name, found in runs.items():
-        best = min(found, key=lambda run: run.wall)
-        print(f"{name:18s} {best.wall:7.2f} s wall {best.cpu:7.2f} s CPU {best.memory:5.0f} MB")
+    jobs = {name: (job, None, name) for name in ("nearest", "bilinear", "cubic", "lanczos", "average")}
+    jobs |= {f"{bands} bands of 4000²": (Job(folder, 4000, bands).make(), None, "bilinear") for bands in (1, 4, 8)}
+    jobs |= {"plain NumPy model": (job, PlainNumPy(job.model()), "bilinear")}
+    for name, (which, model, kernel) in jobs.items():
+        alone(which, model, kernel)
+        seconds = [(alone(which, model, kernel), alone(job)) for _ in range(5)]
+        runs[name] = [Run(mine, 0.0, 0.0) for mine, _ in seconds]
+        ratio = statistics.median(mine / base for mine, base in seconds)
+        wall = statistics.median(mine for mine, _ in seconds)
+        print(
+            f"{name:20s} {wall:6.2f} s   {wall / which.megapixels * 1e3:5.1f} ns/px   {ratio:5.2f} x RPC bilinear 8000²"
+        )
     return runs
 
 
