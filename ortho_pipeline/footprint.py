@@ -6,21 +6,26 @@ height range stand in, so a DEM that covers half the scene cannot cut the ortho 
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pyproj
 
 from ortho_pipeline.crs import GroundTransform, ground_transform, utm_crs
-from ortho_pipeline.dem import Surface, intersect
+from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import CoverageError, InputError, ModelError
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster import Grid
+from ortho_pipeline.rays import intersect
 
 #: Points per side of the image at which the DEM is asked for.
 _COVERAGE_SIDE = 65
 _BORDER_SIDE = 65
+#: Samples of the DEM per side of the blocks in which voids are counted.
+_BLOCK = 1024
 
 
 def image_grid(width: int, height: int, side: int) -> Array:
@@ -45,13 +50,23 @@ def border(width: int, height: int, side: int = _BORDER_SIDE) -> Array:
     return ring * (float(width), float(height))
 
 
-def coverage(model: SensorModel, surface: Surface, width: int, height: int) -> float:
-    """Return the share (0 to 1) of the scene's footprint for which the DEM has a height.
+def facing(model: SensorModel, surface: Surface, width: int, height: int) -> Surface:
+    """Return the surface with the seam of a global DEM opposite to the scene; any other surface unchanged."""
+    if surface.constant_height is not None:
+        return surface
+    centre = ground_transform(model.crs, "EPSG:4979")(_centre(model, width, height))
+    return surface.around(float(centre[0, 0]))
 
-    Fill rules of the surface do not count: it is what the DEM itself covers.
+
+def coverage(model: SensorModel, surface: Surface, width: int, height: int) -> float:
+    """Return the share (0 to 1) of the scene's footprint for which the DEM has a height, by a grid of rays.
+
+    Fill rules of the surface do not count: it is what the DEM itself covers. A void between the rays is not seen
+    here but by `voids`.
     """
     if surface.constant_height is not None:
         return 1.0
+    surface = facing(model, surface, width, height)
     image = image_grid(width, height, _COVERAGE_SIDE)
     ground = intersect(model, image, surface)
     met = np.isfinite(ground).all(axis=1)
@@ -60,6 +75,42 @@ def coverage(model: SensorModel, surface: Surface, width: int, height: int) -> f
         raise ModelError("no image point meets the ground: the model does not belong to this image")
     own = surface.coverage(ground[met, :2], model.crs)
     return own * float(met.sum() / projects.sum())
+
+
+@dataclass(frozen=True)
+class Voids:
+    """Samples of the DEM without a height within the footprint: how many, and their share (0 to 1) of it."""
+
+    count: int
+    share: float
+
+
+def voids(model: SensorModel, surface: Surface, width: int, height: int) -> Voids:
+    """Count every sample of the DEM within the footprint that has no height of its own, whatever the fill rule.
+
+    Where rays leave the DEM, the convex hull of both ends of the height range stands for the footprint.
+    """
+    if surface.constant_height is not None:
+        return Voids(0, 0.0)
+    import shapely
+
+    surface = copy.copy(facing(model, surface, width, height))
+    surface.fill = "mask"
+    ground = ground_transform(model.crs, surface.crs)(footprint(model, surface, width, height))
+    samples = surface.samples_at(ground[:, :2])
+    outline = shapely.Polygon(samples)
+    if len(samples) != len(border(width, height)) or not outline.is_valid:
+        outline = shapely.MultiPoint(samples).convex_hull
+    shapely.prepare(outline)
+    left, top, right, bottom = (int(value) for value in (*np.floor(outline.bounds[:2]), *np.ceil(outline.bounds[2:])))
+    count = 0
+    for v in range(top, bottom + 1, _BLOCK):
+        for u in range(left, right + 1, _BLOCK):
+            heights = surface.window(u, v, min(_BLOCK, right + 1 - u), min(_BLOCK, bottom + 1 - v))
+            rows, columns = np.nonzero(np.isnan(heights))
+            if len(rows):
+                count += int(shapely.contains_xy(outline, columns + u, rows + v).sum())
+    return Voids(count, min(1.0, count / max(outline.area, 1.0)))
 
 
 def require_coverage(share: float, surface: Surface) -> None:
@@ -113,7 +164,7 @@ def footprint(model: SensorModel, surface: Surface, width: int, height: int) -> 
     Points on the surface, and where a ray leaves the DEM, points at both ends of the model's height range.
     """
     ring = border(width, height)
-    ground = intersect(model, ring, surface)
+    ground = intersect(model, ring, facing(model, surface, width, height))
     lost = ~np.isfinite(ground).all(axis=1)
     parts = [ground]
     if lost.any():

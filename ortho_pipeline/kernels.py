@@ -314,17 +314,7 @@ def warp_block(
             rows,
         )
         line, count = row - first_row, last - first
-        # Between `begin` and `end` no neighbour is missing; the rest of the row is done with care.
-        begin, end = 0, 0 if masked else count
-        while begin < end and not (low_col <= columns[begin] < high_col and low_row <= rows[begin] < high_row):
-            begin += 1
-        while end > begin and not (low_col <= columns[end - 1] < high_col and low_row <= rows[end - 1] < high_row):
-            end -= 1
-        inside = True
-        for k in range(begin, end):
-            inside &= (columns[k] >= low_col) & (columns[k] < high_col) & (rows[k] >= low_row) & (rows[k] < high_row)
-        if not inside:
-            begin, end = count, count
+        begin, end = (0, 0) if masked else _span(columns, rows, low_col, high_col, low_row, high_row)
         for band in range(bands if end > begin else 0):
             _row_inside(
                 kernel, source[band], columns[begin:end], rows[begin:end], left, top, low, high, integer, box,
@@ -339,6 +329,20 @@ def warp_block(
                     reach, box
                 )  # fmt: skip
     return short
+
+
+@_jit
+def _span(columns, rows, low_col, high_col, low_row, high_row):
+    """Return where the part of a row begins and ends in which no neighbour is missing; the rest is done with care."""
+    begin, end = 0, columns.size
+    while begin < end and not (low_col <= columns[begin] < high_col and low_row <= rows[begin] < high_row):
+        begin += 1
+    while end > begin and not (low_col <= columns[end - 1] < high_col and low_row <= rows[end - 1] < high_row):
+        end -= 1
+    inside = True
+    for k in range(begin, end):
+        inside &= (columns[k] >= low_col) & (columns[k] < high_col) & (rows[k] >= low_row) & (rows[k] < high_row)
+    return (begin, end) if inside else (0, 0)
 
 
 @_inline

@@ -43,8 +43,16 @@ class PointOptions:
         Where CSV files count pixels from.
     check : str, optional
         ``every:N`` or ``ids:a,b``: which points only check.
+    select : str, optional
+        ``even:N``, ``cluster:N``, ``ids:a,b`` or ``random:N:seed``: which points control; the others check.
     correction : {'none', 'shift', 'shift-drift', 'affine'}, optional
         Default: shift if there are control points.
+    fit_model : str, optional
+        A model family (`ortho models`) that is fitted to the points alone, in place of the image's own model.
+    model_crs : str, optional
+        Ground CRS of that family: geocentric, geographic, utm or EPSG:n; that of the points by default.
+    prune : bool
+        Remove parameters that the points do not justify.
     """
 
     gcps: str | os.PathLike[str] | None = None
@@ -52,7 +60,11 @@ class PointOptions:
     vertical: str | None = None
     pixel_origin: str = "corner"
     check: str | None = None
+    select: str | None = None
     correction: str | None = None
+    fit_model: str | None = None
+    model_crs: str | None = None
+    prune: bool = False
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,11 @@ Every function here takes options, does the work and returns a result with `to_j
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -17,27 +17,22 @@ from typing import Any
 import numpy as np
 import pyproj
 
+from ortho_pipeline import compare as comparing
 from ortho_pipeline import crs as crs_module
-from ortho_pipeline import dem, footprint, plugins, raster, report, rpc, warp
-from ortho_pipeline.crs import Vertical, parse_crs
+from ortho_pipeline import dem, footprint, gcp_export, inputs, plugins, raster, report, rpc, warp
+from ortho_pipeline.crs import parse_crs
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import Fit
-from ortho_pipeline.estimation import fit as fit_model
-from ortho_pipeline.files import sha256, write_text
+from ortho_pipeline.files import write_text
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.model_file import SavedModel, read_model_file, write_model_file
-from ortho_pipeline.models import ImageCorrection, SensorModel
+from ortho_pipeline.inputs import has_surface, open_scene, open_surface
+from ortho_pipeline.model_file import SavedModel, write_model_file
+from ortho_pipeline.models import SensorModel, families
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, read_points
+from ortho_pipeline.scene_fit import Adjusted, adjust, heights_around, heights_where_wanted, open_adjustable
 from ortho_pipeline.swaps import refuse_swapped
 
 SCHEMA_VERSION = 1
-#: Side-cars that GDAL would attach to an image of this stem, whatever the image itself says.
-SIDE_CARS = ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", "_metadata.txt", ".IMD")
-#: In place of a file of points: the ground control points that the image itself holds.
-OWN_POINTS = "own"
-FORMATS = ("rpctxt", "rpb", "vrt", "tif")
-
 
 # -- results ---------------------------------------------------------------------------------------------------------
 
@@ -49,6 +44,7 @@ class FitResult:
     scene: Scene
     fit: Fit
     warnings: tuple[str, ...] = ()
+    removed: tuple[Mapping[str, Any], ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho fit --json`` (docs/formats.md)."""
@@ -60,6 +56,7 @@ class FitResult:
             "model": document.pop("model"),
             "model_source": self.scene.model_source,
             **document,
+            "removed": [dict(one) for one in self.removed],
         }
 
 
@@ -75,6 +72,25 @@ class Result:
         """Return files and document as JSON values."""
         files = {name: str(path) for name, path in self.files.items()}
         return {"schema_version": SCHEMA_VERSION, "files": files, **self.document}
+
+
+@dataclass(frozen=True)
+class CompareResult:
+    """A comparison of models, and the report that was written, if any."""
+
+    scene: Scene
+    comparison: comparing.Comparison
+    files: Mapping[str, Path] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of ``ortho compare --json`` (docs/formats.md)."""
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "image": str(self.scene.path),
+            "sensor": self.scene.sensor,
+            **self.comparison.to_json(),
+            "files": {name: str(path) for name, path in self.files.items()},
+        }
 
 
 # -- commands --------------------------------------------------------------------------------------------------------
@@ -122,6 +138,11 @@ def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) 
     }
 
 
+def models() -> list[dict[str, Any]]:
+    """List the classical model families, simple to complex, and what a scene's own model can be corrected by."""
+    return [family.to_json() for family in families()]
+
+
 def fit(
     image: str | os.PathLike[str],
     points: PointOptions,
@@ -137,10 +158,73 @@ def fit(
     """
     if points.gcps is None:
         raise InputError("there are no points to fit to", field="--gcps", remedy="give a file of points with --gcps")
-    opened = open_scene(image, scene)
-    heights = open_surface(surface, scene.allow_network) if _is_given(surface) else None
-    adjusted = _adjust(opened, points, scene, heights)
-    return FitResult(opened, adjusted, _warnings(opened, adjusted, heights))
+    opened = open_adjustable(image, scene, points)
+    heights = open_surface(surface, scene.allow_network) if has_surface(surface) else None
+    adjusted = adjust(opened, points, scene, heights)
+    return FitResult(
+        adjusted.scene, adjusted.fit, adjusted.warnings(heights), removed=tuple(adjusted.removed_json())
+    )  # fmt: skip
+
+
+def compare(
+    image: str | os.PathLike[str],
+    points: PointOptions,
+    *,
+    models: str = "all",
+    folder: str | os.PathLike[str] | None = None,
+    scene: SceneOptions = SceneOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+    command: str | None = None,
+) -> CompareResult:
+    """Fit many models to the same points, and recommend one.
+
+    Parameters
+    ----------
+    models : str
+        ``all`` or names separated by commas: those of `models`, and the image's own model with its corrections
+        (``rpc``, ``rpc+shift``, ``rpc+shift-drift``, ``rpc+affine``).
+    folder : path, optional
+        Where the report of the recommended model goes, with the comparison in it.
+
+    Raises
+    ------
+    InputError
+        If there are no points, a model is unknown, or a file is wrong. A model that cannot be fitted is a row.
+    """
+    if points.gcps is None:
+        raise InputError("there are no points to fit to", field="--gcps", remedy="give a file of points with --gcps")
+    if points.correction is not None or points.fit_model is not None:
+        raise InputError("compare takes its models from --models", field="--models", remedy="for example all")
+    opened = inputs.open_image(image, scene, needs_model=False)
+    own = opened.model if opened.models else None
+    names = comparing.choose_models(models, own)
+    heights = open_surface(surface, scene.allow_network) if has_surface(surface) else None
+    given = inputs.read_control(opened, points, scene.allow_network)
+    if own is not None:
+        refuse_swapped(own, given, opened.height)
+    given = heights_where_wanted(given, heights, *names)
+    compared = comparing.compare(
+        given, names, own=own, size=(opened.width, opened.height), crs=points.model_crs,
+        heights=heights_around(given, heights),
+    )  # fmt: skip
+    result = CompareResult(opened, compared)
+    best = compared.best
+    if folder is None or best is None or best.fit is None:
+        return result
+    stem = Path(image).stem
+    files = {name: Path(folder) / f"{stem}{_ENDINGS[name]}" for name in ("residuals", "style", "report", "html")}
+    inputs.check_paths(files, image, scene, points, surface)
+    if best.model in {family.name for family in families()}:
+        opened = replace(opened, models={best.model: best.fit.model}, model_source="control points")
+    adjusted = Adjusted(opened, best.fit)
+    hashed = inputs.hash_inputs(image, scene, points, surface)
+    record = inputs.provenance(opened, points, heights, hashed, command, {"scene": scene, "surface": surface})
+    document = report.build_report(
+        scene=opened, fit=best.fit, surface=heights, comparison=result.to_json(), provenance=record,
+        warnings=adjusted.warnings(heights),
+    )  # fmt: skip
+    _write_report(document, best.fit, files)
+    return replace(result, files=files)
 
 
 def rectify(
@@ -152,6 +236,7 @@ def rectify(
     surface: SurfaceOptions = SurfaceOptions(),
     output: OutputOptions = OutputOptions(),
     progress: Callable[[float], None] | None = None,
+    command: str | None = None,
 ) -> Result:
     """Make the orthoimage of a scene, its adjusted model in every format, and the accuracy report.
 
@@ -160,7 +245,8 @@ def rectify(
     Returns
     -------
     Result
-        `files` has ortho, model, rpc, vrt, residuals (with points only), report and html.
+        `files` has ortho, model, rpc, vrt (unless no RPC stands for the model), residuals and style (with points
+        only), report and html.
 
     Raises
     ------
@@ -168,39 +254,37 @@ def rectify(
         For whatever the user can correct: no heights, a DEM that does not cover the scene, a path that is read and
         written, an old side-car that would attach to the ortho.
     """
-    stem = Path(image).stem
-    files = {name: Path(folder) / f"{stem}{ending}" for name, ending in _RECTIFIED.items()}
-    _check_paths(files, image, scene, points, surface)
-    if not _is_given(surface):
+    files = {name: Path(folder) / f"{Path(image).stem}{ending}" for name, ending in _ENDINGS.items()}
+    inputs.check_paths(files, image, scene, points, surface)
+    if not has_surface(surface):
         raise InputError(
             "an orthoimage needs heights",
             field="--dem",
             remedy="give --dem FILE, or --height METRES above the ellipsoid for flat ground",
         )
-    opened = open_scene(image, scene)
+    opened = open_adjustable(image, scene, points)
     heights = open_surface(surface, scene.allow_network)
-    adjusted = _adjust(opened, points, scene, heights)
-    model = _result_of(adjusted)
-    share = footprint.coverage(model, heights, opened.width, opened.height)
-    footprint.require_coverage(share, heights)
+    adjusted = adjust(opened, points, scene, heights)
+    opened, model, size = adjusted.scene, adjusted.model, (opened.width, opened.height)
+    heights = footprint.facing(model, heights, *size)
+    share, notes = _coverage(model, heights, size)
     crs = parse_crs(output.crs) if output.crs else None
-    size = opened.width, opened.height
     grid = footprint.choose_grid(model, heights, size, crs=crs, resolution=output.resolution, extent=output.extent)
-    exported = rpc.export_rpc(model)
+    exported, complaints = _as_rpc(model)
     source = raster.RasterSource(image, allow_network=scene.allow_network)
-    warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
-    provenance = _provenance(image, opened, points, heights)
-    _write_models(model, exported, opened, source, files, {**provenance, "adjustment": adjusted.to_json()})
-    document = report.build_report(
-        scene=opened, fit=adjusted, exported=exported, surface=heights, coverage=share, grid=grid, warp=warped,
-        provenance=provenance, warnings=[*_warnings(opened, adjusted, heights), *exported.warnings],
+    with ThreadPoolExecutor(1) as pool:
+        hashing = pool.submit(inputs.hash_inputs, image, scene, points, surface)
+        warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
+        hashed = hashing.result()
+    record = inputs.provenance(
+        opened, points, heights, hashed, command, {"scene": scene, "surface": surface, "output": output}
     )  # fmt: skip
-    if len(adjusted.points):
-        write_text(files["residuals"], json.dumps(report.residuals_geojson(adjusted), allow_nan=False))
-    else:
-        del files["residuals"]
-    report.write_report_json(document, files["report"])
-    report.write_report_html(document, files["html"], ortho=files["ortho"])
+    _write_models(model, exported, opened, source, files, {**record, "adjustment": adjusted.fit.to_json()})
+    document = report.build_report(
+        scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=share, grid=grid, warp=warped,
+        provenance=record, warnings=[*adjusted.warnings(heights), *notes, *complaints],
+    )  # fmt: skip
+    _write_report(document, adjusted.fit, files)
     return Result(files, {"report": document}, report.summary_text(document))
 
 
@@ -208,43 +292,67 @@ def export(
     image: str | os.PathLike[str],
     folder: str | os.PathLike[str],
     *,
-    formats: Sequence[str] = FORMATS,
+    formats: Sequence[str] = gcp_export.FORMATS[:4],
     scene: SceneOptions = SceneOptions(),
     points: PointOptions = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
+    force: bool = False,
 ) -> Result:
-    """Write the model of a scene, adjusted if there are points, as RPC text, RPB, VRT and tagged GeoTIFF.
+    """Write the model of a scene, adjusted if there are points, in formats that GDAL and every GIS read.
+
+    Parameters
+    ----------
+    formats : sequence of str
+        Some of `gcp_export.FORMATS`: rpc-txt, rpb, vrt, tag, gcp, gcp-tag, geolocation.
+    force : bool
+        Accept an RPC that stands for the model only to more than 0.1 px.
 
     Returns
     -------
     Result
-        `document` says whether the RPC is exact, and its largest error in pixels if it is not.
+        `document` says whether the RPC is exact, and the largest error of everything that is not.
+
+    Raises
+    ------
+    InputError
+        For an unknown format, a geolocation without heights, and as `fit`.
     """
-    unknown = sorted(set(formats) - set(FORMATS))
-    if unknown:
-        raise InputError(
-            f"no format is called {', '.join(unknown)}", field="--as", remedy=f"one of {', '.join(FORMATS)}"
-        )
+    formats = gcp_export.check_formats(formats)
     stem = Path(image).stem
-    endings = {"rpctxt": "_RPC.TXT", "rpb": ".RPB", "vrt": ".vrt", "tif": "_rpc.tif"}
-    files = {name: Path(folder) / f"{stem}{endings[name]}" for name in formats}
-    _check_paths(files, image, scene, points, surface)
-    opened = open_scene(image, scene)
-    heights = open_surface(surface, scene.allow_network) if _is_given(surface) else None
-    model = _result_of(_adjust(opened, points, scene, heights))
-    exported = rpc.export_rpc(model)
+    files = {name: Path(folder) / f"{stem}{gcp_export.ENDINGS[name]}" for name in formats}
+    inputs.check_paths(files, image, scene, points, surface)
+    opened = open_adjustable(image, scene, points)
+    heights = open_surface(surface, scene.allow_network) if has_surface(surface) else None
+    adjusted = adjust(opened, points, scene, heights)
     dataset = raster.open_dataset(image, allow_network=scene.allow_network)
-    writers: dict[str, Callable[[Path], object]] = {
-        "rpctxt": lambda path: rpc.write_rpc_txt(exported.rpc, path),
-        "rpb": lambda path: rpc.write_rpb(exported.rpc, path),
-        "vrt": lambda path: rpc.write_vrt(dataset, exported.rpc, path),
-        "tif": lambda path: rpc.write_tagged_copy(dataset, exported.rpc, path),
-    }
+    size = opened.width, opened.height
+    if heights is not None:
+        heights = footprint.facing(adjusted.model, heights, *size)
+    job = gcp_export.Export(dataset, adjusted.model, size, heights, adjusted.fit.points, force=force)
     for name, path in files.items():
-        writers[name](path)
-    document = {"exact": exported.exact, "max_error_px": exported.max_error_px, "model_source": opened.model_source}
-    how = "exact" if exported.exact else f"refitted, at most {exported.max_error_px:.2g} px off"
-    return Result(files, document, f"RPC of {opened.model_source}: {how}")
+        job.write(name, path)
+    document = {**job.document, "model": adjusted.fit.model_name, "model_source": adjusted.scene.model_source}
+    return Result(files, document, job.summary(adjusted.fit.model_name, adjusted.scene.model_source))
+
+
+def write_plots(report_file: str | os.PathLike[str], folder: str | os.PathLike[str], kind: str = "svg") -> Result:
+    """Write the plots of a report again, each as a picture of its own.
+
+    Parameters
+    ----------
+    report_file : path
+        A ``<stem>_report.json``.
+    kind : {'svg', 'png'}
+
+    Raises
+    ------
+    InputError
+        If it is no report, or PNG is asked for and matplotlib is not installed.
+    """
+    document = report.read_report_json(report_file)
+    stem = Path(report_file).stem
+    files = report.write_plots(document, Path(folder), stem, kind)
+    return Result(files, {}, f"{len(files)} plots of {document['scene']['name']}")
 
 
 def doctor() -> dict[str, Any]:
@@ -271,197 +379,51 @@ def doctor() -> dict[str, Any]:
 
 # -- parts -----------------------------------------------------------------------------------------------------------
 
-_RECTIFIED = {
+_ENDINGS = {
     "ortho": "_ortho.tif",
     "model": "_model.json",
     "rpc": "_RPC.TXT",
     "vrt": ".vrt",
     "residuals": "_residuals.geojson",
+    "style": "_residuals.qml",
     "report": "_report.json",
     "html": "_report.html",
 }
 
 
-def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> Scene:
-    """Open an image with its sensor, or with the model of a model file.
+def _coverage(model: SensorModel, surface: dem.Surface, size: tuple[int, int]) -> tuple[float, list[str]]:
+    """Return the share of the scene that has heights, and a warning about voids that are too small to stop for.
 
     Raises
     ------
-    InputError
-        If no sensor recognises the image, or the model file belongs to an image of another size.
+    CoverageError
+        If the DEM leaves a part of the scene without heights and nothing was said about the rest.
     """
-    if options.model is None:
-        given = {} if options.rpc is None else {"rpc": options.rpc}
-        return plugins.open_scene(image, options.sensor, given, allow_network=options.allow_network)
-    if options.rpc is not None or options.sensor is not None:
-        raise InputError(
-            "a model file takes the place of the image's model", field="--model", remedy="leave out --rpc and --sensor"
-        )
-    dataset = raster.open_dataset(image, allow_network=options.allow_network)
-    saved = read_model_file(options.model)
-    size = dataset.RasterXSize, dataset.RasterYSize
-    if saved.size is not None and saved.size != size:
-        raise InputError(
-            f"this model is of an image of {saved.size[0]} x {saved.size[1]} pixels, {Path(image).name} has "
-            f"{size[0]} x {size[1]}",
-            file=options.model,
-            field="size",
-            remedy="give the model file of this image",
-        )
-    return Scene(
-        sensor=saved.sensor or "model file", path=image, width=size[0], height=size[1],
-        models={saved.model.kind: saved.model}, model_source=str(options.model),
-        facts={"delivered_model_source": saved.model_source} if saved.model_source else {},
-    )  # fmt: skip
+    share = footprint.coverage(model, surface, *size)
+    footprint.require_coverage(share, surface)
+    voids = footprint.voids(model, surface, *size)
+    if not voids.count:
+        return share, []
+    what = "have no pixels in the ortho" if surface.fill in ("error", "mask") else "were filled"
+    note = (
+        f"the DEM has {voids.count} samples without a height within the scene ({100 * voids.share:.2g} % of its "
+        f"footprint): these places {what}"
+    )
+    return min(share, 1.0 - voids.share), [note]
 
 
-def open_surface(options: SurfaceOptions, allow_network: bool = False) -> dem.Surface:
-    """Open the DEM, or make a surface of one height.
-
-    Raises
-    ------
-    InputError
-        If both or neither are given, or a rule is unknown.
-    """
-    if options.dem is not None and options.height is not None:
-        raise InputError("--dem and --height exclude each other", field="--height", remedy="give one of them")
-    if options.height is not None:
-        return dem.Surface.constant(options.height)
-    if options.dem is None:
-        raise InputError("there are no heights", field="--dem", remedy="give --dem FILE or --height METRES")
-    vertical = None if options.vertical is None else Vertical.parse(options.vertical)
-    return dem.Surface.open(
-        options.dem, vertical, override=options.override_vertical, fill=options.fill,
-        allow_network=allow_network,
-    )  # fmt: skip
-
-
-def _is_given(options: SurfaceOptions) -> bool:
-    return options.dem is not None or options.height is not None
-
-
-def _adjust(scene: Scene, options: PointOptions, opened: SceneOptions, surface: dem.Surface | None) -> Fit:
-    """Return the adjustment; without points one in which nothing was adjusted."""
-    points = _read(scene, options, opened.allow_network)
-    refuse_swapped(scene.model, points, scene.height)
-    points = _with_heights(points, surface)
-    correction = options.correction
-    if correction is None:
-        correction = "shift" if points.control.any() and opened.model is None else "none"
-    elif correction != "none" and opened.model is not None:
-        raise InputError(
-            "a model file is an adjusted model: adjusting it again would count points twice",
-            field="--correction",
-            remedy="adjust the scene's own model with all points (leave out --model)",
-        )
-    start = ImageCorrection.identity(scene.model, correction, (scene.width / 2, scene.height / 2))
-    name = scene.model.kind if correction == "none" else f"{scene.model.kind}+{correction}"
-    return fit_model(start, points, robust=correction != "none", name=name)
-
-
-def _result_of(adjusted: Fit) -> SensorModel:
-    """Return the adjusted model without a correction that corrects nothing."""
-    model = adjusted.model
-    return model.model if isinstance(model, ImageCorrection) and model.correction == "none" else model
-
-
-def _read(scene: Scene, options: PointOptions, allow_network: bool) -> Points:
-    if options.gcps is None:
-        if options.correction not in (None, "none"):
-            raise InputError(
-                f"a {options.correction} needs control points", field="--gcps", remedy="give a file of points"
-            )
-        return _no_points()
-    if os.fspath(options.gcps) == OWN_POINTS:
-        points = gcps_of_dataset(raster.open_dataset(scene.path, allow_network=allow_network))
-    else:
-        points = read_points(
-            options.gcps,
-            crs=None if options.crs is None else parse_crs(options.crs),
-            vertical=None if options.vertical is None else Vertical.parse(options.vertical),
-            pixel_origin=options.pixel_origin,
-            image_name=Path(scene.path).name,
-        )
-    return points if options.check is None else assign_roles(points, options.check)
-
-
-def _no_points() -> Points:
-    none = np.zeros(0)
-    return Points(
-        ids=(), image=np.zeros((0, 2)), ground=np.zeros((0, 3)), roles=np.zeros(0, dtype="<U7"), sigma_image=none,
-        sigma_ground=np.zeros((0, 3)), crs=pyproj.CRS.from_epsg(4326), source="",
-    )  # fmt: skip
-
-
-def _with_heights(points: Points, surface: dem.Surface | None) -> Points:
-    """Fill heights that a file does not give from the surface."""
-    missing = ~np.isfinite(points.ground[:, 2])
-    if not missing.any():
-        return points
-    if surface is None:
-        names = ", ".join(np.array(points.ids)[missing][:5])
-        raise InputError(
-            f"{int(missing.sum())} points have no height ({names})", file=points.source, field="h",
-            remedy="give heights in the file, or a DEM with --dem to take them from",
-        )  # fmt: skip
-    ground = points.ground.copy()
-    ground[missing, 2] = surface.heights(ground[missing, :2], points.crs)
-    return points.with_ground(ground)
-
-
-def _warnings(scene: Scene, adjusted: Fit, surface: dem.Surface | None) -> tuple[str, ...]:
-    """Return what people ought to know before they trust the numbers."""
-    found = [*scene.warnings, *adjusted.warnings]
-    if surface is not None:
-        found += surface.provenance.get("warnings", [])
-    points = adjusted.points
-    found += [f"point {name} was left out: {reason}" for name, reason in adjusted.rejected]
-    inside = ((points.image >= 0) & (points.image <= (scene.width, scene.height))).all(axis=1)
-    if not inside.all():
-        outside = ", ".join(np.array(points.ids)[~inside])
-        found.append(f"points outside of the image (used all the same): {outside}")
-    if adjusted.used.any() and len(adjusted.param_names) and adjusted.redundancy == 0:
-        found.append("no redundancy: the RMSE of the control points is zero by construction and says nothing")
-    checks = int(points.check.sum())
-    if len(points) and checks < 30:
-        found.append(f"{checks} check points: fewer than the 30 that ASPRS 2023 asks for before accuracy is claimed")
-    return tuple(dict.fromkeys(found))
-
-
-def _check_paths(
-    files: Mapping[str, Path],
-    image: str | os.PathLike[str],
-    scene: SceneOptions,
-    points: PointOptions,
-    surface: SurfaceOptions,
-) -> None:
-    """Refuse to write what is read, and outputs that change the model of the source or of the ortho."""
-    given = (image, scene.model, scene.rpc, points.gcps, surface.dem)
-    inputs = {Path(path).resolve() for path in given if path is not None}
-    for path in files.values():
-        if path.resolve() in inputs:
-            raise InputError(
-                "this path would be read and written", file=path, field="-o", remedy="choose another output folder"
-            )
-    folder = next(iter(files.values())).parent
-    if folder.resolve() == Path(image).resolve().parent:
-        raise InputError(
-            "the RPC files written here would attach to the source image and change its model", file=folder,
-            field="-o", remedy="choose an output folder of its own",
-        )  # fmt: skip
-    if "ortho" in files:
-        for ending in SIDE_CARS:
-            stale = files["ortho"].with_name(files["ortho"].stem + ending)
-            if stale.exists():
-                raise InputError(
-                    "an old side-car lies here that GDAL would attach to the ortho", file=stale,
-                    remedy="remove it, or choose another output folder",
-                )  # fmt: skip
+def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[str]]:
+    """Return the model as RPC and what there is to say about it; None where no RPC stands for it."""
+    try:
+        exported = rpc.export_rpc(model)
+    except InputError as error:
+        return None, [f"no RPC files were written: {error.message}"]
+    return exported, list(exported.warnings)
 
 
 def _warp(
     model: SensorModel,
-    exported: rpc.RpcExport,
+    exported: rpc.RpcExport | None,
     source: raster.RasterSource,
     surface: dem.Surface,
     grid: raster.Grid,
@@ -481,43 +443,38 @@ def _warp(
         return warp.rectify(model, source, surface, grid, path, tolerance=output.tolerance, **common)
     if output.engine != "gdal":
         raise InputError(f"no engine is called {output.engine!r}", field="--engine", remedy="ortho or gdal")
+    if exported is None:
+        raise InputError("GDAL's warper needs an RPC, and none stands for this model", field="--engine", remedy="ortho")
     return warp.rectify_gdal(rpc.rpc_metadata(exported.rpc), source, surface, grid, path, **common)
-
-
-def _provenance(
-    image: str | os.PathLike[str], scene: Scene, points: PointOptions, surface: dem.Surface
-) -> dict[str, Any]:
-    control = None
-    if points.gcps is not None and os.fspath(points.gcps) != OWN_POINTS:
-        control = {**dataclasses.asdict(points), "gcps": str(points.gcps), "sha256": sha256(points.gcps)}
-    elif points.gcps is not None:
-        control = {**dataclasses.asdict(points), "gcps": OWN_POINTS}
-    return {
-        "image": {"path": str(image), "size": [scene.width, scene.height]},
-        "sensor": scene.sensor,
-        "model_source": scene.model_source,
-        "points": control,
-        "surface": dict(surface.provenance),
-        "software": {
-            "ortho-pipeline": metadata.version("ortho-pipeline"),
-            "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
-            "proj": pyproj.proj_version_str,
-        },
-    }
 
 
 def _write_models(
     model: SensorModel,
-    exported: rpc.RpcExport,
+    exported: rpc.RpcExport | None,
     scene: Scene,
     source: raster.RasterSource,
-    files: Mapping[str, Path],
+    files: dict[str, Path],
     provenance: Mapping[str, Any],
 ) -> None:
+    """Write the model in every format; what cannot be written is taken out of `files`."""
     size = scene.width, scene.height
     write_model_file(SavedModel(model, scene.sensor, scene.model_source, size, provenance), files["model"])
+    if exported is None:
+        del files["rpc"], files["vrt"]
+        return
     rpc.write_rpc_txt(exported.rpc, files["rpc"])
     rpc.write_vrt(source.dataset, exported.rpc, files["vrt"])
+
+
+def _write_report(document: Mapping[str, Any], fit: Fit, files: dict[str, Path]) -> None:
+    """Write report and residuals; without points there are no residuals, and they are taken out of `files`."""
+    if len(fit.points):
+        write_text(files["residuals"], json.dumps(report.residuals_geojson(fit), allow_nan=False))
+        write_text(files["style"], report.residuals_style(document))
+    else:
+        del files["residuals"], files["style"]
+    report.write_report_json(document, files["report"])
+    report.write_report_html(document, files["html"], ortho=files.get("ortho"))
 
 
 def crs_text(crs: pyproj.CRS) -> str:

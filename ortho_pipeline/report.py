@@ -1,4 +1,4 @@
-"""The accuracy report: one dict, shown as JSON, as a page, as a plot, as GeoJSON and as text for the terminal.
+"""The accuracy report: one dict, shown as JSON, as a page, as plots, as GeoJSON and as text for the terminal.
 
 `build_report` collects everything; the other functions only show what is in its dict. A residual is measured minus
 predicted, in pixels. In metres it is where the ortho shows a point minus where the point belongs, east and north, on
@@ -20,13 +20,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.crs import Vertical, ground_transform, parse_crs
-from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.crs import Vertical, ground_transform
+from ortho_pipeline.drawing import style_sheet
+from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.estimation import Fit, root_mean_square
-from ortho_pipeline.files import write_text
-from ortho_pipeline.geometry import units_per_metre
-from ortho_pipeline.models.base import solve_2x2
-from ortho_pipeline.report_figures import plot_residuals, preview_png
+from ortho_pipeline.files import whole_or_nothing, write_text
+from ortho_pipeline.ground_error import along_view, in_metres, metre_partials, rmse_metres
+from ortho_pipeline.preview import preview_png
+from ortho_pipeline.report_plots import plots, round_down
+from ortho_pipeline.report_text import fixed, flat, headline, metres, plain_size, px, share, short, signed, summary_text
 
 if TYPE_CHECKING:
     import pyproj
@@ -41,18 +43,23 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 SCHEMA_VERSION = 1
-#: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
-ENOUGH_CHECK_POINTS = 30
+DOCUMENT = "ortho-pipeline report"
 #: Median of control height minus DEM height from which a difference of datums is suspected, metres.
 _SUSPICIOUS_HEIGHT = 5.0
+_MAX_BYTES = 50_000_000
+#: In the pipeline's warning about check points, which the headline repeats in its own words.
+_FEW = "check points: fewer than"
 
 __all__ = [
     "build_report",
     "headline",
-    "plot_residuals",
+    "plots",
     "preview_png",
+    "read_report_json",
     "residuals_geojson",
+    "residuals_style",
     "summary_text",
+    "write_plots",
     "write_report_html",
     "write_report_json",
 ]
@@ -69,6 +76,7 @@ def build_report(
     coverage: float | None = None,
     grid: Grid | None = None,
     warp: WarpResult | None = None,
+    comparison: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
     warnings: Iterable[str] = (),
 ) -> dict[str, Any]:
@@ -80,6 +88,8 @@ def build_report(
         The adjusted model as RPC.
     coverage : float, optional
         Share (0 to 1) of the scene for which the DEM has a height.
+    comparison : mapping, optional
+        The document of ``ortho compare``.
     warnings : iterable of str
         What the reader ought to know; a suspicious difference between control and DEM heights is added to them.
     """
@@ -87,12 +97,14 @@ def build_report(
     heights = None if surface is None else _heights_of_points(fit, surface, viewing)
     noted = [*warnings, *([heights["warning"]] if heights and heights["warning"] else [])]
     adjustment = {**fit.to_json(), "warnings": noted}
-    metres = _in_metres(fit, fit.residuals)
+    shifts, views = in_metres(fit, fit.residuals), along_view(fit)
     for i, point in enumerate(adjustment["points"]):
         point["raw_residual"] = _numbers(fit.raw_residuals[i])
-        point["residual_m"] = _numbers(metres[i])
+        point["residual_m"] = _numbers(shifts[i])
+        point["view_residual"] = _numbers(views[i])
+        point["height_m"] = _number(fit.points.ground[i, 2])
     report = {
-        "document": "ortho-pipeline report",
+        "document": DOCUMENT,
         "schema_version": SCHEMA_VERSION,
         "created": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
         "scene": {
@@ -104,7 +116,10 @@ def build_report(
             **viewing,
         },
         "adjustment": adjustment,
-        "rmse_m": _rmse_metres(fit),
+        "rmse_m": rmse_metres(fit),
+        "view_rmse": _view_rmse(fit, views),
+        "control_hull": _control_hull(fit, scene.width, scene.height),
+        "comparison": None if comparison is None else _plain(comparison),
         "heights": heights,
         "surface": None if surface is None else {"coverage": coverage, **_plain(surface.provenance)},
         "rpc": None if exported is None else {"exact": exported.exact, "max_error_px": exported.max_error_px},
@@ -117,58 +132,13 @@ def build_report(
     return report
 
 
-def headline(report: Mapping[str, Any]) -> dict[str, Any]:
-    """Say how accurate the result is, in words, from the best evidence that there is.
-
-    Returns
-    -------
-    dict
-        `figure` (``"0.21 px"`` or a word), `metres` (text or None), `what` (a phrase that follows the figure),
-        `notes` (sentences that qualify it).
-    """
-    adjustment = report["adjustment"]
-    rmse, redundancy, parameters = adjustment["rmse"], adjustment["redundancy"], len(adjustment["parameters"])
-    control, check, loo = rmse["control"], rmse["check"], rmse["loo"]
-    if not adjustment["points"]:
-        notes = ["The model is used as it was delivered. Vendors' models are commonly off by 5 to 25 m."]
-        return {"figure": "Not tested", "metres": None, "what": "there were no ground control points", "notes": notes}
-    notes = []
-    if control and parameters:
-        fitted = f"{_px(control['total'])} RMSE at {_count(control['n'], 'control point')}"
-        notes.append(
-            f"The fit: {fitted}, redundancy {redundancy}."
-            if redundancy
-            else f"No redundancy: {_count(control['n'], 'control point')} for {parameters} parameters fit exactly, "
-            "which says nothing about accuracy."
-        )
-    if check:
-        what = f"RMSE at {_count(check['n'], 'check point')} that took no part in the adjustment"
-        if check["n"] < ENOUGH_CHECK_POINTS:
-            notes.append(
-                f"Fewer than {ENOUGH_CHECK_POINTS} check points: an indication, not a claim of accuracy (ASPRS 2023)."
-            )
-        return {**_figure(check, report["rmse_m"]["check"]), "what": what, "notes": notes}
-    if control and not parameters:
-        what = f"RMSE at {_count(control['n'], 'point')} of the model as delivered, none of which it was adjusted to"
-        return {**_figure(control, report["rmse_m"]["control"]), "what": what, "notes": notes}
-    notes.append("No check points were kept apart.")
-    if loo and redundancy:
-        what = f"RMSE when each of {_count(loo['n'], 'control point')} is left out in turn"
-        return {**_figure(loo, report["rmse_m"]["loo"]), "what": what, "notes": notes}
-    return {"figure": "Not tested", "metres": None, "what": "nothing is left over to test the fit with", "notes": notes}
-
-
-def _figure(rmse: Mapping[str, Any], metres: Mapping[str, Any] | None) -> dict[str, Any]:
-    return {"figure": _px(rmse["total"]), "metres": _m(metres["total"]) if metres else None}
-
-
 def _viewing(model: SensorModel, width: int, height: int) -> dict[str, Any]:
     """Return pixel size on the ground (m) and how far and whereto (azimuth) the ortho moves per metre of height."""
     centre = model.image_to_ground(np.array([[width / 2, height / 2]]), model.reference_height)
     nothing = {"ground_pixel_m": None, "lean_m_per_m": None, "lean_azimuth_deg": None}
     if not np.isfinite(centre).all():
         return nothing
-    plan, up = _metre_partials(model, centre)
+    plan, up = metre_partials(model, centre)
     try:
         inverse = np.linalg.inv(plan[0])
     except np.linalg.LinAlgError:
@@ -181,30 +151,26 @@ def _viewing(model: SensorModel, width: int, height: int) -> dict[str, Any]:
     }
 
 
-def _metre_partials(model: SensorModel, ground: Array) -> tuple[Array, Array]:
-    """Return d(image)/d(x, y in metres) ``(N, 2, 2)`` and d(image)/d(height) ``(N, 2)``."""
-    partials = model.ground_partials(ground)
-    units = units_per_metre(parse_crs(model.crs), ground)
-    return partials[:, :, :2] * units[:, None, :2], partials[:, :, 2]
-
-
-def _in_metres(fit: Fit, residuals: Array) -> Array:
-    """Return residuals ``(N, 2)`` px as shifts of the ortho, metres along x and y of the model's ground CRS."""
-    if not len(residuals):
-        return np.zeros((0, 2))
-    plan, _ = _metre_partials(fit.model, fit.points.ground)
-    return solve_2x2(plan, residuals)
-
-
-def _rmse_metres(fit: Fit) -> dict[str, Any]:
-    kept = {"control": fit.used, "check": fit.points.check}
-    shifts = {name: _in_metres(fit, fit.residuals)[mask] for name, mask in kept.items()}
-    shifts["loo"] = _in_metres(fit, fit.loo_residuals)
-    found = {}
-    for name, values in shifts.items():
-        rmse = root_mean_square(values[np.isfinite(values).all(axis=1)])
-        found[name] = rmse and {"x": rmse["col"], "y": rmse["row"], "total": rmse["total"], "n": rmse["n"]}
+def _view_rmse(fit: Fit, views: Array) -> dict[str, Any]:
+    """Return root mean squares (px) along and across the direction of view, over control (used) and check points."""
+    found: dict[str, Any] = {}
+    for name, mask in (("control", fit.used), ("check", fit.points.check)):
+        rows = views[mask]
+        rmse = root_mean_square(rows[np.isfinite(rows).all(axis=1)])
+        found[name] = rmse and {"along": rmse["col"], "across": rmse["row"], "n": rmse["n"]}
     return found
+
+
+def _control_hull(fit: Fit, width: int, height: int) -> dict[str, Any] | None:
+    """Return the convex hull of the used control points and its share of the image; None below three points."""
+    if fit.used.sum() < 3:
+        return None
+    import shapely
+
+    hull = shapely.MultiPoint(fit.points.image[fit.used]).convex_hull
+    inside = hull.intersection(shapely.box(0, 0, width, height))
+    outline = [[float(x), float(y)] for x, y in hull.exterior.coords[:-1]] if hull.geom_type == "Polygon" else []
+    return {"share": float(inside.area) / (width * height), "n": int(fit.used.sum()), "outline": outline}
 
 
 def _heights_of_points(fit: Fit, surface: Surface, viewing: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -221,11 +187,11 @@ def _heights_of_points(fit: Fit, surface: Surface, viewing: Mapping[str, Any]) -
     warning = None
     if len(difference) >= 3 and abs(median) > max(_SUSPICIOUS_HEIGHT, 3 * spread):
         lean = viewing["lean_m_per_m"]
-        moved = "" if lean is None else f"; that moves the ortho by {_m(abs(median) * lean)}"
+        moved = "" if lean is None else f"; that moves the ortho by {metres(abs(median) * lean)}"
         side = "above" if median > 0 else "below"
         warning = (
-            f"the points lie {_m(abs(median))} {side} the DEM (median; spread {_m(spread)}): their heights probably "
-            f"have another datum than the DEM's{_undulation_there(points.ground, points.crs)}{moved}"
+            f"the points lie {metres(abs(median))} {side} the DEM (median; spread {metres(spread)}): their heights "
+            f"probably have another datum than the DEM's{_undulation_there(points.ground, points.crs)}{moved}"
         )
     return {"median_m": median, "spread_m": spread, "n": len(difference), "warning": warning}
 
@@ -260,7 +226,7 @@ def residuals_geojson(fit: Fit) -> dict[str, Any]:
     """
     points = fit.points
     where = ground_transform(points.crs, "EPSG:4979")(points.ground) if len(points) else np.zeros((0, 3))
-    metres = _in_metres(fit, fit.residuals)
+    metres = in_metres(fit, fit.residuals)
     reasons = dict(fit.rejected)
     features = []
     for i, name in enumerate(points.ids):
@@ -284,12 +250,75 @@ def residuals_geojson(fit: Fit) -> dict[str, Any]:
     return {"type": "FeatureCollection", "features": features}
 
 
+def residuals_style(report: Mapping[str, Any]) -> str:
+    """Return a QGIS style (QML) for the residuals: marks by role, and arrows that are exaggerated in length.
+
+    QGIS takes it by itself, as it has the name of the GeoJSON file with the ending ``.qml``.
+    """
+    template = _environment().get_template("residuals.qml.j2")
+    lengths = [math.hypot(*point["residual_m"]) for point in report["adjustment"]["points"] if point["residual_m"]]
+    ground = report["scene"]["ground_pixel_m"]
+    extent = max(report["scene"]["size"]) * (max(ground) if ground else 1.0)
+    longest = max(lengths, default=0.0)
+    # The longest arrow spans about a twelfth of the scene.
+    return str(template.render(exaggeration=round_down(extent / 12 / longest) if longest > 0 else 1.0))
+
+
 # -- showing ---------------------------------------------------------------------------------------------------------
 
 
 def write_report_json(report: Mapping[str, Any], path: str | PathLike[str]) -> None:
     """Write the report as JSON, whole or not at all."""
     write_text(path, json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def read_report_json(path: str | PathLike[str]) -> dict[str, Any]:
+    """Read a report again.
+
+    Raises
+    ------
+    InputError
+        If the file is no report of this version.
+    """
+    try:
+        if Path(path).stat().st_size > _MAX_BYTES:
+            raise InputError("a report of more than 50 MB is not read", file=path)
+        document = json.loads(Path(path).read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", file=path, remedy="check the path") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"this is no JSON ({error})", file=path, remedy="give a <stem>_report.json") from error
+    if not isinstance(document, dict) or document.get("document") != DOCUMENT:
+        raise InputError("this is no report of ortho-pipeline", file=path, remedy="give a <stem>_report.json")
+    if document.get("schema_version") != SCHEMA_VERSION:
+        raise InputError(
+            f"schema version {document.get('schema_version')!r} is not known here (this version reads "
+            f"{SCHEMA_VERSION})", file=path, field="schema_version", remedy="make the report again",
+        )  # fmt: skip
+    return document
+
+
+def write_plots(report: Mapping[str, Any], folder: Path, stem: str, kind: str = "svg") -> dict[str, Path]:
+    """Write each plot as a picture of its own: ``<stem>_<plot>.svg`` or ``.png``.
+
+    Raises
+    ------
+    InputError
+        If PNG is asked for and matplotlib is not installed, or the report does not hold what its schema says.
+    """
+    try:
+        drawings = plots(report)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"the report is damaged ({error})", remedy="make the report again") from error
+    files = {}
+    for name, drawing in drawings.items():
+        files[name] = folder / f"{stem}_{name}.{kind}"
+        if kind == "svg":
+            write_text(files[name], drawing.svg(alone=True) + "\n")
+            continue
+        with whole_or_nothing(files[name]) as temporary:
+            temporary.write_bytes(drawing.png())
+    return files
 
 
 def write_report_html(
@@ -302,6 +331,29 @@ def write_report_html(
     ortho : path or bytes, optional
         The orthoimage, of which a preview is made, or the PNG of a preview.
     """
+    png = ortho if isinstance(ortho, bytes) or ortho is None else preview_png(ortho)
+    page = (
+        _environment()
+        .get_template("report.html.j2")
+        .render(
+            report=report,
+            adjustment=report["adjustment"],
+            head=report["headline"],
+            # The headline's notes have said these already.
+            warnings=[text for text in report["warnings"] if not text.startswith("no redundancy") and _FEW not in text],
+            rejected={entry["id"]: entry["reason"] for entry in report["adjustment"]["rejected"]},
+            has_loo=any(point["loo_residual"] for point in report["adjustment"]["points"]),
+            provenance=list(flat({**report["scene"]["facts"], **_brief(report["provenance"])})),
+            inputs=report["provenance"].get("inputs") or [],
+            plots={name: drawing.svg() for name, drawing in plots(report).items()},
+            plot_style=style_sheet(),
+            preview=base64.b64encode(png).decode() if png else None,
+        )
+    )
+    write_text(path, page)
+
+
+def _environment() -> Any:
     import jinja2
 
     environment = jinja2.Environment(
@@ -311,70 +363,18 @@ def write_report_html(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"px": _px, "m": _m, "signed": _signed, "share": _share, "fixed": _fixed, "number": _short}
-    png = ortho if isinstance(ortho, bytes) or ortho is None else preview_png(ortho)
-    page = environment.get_template("report.html.j2").render(
-        report=report,
-        adjustment=report["adjustment"],
-        head=report["headline"],
-        rejected={entry["id"]: entry["reason"] for entry in report["adjustment"]["rejected"]},
-        has_loo=any(point["loo_residual"] for point in report["adjustment"]["points"]),
-        provenance=list(_flat({**report["scene"]["facts"], **report["provenance"]})),
-        plot=plot_residuals(report),
-        preview=base64.b64encode(png).decode() if png else None,
-    )
-    write_text(path, page)
+    environment.filters |= {
+        "px": px, "m": metres, "signed": signed, "share": share, "fixed": fixed, "number": short, "plain": plain_size,
+    }  # fmt: skip
+    return environment
 
 
-def summary_text(report: Mapping[str, Any]) -> str:
-    """Return the report as a screenful of text, without colours."""
-    adjustment, scene, head = report["adjustment"], report["scene"], report["headline"]
-    rows = [("scene", f"{scene['name']}, {_size(scene['size'])} px, {scene['sensor']} ({scene['model_source']})")]
-    if raw := adjustment["raw_bias"]:
-        rows.append(("raw bias", f"{_bias(raw)} (measured minus delivered model, {_count(raw['n'], 'point')})"))
-    if adjustment["parameters"]:
-        values = [f"{name} {_parameter(entry)}" for name, entry in adjustment["parameters"].items()]
-        rows.append(("model", f"{adjustment['model']}: {', '.join(values)}"))
-    else:
-        rows.append(("model", adjustment["model"]))
-    metres = f" ({head['metres']})" if head["metres"] else ""
-    rows.append(("accuracy", f"{head['figure']}{metres}: {head['what']}"))
-    rows += [("", note) for note in head["notes"]]
-    rows += [("left out", f"{entry['id']}: {entry['reason']}") for entry in adjustment["rejected"]]
-    if surface := report["surface"]:
-        rows.append(("heights", _surface_text(surface)))
-    if ortho := report["ortho"]:
-        steps = " x ".join(_short(step) for step in ortho["resolution"])
-        rows.append(("ortho", f"{_size(ortho['size'])} px of {steps} {ortho['unit']}, {ortho['crs']}"))
-    if warp := report["warp"]:
-        rows.append(("warp", f"{_px(warp['max_error_px'])} at worst from the exact model, {warp['seconds']:.1f} s"))
-    # The headline and the rows above have said these already.
-    said = " ".join(value for _, value in rows).lower()
-    known = ("left out", "no redundancy", "check points: fewer")
-    rows += [
-        ("warning", text)
-        for text in report["warnings"]
-        if text.lower() not in said and not any(word in text for word in known)
-    ]
-    return "\n".join(f"{key:<10}{value}" for key, value in rows)
+def _brief(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the provenance without what the page shows in tables of its own."""
+    return {key: value for key, value in provenance.items() if key not in ("inputs", "surface", "model_source")}
 
 
-def _surface_text(surface: Mapping[str, Any]) -> str:
-    if surface.get("constant_height") is not None:
-        return f"flat ground at {_m(surface['constant_height'])} above the ellipsoid"
-    covered = "" if surface["coverage"] is None else f", covers {_share(surface['coverage'])} of the scene"
-    return f"{Path(str(surface.get('path', ''))).name}, heights above {surface.get('vertical_label')}{covered}"
-
-
-def _bias(raw: Mapping[str, Any]) -> str:
-    return f"column {_signed(raw['col'])} px, row {_signed(raw['row'])} px"
-
-
-def _parameter(entry: Mapping[str, Any]) -> str:
-    return f"{_short(entry['value'], '+')} ±{_short(entry['sigma'])}"
-
-
-# -- numbers as people read them -------------------------------------------------------------------------------------
+# -- plain data ------------------------------------------------------------------------------------------------------
 
 
 def _numbers(values: Array) -> list[float] | None:
@@ -396,61 +396,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float):
         return _number(value)
     return value if value is None or isinstance(value, bool | int | str) else str(value)
-
-
-def _flat(value: Any, name: str = "") -> Iterable[tuple[str, str]]:
-    """Yield the leaves of nested values as (path of keys, text); what is None or empty is left out."""
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from _flat(item, f"{name} · {key}" if name else str(key))
-    elif isinstance(value, list):
-        if value:
-            yield name, ", ".join(str(item) for item in value)
-    elif value is not None:
-        yield name, str(value)
-
-
-def _decimals(value: float) -> int:
-    """Return how many decimals show three digits of a value, at least two and at most five."""
-    return 2 if abs(value) >= 1 or value == 0 else min(5, 2 - math.floor(math.log10(abs(value))))
-
-
-def _px(value: float) -> str:
-    return f"{_fixed(value)} px"
-
-
-def _m(value: float) -> str:
-    return f"{value:.2f} m" if abs(value) < 10 else f"{value:.1f} m"
-
-
-def _fixed(value: float | None) -> str:
-    if value is None:
-        return "–"
-    # Below 1e-9 it is rounding, and "0.00" is not "0.00000".
-    return f"{value:.2f}" if abs(value) >= 0.1 or abs(value) < 1e-9 else f"{value:.{min(_decimals(value), 4)}f}"
-
-
-def _signed(value: float | None) -> str:
-    if value is None:
-        return "–"
-    text = f"{value:+.2f}"
-    return "0.00" if text[1:] == "0.00" else text.replace("-", "−")
-
-
-def _short(value: float, sign: str = "") -> str:
-    return f"{value:{sign}.3g}".replace("-", "−") if value else "0"
-
-
-def _share(value: float | None) -> str:
-    if value is None:
-        return "–"
-    # "100 %" is only said where it is so.
-    return "100 %" if value >= 1 else f"{min(math.floor(value * 1000) / 10, 99.9):.1f} %"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
-
-
-def _size(size: Iterable[int]) -> str:
-    return " x ".join(str(side) for side in size)

@@ -40,7 +40,9 @@ __all__ = [
     "RpcExport",
     "export_rpc",
     "fit_rpc",
+    "gdal_errors",
     "has_rpc",
+    "name_sources_relatively",
     "read_rpc",
     "rpc_metadata",
     "rpc_of_dataset",
@@ -194,24 +196,29 @@ def write_vrt(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> Non
     ModelError
         If the file does not give the same RPC again.
     """
-    from defusedxml import ElementTree
-
     with files.whole_or_nothing(path) as temporary:
-        with _gdal_errors(path):
+        with gdal_errors(path):
             copy = gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), dataset)
             copy.SetGCPs([], "")
             copy.SetMetadata(rpc_metadata(rpc), "RPC")
             copy.FlushCache()
             del copy
-        root = ElementTree.fromstring(temporary.read_bytes())
-        folder = Path(path).resolve().parent
-        for source in root.iter("SourceFilename"):
-            if source.get("relativeToVRT") != "1" and source.text and Path(source.text).is_file():
-                source.text = os.path.relpath(Path(source.text).resolve(), folder)
-                source.set("relativeToVRT", "1")
-        temporary.write_bytes(ElementTree.tostring(root))
-        with _gdal_errors(path):
+        name_sources_relatively(temporary, Path(path))
+        with gdal_errors(path):
             _check_written(gdal.OpenEx(os.fspath(temporary), gdal.OF_RASTER, allowed_drivers=["VRT"]), rpc, path)
+
+
+def name_sources_relatively(vrt: Path, final: Path) -> None:
+    """Let a VRT, whose final place is `final`, name its sources relative to itself."""
+    from defusedxml import ElementTree
+
+    root = ElementTree.fromstring(vrt.read_bytes())
+    folder = final.resolve().parent
+    for source in root.iter("SourceFilename"):
+        if source.get("relativeToVRT") != "1" and source.text and Path(source.text).is_file():
+            source.text = os.path.relpath(Path(source.text).resolve(), folder)
+            source.set("relativeToVRT", "1")
+    vrt.write_bytes(ElementTree.tostring(root))
 
 
 def write_tagged_copy(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> None:
@@ -230,7 +237,7 @@ def write_tagged_copy(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]
     stale = [file for file in _sidecar_names(Path(path)) if file.exists()]
     if stale:
         raise InputError("this RPC file would override the tag of the copy", file=stale[0], remedy="remove it")
-    with files.whole_or_nothing(path) as temporary, _gdal_errors(path):
+    with files.whole_or_nothing(path) as temporary, gdal_errors(path):
         view = gdal.GetDriverByName("VRT").CreateCopy("", dataset)
         view.SetGCPs([], "")
         view.SetMetadata(rpc_metadata(rpc), "RPC")
@@ -252,7 +259,8 @@ def _check_written(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -
 
 
 @contextmanager
-def _gdal_errors(path: str | PathLike[str]) -> Iterator[None]:
+def gdal_errors(path: str | PathLike[str]) -> Iterator[None]:
+    """Turn GDAL's complaints about writing `path` into an `InputError`; masks go into the file itself."""
     previous = gdal.GetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK")
     gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", "YES")
     try:
@@ -413,15 +421,16 @@ def _fit_ratio(terms: Array, values: Array) -> tuple[Array, Array]:
 
 def _iterate_ratio(terms: Array, values: Array, damping: float, iterations: int = 5) -> tuple[Array, Array] | None:
     """Return the best of some iterations, None if the first of them has a pole."""
-    system = np.hstack([terms, -values[:, None] * terms[:, 1:]])
-    penalty = np.sqrt(len(terms)) * np.diag(np.repeat([TIKHONOV, damping], [20, 19]))
-    right = np.concatenate([values, np.zeros(39)])
+    system = np.column_stack([terms, -values[:, None] * terms[:, 1:], values])
+    penalty = np.sqrt(len(terms)) * np.repeat([TIKHONOV, damping], [20, 19])
     denominator = np.ones(len(terms))
     best: tuple[float, Array, Array] | None = None
     for _ in range(iterations):
-        right[: len(terms)] = values / denominator
-        q, r = np.linalg.qr(np.vstack([system / denominator[:, None], penalty]))
-        solution = np.linalg.solve(r, q.T @ right)
+        # The right side is the last column, so that R alone holds all that is needed. The penalty enters through the
+        # singular values of R: as more rows of the system it would fill the reflections with denormal numbers.
+        r: Array = np.asarray(np.linalg.qr(system / denominator[:, None], mode="r"))
+        u, size, vt = np.linalg.svd(r[:39, :39] / penalty)
+        solution: Array = vt.T @ (size / (size**2 + 1.0) * (u.T @ r[:39, 39])) / penalty
         num, den = solution[:20], np.concatenate([[1.0], solution[20:]])
         denominator = terms @ den
         if denominator.min() < 1e-3:

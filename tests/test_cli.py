@@ -39,7 +39,7 @@ def test_python_m_is_the_same_command():
     done = subprocess.run(
         [sys.executable, "-m", "ortho_pipeline", "--help"], capture_output=True, text=True, check=True
     )
-    for command in ("sensors", "info", "fit", "rectify", "export", "doctor"):
+    for command in ("sensors", "models", "info", "fit", "compare", "rectify", "export", "report", "doctor"):
         assert f"\n  {command} " in done.stdout
 
 
@@ -88,7 +88,7 @@ def test_fit_prints_the_documented_json(tiny):
     document = json.loads(done.stdout)
     expected = {
         "schema_version", "sensor", "model", "model_source", "parameters", "points", "rmse", "raw_bias",
-        "redundancy", "sigma0", "rejected", "warnings",
+        "redundancy", "sigma0", "rejected", "warnings", "statistics", "removed",
     }  # fmt: skip
     assert set(document) == expected
     assert document["model"] == "rpc+shift"

@@ -247,6 +247,24 @@ def test_points_without_a_projection_are_left_out_and_said(rpc):
     assert found.used.sum() == 10
 
 
+def test_check_points_without_a_projection_are_not_counted_and_said(rpc):
+    points = make_points(rpc)
+    ground = points.ground.copy()
+    ground[3, 0] += 90.0
+    roles = np.array(["check" if i < 5 else "control" for i in range(12)])
+    found = fit(start(rpc), make_points(rpc, ground=ground, roles=roles))
+    assert found.rmse("check")["n"] == 4
+    assert "check points without a projection" in found.warnings[0]
+
+
+def test_points_known_to_be_wrong_are_left_out_and_listed(rpc):
+    points = make_points(rpc)
+    found = fit(start(rpc), points, exclude={"p4": "wrong crossroads"})
+    assert found.rejected == (("p4", "wrong crossroads"),)
+    others = fit(start(rpc), points.select(np.arange(12) != 4))
+    np.testing.assert_allclose(found.values, others.values, atol=1e-12)
+
+
 def test_a_model_without_parameters_is_evaluated(rpc):
     points = make_points(rpc, noise=0.0)
     found = fit(start(rpc, "none"), points)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,11 @@ import pytest
 from osgeo import gdal
 
 import ortho_pipeline
-from ortho_pipeline import pipeline
+from ortho_pipeline import pipeline, plugins
 from ortho_pipeline.errors import CoverageError, DatumError, DegeneratePoints, InputError
 from ortho_pipeline.model_file import read_model_file
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.rpc import read_rpc
+from ortho_pipeline.rpc import read_rpc, rpc_metadata, write_rpc_txt
 
 CRS = "EPSG:4979"
 
@@ -45,7 +46,7 @@ def valid(path: Path) -> np.ndarray:
 def test_rectify_writes_everything_and_finds_the_bias(tiny, tmp_path):
     result = rectify(tiny, tmp_path / "out")
     assert {path.name for path in result.files.values()} == {
-        "tiny_ortho.tif", "tiny_model.json", "tiny_RPC.TXT", "tiny.vrt", "tiny_residuals.geojson",
+        "tiny_ortho.tif", "tiny_model.json", "tiny_RPC.TXT", "tiny.vrt", "tiny_residuals.geojson", "tiny_residuals.qml",
         "tiny_report.json", "tiny_report.html",
     }  # fmt: skip
     assert all(path.stat().st_size > 0 for path in result.files.values())
@@ -128,7 +129,7 @@ def test_export_writes_every_format_exactly(tiny, tmp_path):
     assert result.document["exact"]
     fitted = pipeline.fit(tiny.image, points_of(tiny)).fit.model
     ground = np.array([[20.004, -30.003, 430.0], [19.996, -29.997, 610.0]])
-    for name in ("rpctxt", "rpb", "tif", "vrt"):
+    for name in ("rpc-txt", "rpb", "tag", "vrt"):
         if name == "vrt":
             domain = gdal.Open(str(result.files[name])).GetMetadata("RPC")
             assert float(domain["SAMP_OFF"].split()[0]) == pytest.approx(tiny.model.col_off - 0.5 + 3, abs=0.2)
@@ -373,3 +374,71 @@ def test_quickbird_finds_a_blunder_among_five_points(real, tmp_path):
     assert name in result.files["html"].read_text()
     assert fit["rmse"]["control"]["total"] <= 0.15
     assert fit["parameters"]["col_shift"]["value"] == pytest.approx(-3.0, abs=0.2)
+
+
+# -- heights of the whole scene --------------------------------------------------------------------------------------
+
+
+def test_a_void_between_the_rays_is_reported_with_its_share(tiny, tmp_path):
+    fine = tiny.folder / "fine.tif"
+    gdal.Translate(str(fine), str(tiny.dem), xRes=5, yRes=5, resampleAlg="bilinear")
+    dem = gdal.Open(str(fine), gdal.GA_Update)
+    heights = dem.ReadAsArray()
+    heights[394, 396] = -32768
+    dem.GetRasterBand(1).SetNoDataValue(-32768)
+    dem.WriteArray(heights)
+    dem = None
+    report = rectify(tiny, tmp_path / "out", surface=dem_of(tiny, dem=fine)).document["report"]
+    found = [text for text in report["warnings"] if "1 samples without a height" in text]
+    assert len(found) == 1
+    # The scene has 1.92 x 1.44 km, a sample 5 x 5 m.
+    assert 1 - report["surface"]["coverage"] == pytest.approx(25 / (1920 * 1440), rel=0.1)
+    assert "100 % of the scene" not in (tmp_path / "out" / "tiny_report.html").read_text()
+    filled = rectify(tiny, tmp_path / "filled", surface=dem_of(tiny, dem=fine, fill="nearest")).document["report"]
+    assert any("were filled" in text for text in filled["warnings"])
+
+
+@pytest.mark.parametrize("lon", [179.995, -179.995])
+def test_a_scene_at_the_antimeridian_with_a_global_dem(tiny, tmp_path, lon):
+    image = tmp_path / "far.tif"
+    gdal.Translate(str(image), str(tiny.image))
+    dataset = gdal.Open(str(image), gdal.GA_Update)
+    dataset.SetMetadata(rpc_metadata(tiny.model._replace(lon_off=lon)), "RPC")
+    dataset = None
+    world = tmp_path / "world.tif"
+    dem = gdal.GetDriverByName("GTiff").Create(str(world), 720, 360, 1, gdal.GDT_Float32)
+    dem.SetGeoTransform((-180, 0.5, 0, 90, 0, -0.5))
+    dem.SetProjection("EPSG:4326")
+    dem.GetRasterBand(1).Fill(500.0)
+    dem = None
+    surface = SurfaceOptions(dem=world, vertical="ellipsoid")
+    result = pipeline.rectify(image, tmp_path / "out", surface=surface)
+    assert result.document["report"]["surface"]["coverage"] == 1.0
+    flat = pipeline.rectify(image, tmp_path / "flat", surface=SurfaceOptions(height=500.0))
+    one, other = (gdal.Open(str(made.files["ortho"])) for made in (result, flat))
+    assert one.GetGeoTransform() == other.GetGeoTransform()
+    np.testing.assert_array_equal(one.ReadAsArray(), other.ReadAsArray())
+
+
+def test_provenance_has_the_checksum_of_every_input_and_the_command(tiny, tmp_path):
+    side_car = tiny.folder / "tiny_RPC.TXT"
+    write_rpc_txt(tiny.model, side_car)
+    result = rectify(tiny, tmp_path / "out", command="ortho rectify tiny.tif")
+    given = result.document["report"]["provenance"]
+    assert given["command"] == "ortho rectify tiny.tif"
+    found = {Path(one["path"]): one for one in given["inputs"]}
+    for path, role in ((tiny.image, "image"), (side_car, "image"), (tiny.dem, "DEM"), (tiny.gcps, "points")):
+        assert found[path]["role"] == role
+        assert found[path]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+        assert found[path]["bytes"] == path.stat().st_size
+        assert found[path]["sha256"] in result.files["html"].read_text()
+    assert given["options"]["surface"]["vertical"] == "ellipsoid"
+
+
+def test_model_files_may_name_model_families_of_plugins(tiny, tmp_path, monkeypatch):
+    called = []
+    monkeypatch.setattr(plugins.Host, "discover", classmethod(called.append))
+    path = tmp_path / "m_model.json"
+    ortho_pipeline.save_model(tiny.model, path)
+    pipeline.open_scene(tiny.image, SceneOptions(model=path))
+    assert called

@@ -14,9 +14,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from defusedxml import ElementTree
 from osgeo import gdal
 
 from ortho_pipeline import report
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import Fit, fit
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.landscape import Terrain
@@ -187,7 +189,7 @@ def test_headline_without_points_says_so():
     assert made["headline"]["figure"] == "Not tested"
     assert "no ground control" in made["headline"]["what"]
     assert "Not tested" in report.summary_text(made)
-    assert report.plot_residuals(made) == ""
+    assert report.plots(made) == {}
 
 
 def test_headline_of_a_model_as_delivered():
@@ -275,7 +277,7 @@ def test_page_needs_nothing_else(page):
     assert "@import" not in page
     assert "url(" not in page
     # The name of the SVG vocabulary is not loaded by anything.
-    assert re.findall(r"https?://[^\"'\s]*", page) == ["http://www.w3.org/2000/svg"]
+    assert set(re.findall(r"https?://[^\"'\s]*", page)) == {"http://www.w3.org/2000/svg"}
 
 
 def test_page_escapes_what_others_wrote(page):
@@ -309,6 +311,10 @@ def test_page_without_optional_parts(tmp_path):
     assert "<img" not in page
 
 
+def drawn_residuals(made: dict[str, Any]) -> str:
+    return report.plots(made)["residuals"].svg()
+
+
 # -- figures ---------------------------------------------------------------------------------------------------------
 
 
@@ -317,7 +323,7 @@ def test_plot_tells_the_points_apart_and_has_a_scale():
     image = measured.image.copy()
     image[3] += (200.0, 0.0)
     result = adjusted(dataclasses.replace(measured, image=image))
-    drawn = report.plot_residuals(document(result))
+    drawn = drawn_residuals(document(result))
     assert drawn.count("<circle") == 11 + 1  # the legend has one of each
     assert drawn.count('<rect class="check"') == 6 + 1
     assert drawn.count('<path class="out"') == 1 + 1
@@ -333,7 +339,7 @@ def test_plot_keeps_points_outside_of_the_image_in_view():
     image[0] = BIAS + np.array([-400.0, 1500.0])
     moved = measured.ground.copy()
     moved[0] = ground[0]
-    drawn = report.plot_residuals(document(adjusted(dataclasses.replace(measured, image=image, ground=moved))))
+    drawn = drawn_residuals(document(adjusted(dataclasses.replace(measured, image=image, ground=moved))))
     view = re.search(r'viewBox="0 0 (\d+) (\d+)"', drawn)
     assert view
     width, height = map(float, view.groups())
@@ -345,7 +351,69 @@ def test_plot_keeps_points_outside_of_the_image_in_view():
 def test_plot_of_a_perfect_point_has_no_arrow():
     made = document(adjusted(points(control=1, check=0)))
     made["adjustment"]["points"][0]["residual"] = [0.0, 0.0]
-    assert "<line" not in report.plot_residuals(made)
+    assert "<line" not in drawn_residuals(made)
+
+
+def test_plots_of_a_whole_report_as_svg_and_png(tmp_path):
+    made = document(adjusted(points(), "affine"))
+    report.write_report_json(made, tmp_path / "scene_report.json")
+    again = report.read_report_json(tmp_path / "scene_report.json")
+    for kind in ("svg", "png"):
+        files = report.write_plots(again, tmp_path / "plots", "scene_report", kind)
+        assert set(files) == {"residuals", "directions", "heights", "correlation"}
+    for path in (tmp_path / "plots").glob("*.svg"):
+        text = path.read_text(encoding="utf-8")
+        assert "var(" not in text
+        ElementTree.fromstring(text)
+    for path in (tmp_path / "plots").glob("*.png"):
+        assert gdal.Open(str(path)).ReadAsArray()[0].std() > 1
+
+
+def test_a_report_that_is_none_is_refused(tmp_path):
+    for text in ("[]", "{", '{"document": "ortho-pipeline report", "schema_version": 99}'):
+        (tmp_path / "r.json").write_text(text)
+        with pytest.raises(InputError):
+            report.read_report_json(tmp_path / "r.json")
+    with pytest.raises(InputError, match="cannot be read"):
+        report.read_report_json(tmp_path / "absent.json")
+    made = document(adjusted(points()))
+    del made["scene"]["size"]
+    with pytest.raises(InputError, match="damaged"):
+        report.write_plots(made, tmp_path, "r")
+
+
+def test_a_wrong_height_shows_along_the_view_and_not_across():
+    measured = points(sigma_image=0.01, sigma_ground=0.0)
+    index = int(np.flatnonzero(measured.check)[0])
+    ground = measured.ground.copy()
+    ground[index, 2] += 20.0
+    made = document(adjusted(dataclasses.replace(measured, ground=ground)))
+    along, across = made["adjustment"]["points"][index]["view_residual"]
+    # 20 m of height at tan(20 degrees), in pixels of 2.5 m; the point is believed too high, so it is measured short.
+    assert along == pytest.approx(-20 * 0.41 / 2.5, rel=0.05)
+    assert across == pytest.approx(0.0, abs=0.1)
+    assert made["view_rmse"]["check"]["along"] > 5 * made["view_rmse"]["check"]["across"]
+
+
+def test_hull_of_the_control_points_is_a_share_of_the_image():
+    measured = points(control=4, check=0, sigma_image=0.01)
+    corners = np.array([[0.0, 0.0], [1000.0, 0.0], [1000.0, 500.0], [0.0, 500.0]])
+    ground = CAMERA.image_to_ground(corners, 1000.0)
+    moved = dataclasses.replace(measured, image=corners, ground=ground)
+    hull = document(adjusted(moved, "none"))["control_hull"]
+    assert hull["share"] == pytest.approx(0.5)
+    assert hull["n"] == len(hull["outline"]) == 4
+    assert document(adjusted(points(control=2, check=0)))["control_hull"] is None
+
+
+def test_style_of_the_residuals_is_qgis_xml():
+    made = document(adjusted(points()))
+    root = ElementTree.fromstring(report.residuals_style(made).split("\n", 1)[1])
+    assert [rule.get("label") for rule in root.iter("rule")] == ["control", "check", "left out", "tie"]
+    fields = {prop.get("v") for prop in root.iter("prop") if prop.get("k") in ("x_attribute", "y_attribute")}
+    features = report.residuals_geojson(adjusted(points()))["features"]
+    assert fields == {"east_m", "north_m"}
+    assert fields <= set(features[0]["properties"])
 
 
 @pytest.mark.parametrize(("bands", "colour_type"), [(1, 4), (2, 4), (3, 6), (4, 6)])

@@ -132,8 +132,19 @@ install_bindings() {
     fi
 }
 
+# A browser for the tests that look at the report; without it they are skipped.
+want_browser() {
+    if have chromium || have chromium-browser || have google-chrome; then return; fi
+    if may_install; then
+        (apt_install chromium) || say "NOTE: no Chromium: the tests of the report in a browser will be skipped."
+    else
+        say "NOTE: no Chromium and no right to install it: the tests of the report in a browser will be skipped."
+    fi
+}
+
 need_python
 choose_gdal
+want_browser
 make_venv
 install_bindings
 say "installing ortho-pipeline and its tools (editable)"

@@ -7,10 +7,13 @@ from typing import Any
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
-from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.models.families import Family, families, family_of
+from ortho_pipeline.models.frame import FrameCamera
+from ortho_pipeline.models.rational import RPC, Rational
+from ortho_pipeline.models.start import model_crs, start_model
 
 #: Model classes by the `kind` under which files name them; the hook `ortho_models` adds to it.
-KINDS: dict[str, type[SensorModel]] = {cls.kind: cls for cls in (RPC, ImageCorrection)}
+KINDS: dict[str, type[SensorModel]] = {cls.kind: cls for cls in (RPC, Rational, ImageCorrection, FrameCamera)}
 
 
 def model_from_dict(data: dict[str, Any]) -> SensorModel:
@@ -34,4 +37,17 @@ def model_from_dict(data: dict[str, Any]) -> SensorModel:
         raise InputError(f"this is no model of kind {kind!r} ({error})") from error
 
 
-__all__ = ["KINDS", "RPC", "ImageCorrection", "SensorModel", "model_from_dict"]
+__all__ = [
+    "KINDS",
+    "RPC",
+    "Family",
+    "FrameCamera",
+    "ImageCorrection",
+    "Rational",
+    "SensorModel",
+    "families",
+    "family_of",
+    "model_crs",
+    "model_from_dict",
+    "start_model",
+]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
@@ -75,6 +76,25 @@ class SensorModel(ABC):
         if np.size(params):
             raise InputError(f"the model {self.kind!r} has no adjustable parameters")
         return self
+
+    @property
+    def minimum_points(self) -> int:
+        """Least number of control points that determine all parameters: each gives two equations."""
+        return -(-len(self.param_names) // 2)
+
+    @property
+    def uses_height(self) -> bool:
+        """False for a model of the plane, which maps points of any height alike."""
+        return True
+
+    @property
+    def removable(self) -> tuple[str, ...]:
+        """Names of the parameters that `without` may take out next: those on which no higher term builds."""
+        return ()
+
+    def without(self, names: Iterable[str]) -> Self:
+        """Return this model with these parameters removed: zero, and no parameters any more."""
+        raise InputError(f"parameters of a model {self.kind!r} cannot be removed", field=", ".join(names))
 
     # -- derived maps ------------------------------------------------------------------------------------------------
 

@@ -17,6 +17,7 @@ row_per_row.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
@@ -49,6 +50,8 @@ class ImageCorrection(SensorModel):
         Column and row (px) about which the linear terms turn.
     coefficients : (6,)
         In the order of `COEFFICIENTS`; shifts in pixels, the others in pixels per pixel.
+    removed : tuple of str
+        Coefficients that are no parameters although the correction has them: found unjustified, and zero.
     """
 
     kind: ClassVar[str] = "image_correction"
@@ -57,6 +60,7 @@ class ImageCorrection(SensorModel):
     correction: str
     origin: tuple[float, float]
     coefficients: Array
+    removed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.correction not in FREE:
@@ -66,6 +70,9 @@ class ImageCorrection(SensorModel):
             raise InputError("a correction has 6 finite coefficients", field="coefficients")
         if abs(np.linalg.det(_matrix(coefficients))) < 1e-6:
             raise InputError("this correction cannot be inverted", field="coefficients")
+        object.__setattr__(self, "removed", tuple(self.removed))
+        if not set(self.removed) <= set(FREE[self.correction]):
+            raise InputError("only coefficients of the correction can be removed", field="removed")
         coefficients.setflags(write=False)
         object.__setattr__(self, "coefficients", coefficients)
         object.__setattr__(self, "origin", (float(self.origin[0]), float(self.origin[1])))
@@ -85,7 +92,27 @@ class ImageCorrection(SensorModel):
 
     @property
     def param_names(self) -> tuple[str, ...]:
-        return FREE[self.correction]
+        return tuple(name for name in FREE[self.correction] if name not in self.removed)
+
+    @property
+    def uses_height(self) -> bool:
+        return self.model.uses_height
+
+    @property
+    def removable(self) -> tuple[str, ...]:
+        left = self.param_names
+        # The origin is a convention: a slope without a shift would depend on it.
+        slopes = tuple(name for name in left if not name.endswith("_shift"))
+        return slopes + tuple(
+            f"{axis}_shift" for axis in ("col", "row")
+            if f"{axis}_shift" in left and not any(name.startswith(axis) for name in slopes)
+        )  # fmt: skip
+
+    def without(self, names: Iterable[str]) -> Self:
+        names = tuple(names)
+        coefficients = self.coefficients.copy()
+        coefficients[[COEFFICIENTS.index(name) for name in names]] = 0.0
+        return self._replace(coefficients=coefficients, removed=(*self.removed, *names))
 
     @property
     def params(self) -> Array:
@@ -137,7 +164,8 @@ class ImageCorrection(SensorModel):
         inner = data.get("model")
         if not isinstance(inner, dict):
             raise InputError("a correction needs the model that it corrects", field="model")
-        return super().from_dict({**data, "model": model_from_dict(inner)})
+        # Files of versions before parameters could be removed do not have this field.
+        return super().from_dict({"removed": (), **data, "model": model_from_dict(inner)})
 
 
 def _matrix(coefficients: Array) -> Array:

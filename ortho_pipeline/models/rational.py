@@ -1,5 +1,7 @@
 r"""Rational functions: image coordinates as ratios of polynomials of the ground.
 
+`Rational` is every classical model: which one, says the table in `ortho_pipeline.models.families`.
+
 The RPC model of vendors (RPC00B) is the cubic case with its coefficients given. With ground coordinates normalised to
 :math:`L, P, H` (longitude, latitude, ellipsoidal height; minus offset, over scale),
 
@@ -13,13 +15,16 @@ Source: NIMA STDI-0002, appendix E (RPC00B); Grodecki and Dial 2001; formula 6 o
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import ClassVar
+from functools import lru_cache
+from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.geometry import horizon_from_geodetic
 from ortho_pipeline.models.base import (
     INVERSE_TOLERANCE,
     INVERSE_VERIFIED,
@@ -28,6 +33,7 @@ from ortho_pipeline.models.base import (
     as_ground,
     as_image,
 )
+from ortho_pipeline.models.families import Family, exponents, family_of, points_needed
 
 #: Exponents of (L, P, H) in the order of RPC00B: 1, L, P, H, LP, LH, PH, LL, PP, HH, PLH, LLL, LPP, LHH, LLP, PPP,
 #: PHH, LLH, PPH, HHH.
@@ -91,11 +97,11 @@ def rpc_term_partials(lon: Array, lat: Array, h: Array) -> Array:
     powers = [np.stack([np.ones_like(v), v, v * v, v * v * v]) for v in (lon, lat, h)]
     partials = np.zeros((3, 20, lon.size))
     for axis in range(3):
-        for term, exponents in enumerate(RPC_TERMS):
-            if exponents[axis]:
-                lowered = exponents.copy()
+        for term, powers_of_term in enumerate(RPC_TERMS):
+            if powers_of_term[axis]:
+                lowered = powers_of_term.copy()
                 lowered[axis] -= 1
-                value = float(exponents[axis]) * powers[0][lowered[0]]
+                value = float(powers_of_term[axis]) * powers[0][lowered[0]]
                 partials[axis, term] = value * powers[1][lowered[1]] * powers[2][lowered[2]]
     return partials
 
@@ -260,3 +266,258 @@ class RPC(SensorModel):
             col_scale=self.col_scale / factor,
             row_scale=self.row_scale / factor,
         )
+
+
+# -- classical models ------------------------------------------------------------------------------------------------
+
+#: The `ground_crs` of a model in geocentric coordinates.
+GEOCENTRIC = "geocentric"
+#: A denominator below this part of its constant is at, or behind, the pole of the model.
+_POLE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """Where coefficients of a family stand in a table of the rows col, row (numerators), col, row (denominators)."""
+
+    family: Family
+    powers: NDArray[np.int64]  # (T, 3), of all terms that occur
+    places: tuple[tuple[NDArray[np.int64], int], ...]  # for each parameter: its rows of the table, its term
+
+    def table(self, coefficients: Array) -> Array:
+        """Return the coefficients as ``(4, T)``, the constants of the denominators included."""
+        table = np.zeros((4, len(self.powers)))
+        table[2:, 0] = 1.0
+        for value, (rows, term) in zip(coefficients, self.places, strict=True):
+            table[rows, term] = value
+        return table
+
+
+@lru_cache(maxsize=64)
+def _layout(name: str) -> _Layout:
+    family = family_of(name)
+    terms = list(dict.fromkeys(("1", *family.col, *family.row, *family.den)))
+    rows = {"col": [0], "row": [1], "den": [2, 3], "col_den": [2], "row_den": [3]}
+    places = []
+    for parameter in family.param_names:
+        part, _, term = parameter.rpartition("_")
+        places.append((np.array(rows[part]), terms.index(term)))
+    return _Layout(family, np.array([exponents(term) for term in terms]), tuple(places))
+
+
+@dataclass(frozen=True, eq=False)
+class Rational(SensorModel):
+    """A classical model: ratio of polynomials of normalised ground coordinates.
+
+    Parameters
+    ----------
+    family : str
+        Which terms there are: a name of `ortho_pipeline.models.families`.
+    ground_crs : str
+        CRS of the ground coordinates; ``geocentric`` takes lon, lat, h (EPSG:4979) and turns them into Cartesian
+        coordinates in the horizon of the middle of `box`, an affine change of geocentric ones.
+    coefficients : (P,)
+        In the order of the family's `param_names`, for normalised coordinates.
+    ground_offset, ground_scale : (3,)
+    image_offset, image_scale : (2,)
+        Normalised is (value - offset) / scale.
+    box : (2, 3)
+        Lowest and highest ground for which the model is meant; NaN beyond 1.5 half-sizes from its middle in plan.
+    wraps : bool
+        The first ground coordinate is a longitude in degrees.
+    removed : tuple of str
+        Coefficients that are zero and no parameters.
+    """
+
+    kind: ClassVar[str] = "rational"
+
+    family: str
+    ground_crs: str
+    coefficients: Array = field(repr=False)
+    ground_offset: Array = field(repr=False)
+    ground_scale: Array = field(repr=False)
+    image_offset: Array = field(repr=False)
+    image_scale: Array = field(repr=False)
+    box: Array = field(repr=False)
+    wraps: bool = False
+    removed: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        layout = _layout(self.family)
+        shapes = {
+            "coefficients": (layout.family.parameters,), "ground_offset": (3,), "ground_scale": (3,),
+            "image_offset": (2,), "image_scale": (2,), "box": (2, 3),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            values = np.array(getattr(self, name), dtype=np.float64)
+            if values.shape != shape or not np.isfinite(values).all():
+                raise InputError(f"a model of this family has {shape} finite numbers here", field=name)
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
+        if not ((self.ground_scale > 0).all() and (self.image_scale > 0).all()):
+            raise InputError("scales are positive", field="ground_scale, image_scale")
+        if not (self.box[0] < self.box[1]).all():
+            raise InputError("the lowest is not below the highest", field="box")
+        object.__setattr__(self, "removed", tuple(self.removed))
+        unknown = set(self.removed) - set(layout.family.param_names)
+        gone = [layout.family.param_names.index(name) for name in self.removed if name not in unknown]
+        if unknown or self.coefficients[gone].any():
+            raise InputError("what is removed is a coefficient of the family, and zero", field="removed")
+        object.__setattr__(self, "_table", layout.table(self.coefficients))
+
+    @property
+    def crs(self) -> str:
+        return "EPSG:4979" if self.ground_crs == GEOCENTRIC else self.ground_crs
+
+    @property
+    def domain(self) -> tuple[Array, Array]:
+        return self.box.mean(axis=0), (self.box[1] - self.box[0]) / 2
+
+    @property
+    def uses_height(self) -> bool:
+        return family_of(self.family).dimensions == 3
+
+    # -- parameters --------------------------------------------------------------------------------------------------
+
+    @property
+    def param_names(self) -> tuple[str, ...]:
+        names = _layout(self.family).family.param_names
+        return tuple(name for name in names if name not in self.removed) if self.removed else names
+
+    @property
+    def _free(self) -> list[int]:
+        return [k for k, name in enumerate(family_of(self.family).param_names) if name not in self.removed]
+
+    @property
+    def params(self) -> Array:
+        return self.coefficients[self._free]
+
+    def with_params(self, params: ArrayLike) -> Self:
+        coefficients = np.zeros(len(self.coefficients))
+        coefficients[self._free] = params
+        return self._replace(coefficients=coefficients)
+
+    @property
+    def minimum_points(self) -> int:
+        return points_needed(self.param_names)
+
+    @property
+    def removable(self) -> tuple[str, ...]:
+        parts: dict[str, list[tuple[str, NDArray[np.int64]]]] = {}
+        for name in self.param_names:
+            part, _, term = name.rpartition("_")
+            parts.setdefault(part, []).append((name, exponents(term)))
+        return tuple(
+            name
+            for terms in parts.values()
+            for name, powers in terms
+            if powers.any() and not any((other >= powers).all() for also, other in terms if also != name)
+        )
+
+    def without(self, names: Iterable[str]) -> Self:
+        names = tuple(names)
+        coefficients = self.coefficients.copy()
+        coefficients[[family_of(self.family).param_names.index(name) for name in names]] = 0.0
+        return self._replace(coefficients=coefficients, removed=(*self.removed, *names))
+
+    @property
+    def penalised(self) -> tuple[str, ...]:
+        """Names of the parameters that a regularisation draws to zero: all but the affine part of the numerators."""
+        return tuple(
+            name
+            for name in self.param_names
+            if "den_" in name or int(exponents(name.rpartition("_")[2]).sum()) > 1
+        )  # fmt: skip
+
+    # -- evaluation --------------------------------------------------------------------------------------------------
+
+    def normalise(self, ground: ArrayLike) -> tuple[Array, Array | None]:
+        """Return normalised coordinates ``(N, 3)``, NaN outside the domain, and their slopes if not simply 1 / scale.
+
+        The slopes ``(N, 3, 3)`` are those of Cartesian by geodetic coordinates, before the scale.
+        """
+        ground = as_ground(ground).copy()
+        centre, half = self.domain
+        with np.errstate(invalid="ignore"):
+            if self.wraps:
+                ground[:, 0] -= 360.0 * np.round((ground[:, 0] - centre[0]) / 360.0)
+            outside = (np.abs(ground[:, :2] - centre[:2]) > DOMAIN_LIMIT * half[:2]).any(axis=1)
+        ground[outside | ~np.isfinite(ground).all(axis=1)] = np.nan
+        slopes = None
+        if self.ground_crs == GEOCENTRIC:
+            ground, slopes = horizon_from_geodetic(ground, centre)
+        return (ground - self.ground_offset) / self.ground_scale, slopes
+
+    def _sums(self, terms: Array) -> Array:
+        """Return the four polynomials ``(4, N)``; NaN where a denominator has its pole behind it."""
+        sums = self._table @ terms  # type: ignore[attr-defined]
+        with np.errstate(invalid="ignore"):
+            sums[:, ~(sums[2:] > _POLE).all(axis=0)] = np.nan
+        return sums
+
+    def ground_to_image(self, ground: ArrayLike) -> Array:
+        normalised, _ = self.normalise(ground)
+        sums = self._sums(_terms(self.family, normalised))
+        image = (sums[:2] / sums[2:]).T * self.image_scale + self.image_offset
+        image[~np.isfinite(normalised).all(axis=1)] = np.nan
+        return np.ascontiguousarray(image)
+
+    def ground_partials(self, ground: ArrayLike) -> Array:
+        normalised, slopes = self.normalise(ground)
+        sums = self._sums(_terms(self.family, normalised))
+        ratios = sums[:2] / sums[2:]
+        by_axis = self._table @ _term_partials(self.family, normalised)  # type: ignore[attr-defined]
+        partials = np.moveaxis((by_axis[:, :2] - ratios * by_axis[:, 2:]) / sums[2:], (0, 1, 2), (2, 1, 0))
+        partials = partials * self.image_scale[:, None] / self.ground_scale
+        partials[~np.isfinite(normalised).all(axis=1)] = np.nan
+        return partials if slopes is None else partials @ slopes
+
+    def param_partials(self, ground: ArrayLike) -> Array:
+        normalised, _ = self.normalise(ground)
+        terms = _terms(self.family, normalised)
+        sums = self._sums(terms)
+        factors = np.concatenate([1.0 / sums[2:], -sums[:2] / sums[2:] ** 2]) * np.tile(self.image_scale, 2)[:, None]
+        free = self._free
+        partials = np.zeros((terms.shape[1], 2, len(free)))
+        places = _layout(self.family).places
+        for k, index in enumerate(free):
+            rows, term = places[index]
+            for row in rows:
+                partials[:, row % 2, k] = factors[row] * terms[term]
+        partials[~np.isfinite(normalised).all(axis=1)] = np.nan
+        return partials
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        if not isinstance(data.get("family"), str):
+            raise InputError("a rational model has the name of its family", field="family")
+        return super().from_dict(data)
+
+
+def _powers(name: str, normalised: Array) -> tuple[NDArray[np.int64], list[list[Array]]]:
+    table = _layout(name).powers
+    found = []
+    for axis in range(3):
+        powers = [np.ones(len(normalised))]
+        for _ in range(int(table[:, axis].max())):
+            powers.append(powers[-1] * normalised[:, axis])
+        found.append(powers)
+    return table, found
+
+
+def _terms(name: str, normalised: Array) -> Array:
+    """Return the terms of a family ``(T, N)``."""
+    table, powers = _powers(name, normalised)
+    return np.array([powers[0][i] * powers[1][j] * powers[2][k] for i, j, k in table])
+
+
+def _term_partials(name: str, normalised: Array) -> Array:
+    """Return the derivatives of the terms by the normalised coordinates ``(3, T, N)``."""
+    table, powers = _powers(name, normalised)
+    partials = np.zeros((3, len(table), len(normalised)))
+    for axis in range(3):
+        for term, exponent in enumerate(table):
+            if exponent[axis]:
+                i, j, k = exponent - (np.arange(3) == axis)
+                partials[axis, term] = float(exponent[axis]) * powers[0][i] * powers[1][j] * powers[2][k]
+    return partials

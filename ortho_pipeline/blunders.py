@@ -1,0 +1,186 @@
+"""Search for gross errors among control points.
+
+Points that agree with each other are looked for first, in a way that bad ones cannot spoil: by least median of squares
+over minimal subsets for models with few parameters (linearised, and linearised again where that led), by taking out the
+worst point over and over for models with many. Every excluded point is then tested against the fit of the others and
+comes back if it agrees with them.
+
+Source: Baarda 1968 (data snooping); Rousseeuw 1984 (LMedS).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+
+from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.problem import Problem, Solution
+from ortho_pipeline.ridge import regularised
+
+#: Chance that a good set of points loses any of its points to the search for gross errors.
+BLUNDER_RISK = 0.001
+#: More than this share of rejected control points is an error, not a clean-up.
+REJECTED_LIMIT = 0.3
+#: Residuals are never tested at a finer scale than this part of their stated sigma (noise-free simulations).
+_SCALE_FLOOR = 1e-3
+_SUBSETS = 500
+#: Minimal subsets of models with more parameters hardly ever are without a bad point.
+_FEW_PARAMETERS = 14
+_ROUNDS = 4
+
+
+def find_blunders(problem: Problem, ridge: float | str | None = None) -> tuple[np.ndarray, dict[int, str]]:
+    """Return the mask of points to keep ``(n,)`` and the reason for each that is not.
+
+    A regularisation that is to be found is found once more when suspected points are out.
+    """
+    count = len(problem.rows)
+    keep = np.ones(count, dtype=bool)
+    few = len(problem.model.params) <= _FEW_PARAMETERS and not problem.ridge
+    solution = _common(problem) if few else problem.solve(keep, linear=True)
+    if solution.redundancy < 2 * 2:  # a single spare point can contradict, but not say who is wrong
+        return keep, {}
+    if few:
+        keep = _median_start(problem, solution)
+    else:
+        keep = _snooping_start(problem, solution, linear=True)
+        if ridge is not None:
+            problem, _ = regularised(problem, keep, ridge)
+        keep = _snooping_start(problem, problem.solve(keep), keep)
+    reasons: dict[int, str] = {}
+    # Suspicion first falls on too many: re-admit the excluded that agree with the others, until none is left that does.
+    while not keep.all():
+        chances, sizes = _chance(problem, keep)
+        agree = ~keep & (chances >= BLUNDER_RISK / count)
+        if not agree.any():
+            reasons = {int(i): _reason(sizes[i]) for i in np.flatnonzero(~keep)}
+            break
+        keep = keep | agree
+    return keep, reasons
+
+
+def _common(problem: Problem) -> Solution:
+    """Return the solution of all points, or one step towards it where gross errors keep it from converging."""
+    everything = np.ones(len(problem.rows), dtype=bool)
+    try:
+        return problem.solve(everything)
+    except NotConverged:
+        return problem.solve(everything, linear=True)
+
+
+def _reason(size: float) -> str:
+    if not math.isfinite(size):
+        return "gross error: the other points put it outside of the model"
+    return f"gross error: {size:.1f} px from where the other points put it"
+
+
+def _median_start(problem: Problem, solution: Solution) -> np.ndarray:
+    """Return a clean subset ``(n,)``, linearised anew until the linear prediction of its solution holds."""
+    keep = _median_subset(solution, len(problem.priors))
+    for _ in range(_ROUNDS):
+        try:
+            found = problem.started(solution.model).solve(keep)
+        except (DegeneratePoints, NotConverged):
+            return keep
+        step = found.model.params - solution.model.params
+        linear = solution.residuals - solution.jacobian @ step
+        residuals = problem.image - found.model.ground_to_image(problem.ground)
+        with np.errstate(invalid="ignore"):
+            bent = ~(np.abs(residuals - linear) / problem.sigma < 0.1).all(axis=1)
+        if not bent.any() or not np.isfinite(residuals).all():
+            return keep
+        # The common solution was so far off that the model is not linear on the way: look again from the clean one.
+        jacobian = found.model.param_partials(problem.ground)
+        solution = Solution(
+            found.model, jacobian, residuals, problem.sigma, found.cofactors, found.freedom, found.effective,
+            found.sigma0, found.condition,
+        )  # fmt: skip
+        again = _median_subset(solution, len(problem.priors))
+        if (again == keep).all():
+            return keep
+        keep = again
+    return keep
+
+
+def _median_subset(solution: Solution, priors: int) -> np.ndarray:
+    """Return a clean subset ``(n,)`` by least median of squares on the linearised problem."""
+    jacobian, residuals = solution.jacobian / solution.sigma[:, :, None], solution.residuals / solution.sigma
+    count, params = len(jacobian), jacobian.shape[2]
+    size = max(1, solution.model.minimum_points, math.ceil((params - priors) / 2))
+    if priors:
+        size = max(1, math.ceil((params - priors) / 2))
+    subsets = np.array(_minimal_subsets(count, size))
+    # Linear in a step from the common solution; a minimal subset with 2 * size > params is solved by least squares.
+    inverses = np.linalg.pinv(jacobian[subsets].reshape(len(subsets), 2 * size, params))
+    steps = (inverses @ residuals[subsets].reshape(len(subsets), 2 * size, 1))[:, :, 0]
+    left = residuals[None] - (steps @ jacobian.reshape(-1, params).T).reshape(len(subsets), count, 2)
+    squares = (left**2).sum(axis=2)
+    half = (count + size + 1) // 2
+    merit = np.sort(squares, axis=1)[:, half - 1]
+    best = int(np.argmin(merit))
+    keep = np.zeros(count, dtype=bool)
+    keep[np.argsort(squares[best], kind="stable")[: max(half, size + 1)]] = True
+    return keep
+
+
+def _minimal_subsets(count: int, size: int) -> list[list[int]]:
+    if math.comb(count, size) <= _SUBSETS:
+        return [list(subset) for subset in itertools.combinations(range(count), size)]
+    generator = np.random.default_rng(0)  # the same points give the same answer every time
+    return [sorted(generator.choice(count, size, replace=False).tolist()) for _ in range(_SUBSETS)]
+
+
+def _snooping_start(
+    problem: Problem, solution: Solution, keep: np.ndarray | None = None, *, linear: bool = False
+) -> np.ndarray:
+    """Return the points ``(n,)`` that are left when the one that fits the others worst is taken out, over and over."""
+    from scipy.stats import f as fisher
+
+    count = len(problem.rows)
+    keep = np.ones(count, dtype=bool) if keep is None else keep.copy()
+    # One more than may be rejected: the caller then says that there are too many.
+    while (~keep).sum() <= REJECTED_LIMIT * count:
+        spare = solution.spare()
+        standardised = solution.residuals / solution.sigma
+        good = np.linalg.det(spare) > 1e-6
+        squares = np.zeros(len(spare))
+        solved = np.linalg.solve(spare[good], standardised[good][:, :, None])[:, :, 0]
+        squares[good] = (standardised[good] * solved).sum(axis=1)
+        freedom = solution.freedom - 2
+        if solution.sigma0 is None or freedom < 1:
+            break
+        others = np.maximum((solution.sigma0**2 * solution.freedom - squares) / freedom, _SCALE_FLOOR**2)
+        chances = fisher.sf(squares / 2 / others, 2, freedom)
+        # Where chances underflow to zero, the ratio still tells which is worst.
+        worst = int(np.argmax(squares / others))
+        if chances[worst] >= BLUNDER_RISK / count:
+            break
+        keep[np.flatnonzero(keep)[worst]] = False
+        try:
+            solution = problem.started(solution.model).solve(keep, linear=linear)
+        except (DegeneratePoints, NotConverged, TooFewPoints):
+            break
+    return keep
+
+
+def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
+    """Return for each point the chance of lying so far from the fit of the kept ones, and that distance in pixels."""
+    from scipy.stats import f as fisher
+
+    try:
+        solution = problem.solve(keep)
+    except (DegeneratePoints, TooFewPoints):
+        return np.ones(len(keep)), np.zeros(len(keep))
+    miss = problem.image - solution.model.ground_to_image(problem.ground)
+    miss[~np.isfinite(miss).all(axis=1)] = np.inf
+    jacobian = solution.model.param_partials(problem.ground) / problem.sigma[:, :, None]
+    jacobian[~np.isfinite(jacobian).all(axis=(1, 2))] = 0.0
+    spread = np.eye(2) + jacobian @ solution.cofactors @ jacobian.transpose(0, 2, 1)
+    standardised = np.minimum(miss / problem.sigma, 1e150)
+    distance = (standardised * np.linalg.solve(spread, standardised[:, :, None])[:, :, 0]).sum(axis=1)
+    freedom = max(solution.freedom, 1.0)
+    scale = max(solution.sigma0 or 0.0, _SCALE_FLOOR)
+    return fisher.sf(distance / 2 / scale**2, 2, freedom), np.hypot(miss[:, 0], miss[:, 1])

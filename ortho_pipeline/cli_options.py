@@ -1,0 +1,219 @@
+"""The options that several commands share, as decorators; each group arrives as one object of `options`."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+
+
+def json_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add ``--json``, and remember it for errors."""
+
+    def remember(ctx: click.Context, _: click.Parameter, value: bool) -> bool:
+        ctx.meta["json"] = value
+        return value
+
+    return click.option(
+        "--json", "as_json", is_flag=True, callback=remember, is_eager=True, help="Print one JSON document on stdout."
+    )(command)
+
+
+def _grouped(
+    name: str, make: Callable[..., Any], *options: Callable[[Callable[..., Any]], Callable[..., Any]]
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Add click options to a command and hand them to it as one object, the keyword argument `name`."""
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(command)
+        def wrapper(**given: Any) -> Any:
+            fields = {key.removeprefix(prefix): given.pop(key) for key in list(given) if key.startswith(prefix)}
+            return command(**given, **{name: make(**fields)})
+
+        for option in reversed(options):
+            wrapper = option(wrapper)
+        return wrapper
+
+    prefix = f"{name}_"
+    return decorate
+
+
+_FILE = click.Path(dir_okay=False)
+
+scene_options = _grouped(
+    "scene",
+    SceneOptions,
+    click.option("--sensor", "scene_sensor", metavar="NAME", help="Sensor of the image (see 'ortho sensors')."),
+    click.option(
+        "--rpc", "scene_rpc", metavar="tag|sidecar|FILE", help="Which RPC, where there are several, or an RPC file."
+    ),
+    click.option("--model", "scene_model", type=_FILE, help="A saved *_model.json in place of the image's model."),
+    click.option("--allow-network", "scene_allow_network", is_flag=True, help="Open URLs and /vsi paths too."),
+)
+
+point_options = _grouped(
+    "points",
+    PointOptions,
+    click.option(
+        "--gcps",
+        "points_gcps",
+        metavar="FILE|own",
+        help="Points: CSV, GeoJSON, QGIS .points, ODM gcp_list.txt, ENVI .pts; or 'own' for those in the image.",
+    ),
+    click.option("--points-crs", "points_crs", metavar="CRS", help="CRS of the points, where their file has none."),
+    click.option(
+        "--points-vertical",
+        "points_vertical",
+        metavar="DATUM",
+        help="Height datum of the points: ellipsoid, egm96, egm2008, EPSG:n or a grid file.",
+    ),
+    click.option(
+        "--pixel-origin",
+        "points_pixel_origin",
+        type=click.Choice(["corner", "center"]),
+        default="corner",
+        show_default=True,
+        help="What (0, 0) is in CSV files: the outer corner of the first pixel or its centre.",
+    ),
+    click.option("--check", "points_check", metavar="every:N|ids:A,B", help="Points that check and do not control."),
+    click.option(
+        "--select",
+        "points_select",
+        metavar="even:N|cluster:N|ids:A,B|random:N:SEED",
+        help="Points that control: N well spread, N of one region, these, or N by lot; all others check.",
+    ),
+    click.option(
+        "--correction",
+        "points_correction",
+        type=click.Choice(["none", "shift", "shift-drift", "affine"]),
+        help="What is adjusted, in image space  [default: shift if there are control points]",
+    ),
+    click.option(
+        "--fit-model",
+        "points_fit_model",
+        metavar="NAME",
+        help="Fit a model from the points alone (see 'ortho models'), in place of the image's own.",
+    ),
+    click.option(
+        "--model-crs",
+        "points_model_crs",
+        metavar="CRS",
+        help="Ground of fitted models: geocentric, geographic, utm or EPSG:n  [default: that of the points]",
+    ),
+    click.option("--prune", "points_prune", is_flag=True, help="Remove parameters that the points do not justify."),
+)
+
+surface_options = _grouped(
+    "surface",
+    SurfaceOptions,
+    click.option("--dem", "surface_dem", metavar="FILE", help="Digital elevation model."),
+    click.option(
+        "--dem-vertical",
+        "surface_vertical",
+        metavar="DATUM",
+        help="Height datum of the DEM: ellipsoid, egm96, egm2008, EPSG:n or a grid file.",
+    ),
+    click.option(
+        "--override-dem-vertical",
+        "surface_override_vertical",
+        is_flag=True,
+        help="Believe --dem-vertical even where the DEM declares another datum.",
+    ),
+    click.option(
+        "--dem-fill",
+        "surface_fill",
+        metavar="error|mask|nearest|M",
+        default="error",
+        show_default=True,
+        help="Where the DEM has no height: stop, leave pixels out, take the nearest, or an ellipsoidal height.",
+    ),
+    click.option("--height", "surface_height", type=float, metavar="M", help="One ellipsoidal height, no DEM."),
+)
+
+output_options = _grouped(
+    "output",
+    lambda creation_options, memory_mb, **fields: OutputOptions(
+        creation_options=dict(creation_options), memory=memory_mb * 1_000_000, **fields
+    ),
+    click.option("--output-crs", "-t_srs", "output_crs", metavar="CRS", help="[default: the UTM zone of the scene]"),
+    click.option(
+        "--resolution",
+        "-tr",
+        "output_resolution",
+        type=float,
+        metavar="R",
+        help="Pixel size in units of the output CRS  [default: the ground sample distance]",
+    ),
+    click.option(
+        "--extent",
+        "-te",
+        "output_extent",
+        type=float,
+        nargs=4,
+        metavar="XMIN YMIN XMAX YMAX",
+        help="Taken as it is  [default: the scene's footprint]",
+    ),
+    click.option(
+        "--resampling",
+        "-r",
+        "output_resampling",
+        type=click.Choice(["nearest", "bilinear", "cubic"]),
+        default="bilinear",
+        show_default=True,
+    ),
+    click.option(
+        "--format", "-of", "output_format", type=click.Choice(["COG", "GTiff"]), default="COG", show_default=True
+    ),
+    click.option(
+        "--creation-option",
+        "-co",
+        "output_creation_options",
+        multiple=True,
+        metavar="K=V",
+        callback=lambda ctx, parameter, values: [_key_value(value) for value in values],
+        help="Option of GDAL's driver; may be repeated.",
+    ),
+    click.option(
+        "--engine",
+        "output_engine",
+        type=click.Choice(["ortho", "gdal"]),
+        default="ortho",
+        show_default=True,
+        help="Our warper, or GDAL's exact one (slow; for comparison).",
+    ),
+    click.option(
+        "--memory",
+        "output_memory_mb",
+        type=click.IntRange(min=16),
+        default=512,
+        show_default=True,
+        metavar="MB",
+        help="Bound on windows and caches.",
+    ),
+    click.option("--threads", "output_threads", type=click.IntRange(min=1), help="[default: all processors]"),
+    click.option(
+        "--tolerance",
+        "output_tolerance",
+        type=click.FloatRange(min=0, min_open=True),
+        default=0.01,
+        show_default=True,
+        metavar="PX",
+        help="Bound on the warper's geometric error, in source pixels.",
+    ),
+)
+
+image_argument = click.argument("image", type=click.Path())
+folder_option = click.option(
+    "--output", "-o", "folder", type=click.Path(file_okay=False), required=True, metavar="DIR", help="Output folder."
+)
+
+
+def _key_value(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise click.BadParameter(f"{text!r} is not KEY=VALUE")
+    return key, value

@@ -1,0 +1,256 @@
+"""A drawing of lines, marks and text that can be shown as SVG or PNG.
+
+The colours are CSS variables, so that one drawing suits a light page, a dark one and paper, and text stays text. Each
+kind of thing has its look in one table, which the SVG style sheet and the PNG are both made from.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from html import escape
+from typing import Any
+
+from ortho_pipeline.errors import InputError
+
+#: Variables of the page and what they are outside of it.
+_COLOURS = {"control": "#2563a8", "check": "#b4500b", "paper": "#ffffff", "ink": "#1b1f24"}
+
+
+@dataclass(frozen=True)
+class Look:
+    """Stroke and fill by name of colour (None for none), opacities, width and dashes in CSS pixels."""
+
+    stroke: str | None = None
+    fill: str | None = None
+    width: float = 1.0
+    stroke_opacity: float = 1.0
+    fill_opacity: float = 1.0
+    dash: str = ""
+
+
+LOOKS = {
+    "frame": Look("ink", None, 1.0, 0.45),
+    "grid": Look("ink", None, 1.0, 0.13),
+    "axis": Look("ink", None, 1.0, 0.5),
+    "guide": Look("ink", None, 1.0, 0.55, dash="4 4"),
+    "hull": Look("control", "control", 1.0, 0.35, 0.07, dash="5 4"),
+    "control": Look("control", "control", 1.7),
+    "check": Look("check", "paper", 1.8),
+    "check-line": Look("check", None, 1.7),
+    "check-head": Look(None, "check"),
+    "control-head": Look(None, "control"),
+    "loo": Look("control", "paper", 1.7),
+    "out": Look("ink", None, 1.6, 0.6),
+    "bar": Look("ink", "ink", 1.7),
+    "plus": Look(None, "control"),
+    "minus": Look(None, "check"),
+    "chosen": Look(None, "control", fill_opacity=0.1),
+}
+_FONT = 'system-ui,-apple-system,"Segoe UI",Roboto,sans-serif'
+
+
+@dataclass
+class Drawing:
+    """Things in drawing order; x to the right, y down, in CSS pixels."""
+
+    width: float
+    height: float
+    label: str
+    name: str = "plot"
+    items: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
+
+    def line(self, kind: str, x1: float, y1: float, x2: float, y2: float) -> None:
+        """Draw a line."""
+        self.items.append(("line", {"kind": kind, "xy": [(x1, y1), (x2, y2)]}))
+
+    def path(self, kind: str, *lines: Sequence[tuple[float, float]], closed: bool = False) -> None:
+        """Draw one or several polylines as one thing."""
+        self.items.append(("path", {"kind": kind, "lines": lines, "closed": closed}))
+
+    def circle(self, kind: str, x: float, y: float, radius: float) -> None:
+        """Draw a circle."""
+        self.items.append(("circle", {"kind": kind, "x": x, "y": y, "r": radius}))
+
+    def rect(self, kind: str, x: float, y: float, wide: float, tall: float, strength: float = 1.0) -> None:
+        """Draw a rectangle whose fill has the opacity `strength` times that of its kind."""
+        self.items.append(("rect", {"kind": kind, "x": x, "y": y, "w": wide, "h": tall, "strength": strength}))
+
+    def text(
+        self, x: float, y: float, text: str, *, anchor: str = "start", quiet: bool = False, turn: bool = False
+    ) -> None:
+        """Write text at its baseline; `turn` writes upwards."""
+        self.items.append(("text", {"x": x, "y": y, "text": text, "anchor": anchor, "quiet": quiet, "turn": turn}))
+
+    @contextmanager
+    def titled(self, title: str) -> Iterator[None]:
+        """Show `title` where the pointer rests on what is drawn within."""
+        self.items.append(("open", {"title": title}))
+        yield
+        self.items.append(("close", {}))
+
+    def arrow(self, kind: str, x: float, y: float, dx: float, dy: float) -> None:
+        """Draw an arrow; nothing where it would be shorter than a pixel."""
+        length = math.hypot(dx, dy)
+        if length < 1.0:
+            return
+        ux, uy = dx / length, dy / length
+        head = min(8.0, 0.6 * length + 2.0)
+        tip_x, tip_y = x + dx, y + dy
+        base_x, base_y, wing = tip_x - head * ux, tip_y - head * uy, 0.42 * head
+        self.line("check-line" if kind == "check" else kind, x, y, base_x, base_y)
+        points = [(tip_x, tip_y), (base_x - wing * uy, base_y + wing * ux), (base_x + wing * uy, base_y - wing * ux)]
+        self.path(kind if kind == "bar" else f"{kind}-head", points, closed=True)
+
+    def mark(self, kind: str, x: float, y: float) -> None:
+        """Draw the mark of a point: a dot for control, a square for check, a cross for what is left out."""
+        if kind == "out":
+            self.path("out", [(x - 4.5, y - 4.5), (x + 4.5, y + 4.5)], [(x + 4.5, y - 4.5), (x - 4.5, y + 4.5)])
+        elif kind == "check":
+            self.rect("check", x - 3.6, y - 3.6, 7.2, 7.2)
+        else:
+            self.circle(kind, x, y, 3.4)
+
+    # -- SVG ---------------------------------------------------------------------------------------------------------
+
+    def svg(self, *, alone: bool = False) -> str:
+        """Return the drawing as SVG: for a page, or `alone` with colours that every program knows."""
+        parts = [
+            f'<svg xmlns="http://www.w3.org/2000/svg" class="plot" viewBox="0 0 {self.width:.0f} {self.height:.0f}" '
+            + (f'width="{self.width:.0f}" height="{self.height:.0f}" ' if alone else "")
+            + f'role="img" aria-label="{escape(self.label)}" data-plot="{self.name}">'
+        ]
+        if alone:
+            style = style_sheet(alone=True)
+            parts.append(f'<style>{style}</style><rect width="100%" height="100%" fill="{_COLOURS["paper"]}"/>')
+        parts += [_svg_item(what, **given) for what, given in self.items]
+        return "\n".join([*parts, "</svg>"])
+
+    # -- PNG ---------------------------------------------------------------------------------------------------------
+
+    def png(self, *, scale: float = 2.0) -> bytes:
+        """Return the drawing as PNG of `scale` pixels per CSS pixel.
+
+        Raises
+        ------
+        InputError
+            If matplotlib is not installed.
+        """
+        import io
+
+        try:
+            from matplotlib.backends.backend_agg import FigureCanvasAgg
+            from matplotlib.figure import Figure
+        except ImportError as error:
+            raise InputError(
+                "PNG needs matplotlib, which is not installed", field="--kind",
+                remedy="pip install 'ortho-pipeline[plots]', or take --kind svg",
+            ) from error  # fmt: skip
+        figure = Figure(figsize=(self.width / 100, self.height / 100), dpi=100 * scale, facecolor=_COLOURS["paper"])
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        axes.set_xlim(0, self.width)
+        axes.set_ylim(self.height, 0)
+        axes.set_axis_off()
+        for order, (what, given) in enumerate(self.items):
+            _paint(axes, what, order, **given)
+        out = io.BytesIO()
+        FigureCanvasAgg(figure).print_png(out)
+        return out.getvalue()
+
+
+def style_sheet(*, alone: bool = False) -> str:
+    """Return the CSS of all kinds of things."""
+
+    def colour(name: str | None) -> str:
+        if name is None:
+            return "none"
+        return _COLOURS[name] if alone else f"var(--{name})"
+
+    rules = [f".plot text{{font:12px {_FONT};fill:{colour('ink')}}}", ".plot .quiet{opacity:.65}"]
+    for kind, look in LOOKS.items():
+        rule = f"fill:{colour(look.fill)};stroke:{colour(look.stroke)};stroke-width:{look.width}"
+        if look.stroke_opacity != 1:
+            rule += f";stroke-opacity:{look.stroke_opacity}"
+        if look.fill_opacity != 1:
+            rule += f";fill-opacity:{look.fill_opacity}"
+        rules.append(f".plot .{kind}{{{rule}{f';stroke-dasharray:{look.dash}' if look.dash else ''}}}")
+    return "\n".join(rules)
+
+
+def _svg_item(what: str, **given: Any) -> str:
+    makers: dict[str, Callable[..., str]] = {
+        "open": lambda title: f"<g><title>{escape(title)}</title>",
+        "close": lambda: "</g>",
+        "line": _svg_line,
+        "path": _svg_path,
+        "circle": lambda kind, x, y, r: f'<circle class="{kind}" cx="{x:.1f}" cy="{y:.1f}" r="{r:.1f}"/>',
+        "rect": _svg_rect,
+        "text": _svg_text,
+    }
+    return makers[what](**given)
+
+
+def _svg_line(kind: str, xy: list[tuple[float, float]]) -> str:
+    (x1, y1), (x2, y2) = xy
+    return f'<line class="{kind}" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>'
+
+
+def _svg_path(kind: str, lines: Sequence[Sequence[tuple[float, float]]], closed: bool) -> str:
+    end = "Z" if closed else ""
+    data = "".join("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in line) + end for line in lines)
+    return f'<path class="{kind}" d="{data}"/>'
+
+
+def _svg_rect(kind: str, x: float, y: float, w: float, h: float, strength: float) -> str:
+    fill = "" if strength == 1 else f' fill-opacity="{strength:.3f}"'
+    return f'<rect class="{kind}" x="{x:.1f}" y="{y:.1f}" width="{w:.1f}" height="{h:.1f}"{fill}/>'
+
+
+def _svg_text(x: float, y: float, text: str, anchor: str, quiet: bool, turn: bool) -> str:
+    place = f'transform="translate({x:.1f} {y:.1f}) rotate(-90)"' if turn else f'x="{x:.1f}" y="{y:.1f}"'
+    kind = ' class="quiet"' if quiet else ""
+    return f'<text{kind} {place} text-anchor="{anchor}">{escape(text)}</text>'
+
+
+def _paint(axes: Any, what: str, order: int, **given: Any) -> None:
+    """Paint one thing with matplotlib."""
+    from matplotlib.patches import Circle, PathPatch, Rectangle
+    from matplotlib.path import Path
+
+    if what in ("open", "close"):
+        return
+    if what == "text":
+        axes.text(
+            given["x"], given["y"], given["text"], fontsize=12 * 0.72, color=_COLOURS["ink"], zorder=order,
+            ha={"start": "left", "middle": "center", "end": "right"}[given["anchor"]], va="baseline",
+            alpha=0.65 if given["quiet"] else 1.0, rotation=90 if given["turn"] else 0, rotation_mode="anchor",
+            parse_math=False,
+        )  # fmt: skip
+        return
+    look = LOOKS[given["kind"]]
+    style: dict[str, Any] = {
+        "edgecolor": _rgba(look.stroke, look.stroke_opacity),
+        "facecolor": _rgba(look.fill, look.fill_opacity * given.get("strength", 1.0)),
+        "linewidth": look.width * 0.72,
+        "linestyle": (0, tuple(float(part) / look.width for part in look.dash.split())) if look.dash else "-",
+        "zorder": order,
+    }
+    if what == "circle":
+        axes.add_patch(Circle((given["x"], given["y"]), given["r"], **style))
+    elif what == "rect":
+        axes.add_patch(Rectangle((given["x"], given["y"]), given["w"], given["h"], **style))
+    else:
+        lines = [given["xy"]] if what == "line" else given["lines"]
+        parts = [Path([*line, line[0]] if given.get("closed") else line) for line in map(list, lines)]
+        if what == "line":
+            style["facecolor"] = "none"
+        axes.add_patch(PathPatch(Path.make_compound_path(*parts), **style))
+
+
+def _rgba(name: str | None, opacity: float) -> Any:
+    if name is None:
+        return "none"
+    code = _COLOURS[name]
+    return (*(int(code[k : k + 2], 16) / 255 for k in (1, 3, 5)), opacity)

@@ -1,0 +1,306 @@
+"""What a command reads: the scene, the surface, the points; which paths it may write; and the record of all that."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterable, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+
+from ortho_pipeline import dem, plugins, raster
+from ortho_pipeline.crs import Vertical, parse_crs
+from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.files import sha256
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.model_file import read_model_file
+from ortho_pipeline.options import PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, read_points
+from ortho_pipeline.selection import select_control
+
+#: Side-cars that GDAL would attach to an image of this stem, whatever the image itself says.
+SIDE_CARS = ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", "_metadata.txt", ".IMD")
+#: In place of a file of points: the ground control points that the image itself holds.
+OWN_POINTS = "own"
+#: Name of the "sensor" of an image that has no model of its own.
+POINTS_ONLY = "points only"
+
+
+# -- opening ---------------------------------------------------------------------------------------------------------
+
+
+def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> Scene:
+    """Open an image with its sensor, or with the model of a model file.
+
+    Raises
+    ------
+    InputError
+        If no sensor recognises the image, or the model file belongs to an image of another size.
+    """
+    if options.model is None:
+        given = {} if options.rpc is None else {"rpc": options.rpc}
+        return plugins.open_scene(image, options.sensor, given, allow_network=options.allow_network)
+    if options.rpc is not None or options.sensor is not None:
+        raise InputError(
+            "a model file takes the place of the image's model", field="--model", remedy="leave out --rpc and --sensor"
+        )
+    dataset = raster.open_dataset(image, allow_network=options.allow_network)
+    plugins.Host.discover()  # model families of plugins, which the file may name
+    saved = read_model_file(options.model)
+    size = dataset.RasterXSize, dataset.RasterYSize
+    if saved.size is not None and saved.size != size:
+        raise InputError(
+            f"this model is of an image of {saved.size[0]} x {saved.size[1]} pixels, {Path(image).name} has "
+            f"{size[0]} x {size[1]}",
+            file=options.model,
+            field="size",
+            remedy="give the model file of this image",
+        )
+    return Scene(
+        sensor=saved.sensor or "model file", path=image, width=size[0], height=size[1],
+        models={saved.model.kind: saved.model}, model_source=str(options.model),
+        facts={"delivered_model_source": saved.model_source} if saved.model_source else {},
+    )  # fmt: skip
+
+
+def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_model: bool) -> Scene:
+    """Open an image whose own model is only wanted if there is one.
+
+    Parameters
+    ----------
+    needs_model : bool
+        Whether an image without a model of its own is an error.
+
+    Returns
+    -------
+    Scene
+        Without models and of the sensor "points only" where no sensor recognises the image.
+    """
+    asked = options.model is not None or options.rpc is not None or options.sensor is not None
+    if needs_model or asked:
+        return open_scene(image, options)
+    dataset = raster.open_dataset(image, allow_network=options.allow_network)
+    host = plugins.Host.discover()
+    try:
+        host.recognise(dataset)
+    except InputError:
+        if any(sensor.recognises(dataset) for sensor in host.sensors.values()):
+            raise
+        return Scene(POINTS_ONLY, Path(image), dataset.RasterXSize, dataset.RasterYSize, {}, "control points")
+    return open_scene(image, options)
+
+
+def open_surface(options: SurfaceOptions, allow_network: bool = False) -> dem.Surface:
+    """Open the DEM, or make a surface of one height.
+
+    Raises
+    ------
+    InputError
+        If both or neither are given, or a rule is unknown.
+    """
+    if options.dem is not None and options.height is not None:
+        raise InputError("--dem and --height exclude each other", field="--height", remedy="give one of them")
+    if options.height is not None:
+        return dem.Surface.constant(options.height)
+    if options.dem is None:
+        raise InputError("there are no heights", field="--dem", remedy="give --dem FILE or --height METRES")
+    vertical = None if options.vertical is None else Vertical.parse(options.vertical)
+    return dem.Surface.open(
+        options.dem, vertical, override=options.override_vertical, fill=options.fill,
+        allow_network=allow_network,
+    )  # fmt: skip
+
+
+def has_surface(options: SurfaceOptions) -> bool:
+    """Tell whether heights are given."""
+    return options.dem is not None or options.height is not None
+
+
+# -- points ----------------------------------------------------------------------------------------------------------
+
+
+def read_control(scene: Scene, options: PointOptions, allow_network: bool = False) -> Points:
+    """Read the points of the options with their roles; none where none are given.
+
+    Raises
+    ------
+    InputError
+        For a wrong file, roles that contradict each other, or an adjustment that has no points.
+    """
+    if options.gcps is None:
+        if options.correction not in (None, "none"):
+            raise InputError(
+                f"a {options.correction} needs control points", field="--gcps", remedy="give a file of points"
+            )
+        return no_points()
+    if os.fspath(options.gcps) == OWN_POINTS:
+        points = gcps_of_dataset(raster.open_dataset(scene.path, allow_network=allow_network))
+    else:
+        points = read_points(
+            options.gcps,
+            crs=None if options.crs is None else parse_crs(options.crs),
+            vertical=None if options.vertical is None else Vertical.parse(options.vertical),
+            pixel_origin=options.pixel_origin,
+            image_name=Path(scene.path).name,
+        )
+    if options.select is not None and options.check is not None:
+        raise InputError(
+            "--select and --check both say which points check", field="--select", remedy="give one of them"
+        )
+    if options.select is not None:
+        return select_control(points, options.select)
+    return points if options.check is None else assign_roles(points, options.check)
+
+
+def no_points() -> Points:
+    """Return an empty table of points."""
+    none = np.zeros(0)
+    return Points(
+        ids=(), image=np.zeros((0, 2)), ground=np.zeros((0, 3)), roles=np.zeros(0, dtype="<U7"), sigma_image=none,
+        sigma_ground=np.zeros((0, 3)), crs=pyproj.CRS.from_epsg(4326), source="",
+    )  # fmt: skip
+
+
+def with_heights(points: Points, surface: dem.Surface | None) -> Points:
+    """Fill heights that a file does not give from the surface."""
+    missing = ~np.isfinite(points.ground[:, 2])
+    if not missing.any():
+        return points
+    if surface is None:
+        names = ", ".join(np.array(points.ids)[missing][:5])
+        raise InputError(
+            f"{int(missing.sum())} points have no height ({names})", file=points.source, field="h",
+            remedy="give heights in the file, or a DEM with --dem to take them from",
+        )  # fmt: skip
+    ground = points.ground.copy()
+    ground[missing, 2] = surface.heights(ground[missing, :2], points.crs)
+    return points.with_ground(ground)
+
+
+# -- paths -----------------------------------------------------------------------------------------------------------
+
+
+def check_paths(
+    files: Mapping[str, Path],
+    image: str | os.PathLike[str],
+    scene: SceneOptions,
+    points: PointOptions,
+    surface: SurfaceOptions,
+) -> None:
+    """Refuse to write what is read, and outputs that change the model of the source or of the ortho.
+
+    Raises
+    ------
+    InputError
+        With the path that is in the way.
+    """
+    given = (image, scene.model, scene.rpc, points.gcps, surface.dem)
+    inputs = {Path(path).resolve() for path in given if path is not None}
+    for path in files.values():
+        if path.resolve() in inputs:
+            raise InputError(
+                "this path would be read and written", file=path, field="-o", remedy="choose another output folder"
+            )
+    folder = next(iter(files.values())).parent
+    attaching = any(str(path).endswith(SIDE_CARS) for path in files.values())
+    if attaching and folder.resolve() == Path(image).resolve().parent:
+        raise InputError(
+            "the RPC files written here would attach to the source image and change its model", file=folder,
+            field="-o", remedy="choose an output folder of its own",
+        )  # fmt: skip
+    if "ortho" in files:
+        for ending in SIDE_CARS:
+            stale = files["ortho"].with_name(files["ortho"].stem + ending)
+            if stale.exists():
+                raise InputError(
+                    "an old side-car lies here that GDAL would attach to the ortho", file=stale,
+                    remedy="remove it, or choose another output folder",
+                )  # fmt: skip
+
+
+# -- record ----------------------------------------------------------------------------------------------------------
+
+
+def hash_inputs(
+    image: str | os.PathLike[str],
+    scene: SceneOptions = SceneOptions(),
+    points: PointOptions = PointOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+) -> list[dict[str, Any]]:
+    """Return path, role, bytes and SHA-256 of every file that is read, side-cars and sources of a VRT included."""
+    read: dict[Path, str] = {}
+
+    def add(role: str, paths: Iterable[str | os.PathLike[str] | None]) -> None:
+        for path in paths:
+            if path is not None and Path(path).is_file():
+                read.setdefault(Path(path), role)
+
+    add("image", [image])
+    add("image", _files_of(image, scene.allow_network))
+    add("RPC", [scene.rpc])
+    add("model", [scene.model])
+    add("points", [points.gcps])
+    if surface.dem is not None:
+        add("DEM", [surface.dem, *_files_of(surface.dem, scene.allow_network)])
+    if surface.vertical is not None:
+        add("geoid", [surface.vertical])
+    return [
+        {"role": role, "path": str(path), "bytes": path.stat().st_size, "sha256": sha256(path)}
+        for path, role in read.items()
+    ]
+
+
+def _files_of(path: str | os.PathLike[str], allow_network: bool) -> list[str]:
+    try:
+        return list(raster.open_dataset(path, allow_network=allow_network).GetFileList() or [])
+    except OrthoError:
+        return []
+
+
+def provenance(
+    scene: Scene,
+    points: PointOptions,
+    surface: dem.Surface | None,
+    inputs: list[dict[str, Any]],
+    command: str | None,
+    asked: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return what is needed to make the same result again: files with checksums, options, versions, the command.
+
+    Parameters
+    ----------
+    inputs : list
+        From `hash_inputs`.
+    asked : mapping of str to dataclass
+        What else the user asked for, by name.
+    """
+    control = None
+    if points.gcps is not None:
+        control = _as_asked(points)
+    return {
+        "command": command,
+        "inputs": inputs,
+        "image": {"path": str(scene.path), "size": [scene.width, scene.height]},
+        "sensor": scene.sensor,
+        "model_source": scene.model_source,
+        "points": control,
+        "surface": None if surface is None else dict(surface.provenance),
+        "options": {name: _as_asked(value) for name, value in asked.items()},
+        "software": {
+            "ortho-pipeline": metadata.version("ortho-pipeline"),
+            "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
+            "proj": pyproj.proj_version_str,
+        },
+    }
+
+
+def _as_asked(options: Any) -> dict[str, Any]:
+    """Return options as JSON values."""
+    return {
+        key: os.fspath(value) if isinstance(value, os.PathLike) else value
+        for key, value in dataclasses.asdict(options).items()
+    }

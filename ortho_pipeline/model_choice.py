@@ -1,0 +1,197 @@
+"""Choosing among classical models: fit one by name, take out what is not justified, predict what was left out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, OrthoError
+from ortho_pipeline.estimation import Fit, Prior, fit
+from ortho_pipeline.models import family_of, start_model
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.points import Points
+from ortho_pipeline.problem import Problem
+from ortho_pipeline.ridge import regularised
+
+
+def fit_family(
+    family: str,
+    points: Points,
+    *,
+    crs: str | None = None,
+    size: tuple[int, int] | None = None,
+    heights: tuple[float, float] | None = None,
+    ridge: float | str | None = "auto",
+    priors: Mapping[str, Prior] | None = None,
+    robust: bool = True,
+) -> Fit:
+    """Fit a classical model to control points.
+
+    Parameters
+    ----------
+    family : str
+        A name of `ortho_pipeline.models.families`. Of ``affine14`` both assignments of the image axes are tried; the
+        one with the smaller leave-one-out residuals is taken, and named in the result.
+    crs, size, heights : optional
+        As for `ortho_pipeline.models.start_model`.
+    ridge : float, 'gcv', 'lcurve', 'auto' or None
+        Regularisation; ``auto`` is generalised cross-validation for rational functions and none for the others.
+
+    Raises
+    ------
+    TooFewPoints, DegeneratePoints
+        If the points do not determine the model; the remedy names a simpler one that they do.
+    """
+    chosen = family_of(family)
+    if chosen.variants:
+        fits = [
+            fit_family(name, points, crs=crs, size=size, heights=heights, ridge=ridge, priors=priors, robust=robust)
+            for name in chosen.variants
+        ]
+        return min(fits, key=_leave_one_out)
+    if ridge == "auto":
+        ridge = "gcv" if chosen.regularised else None
+    start = start_model(family, points, crs=crs, size=size, heights=heights)
+    try:
+        return fit(start, points, priors=priors, robust=robust, ridge=ridge, name=family)
+    except (DegeneratePoints, NotConverged) as error:
+        simpler = _simpler(family, points, crs, size, heights)
+        if simpler is None:
+            raise
+        raise DegeneratePoints(
+            f"{family}: {error.message}",
+            file=error.file,
+            field=error.field,
+            remedy=f"{error.remedy}; these points do determine {simpler}",
+        ) from error
+
+
+def _leave_one_out(found: Fit) -> float:
+    """Return the leave-one-out RMSE; without redundancy the RMSE of the control points is zero and decides nothing."""
+    loo = found.rmse("loo")
+    return float(loo["total"]) if loo is not None else 0.0
+
+
+def _simpler(
+    family: str,
+    points: Points,
+    crs: str | None,
+    size: tuple[int, int] | None,
+    heights: tuple[float, float] | None,
+) -> str | None:
+    """Return the next simpler family that the points determine; None if there is none."""
+    waiting = list(family_of(family).simpler)
+    tried = []
+    while waiting:
+        name = waiting.pop(0)
+        if name in tried:
+            continue
+        tried.append(name)
+        try:
+            fit(start_model(name, points, crs=crs, size=size, heights=heights), points, robust=False)
+        except OrthoError:
+            waiting += [other for other in family_of(name).simpler if other not in waiting]
+            continue
+        return name
+    return None
+
+
+# -- unjustified parameters ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Removed:
+    """A parameter that was taken out, and its Student test at that time."""
+
+    name: str
+    t: float
+    p: float
+
+
+@dataclass(frozen=True, eq=False)
+class Pruned:
+    """The fit without the unjustified parameters, and those in the order in which they went."""
+
+    fit: Fit
+    removed: tuple[Removed, ...]
+
+
+def prune(found: Fit, *, significance: float = 0.05) -> Pruned:
+    """Take out the parameters that the points do not justify, one by one, the least significant first.
+
+    A parameter goes if the hypothesis that it is zero is not rejected; then all others are estimated again. A term on
+    which a higher one builds (X below XZ) stays while that one does, because whether it is zero depends on the origin.
+
+    Parameters
+    ----------
+    found : Fit
+        Of an image correction or a classical model. Points that were rejected stay so.
+    significance : float
+        Chance of keeping a parameter that is zero.
+
+    Raises
+    ------
+    InputError
+        If there is no redundancy to test with, or the model has no removable parameters.
+    """
+    if not 0 < significance < 1:
+        raise InputError("a significance lies between 0 and 1", field="significance")
+    if found.sigma0 is None:
+        raise InputError(
+            "without redundancy no parameter can be tested", field="--prune", remedy="give more control points"
+        )
+    removed: list[Removed] = []
+    while True:
+        t, p = found.student
+        index = {name: k for k, name in enumerate(found.param_names)}
+        candidates = [name for name in found.model.removable if not p[index[name]] <= significance]
+        if not candidates or len(index) == 1:
+            return Pruned(found, tuple(removed))
+        worst = max(candidates, key=lambda name: float(np.nan_to_num(p[index[name]], nan=1.0)))
+        removed.append(Removed(worst, float(t[index[worst]]), float(p[index[worst]])))
+        found = _again(found, worst)
+
+
+def _again(found: Fit, without: str) -> Fit:
+    """Fit once more to the same points, without a parameter."""
+    again = fit(
+        found.model.without([without]),
+        found.points,
+        priors={name: prior for name, prior in found.priors.items() if name != without},
+        robust=False,
+        name=found.model_name,
+        ridge=found.ridge,
+        exclude=dict(found.rejected),
+    )
+    return replace(again, raw_residuals=found.raw_residuals)
+
+
+# -- cross-validation ------------------------------------------------------------------------------------------------
+
+
+def k_fold(found: Fit, k: int = 10, seed: int = 0) -> Array:
+    """Return the residuals ``(N, 2)`` px that points would have had, had their group of one k-th taken no part.
+
+    From the hat matrix, so exact for models that are linear in their parameters, and to first order for the others.
+    Points that took no part in the fit, and groups without which it is not determined, are NaN.
+
+    Parameters
+    ----------
+    k : int
+        Number of groups, at least 2; as many as there are points is leave-one-out.
+    seed : int
+        Chooses the groups.
+    """
+    rows = np.flatnonzero(found.used)
+    if not 2 <= k <= len(rows):
+        raise InputError(f"{k} groups of {len(rows)} points cannot be made", field="k")
+    problem = Problem.of(found.model, found.points, found.used, found.priors)
+    if found.ridge is not None:
+        problem, _ = regularised(problem, np.ones(len(rows), dtype=bool), found.ridge)
+    solution = problem.solve(np.ones(len(rows), dtype=bool))
+    order = np.random.default_rng(seed).permutation(len(rows))
+    left = np.full((len(found.points), 2), np.nan)
+    left[rows] = solution.leave_out(np.array_split(order, k))
+    return left

@@ -1,0 +1,192 @@
+r"""Interior orientation of a frame camera: from directions in the camera to pixels, and back.
+
+A direction is :math:`(u, v)`, the tangents to the right and downwards of the ray from the optical axis. The lens moves
+it (Brown's model as OpenCV, OpenSfM and Metashape write it, dimensionless, :math:`r^2 = u^2 + v^2`)
+
+.. math::
+    u' &= u (1 + k_1 r^2 + k_2 r^4 + k_3 r^6) + 2 p_1 u v + p_2 (r^2 + 2 u^2) \\
+    v' &= v (1 + k_1 r^2 + k_2 r^4 + k_3 r^6) + p_1 (r^2 + 2 v^2) + 2 p_2 u v
+
+and the image plane has the paper's coordinates, metres from the middle of the frame, x to the right and **y upwards**:
+:math:`x = x_0 + f u'`, :math:`y = y_0 - f v'`. Pixels are counted from the outer corner of the first one, rows
+**downwards**: column = width/2 + x / pitch_x, row = height/2 - y / pitch_y.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.models.base import Array, solve_2x2
+
+#: Parameters of the interior orientation, in the order of `Interior.partials`.
+INTERIOR = ("focal_length", "x0", "y0", "pitch_x", "pitch_y", "k1", "k2", "k3", "p1", "p2")
+_UNDISTORT_STEPS = 30
+
+
+@dataclass(frozen=True)
+class Interior:
+    """Interior orientation of a frame camera.
+
+    Parameters
+    ----------
+    width, height : int
+        Size of the frame in pixels.
+    focal_length : float
+        Principal distance f, metres.
+    pitch_x, pitch_y : float
+        Distance of neighbouring pixels along a row and along a column, metres.
+    x0, y0 : float
+        Principal point in the image plane (x right, y up), metres from the middle of the frame.
+    k1, k2, k3, p1, p2 : float
+        Brown's distortion on tangents, v downwards (see the module).
+
+    Raises
+    ------
+    InputError
+        For a number that is not finite, or a size that is not positive.
+    """
+
+    width: int
+    height: int
+    focal_length: float
+    pitch_x: float
+    pitch_y: float
+    x0: float = 0.0
+    y0: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in INTERIOR:
+            value = float(getattr(self, name))
+            if not math.isfinite(value):
+                raise InputError(f"{value} is not a number for a camera", field=name)
+            object.__setattr__(self, name, value)
+        for name in ("width", "height", "focal_length", "pitch_x", "pitch_y"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{getattr(self, name)} is not positive", field=name)
+        if self.width != int(self.width) or self.height != int(self.height):
+            raise InputError("a frame has whole numbers of columns and rows", field="width, height")
+
+    @classmethod
+    def of_square_pixels(cls, width: int, height: int, focal_length_px: float, **others: float) -> Self:
+        """Return a camera of which only the focal length in pixels is known; its pixels are 1 µm wide."""
+        return cls(width, height, focal_length_px * 1e-6, 1e-6, 1e-6, **others)
+
+    @property
+    def field_of_view(self) -> float:
+        """Angle (rad) between the axis and the corner of the frame, without distortion."""
+        return math.atan(math.hypot(self.width * self.pitch_x, self.height * self.pitch_y) / 2 / self.focal_length)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields as JSON values."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+    @cached_property
+    def _farthest(self) -> float:
+        """Square of the radius r up to which the distortion is monotonic; beyond it the image would fold over."""
+        if not (self.k1 or self.k2 or self.k3):
+            return math.inf
+        roots = np.roots([7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
+        real = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real
+        return float(real.min(initial=math.inf))
+
+    @property
+    def _distorts(self) -> bool:
+        return bool(self.k1 or self.k2 or self.k3 or self.p1 or self.p2)
+
+    def image_of(self, directions: Array) -> Array:
+        """Return the image points ``(N, 2)`` of directions ``(N, 2)``; NaN where the lens model folds over."""
+        image = self._pixels(self._distort(directions))
+        if math.isfinite(self._farthest):
+            image[(directions**2).sum(axis=1) >= self._farthest] = np.nan
+        return image
+
+    def directions_of(self, image: Array) -> Array:
+        """Return the directions ``(N, 2)`` that are seen at image points ``(N, 2)``; NaN where there is none.
+
+        Newton's method on the distortion, verified.
+        """
+        x = (image[:, 0] - self.width / 2) * self.pitch_x - self.x0
+        y = (self.height / 2 - image[:, 1]) * self.pitch_y - self.y0
+        seen = np.stack([x, -y], axis=1) / self.focal_length
+        if not self._distorts:
+            return seen
+        found = seen.copy()
+        reach = math.sqrt(self._farthest)
+        for _ in range(_UNDISTORT_STEPS):
+            miss = seen - self._distort(found)
+            found = found + solve_2x2(self._slopes(found), miss)
+            # A step across the fold would end on the wrong branch.
+            radius = np.hypot(found[:, 0], found[:, 1])
+            with np.errstate(invalid="ignore"):
+                found[radius > reach] *= (0.99 * reach / radius[radius > reach])[:, None]
+                if not (np.abs(miss) > 1e-15).any():
+                    break
+        with np.errstate(invalid="ignore"):
+            closed = np.abs(self._distort(found) - seen).max(axis=1, initial=0.0) < 1e-12
+        found[~closed] = np.nan
+        return found
+
+    def partials_of_direction(self, directions: Array) -> Array:
+        """Return d(image)/d(direction) as ``(N, 2, 2)``."""
+        scale = np.array([self.focal_length / self.pitch_x, self.focal_length / self.pitch_y])
+        return self._slopes(directions) * scale[:, None]
+
+    def partials(self, directions: Array) -> Array:
+        """Return d(image)/d(parameters) as ``(N, 2, 10)``, in the order of `INTERIOR`."""
+        u, v = directions.T
+        moved = self._distort(directions)
+        r2 = u**2 + v**2
+        across, down = self.focal_length / self.pitch_x, self.focal_length / self.pitch_y
+        out = np.zeros((len(u), 2, len(INTERIOR)))
+        out[:, 0, 0], out[:, 1, 0] = moved[:, 0] / self.pitch_x, moved[:, 1] / self.pitch_y
+        out[:, 0, 1], out[:, 1, 2] = 1 / self.pitch_x, -1 / self.pitch_y
+        centred = self._pixels(moved) - (self.width / 2, self.height / 2)
+        out[:, 0, 3], out[:, 1, 4] = -centred[:, 0] / self.pitch_x, -centred[:, 1] / self.pitch_y
+        for power in (1, 2, 3):
+            out[:, 0, 4 + power], out[:, 1, 4 + power] = across * u * r2**power, down * v * r2**power
+        out[:, 0, 8], out[:, 1, 8] = across * 2 * u * v, down * (r2 + 2 * v**2)
+        out[:, 0, 9], out[:, 1, 9] = across * (r2 + 2 * u**2), down * 2 * u * v
+        return out
+
+    def _pixels(self, moved: Array) -> Array:
+        col = self.width / 2 + (self.x0 + self.focal_length * moved[:, 0]) / self.pitch_x
+        row = self.height / 2 - (self.y0 - self.focal_length * moved[:, 1]) / self.pitch_y
+        return np.stack([col, row], axis=1)
+
+    def _distort(self, directions: Array) -> Array:
+        if not self._distorts:
+            return directions
+        u, v = directions.T
+        r2 = u**2 + v**2
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        return np.stack(
+            [
+                u * radial + 2 * self.p1 * u * v + self.p2 * (r2 + 2 * u**2),
+                v * radial + self.p1 * (r2 + 2 * v**2) + 2 * self.p2 * u * v,
+            ],
+            axis=1,
+        )
+
+    def _slopes(self, directions: Array) -> Array:
+        """Return d(moved)/d(direction) as ``(N, 2, 2)``."""
+        u, v = directions.T
+        r2 = u**2 + v**2
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        rate = 2 * (self.k1 + r2 * (2 * self.k2 + r2 * 3 * self.k3))
+        cross = u * v * rate + 2 * self.p1 * u + 2 * self.p2 * v
+        out = np.empty((len(u), 2, 2))
+        out[:, 0, 0] = radial + u**2 * rate + 2 * self.p1 * v + 6 * self.p2 * u
+        out[:, 1, 1] = radial + v**2 * rate + 6 * self.p1 * v + 2 * self.p2 * u
+        out[:, 0, 1] = out[:, 1, 0] = cross
+        return out

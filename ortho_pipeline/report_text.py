@@ -1,0 +1,182 @@
+"""The report in words: the headline, the summary for the terminal, and numbers as people read them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+#: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
+ENOUGH_CHECK_POINTS = 30
+
+
+def headline(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Say how accurate the result is, in words, from the best evidence that there is.
+
+    Returns
+    -------
+    dict
+        `figure` (``"0.21 px"`` or a word), `metres` (text or None), `what` (a phrase that follows the figure),
+        `notes` (sentences that qualify it).
+    """
+    adjustment = report["adjustment"]
+    rmse, redundancy, parameters = adjustment["rmse"], adjustment["redundancy"], len(adjustment["parameters"])
+    control, check, loo = rmse["control"], rmse["check"], rmse["loo"]
+    if not adjustment["points"]:
+        notes = ["The model is used as it was delivered. Vendors' models are commonly off by 5 to 25 m."]
+        return {"figure": "Not tested", "metres": None, "what": "there were no ground control points", "notes": notes}
+    notes = []
+    if control and parameters:
+        fitted = f"{px(control['total'])} RMSE at {count(control['n'], 'control point')}"
+        notes.append(
+            f"The fit: {fitted}, redundancy {redundancy}."
+            if redundancy
+            else f"No redundancy: {count(control['n'], 'control point')} for {parameters} parameters fit exactly, "
+            "which says nothing about accuracy."
+        )
+    if check:
+        what = f"RMSE at {count(check['n'], 'check point')} that took no part in the adjustment"
+        if check["n"] < ENOUGH_CHECK_POINTS:
+            notes.append(
+                f"Fewer than {ENOUGH_CHECK_POINTS} check points: an indication, not a claim of accuracy (ASPRS 2023)."
+            )
+        return {**_figure(check, report["rmse_m"]["check"]), "what": what, "notes": notes}
+    if control and not parameters:
+        what = f"RMSE at {count(control['n'], 'point')} of the model as delivered, none of which it was adjusted to"
+        return {**_figure(control, report["rmse_m"]["control"]), "what": what, "notes": notes}
+    notes.append("No check points were kept apart.")
+    if loo and redundancy:
+        what = f"RMSE when each of {count(loo['n'], 'control point')} is left out in turn"
+        return {**_figure(loo, report["rmse_m"]["loo"]), "what": what, "notes": notes}
+    return {"figure": "Not tested", "metres": None, "what": "nothing is left over to test the fit with", "notes": notes}
+
+
+def _figure(rmse: Mapping[str, Any], rmse_m: Mapping[str, Any] | None) -> dict[str, Any]:
+    return {"figure": px(rmse["total"]), "metres": metres(rmse_m["total"]) if rmse_m else None}
+
+
+def summary_text(report: Mapping[str, Any]) -> str:
+    """Return the report as a screenful of text, without colours."""
+    adjustment, scene, head = report["adjustment"], report["scene"], report["headline"]
+    rows = [("scene", f"{scene['name']}, {size_text(scene['size'])} px, {scene['sensor']} ({scene['model_source']})")]
+    if raw := adjustment["raw_bias"]:
+        rows.append(("raw bias", f"{_bias(raw)} (measured minus delivered model, {count(raw['n'], 'point')})"))
+    if adjustment["parameters"]:
+        values = [f"{name} {_parameter(entry)}" for name, entry in adjustment["parameters"].items()]
+        rows.append(("model", f"{adjustment['model']}: {', '.join(values)}"))
+    else:
+        rows.append(("model", adjustment["model"]))
+    ground = f" ({head['metres']})" if head["metres"] else ""
+    rows.append(("accuracy", f"{head['figure']}{ground}: {head['what']}"))
+    rows += [("", note) for note in head["notes"]]
+    rows += [("left out", f"{entry['id']}: {entry['reason']}") for entry in adjustment["rejected"]]
+    if surface := report["surface"]:
+        rows.append(("heights", _surface_text(surface)))
+    if ortho := report["ortho"]:
+        steps = " x ".join(short(step) for step in ortho["resolution"])
+        rows.append(("ortho", f"{size_text(ortho['size'])} px of {steps} {ortho['unit']}, {ortho['crs']}"))
+    if warp := report["warp"]:
+        rows.append(("warp", f"{px(warp['max_error_px'])} at worst from the exact model, {warp['seconds']:.1f} s"))
+    # The headline and the rows above have said these already.
+    said = " ".join(value for _, value in rows).lower()
+    known = ("left out", "no redundancy", "check points: fewer")
+    rows += [
+        ("warning", text)
+        for text in report["warnings"]
+        if text.lower() not in said and not any(word in text for word in known)
+    ]
+    return "\n".join(f"{key:<10}{value}" for key, value in rows)
+
+
+def _surface_text(surface: Mapping[str, Any]) -> str:
+    if surface.get("constant_height") is not None:
+        return f"flat ground at {metres(surface['constant_height'])} above the ellipsoid"
+    covered = "" if surface["coverage"] is None else f", covers {share(surface['coverage'])} of the scene"
+    return f"{Path(str(surface.get('path', ''))).name}, heights above {surface.get('vertical_label')}{covered}"
+
+
+def _bias(raw: Mapping[str, Any]) -> str:
+    return f"column {signed(raw['col'])} px, row {signed(raw['row'])} px"
+
+
+def _parameter(entry: Mapping[str, Any]) -> str:
+    return f"{short(entry['value'], '+')} ±{short(entry['sigma'])}"
+
+
+# -- numbers as people read them -------------------------------------------------------------------------------------
+
+
+def flat(value: Any, name: str = "") -> Iterable[tuple[str, str]]:
+    """Yield the leaves of nested values as (path of keys, text); what is None or empty is left out."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from flat(item, f"{name} · {key}" if name else str(key))
+    elif isinstance(value, list):
+        if value:
+            yield name, ", ".join(str(item) for item in value)
+    elif value is not None:
+        yield name, str(value)
+
+
+def _decimals(value: float) -> int:
+    """Return how many decimals show three digits of a value, at least two and at most five."""
+    return 2 if abs(value) >= 1 or value == 0 else min(5, 2 - math.floor(math.log10(abs(value))))
+
+
+def px(value: float) -> str:
+    """Return pixels."""
+    return f"{fixed(value)} px"
+
+
+def metres(value: float) -> str:
+    """Return metres."""
+    return f"{value:.2f} m" if abs(value) < 10 else f"{value:.1f} m"
+
+
+def fixed(value: float | None) -> str:
+    """Return a value with three digits."""
+    if value is None:
+        return "–"
+    # Below 1e-9 it is rounding, and "0.00" is not "0.00000".
+    return f"{value:.2f}" if abs(value) >= 0.1 or abs(value) < 1e-9 else f"{value:.{min(_decimals(value), 4)}f}"
+
+
+def signed(value: float | None) -> str:
+    """Return a value with its sign and two decimals."""
+    if value is None:
+        return "–"
+    text = f"{value:+.2f}"
+    return "0.00" if text[1:] == "0.00" else text.replace("-", "−")
+
+
+def short(value: float, sign: str = "") -> str:
+    """Return three significant digits."""
+    return f"{value:{sign}.3g}".replace("-", "−") if value else "0"
+
+
+def share(value: float | None) -> str:
+    """Return a share (0 to 1) in per cent."""
+    if value is None:
+        return "–"
+    # "100 %" is only said where it is so.
+    return "100 %" if value >= 1 else f"{min(math.floor(value * 1000) / 10, 99.9):.1f} %"
+
+
+def count(number: int, what: str) -> str:
+    """Return a number and what it counts."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def size_text(size: Iterable[int]) -> str:
+    """Return columns x rows."""
+    return " x ".join(str(side) for side in size)
+
+
+def plain_size(bytes_: float) -> str:
+    """Return a number of bytes."""
+    for unit in ("bytes", "kB", "MB"):
+        if bytes_ < 1000:
+            return f"{bytes_:.3g} {unit}"
+        bytes_ /= 1000
+    return f"{bytes_:.3g} GB"

@@ -1,0 +1,291 @@
+"""Models for other programs: RPC of any model, control points, geolocation arrays, each read again by GDAL."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from osgeo import gdal
+
+from ortho_pipeline import pipeline
+from ortho_pipeline.cli import cli
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.gcp_export import FORMATS
+from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.options import PointOptions, SurfaceOptions
+from ortho_pipeline.rpc import export_rpc, read_rpc
+
+REAL_RPCS = (
+    "gdal/gcore/data/md_ov_rpc.txt",
+    "shareloc/rpc/RPC_PHR1B_P_201308051042194_SEN_690908101-001.XML",
+)
+
+
+def points_of(tiny: Any, **more: Any) -> PointOptions:
+    return PointOptions(gcps=tiny.gcps, crs="EPSG:4979", vertical="ellipsoid", **more)
+
+
+def fitted(tiny: Any) -> Any:
+    return pipeline.fit(tiny.image, points_of(tiny)).fit.model
+
+
+def ground_to_image(path: Path, ground: np.ndarray, *options: str) -> np.ndarray:
+    """Map with GDAL's own transformer, which answers in pixel and line from the outer corner."""
+    dataset = gdal.Open(str(path))
+    transformer = gdal.Transformer(dataset, None, list(options))
+    found, good = transformer.TransformPoints(1, [tuple(row) for row in ground.tolist()])
+    assert all(good)
+    return np.array(found)[:, :2]
+
+
+GROUND = np.array([[20.004, -30.003, 500.0], [19.996, -29.997, 500.0], [20.0, -30.0, 500.0]])
+
+
+# -- cameras from first principles, without anything of the package ----------------------------------------------------
+
+A, E2 = 6378137.0, 6.69437999014e-3
+
+
+def ecef(ground: Any) -> np.ndarray:
+    """Return geocentric metres of (lon, lat in degrees, ellipsoidal height) after the textbook."""
+    lon, lat, h = np.radians(ground[:, 0]), np.radians(ground[:, 1]), ground[:, 2]
+    n = A / np.sqrt(1 - E2 * np.sin(lat) ** 2)
+    return np.stack(
+        [(n + h) * np.cos(lat) * np.cos(lon), (n + h) * np.cos(lat) * np.sin(lon), (n * (1 - E2) + h) * np.sin(lat)],
+        axis=1,
+    )
+
+
+def local_axes(lon: float, lat: float) -> np.ndarray:
+    """Return the unit vectors east, north, up as rows."""
+    lam, phi = np.radians([lon, lat])
+    return np.array(
+        [
+            [-np.sin(lam), np.cos(lam), 0],
+            [-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)],
+            [np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)],
+        ]
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class TestCamera(SensorModel):
+    """What both share: a scene of 30 x 30 km with heights 0 to 1500 m, seen from 650 km, 25 degrees off nadir."""
+
+    __test__ = False
+    lon: float = 30.0
+    lat: float = 38.0
+    size: int = 12_000
+
+    @property
+    def crs(self) -> str:
+        return "EPSG:4979"
+
+    @property
+    def domain(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([self.lon, self.lat, 750.0]), np.array([0.171, 0.135, 750.0])
+
+    def rays(self, ground: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ground relative to the camera's middle position, and the camera's axes as rows."""
+        axes = local_axes(self.lon, self.lat)
+        centre = ecef(np.array([[self.lon, self.lat, 750.0]]))[0]
+        off = np.radians(25.0)
+        towards = axes.T @ np.array([np.sin(off) * 0.8, np.sin(off) * 0.6, np.cos(off)])
+        camera = centre + 650e3 * towards
+        z = -towards
+        x = np.cross(axes[1], -z)
+        x /= np.linalg.norm(x)
+        return ecef(np.asarray(ground, dtype=float)) - camera, np.stack([x, np.cross(z, x), z])
+
+
+class FrameCamera(TestCamera):
+    """Central projection."""
+
+    kind = "test-frame"
+
+    def ground_to_image(self, ground: Any) -> np.ndarray:
+        offset, axes = self.rays(ground)
+        seen = offset @ axes.T
+        return self.size / 2 + 260_000.0 * seen[:, :2] / seen[:, 2:]
+
+
+class Scanner(TestCamera):
+    """A line scanner that flies a circle at 7.5 km/s with a slow turn of its attitude."""
+
+    kind = "test-scanner"
+
+    def ground_to_image(self, ground: Any) -> np.ndarray:
+        offset, axes = self.rays(ground)
+        start = offset @ axes.T
+        radius, speed, line_time = 7.03e6, 7500.0, 30_000.0 / 7500.0 / 12_000
+        t = np.zeros(len(start))
+        for _ in range(8):
+            across, along, depth = self.seen(start, t, radius, speed)
+            step = 0.01
+            _, ahead, depth_ahead = self.seen(start, t + step, radius, speed)
+            slope = (ahead / depth_ahead - along / depth) / step
+            t = t - along / depth / slope
+        across, _, depth = self.seen(start, t, radius, speed)
+        return np.stack([self.size / 2 + 260_000.0 * across / depth, self.size / 2 + t / line_time], axis=1)
+
+    def seen(self, start: np.ndarray, t: np.ndarray, radius: float, speed: float) -> tuple[np.ndarray, ...]:
+        """Return ground in the axes of the scanner at time t: it moves along y on a circle whose centre lies at +z."""
+        angle = speed * t / radius
+        x, y, z = start[:, 0], start[:, 1], start[:, 2] - radius
+        y, z = y * np.cos(angle) + z * np.sin(angle), -y * np.sin(angle) + z * np.cos(angle) + radius
+        yaw, pitch = 2e-3 * t / 2.0, 1e-3 * (t / 2.0) ** 2
+        x, y = x + yaw * y, y - yaw * x
+        return x, y + pitch * z, z
+
+
+# -- RPC -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("camera", [FrameCamera(), Scanner()], ids=["frame", "scanner"])
+def test_rpc_stands_for_any_camera_over_30_km_and_1500_m(camera):
+    exported = export_rpc(camera)
+    centre, half = camera.domain
+    ground = centre + half * np.random.default_rng(7).uniform(-1, 1, (5000, 3))
+    error = np.abs(exported.rpc.ground_to_image(ground) - camera.ground_to_image(ground)).max()
+    assert error <= 0.001
+    assert error <= 2 * exported.max_error_px
+
+
+def test_rpc_of_a_camera_takes_less_than_a_tenth_of_a_second():
+    """In a process of its own with one BLAS thread: beside other processes BLAS threads wait for each other."""
+    code = (
+        "import time, numpy as np; from ortho_pipeline.rpc import export_rpc; "
+        "from ortho_pipeline.simulate import LineScanner; "
+        "camera = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(0.0, 1500.0)); seconds = []\n"
+        "for _ in range(6):\n    begin = time.perf_counter(); export_rpc(camera); "
+        "seconds.append(time.perf_counter() - begin)\nprint(min(seconds))"
+    )
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert float(done.stdout) < 0.1
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", REAL_RPCS)
+def test_rpc_stands_for_a_vendors_rpc(real, name):
+    from ortho_pipeline.rpc import fit_rpc
+
+    path = next(real.rglob(Path(name).name))
+    model = read_rpc(path)
+    centre, half = model.domain
+    box = (centre[0] - half[0], centre[1] - half[1], centre[0] + half[0], centre[1] + half[1])
+    exported = fit_rpc(model, box, model.height_range)
+    ground = centre + half * np.random.default_rng(1).uniform(-1, 1, (5000, 3))
+    assert np.abs(exported.rpc.ground_to_image(ground) - model.ground_to_image(ground)).max() <= 1e-4
+
+
+@pytest.mark.parametrize("family", ["affine3d", "dlt", "poly2"])
+def test_a_model_from_points_alone_is_exported_as_rpc(tiny, tmp_path, family):
+    points = points_of(tiny, fit_model=family, model_crs="utm")
+    result = pipeline.export(tiny.image, tmp_path / "out", formats=["rpc-txt"], points=points)
+    assert result.document["max_error_px"] < 0.02
+    model = pipeline.fit(tiny.image, points).fit.model
+    written = read_rpc(result.files["rpc-txt"])
+    from ortho_pipeline.crs import ground_transform
+
+    ground = ground_transform("EPSG:4979", model.crs)(GROUND)
+    np.testing.assert_allclose(written.ground_to_image(GROUND), model.ground_to_image(ground), rtol=0, atol=0.02)
+
+
+# -- every format, through GDAL --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["vrt", "tag"])
+def test_gdal_maps_with_the_exported_rpc(tiny, tmp_path, name):
+    path = pipeline.export(tiny.image, tmp_path / "out", formats=[name], points=points_of(tiny)).files[name]
+    expected = fitted(tiny).ground_to_image(GROUND)
+    np.testing.assert_allclose(ground_to_image(path, GROUND, "METHOD=RPC"), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["rpc-txt", "rpb"])
+def test_gdal_maps_with_an_exported_side_car(tiny, tmp_path, name):
+    out = tmp_path / "out"
+    pipeline.export(tiny.image, out, formats=[name], points=points_of(tiny))
+    gdal.GetDriverByName("GTiff").Create(str(out / "tiny.tif"), tiny.width, tiny.height, 1)
+    expected = fitted(tiny).ground_to_image(GROUND)
+    np.testing.assert_allclose(ground_to_image(out / "tiny.tif", GROUND, "METHOD=RPC"), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["gcp", "gcp-tag"])
+def test_measured_points_are_gcps_that_gdal_fits_to(tiny, tmp_path, name):
+    path = pipeline.export(tiny.image, tmp_path / "out", formats=[name], points=points_of(tiny)).files[name]
+    dataset = gdal.Open(str(path))
+    assert not dataset.GetMetadata("RPC")
+    rows = tiny.points(12)
+    found = [(p.GCPPixel, p.GCPLine, p.GCPX, p.GCPY, p.GCPZ) for p in dataset.GetGCPs()]
+    np.testing.assert_allclose(found, [row[1:] for row in rows], atol=1e-4)
+    assert dataset.GetGCPSpatialRef().GetAuthorityCode(None) == "4326"
+    # A plane fitted to points on rough ground: near, not exact.
+    found = ground_to_image(path, GROUND, "METHOD=GCP_POLYNOMIAL", "MAX_GCP_ORDER=1")
+    np.testing.assert_allclose(found, fitted(tiny).ground_to_image(GROUND), atol=10)
+    np.testing.assert_array_equal(dataset.ReadAsArray(), gdal.Open(str(tiny.image)).ReadAsArray())
+
+
+def test_without_points_a_grid_of_gcps_stands_for_the_model(tiny, tmp_path):
+    surface = SurfaceOptions(height=500.0)
+    result = pipeline.export(tiny.image, tmp_path / "out", formats=["gcp"], surface=surface)
+    assert result.document["gcps"]["n"] == 121
+    assert "500 m" in result.summary
+    found = ground_to_image(result.files["gcp"], GROUND, "METHOD=GCP_POLYNOMIAL", "MAX_GCP_ORDER=2")
+    np.testing.assert_allclose(found, tiny.model.ground_to_image(GROUND), atol=0.01)
+
+
+@pytest.mark.parametrize("with_dem", [False, True])
+def test_geolocation_arrays_map_as_the_model(tiny, tmp_path, with_dem):
+    surface = SurfaceOptions(dem=tiny.dem, vertical="ellipsoid") if with_dem else SurfaceOptions(height=500.0)
+    result = pipeline.export(
+        tiny.image, tmp_path / "out", formats=["geolocation"], points=points_of(tiny), surface=surface
+    )
+    assert result.document["geolocation"]["max_error_px"] < 0.05
+    path = result.files["geolocation"]
+    transformer = gdal.Transformer(gdal.Open(str(path)), None, ["METHOD=GEOLOC_ARRAY"])
+    image = [(40.25, 60.75), (200.0, 150.0), (333.3, 222.2)]
+    found, good = transformer.TransformPoints(0, [(*pixel, 0.0) for pixel in image])
+    assert all(good)
+    model = fitted(tiny)
+    if with_dem:
+        from ortho_pipeline.rays import intersect
+
+        expected = intersect(model, image, pipeline.open_surface(surface))
+    else:
+        expected = model.image_to_ground(image, 500.0)
+    # A pixel is about 5e-5 degrees.
+    np.testing.assert_allclose(np.array(found)[:, :2], expected[:, :2], atol=5e-5 * 0.05)
+    back, good = transformer.TransformPoints(1, [tuple(row) for row in found])
+    assert all(good)
+    np.testing.assert_allclose(np.array(back)[:, :2], image, atol=0.3)
+
+
+# -- command line ----------------------------------------------------------------------------------------------------
+
+
+def test_every_format_from_the_command_line(tiny, tmp_path):
+    arguments = [tiny.image, "--gcps", tiny.gcps, "--points-crs", "EPSG:4979", "--points-vertical", "ellipsoid"]
+    arguments += ["-o", tmp_path / "out", "--height", "500", "--json"]
+    formats = ["--format", "rpc-txt,rpb", "--format", "tag", "--format", "vrt,gcp,gcp-tag,geolocation"]
+    done = CliRunner().invoke(cli, ["export", *map(str, arguments), *formats])
+    assert done.exit_code == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert set(document["files"]) == set(FORMATS)
+    assert all(Path(path).stat().st_size for path in document["files"].values())
+    assert document["exact"] is True
+
+
+def test_an_unknown_format_is_refused(tiny, tmp_path):
+    with pytest.raises(InputError, match="no format is called shp") as caught:
+        pipeline.export(tiny.image, tmp_path / "out", formats=["rpb", "shp"])
+    assert "geolocation" in str(caught.value.remedy)
+    assert not (tmp_path / "out").exists()

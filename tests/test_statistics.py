@@ -1,0 +1,152 @@
+"""Statistics of parameters and selection of points, against closed forms and regressions of one on the others."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pyproj
+import pytest
+
+from ortho_pipeline.errors import InputError, TooFewPoints
+from ortho_pipeline.model_choice import fit_family
+from ortho_pipeline.points import Points
+from ortho_pipeline.selection import select_control
+from ortho_pipeline.statistics import correlation_of, student_of, total_correlation_of
+
+SIZE = (10_000, 10_000)
+
+
+def perspective(ground: np.ndarray) -> np.ndarray:
+    x, y, z = ((ground - [415e3, 5015e3, 850.0]) / [15e3, 15e3, 650.0]).T
+    return 5000 + 4500 * np.stack([x + 0.02 * z, -y + 0.01 * z], axis=1) / (1 + 0.02 * x - 0.01 * y + 1e-3 * z)[:, None]
+
+
+def make_points(count, noise=0.5, seed=0, camera=perspective) -> Points:
+    random = np.random.default_rng(seed)
+    ground = random.uniform([400e3, 5000e3, 200.0], [430e3, 5030e3, 1500.0], (count, 3))
+    return Points(
+        ids=tuple(f"p{i}" for i in range(count)), image=camera(ground) + noise * random.normal(0, 1, (count, 2)),
+        ground=ground, roles=np.full(count, "control"), sigma_image=np.full(count, 0.5),
+        sigma_ground=np.zeros((count, 3)), crs=pyproj.CRS.from_epsg(32633), source="simulated",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def covariance() -> np.ndarray:
+    root = np.random.default_rng(0).normal(0, 1, (6, 6))
+    return root @ root.T * np.outer(10.0 ** np.arange(-3, 3), 10.0 ** np.arange(-3, 3))
+
+
+def test_correlation(covariance):
+    sample = np.random.default_rng(1).multivariate_normal(np.zeros(6), covariance, 100_000)
+    np.testing.assert_allclose(correlation_of(covariance), np.corrcoef(sample.T), atol=0.02)
+
+
+def test_total_correlation_is_that_with_the_best_prediction_by_the_others(covariance):
+    found = total_correlation_of(covariance)
+    for k in range(6):
+        others = np.delete(np.arange(6), k)
+        weights = np.linalg.solve(covariance[np.ix_(others, others)], covariance[others, k])
+        explained = weights @ covariance[others, k] / covariance[k, k]
+        assert found[k] == pytest.approx(np.sqrt(explained), abs=1e-9)
+    np.testing.assert_array_equal(total_correlation_of(np.diag([4.0, 1.0])), [0.0, 0.0])
+    assert total_correlation_of(np.zeros((0, 0))).shape == (0,)
+    assert total_correlation_of(np.array([[1.0, 1.0], [1.0, 1.0]])) == pytest.approx([1.0, 1.0])
+
+
+def test_student():
+    t, p = student_of(np.array([2.228, 0.0]), np.eye(2), 10)
+    # The table of every textbook: 2.228 for 10 degrees of freedom and 5 %.
+    np.testing.assert_allclose(t, [2.228, 0.0])
+    np.testing.assert_allclose(p, [0.05, 1.0], atol=1e-4)
+    assert student_of(np.array([1.96]), np.eye(1), 0)[1] == pytest.approx(0.05, abs=1e-4)
+
+
+def test_a_parameter_that_is_zero_is_called_significant_as_often_as_stated():
+    """A 3D affine camera has no XZ: p is uniform over repeats."""
+    truth = fit_family("affine3d", make_points(40, noise=0.0)).model
+    chances = []
+    for seed in range(300):
+        found = fit_family("affine12", make_points(20, seed=seed, camera=truth.ground_to_image), robust=False)
+        chances.append(found.student[1][found.param_names.index("col_XZ")])
+    assert 0.02 < np.mean(np.array(chances) < 0.05) < 0.09
+    assert abs(np.mean(chances) - 0.5) < 0.06
+
+
+def test_document_has_the_statistics():
+    found = fit_family("rfm2", make_points(60), size=SIZE)
+    document = json.loads(json.dumps(found.to_json(), allow_nan=False))["statistics"]
+    names = list(found.param_names)
+    assert np.shape(document["correlation"]) == (38, 38)
+    assert all(list(document[key]) == names for key in ("total_correlation", "t", "p"))
+    assert document["ridge"] == found.ridge > 0
+    assert document["effective_parameters"] < 38
+    assert document["degrees_of_freedom"] == pytest.approx(120 - document["effective_parameters"])
+    assert document["condition"] > 1e4
+
+
+def test_predicted_sigma_grows_away_from_the_points():
+    found = fit_family("affine3d", make_points(20), size=SIZE)
+    centre, half = found.model.domain
+    near, corner = found.image_sigma(np.stack([centre, centre + half]))
+    assert (corner > 1.5 * near).all()
+
+
+# -- selection -------------------------------------------------------------------------------------------------------
+
+
+def test_even_points_are_well_spread_whatever_their_order():
+    points = make_points(100)
+    chosen = select_control(points, "even:9")
+    assert chosen.control.sum() == 9
+    assert chosen.check.sum() == 91
+    places = points.image[chosen.control]
+    distances = np.linalg.norm(places[:, None] - places[None], axis=2)[~np.eye(9, dtype=bool)]
+    # Nine points of a 3 x 3 grid are half the extent apart.
+    assert distances.min() > 0.25 * np.ptp(points.image, axis=0).min()
+    shuffled = points.select(np.random.default_rng(0).permutation(100))
+    again = select_control(shuffled, "even:9")
+    assert set(np.array(again.ids)[again.control]) == set(np.array(chosen.ids)[chosen.control])
+
+
+def test_clusters_are_regions():
+    points = make_points(100)
+    middle = points.image.mean(axis=0)
+    signs = {1: (-1, -1), 2: (1, -1), 3: (1, 1), 4: (-1, 1)}
+    for group, sign in signs.items():
+        places = points.image[select_control(points, f"cluster:6:{group}").control]
+        assert len(places) == 6
+        assert ((places.mean(axis=0) - middle) * sign > 0).all()
+    centre = points.image[select_control(points, "cluster:6:5").control]
+    assert np.abs(centre.mean(axis=0) - middle).max() < 0.15 * np.ptp(points.image, axis=0).max()
+    first, same = select_control(points, "cluster:6"), select_control(points, "cluster:6:1")
+    np.testing.assert_array_equal(first.roles, same.roles)
+
+
+def test_ids_and_random_points():
+    points = make_points(30)
+    named = select_control(points, "ids:p3, p7")
+    assert np.flatnonzero(named.control).tolist() == [3, 7]
+    one, two = select_control(points, "random:10:1"), select_control(points, "random:10:2")
+    assert one.control.sum() == two.control.sum() == 10
+    assert (one.roles != two.roles).any()
+    np.testing.assert_array_equal(one.roles, select_control(points, "random:10:1").roles)
+
+
+def test_check_points_stay_check_points():
+    points = make_points(30)
+    points = points.with_roles(np.where(np.arange(30) < 10, "check", "control"))
+    assert not select_control(points, "even:20").check[10:].any()
+    with pytest.raises(TooFewPoints):
+        select_control(points, "even:21")
+    with pytest.raises(InputError, match="no control point"):
+        select_control(points, "ids:p0")
+
+
+@pytest.mark.parametrize(
+    "spec", ["", "even", "even:0", "even:x", "even:3:1", "cluster:3:6", "ids:", "ids:nobody", "random:3:x", "each:3"]
+)
+def test_other_texts_are_refused(spec):
+    with pytest.raises(InputError):
+        select_control(make_points(10), spec)
