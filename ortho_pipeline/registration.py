@@ -1,0 +1,286 @@
+"""Band-to-band registration: bands of several cameras brought onto one of them.
+
+Tie points are measured by sub-pixel phase correlation (scikit-image, Guizar-Sicairos et al. 2008) of patches on a
+regular grid, twice: around the coarse shift of the whole frames, and again around the transformation that fits the
+first pass, so that the patches overlap to a pixel. A similarity, affine, projective or second-order polynomial
+transformation is fitted by least squares without the tie points that contradict the others, and the band is resampled
+once, by cubic splines.
+
+Source: Ok and Turker, section 2.2; Yuksel et al. 2004 (the four cameras of BILSAT-1 onto the red one).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ortho_pipeline.errors import InputError, TooFewPoints
+from ortho_pipeline.models.base import Array, as_image
+
+#: Number of parameters by the name of the transformation.
+TRANSFORMS = {"similarity": 4, "affine": 6, "projective": 8, "poly2": 12}
+#: Correlated patches are found to this part of a pixel.
+_UPSAMPLING = 50
+#: A tie point is dropped beyond this many robust standard deviations, and never below this many pixels.
+_REJECT_SIGMAS, _REJECT_FLOOR = 3.5, 0.02
+#: Patches with less than this part of the band's usual contrast carry nothing to correlate.
+_CONTRAST = 0.2
+#: Patches that correlate less than this could as well be noise.
+_LIKENESS = 0.4
+#: Standard deviation (px) of the blur that is taken away before patches are correlated.
+_BROAD = 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class Transform:
+    """Map of image points of the reference band to another band.
+
+    Parameters
+    ----------
+    kind : str
+        One of `TRANSFORMS`.
+    coefficients : (2, T) or (8,)
+        Polynomial coefficients of column and row, or the projective parameters (a1 a2 a3 b1 b2 b3 c1 c2).
+    centre, scale : (2,), float
+        Points are normalised by (point - centre) / scale on both sides.
+    """
+
+    kind: str
+    coefficients: Array
+    centre: Array
+    scale: float
+
+    def __call__(self, image: ArrayLike) -> Array:
+        """Map image points ``(N, 2)``."""
+        points = (as_image(image) - self.centre) / self.scale
+        if self.kind == "projective":
+            return _project(self.coefficients, points) * self.scale + self.centre
+        return np.asarray(_terms(self.kind, points) @ self.coefficients.T * self.scale + self.centre)
+
+    @classmethod
+    def fit(cls, kind: str, reference: ArrayLike, moving: ArrayLike) -> Transform:
+        """Fit a transformation to tie points ``(N, 2)`` by least squares.
+
+        Raises
+        ------
+        InputError, TooFewPoints
+            If there is no such transformation, or there are too few points for it.
+        """
+        if kind not in TRANSFORMS:
+            raise InputError(f"{kind!r} is no transformation", field="transform", remedy=", ".join(TRANSFORMS))
+        source, target = as_image(reference), as_image(moving)
+        if 2 * len(source) < TRANSFORMS[kind]:
+            raise TooFewPoints(f"{len(source)} tie points do not determine a {kind} transformation")
+        centre = source.mean(axis=0)
+        scale = max(float(np.abs(source - centre).max()), 1.0)
+        x, y = (source - centre) / scale, (target - centre) / scale
+        return cls(kind, _solve(kind, x, y), centre, scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """How one band was brought onto the reference: tie points, transformation, residuals (moving minus fitted, px)."""
+
+    band: str
+    transform: Transform
+    reference: Array
+    moving: Array
+    residuals: Array
+    used: NDArray[np.bool_]
+
+    def row(self) -> dict[str, Any]:
+        """Return the row of the residual table: root mean squares and largest residual of the used tie points, px."""
+        used = self.residuals[self.used]
+        col, row = np.sqrt((used**2).mean(axis=0)).tolist()
+        return {
+            "band": self.band,
+            "transform": self.transform.kind,
+            "tie_points": len(self.used),
+            "used": int(self.used.sum()),
+            "rmse_col": col,
+            "rmse_row": row,
+            "rmse": math.hypot(col, row),
+            "largest": float(np.hypot(used[:, 0], used[:, 1]).max()),
+        }
+
+
+def register(
+    bands: Sequence[Array],
+    names: Sequence[str],
+    *,
+    reference: int = 0,
+    transform: str = "projective",
+    patch: int = 64,
+    spacing: int | None = None,
+) -> tuple[Array, tuple[Registration, ...]]:
+    """Bring bands of one size onto one of them.
+
+    Parameters
+    ----------
+    bands : sequence of (rows, columns) arrays
+    reference : int
+        Index of the band that stays as it is.
+    patch, spacing : int
+        Side of the correlated patches and distance of their centres, px.
+
+    Returns
+    -------
+    stack : ndarray (bands, rows, columns) float64
+        NaN where a band has no pixel.
+    registrations : tuple of Registration
+        One for each band but the reference.
+
+    Raises
+    ------
+    InputError
+        If the sizes differ, or two bands have nothing in common.
+    """
+    arrays = [np.asarray(band, dtype=np.float64) for band in bands]
+    if len(arrays) != len(names) or len({array.shape for array in arrays}) != 1 or arrays[0].ndim != 2:
+        raise InputError("bands are images of one size, each with a name", field="bands")
+    fixed = arrays[reference]
+    stack, registrations = np.empty((len(arrays), *fixed.shape)), []
+    for index, (array, name) in enumerate(zip(arrays, names, strict=True)):
+        if index == reference:
+            stack[index] = array
+            continue
+        registration = _register_band(fixed, array, name, transform, patch, spacing or patch)
+        stack[index] = resample(array, registration.transform)
+        registrations.append(registration)
+    return stack, tuple(registrations)
+
+
+def resample(band: Array, transform: Transform) -> Array:
+    """Return a band on the pixels of the reference, by cubic splines; NaN where it has none."""
+    from scipy.ndimage import map_coordinates
+
+    rows, columns = np.indices(band.shape)
+    there = transform(np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5) - 0.5
+    return map_coordinates(band, there.T[::-1], order=3, cval=np.nan).reshape(band.shape)
+
+
+def measure(fixed: Array, moving: Array, guess: Any, *, patch: int, spacing: int) -> tuple[Array, Array]:
+    """Measure tie points by phase correlation.
+
+    Parameters
+    ----------
+    guess : callable
+        Where about image points ``(N, 2)`` of `fixed` lie in `moving`.
+
+    Returns
+    -------
+    reference, moving : ndarray (N, 2)
+        Centres of the patches and where they were found, in pixels from the outer corner.
+    """
+    half = patch // 2
+    steps = [np.arange(half + 1, size - half, spacing) for size in fixed.shape]
+    centres = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 2)[:, ::-1]
+    corners = np.rint(guess(centres.astype(float))).astype(int) - half
+    window = np.outer(np.hanning(patch), np.hanning(patch))
+    floors = [_CONTRAST * float(band.std()) for band in (fixed, moving)]
+    found = []
+    for centre, (left, top) in zip(centres, corners, strict=True):
+        if left < 0 or top < 0 or left + patch > moving.shape[1] or top + patch > moving.shape[0]:
+            continue
+        first = fixed[centre[1] - half : centre[1] + half, centre[0] - half : centre[0] + half]
+        second = moving[top : top + patch, left : left + patch]
+        if not (first.std() > floors[0] and second.std() > floors[1]):
+            continue
+        shift, likeness = _shift(first, second, window)
+        if np.abs(shift).max() < patch / 4 and likeness > _LIKENESS:
+            found.append((*centre, left + half + shift[0], top + half + shift[1]))
+    table = np.array(found, dtype=np.float64).reshape(-1, 4)
+    return table[:, :2], table[:, 2:]
+
+
+def _register_band(fixed: Array, moving: Array, name: str, transform: str, patch: int, spacing: int) -> Registration:
+    coarse, _ = _shift(fixed, moving, np.outer(np.hanning(fixed.shape[0]), np.hanning(fixed.shape[1])))
+    fixed, moving = _details(fixed), _details(moving)
+    reference, there = measure(fixed, moving, lambda image: image + coarse, patch=2 * patch, spacing=2 * spacing)
+    first, _ = _fit_robust("similarity", reference, there, name)
+    for _ in range(2):
+        reference, there = measure(fixed, moving, first, patch=patch, spacing=spacing)
+        first, used = _fit_robust(transform, reference, there, name)
+    return Registration(name, first, reference, there, there - first(reference), used)
+
+
+def _details(band: Array) -> Array:
+    """Return what is smaller than a dozen pixels: broad differences of brightness pull the peak aside."""
+    from scipy.ndimage import gaussian_filter
+
+    return np.asarray(band - gaussian_filter(band, _BROAD), dtype=np.float64)
+
+
+def _shift(first: Array, second: Array, window: Array) -> tuple[Array, float]:
+    """Return by how many columns and rows the content of `first` has moved in `second`, and their correlation."""
+    from skimage.registration import phase_cross_correlation
+
+    # Without normalisation frequencies that carry nothing but noise have no say.
+    rows_columns, error, _ = phase_cross_correlation(
+        (first - first.mean()) * window,
+        (second - second.mean()) * window,
+        upsample_factor=_UPSAMPLING,
+        normalization=None,
+    )
+    likeness = math.sqrt(max(0.0, 1.0 - min(float(error), 1.0) ** 2))
+    return -np.asarray(rows_columns, dtype=np.float64)[::-1], likeness
+
+
+def _fit_robust(kind: str, reference: Array, moving: Array, name: str) -> tuple[Transform, NDArray[np.bool_]]:
+    used = np.ones(len(reference), dtype=bool)
+    for _ in range(10):
+        if 2 * used.sum() < TRANSFORMS[kind] + 4 or used.sum() < 0.3 * len(used):
+            raise TooFewPoints(
+                f"{int(used.sum())} of {len(used)} tie points of the band {name} agree: too few for a transformation",
+                field=name,
+                remedy="check that the bands are of one scene, or take larger patches",
+            )
+        transform = Transform.fit(kind, reference[used], moving[used])
+        miss = np.hypot(*(moving - transform(reference)).T)
+        # The median of the length of a two-dimensional error is 1.18 sigma.
+        limit = max(_REJECT_FLOOR, _REJECT_SIGMAS * float(np.median(miss[used])) / 1.18)
+        keep = miss <= limit
+        if np.array_equal(keep, used):
+            break
+        used = keep
+    return transform, used
+
+
+def _terms(kind: str, points: Array) -> Array:
+    x, y = points.T
+    one = np.ones_like(x)
+    return np.stack([one, x, y] if kind != "poly2" else [one, x, y, x * x, x * y, y * y], axis=1)
+
+
+def _solve(kind: str, x: Array, y: Array) -> Array:
+    if kind == "similarity":
+        zero, one = np.zeros(len(x)), np.ones(len(x))
+        design = np.vstack(
+            [np.stack([one, zero, x[:, 0], -x[:, 1]], axis=1), np.stack([zero, one, x[:, 1], x[:, 0]], axis=1)]
+        )
+        shift_col, shift_row, cos, sin = np.linalg.lstsq(design, y.T.ravel())[0]
+        return np.array([[shift_col, cos, -sin], [shift_row, sin, cos]])
+    if kind == "projective":
+        return _solve_projective(x, y)
+    return np.asarray(np.linalg.lstsq(_terms(kind, x), y)[0].T, dtype=np.float64)
+
+
+def _solve_projective(x: Array, y: Array) -> Array:
+    from scipy.optimize import least_squares
+
+    zero, terms = np.zeros((len(x), 3)), _terms("affine", x)
+    design = np.vstack([np.hstack([terms, zero, -x * y[:, :1]]), np.hstack([zero, terms, -x * y[:, 1:]])])
+    start = np.linalg.lstsq(design, y.T.ravel())[0]
+    # The linear solution weights points by their denominator; the image residuals are what counts.
+    return np.asarray(least_squares(lambda p: (_project(p, x) - y).ravel(), start, method="lm").x)
+
+
+def _project(parameters: Array, points: Array) -> Array:
+    terms = _terms("affine", points)
+    below = 1.0 + points @ parameters[6:]
+    return np.stack([terms @ parameters[:3], terms @ parameters[3:6]], axis=1) / below[:, None]

@@ -1,0 +1,101 @@
+"""Sensor plugin for BILSAT-1 scenes: an image and its imaging survey (docs/formats/bilsat.md) beside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from osgeo import gdal
+
+from ortho_bilsat.survey import MARK, Survey, read_survey
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geometry import geodetic, orbital_from_ecef
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.models.frame import FrameCamera, camera_from_platform
+
+
+@hookimpl
+def ortho_sensors() -> Iterable[Sensor]:
+    """Offer the sensor ``bilsat``."""
+    yield Sensor(
+        "bilsat",
+        "BILSAT-1 PAN and XS frames with an imaging survey file",
+        recognises,
+        open_scene,
+        options={
+            "survey": "the imaging survey file, where it is not <image>_survey.txt",
+            "attitude": "survey (default where there is one) or zero: start from equation 5 of the paper",
+        },
+    )
+
+
+def recognises(dataset: gdal.Dataset) -> bool:
+    """Tell whether an imaging survey lies beside the image."""
+    path = survey_of(dataset.GetDescription())
+    try:
+        with open(path, "rb") as file:
+            return file.read(len(MARK)) == MARK.encode()
+    except (OSError, ValueError):
+        return False
+
+
+def survey_of(image: str) -> Path:
+    """Return the path at which the survey of an image is looked for."""
+    path = Path(image)
+    return path.with_name(f"{path.stem}_survey.txt")
+
+
+def open_scene(dataset: gdal.Dataset, *, survey: str | None = None, attitude: str = "survey") -> Scene:
+    """Open a BILSAT-1 image with its imaging survey."""
+    name = dataset.GetDescription()
+    path = Path(survey) if survey else survey_of(name)
+    read = read_survey(path)
+    if (dataset.RasterXSize, dataset.RasterYSize) != (read.interior.width, read.interior.height):
+        raise InputError(
+            f"the survey is for {read.interior.width} x {read.interior.height} pixels, the image has "
+            f"{dataset.RasterXSize} x {dataset.RasterYSize}",
+            file=path,
+            field="columns, rows",
+            remedy="give the whole frame and its own survey",
+        )
+    if attitude not in ("survey", "zero"):
+        raise InputError(f"{attitude!r} is no source of the attitude", field="attitude", remedy="survey or zero")
+    model = rigorous_model(read, use_attitude=attitude == "survey")
+    warnings = []
+    if read.attitude is None or attitude == "zero":
+        warnings.append("the attitude is not known: the model only starts an adjustment to ground control points")
+    return Scene(
+        sensor="bilsat",
+        path=name,
+        width=read.interior.width,
+        height=read.interior.height,
+        models={"rigorous": model},
+        model_source=str(path),
+        facts=_facts(read, model),
+        warnings=tuple(warnings),
+    )
+
+
+def rigorous_model(survey: Survey, *, use_attitude: bool = True) -> FrameCamera:
+    """Return the collinearity model of a survey: its attitude, or zero angles (equation 5)."""
+    position, velocity = np.array(survey.position), np.array(survey.velocity)
+    rotation = None
+    if use_attitude and survey.attitude is not None:
+        rotation = camera_from_platform(*survey.attitude) @ orbital_from_ecef(position, velocity)
+    return FrameCamera.from_geocentric(survey.interior, position, rotation, heights=survey.heights)
+
+
+def _facts(survey: Survey, model: FrameCamera) -> dict[str, object]:
+    lon, lat, height = geodetic(np.array([survey.position]))[0].tolist()
+    interior = survey.interior
+    return {
+        "scene": survey.scene,
+        "camera": survey.camera,
+        "acquired": survey.acquired,
+        "satellite_lon_lat_height": [round(lon, 7), round(lat, 7), round(height, 2)],
+        "off_nadir_deg": round(math.degrees(math.acos(min(1.0, abs(float(model.rotation[2, 2]))))), 3),
+        "pixel_at_nadir_m": round(interior.pitch_x * height / interior.focal_length, 3),
+        "position_sigma_m": survey.position_sigma,
+    }

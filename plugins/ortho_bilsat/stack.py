@@ -1,0 +1,75 @@
+"""The four XS bands of one acquisition, taken by four cameras, made into one 4-band image."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import whole_or_nothing
+from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.registration import Registration, register
+
+
+def stack_bands(
+    bands: Mapping[str, str | PathLike[str]],
+    output: str | PathLike[str],
+    *,
+    reference: str = "red",
+    transform: str = "projective",
+) -> tuple[Registration, ...]:
+    """Register single-band images onto one of them and write a GeoTIFF with all bands.
+
+    The stack has the geometry of the reference camera, whose imaging survey belongs to it. Pixels that a band does not
+    cover are 0, which is declared as nodata.
+
+    Parameters
+    ----------
+    bands : mapping of band name to path
+        In the order of the stack.
+
+    Raises
+    ------
+    InputError
+        If an image cannot be read or has several bands, the sizes or types differ, or nothing matches.
+    """
+    if reference not in bands or len(bands) < 2:
+        raise InputError(f"there is no band {reference!r} to register onto", field="reference", remedy=", ".join(bands))
+    images = {name: _read(path) for name, path in bands.items()}
+    types = {image.dtype for image in images.values()}
+    if len(types) != 1 or next(iter(types)).kind != "u":
+        raise InputError("the bands are unsigned integers of one type", field="bands")
+    names = list(images)
+    stack, registrations = register(list(images.values()), names, reference=names.index(reference), transform=transform)
+    dtype = next(iter(types))
+    # Splines overshoot; a dark pixel that is there is not nodata.
+    low, high = 1, np.iinfo(dtype).max
+    filled = np.where(np.isfinite(stack), np.clip(np.rint(stack), low, high), 0).astype(dtype)
+    _write(filled, names, output)
+    return registrations
+
+
+def _read(path: str | PathLike[str]) -> np.ndarray[Any, Any]:
+    dataset = open_dataset(path)
+    if dataset.RasterCount != 1:
+        raise InputError(f"this image has {dataset.RasterCount} bands, one is expected", file=path)
+    return np.asarray(dataset.ReadAsArray())
+
+
+def _write(stack: np.ndarray[Any, Any], names: list[str], output: str | PathLike[str]) -> None:
+    count, rows, columns = stack.shape
+    kind = gdal.GDT_Byte if stack.dtype == np.uint8 else gdal.GDT_UInt16
+    with whole_or_nothing(output) as temporary:
+        options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "TILED=YES", "BIGTIFF=IF_SAFER"]
+        dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, count, kind, options)
+        for index, name in enumerate(names, start=1):
+            band = dataset.GetRasterBand(index)
+            band.SetDescription(name)
+            band.SetNoDataValue(0)
+            band.WriteArray(stack[index - 1])
+        dataset.FlushCache()
+        del band, dataset

@@ -1,0 +1,183 @@
+"""The imaging survey: a text file of ``key = value`` lines (docs/formats/bilsat.md), read and written."""
+
+from __future__ import annotations
+
+import datetime
+import math
+import re
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import write_text
+from ortho_pipeline.models.lens import Interior
+
+MARK = "BILSAT-1 IMAGING SURVEY 1"
+CAMERAS = ("PAN", "XS-BLUE", "XS-GREEN", "XS-RED", "XS-NIR")
+MAX_BYTES = 100_000
+#: How many numbers each key has; those in OPTIONAL may be missing.
+NUMBERS = {
+    "position_m": 3, "velocity_m_s": 3, "attitude_deg": 3, "focal_length_mm": 1, "pixel_pitch_um": 1, "columns": 1,
+    "rows": 1, "position_sigma_m": 1, "heights_m": 2,
+}  # fmt: skip
+TEXTS = ("scene", "camera", "acquired")
+OPTIONAL = ("attitude_deg", "position_sigma_m", "heights_m")
+HEIGHTS = (-500.0, 9000.0)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What an imaging survey says; metres, radians, ECEF (WGS84).
+
+    `attitude` is roll, pitch, yaw from the orbital frame (along, right, down) or None.
+    """
+
+    scene: str
+    camera: str
+    acquired: str
+    position: tuple[float, float, float]
+    velocity: tuple[float, float, float]
+    attitude: tuple[float, float, float] | None
+    interior: Interior
+    position_sigma: float | None = None
+    heights: tuple[float, float] = HEIGHTS
+
+
+def read_survey(path: str | PathLike[str]) -> Survey:
+    """Read an imaging survey.
+
+    Raises
+    ------
+    InputError
+        Names the key (or line) that is missing, unknown, twice there, not a number or not possible.
+    """
+    fields = _fields(path)
+    texts = {key: fields.pop(key) for key in TEXTS}
+    numbers = {key: _numbers(path, key, text) for key, text in fields.items()}
+    if texts["camera"] not in CAMERAS:
+        raise InputError(
+            f"there is no camera {texts['camera']!r}", file=path, field="camera", remedy=", ".join(CAMERAS)
+        )
+    _check_time(path, texts["acquired"])
+    _check_orbit(path, numbers["position_m"], numbers["velocity_m_s"])
+    attitude, heights = numbers.get("attitude_deg"), numbers.get("heights_m", HEIGHTS)
+    if not heights[0] < heights[1]:
+        raise InputError("the lower height comes first", file=path, field="heights_m")
+    sigma = numbers.get("position_sigma_m", (None,))[0]
+    if sigma is not None and not sigma > 0:
+        raise InputError("a standard deviation is positive", file=path, field="position_sigma_m")
+    return Survey(
+        **texts,
+        position=_triple(numbers["position_m"]),
+        velocity=_triple(numbers["velocity_m_s"]),
+        attitude=None if attitude is None else _triple(tuple(math.radians(angle) for angle in attitude)),
+        interior=_interior(path, numbers),
+        position_sigma=sigma,
+        heights=(heights[0], heights[1]),
+    )
+
+
+def write_survey(survey: Survey, path: str | PathLike[str]) -> None:
+    """Write an imaging survey; numbers are kept to the last bit."""
+    interior = survey.interior
+    values: dict[str, tuple[float, ...]] = {"position_m": survey.position, "velocity_m_s": survey.velocity}
+    if survey.attitude is not None:
+        values["attitude_deg"] = tuple(math.degrees(angle) for angle in survey.attitude)
+    values |= {"focal_length_mm": (interior.focal_length * 1e3,), "pixel_pitch_um": (interior.pitch_x * 1e6,)}
+    values |= {"columns": (interior.width,), "rows": (interior.height,), "heights_m": survey.heights}
+    if survey.position_sigma is not None:
+        values["position_sigma_m"] = (survey.position_sigma,)
+    lines = [MARK, *(f"{key} = {getattr(survey, key)}" for key in TEXTS)]
+    lines += [f"{key} = {' '.join(map(repr, numbers))}" for key, numbers in values.items()]
+    write_text(path, "\n".join([*lines, "END"]) + "\n")
+
+
+def _fields(path: str | PathLike[str]) -> dict[str, str]:
+    lines = _text(path).splitlines()
+    if not lines or lines[0].strip() != MARK:
+        raise InputError("this is no imaging survey", file=path, field="line 1", remedy=f"its first line is {MARK!r}")
+    fields: dict[str, str] = {}
+    ended = False
+    for number, line in enumerate(lines[1:], start=2):
+        plain = line.split("#", 1)[0].strip()
+        if not plain:
+            continue
+        if ended:
+            raise InputError("there is something after END", file=path, field=f"line {number}")
+        if plain == "END":
+            ended = True
+            continue
+        key, sign, value = (part.strip() for part in plain.partition("="))
+        if not sign or (key not in NUMBERS and key not in TEXTS):
+            raise InputError(f"{key[:60]!r} is no key of a survey", file=path, field=f"line {number}")
+        if key in fields:
+            raise InputError("this key stands twice", file=path, field=key)
+        fields[key] = value
+    if not ended:
+        raise InputError("the file is cut off: END is missing", file=path)
+    missing = [key for key in (*TEXTS, *NUMBERS) if key not in fields and key not in OPTIONAL]
+    if missing:
+        raise InputError("this key is missing", file=path, field=missing[0], remedy="see docs/formats/bilsat.md")
+    return fields
+
+
+def _text(path: str | PathLike[str]) -> str:
+    try:
+        if Path(path).stat().st_size > MAX_BYTES:
+            raise InputError(f"a survey of more than {MAX_BYTES} bytes is not read", file=path)
+        return Path(path).read_text(encoding="ascii")
+    except OSError as error:
+        raise InputError(
+            f"cannot be read ({error.strerror})", file=path, field="survey", remedy="give the option survey"
+        ) from error
+    except ValueError as error:
+        raise InputError("a survey is plain ASCII text", file=path) from error
+
+
+def _numbers(path: str | PathLike[str], key: str, text: str) -> tuple[float, ...]:
+    # float() also reads inf, nan, 1_000 and digits of other scripts.
+    parts = text.split()
+    if not all(re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", part) for part in parts):
+        raise InputError(f"{text[:60]!r} is not made of numbers", file=path, field=key)
+    values = tuple(float(part) for part in parts)
+    if len(values) != NUMBERS[key] or not all(abs(value) < 1e12 for value in values):
+        raise InputError(f"{text[:60]!r} are not {NUMBERS[key]} numbers in range", file=path, field=key)
+    return values
+
+
+def _check_time(path: str | PathLike[str], text: str) -> None:
+    try:
+        time = datetime.datetime.fromisoformat(text)
+    except ValueError:
+        time = None
+    if time is None or time.utcoffset() != datetime.timedelta(0):
+        raise InputError(
+            f"{text[:60]!r} is no time in UTC", file=path, field="acquired", remedy="2005-08-03T08:12:31.25Z"
+        )
+
+
+def _check_orbit(path: str | PathLike[str], position: tuple[float, ...], velocity: tuple[float, ...]) -> None:
+    if not 6.5e6 < math.hypot(*position) < 5e7:
+        raise InputError("no satellite is there", file=path, field="position_m", remedy="ECEF in metres")
+    if not 1e3 < math.hypot(*velocity) < 1.2e4:
+        raise InputError("no satellite is so fast or slow", file=path, field="velocity_m_s", remedy="ECEF in m/s")
+    cosine = sum(p * v for p, v in zip(position, velocity, strict=True)) / math.hypot(*position) / math.hypot(*velocity)
+    if abs(cosine) > 0.5:
+        raise InputError("this velocity goes up or down", file=path, field="velocity_m_s")
+
+
+def _interior(path: str | PathLike[str], numbers: dict[str, tuple[float, ...]]) -> Interior:
+    (focal,), (pitch,) = numbers["focal_length_mm"], numbers["pixel_pitch_um"]
+    (columns,), (rows,) = numbers["columns"], numbers["rows"]
+    for key, value in (("columns", columns), ("rows", rows)):
+        if value != int(value) or not 0 < value < 1e6:
+            raise InputError(f"{value} is no number of pixels", file=path, field=key)
+    for key, value in (("focal_length_mm", focal), ("pixel_pitch_um", pitch)):
+        if not 1e-6 < value < 1e6:
+            raise InputError(f"{value} is not possible", file=path, field=key)
+    return Interior(int(columns), int(rows), focal * 1e-3, pitch * 1e-6, pitch * 1e-6)
+
+
+def _triple(values: tuple[float, ...]) -> tuple[float, float, float]:
+    return values[0], values[1], values[2]

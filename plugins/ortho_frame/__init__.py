@@ -1,0 +1,134 @@
+"""Sensor plugin for frame images in general: a camera file, and a table of exterior orientations.
+
+It recognises nothing by itself: it is taken when its options are given (``camera``, ``exterior``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+from osgeo import gdal
+
+from ortho_frame.tables import Pose, read_camera, read_exterior
+from ortho_pipeline.crs import Vertical, ground_transform
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.models.frame import TOPOCENTRIC, FrameCamera
+from ortho_pipeline.models.lens import Interior
+
+OPTIONS = {
+    "camera": "camera file: JSON (docs/formats/frame.md) or OpenSfM's cameras.json or reconstruction.json",
+    "exterior": "CSV: filename, and x y z omega phi kappa or lon lat alt roll pitch yaw (degrees)",
+    "crs": "projected CRS of x and y",
+    "vertical": "what the camera heights are above: ellipsoid, egm96, egm2008, EPSG:n or a grid file",
+    "frame": "work in a topocentric frame (default) or directly in the map projection: topocentric, map",
+    "heights": "lowest and highest ground in ellipsoidal metres: low,high",
+    "refraction": "bend rays by the standard atmosphere: yes or no (default)",
+}
+
+
+@hookimpl
+def ortho_sensors() -> Iterable[Sensor]:
+    """Offer the sensor ``frame``."""
+    yield Sensor(
+        "frame",
+        "aerial, drone and other frame images with a camera file and exterior orientations",
+        lambda dataset: False,
+        open_scene,
+        options=OPTIONS,
+        fallback=True,
+    )
+
+
+def open_scene(
+    dataset: gdal.Dataset,
+    *,
+    camera: str | None = None,
+    exterior: str | None = None,
+    crs: str | None = None,
+    vertical: str | None = None,
+    frame: str = TOPOCENTRIC,
+    heights: str | None = None,
+    refraction: str = "no",
+) -> Scene:
+    """Open a frame image with its camera and its row of the table of exterior orientations."""
+    name = dataset.GetDescription()
+    if camera is None or exterior is None or vertical is None:
+        missing = [
+            key for key, value in (("camera", camera), ("exterior", exterior), ("vertical", vertical)) if not value
+        ]
+        raise InputError(
+            f"a frame image needs {', '.join(missing)}", file=name, field=missing[0], remedy=OPTIONS[missing[0]]
+        )
+    if refraction not in ("yes", "no"):
+        raise InputError(f"{refraction!r} is neither yes nor no", field="refraction")
+    interior = read_camera(camera, dataset.RasterXSize, dataset.RasterYSize)
+    pose = read_exterior(exterior, name)
+    model = _model(interior, pose, crs, Vertical.parse(vertical), frame, heights, refraction == "yes")
+    return Scene(
+        sensor="frame",
+        path=name,
+        width=dataset.RasterXSize,
+        height=dataset.RasterYSize,
+        models={"frame": model},
+        model_source=exterior,
+        facts=_facts(model, pose),
+    )
+
+
+def _model(
+    interior: Interior,
+    pose: Pose,
+    crs: str | None,
+    vertical: Vertical,
+    frame: str,
+    heights: str | None,
+    refraction: bool,
+) -> FrameCamera:
+    position, angles = np.array(pose.position), np.radians(pose.angles)
+    if not pose.geographic and crs is None:
+        raise InputError(
+            "the CRS of x and y is not known",
+            file=pose.source,
+            field="crs",
+            remedy="give the option crs, such as EPSG:32636",
+        )
+    place = position if pose.geographic else ground_transform(str(crs), "EPSG:4979")([[*position[:2], 0.0]])[0]
+    position[2] += float(vertical.undulation(place[:1], place[1:2])[0])
+    if not np.isfinite(position).all():
+        raise InputError("this position is not on the map", file=pose.source, field=pose.where)
+    others = {"heights": _heights(heights, float(position[2])), "refraction": refraction}
+    if pose.geographic:
+        if frame != TOPOCENTRIC:
+            raise InputError("roll, pitch and yaw belong to no map", field="frame", remedy="leave the option out")
+        return FrameCamera.from_roll_pitch_yaw(interior, position, *angles.tolist(), **others)
+    return FrameCamera.from_map(interior, str(crs), np.concatenate([position, angles]), frame=frame, **others)
+
+
+def _heights(text: str | None, camera: float) -> tuple[float, float]:
+    if text is None:
+        # What is known is only that the ground is below the camera.
+        low = min(-100.0, camera - 1000.0)
+        return low, min(9000.0, camera - 0.1 * (camera - low))
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:
+        low = high = math.nan
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise InputError(f"{text!r} is no range of heights", field="heights", remedy="give low,high in metres")
+    return low, high
+
+
+def _facts(model: FrameCamera, pose: Pose) -> dict[str, object]:
+    centre: Array = model.perspective_centre
+    tilt = math.degrees(math.acos(min(1.0, abs(float(model.rotation[2, 2])))))
+    return {
+        "exterior_orientation": pose.where,
+        "perspective_centre": [round(float(value), 9) for value in centre],
+        "perspective_centre_crs": model.crs,
+        "tilt_deg": round(tilt, 3),
+        "focal_length_px": round(model.interior.focal_length / model.interior.pitch_x, 3),
+    }

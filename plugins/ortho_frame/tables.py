@@ -1,0 +1,244 @@
+"""Camera files and tables of exterior orientations, checked field by field (docs/formats/frame.md)."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.models.lens import Interior
+
+MAX_BYTES = 5_000_000
+#: Columns of a table, by the ways to write them; the first of each is the name in messages.
+MAP_COLUMNS = (("x",), ("y",), ("z",), ("omega",), ("phi",), ("kappa",))
+GEOGRAPHIC_COLUMNS = (
+    ("lon", "longitude"), ("lat", "latitude"), ("alt", "altitude", "height", "h"), ("roll",), ("pitch",), ("yaw",),
+)  # fmt: skip
+CAMERA_KEYS = {
+    "name", "width", "height", "focal_length_mm", "sensor_mm", "pixel_pitch_um", "principal_point_mm", "distortion",
+}  # fmt: skip
+DISTORTION_KEYS = ("k1", "k2", "k3", "p1", "p2")
+
+
+@dataclass(frozen=True)
+class Pose:
+    """One row of the table: position and angles (degrees) as they stand there."""
+
+    source: str
+    where: str
+    geographic: bool
+    position: tuple[float, float, float]
+    angles: tuple[float, float, float]
+
+
+# -- the camera ------------------------------------------------------------------------------------------------------
+
+
+def read_camera(path: str | PathLike[str], width: int, height: int) -> Interior:
+    """Read the interior orientation for an image of `width` x `height` pixels.
+
+    A camera of another size with the same proportions is scaled: the image is then a reduced copy.
+
+    Raises
+    ------
+    InputError
+        If the file is no camera, a field is missing, unknown or wrong, or the proportions differ.
+    """
+    try:
+        document = json.loads(_text(path), object_pairs_hook=_unique, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"this is no JSON ({error})", file=path, remedy="see docs/formats/frame.md") from error
+    given = _opensfm(path, document) if _is_opensfm(document) else _own(path, document)
+    if given.width * height != given.height * width:
+        raise InputError(
+            f"the camera has {given.width} x {given.height} pixels, the image {width} x {height}",
+            file=path,
+            field="width, height",
+            remedy="give the camera of this image; a crop is not the whole frame",
+        )
+    ratio = given.width / width
+    fields = {**given.to_dict(), "width": width, "height": height}
+    return Interior(**{**fields, "pitch_x": given.pitch_x * ratio, "pitch_y": given.pitch_y * ratio})
+
+
+def _own(path: str | PathLike[str], document: Any) -> Interior:
+    if not isinstance(document, dict):
+        raise InputError("a camera file is a JSON object", file=path, remedy="see docs/formats/frame.md")
+    unknown = sorted(set(document) - CAMERA_KEYS)
+    if unknown:
+        raise InputError("there is no such field", file=path, field=unknown[0], remedy=f"one of {sorted(CAMERA_KEYS)}")
+    width, height = (_number(path, key, document.get(key)) for key in ("width", "height"))
+    focal = _number(path, "focal_length_mm", document.get("focal_length_mm")) * 1e-3
+    if ("sensor_mm" in document) == ("pixel_pitch_um" in document):
+        raise InputError("give one of sensor_mm and pixel_pitch_um", file=path, field="sensor_mm")
+    if "sensor_mm" in document:
+        across, down = _pair(path, "sensor_mm", document["sensor_mm"])
+        if not (width > 0 and height > 0):
+            raise InputError("a frame has a positive size", file=path, field="width, height")
+        pitch = across * 1e-3 / width, down * 1e-3 / height
+    else:
+        across, down = _pair(path, "pixel_pitch_um", document["pixel_pitch_um"])
+        pitch = across * 1e-6, down * 1e-6
+    x0, y0 = _pair(path, "principal_point_mm", document.get("principal_point_mm", [0.0, 0.0]))
+    lens = document.get("distortion", {})
+    if not isinstance(lens, dict) or set(lens) - set(DISTORTION_KEYS):
+        raise InputError(f"distortion has the fields {', '.join(DISTORTION_KEYS)}", file=path, field="distortion")
+    brown = {key: _number(path, f"distortion.{key}", value) for key, value in lens.items()}
+    return _interior(path, width, height, focal, *pitch, x0=x0 * 1e-3, y0=y0 * 1e-3, **brown)
+
+
+def _is_opensfm(document: Any) -> bool:
+    first = document[0] if isinstance(document, list) and document else document
+    return (
+        isinstance(first, dict)
+        and "width" not in first
+        and ("cameras" in first or any(isinstance(v, dict) and "projection_type" in v for v in first.values()))
+    )
+
+
+def _opensfm(path: str | PathLike[str], document: Any) -> Interior:
+    first = document[0] if isinstance(document, list) else document
+    cameras = first.get("cameras", first)
+    if not isinstance(cameras, dict) or len(cameras) != 1 or not isinstance(next(iter(cameras.values())), dict):
+        raise InputError("give a file with one camera", file=path, field="cameras")
+    camera = next(iter(cameras.values()))
+    kind = camera.get("projection_type")
+    if kind not in ("brown", "perspective"):
+        raise InputError(
+            f"cameras of the type {kind!r} are not known",
+            file=path,
+            field="projection_type",
+            remedy="brown, perspective",
+        )
+    width, height = (_number(path, key, camera.get(key)) for key in ("width", "height"))
+    size = max(width, height) * 1e-6  # with pixels of 1 µm
+    focal = camera.get("focal_x", camera.get("focal"))
+    focal_x = _number(path, "focal_x", focal)
+    focal_y = _number(path, "focal_y", camera.get("focal_y", focal))
+    if not focal_x > 0 or not focal_y > 0:
+        raise InputError("a focal length is positive", file=path, field="focal_x")
+    brown = {key: _number(path, key, camera.get(key, 0.0)) for key in DISTORTION_KEYS}
+    c_x, c_y = (_number(path, key, camera.get(key, 0.0)) for key in ("c_x", "c_y"))
+    # Its y points down; different focal lengths of the axes are different pitches here.
+    return _interior(
+        path, width, height, focal_x * size, 1e-6, 1e-6 * focal_x / focal_y,
+        x0=c_x * size, y0=-c_y * size * focal_x / focal_y, **brown,
+    )  # fmt: skip
+
+
+def _interior(path: str | PathLike[str], width: float, height: float, *values: float, **others: float) -> Interior:
+    try:
+        if width != int(width) or height != int(height) or not 0 < width < 1e6 or not 0 < height < 1e6:
+            raise InputError("a frame has whole numbers of columns and rows", field="width, height")
+        return Interior(int(width), int(height), *values, **others)
+    except InputError as error:
+        raise InputError(error.message, file=path, field=error.field, remedy=error.remedy) from error
+
+
+def _pair(path: str | PathLike[str], field: str, value: Any) -> tuple[float, float]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise InputError("this is a list of two numbers, x first", file=path, field=field)
+    return _number(path, field, value[0]), _number(path, field, value[1])
+
+
+def _number(path: str | PathLike[str], field: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e15:
+        raise InputError("is missing" if value is None else f"{value!r} is not a number", file=path, field=field)
+    return float(value)
+
+
+# -- exterior orientations -------------------------------------------------------------------------------------------
+
+
+def read_exterior(path: str | PathLike[str], image: str | PathLike[str]) -> Pose:
+    """Return the row of a table of exterior orientations that belongs to an image, by its file name.
+
+    Raises
+    ------
+    InputError
+        If the table has no header, the image is not in it or stands twice, or a number is wrong.
+    """
+    header, rows = _table(path)
+    geographic, columns = _columns(path, header)
+    wanted = Path(image)
+    found = [(line, row) for line, row in rows if row and row[0] in (wanted.name, wanted.stem)]
+    if len(found) != 1:
+        what = "stands twice" if found else "is not in this table"
+        raise InputError(f"the image {wanted.name} {what}", file=path, field=header[0], remedy="give one row per image")
+    line, row = found[0]
+    values = []
+    for name, column in columns:
+        try:
+            value = float(row[column])
+        except (IndexError, ValueError):
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError("this is not a number", file=path, field=f"line {line}, {name}")
+        values.append(value)
+    if geographic and not (abs(values[0]) <= 360 and abs(values[1]) <= 90):
+        raise InputError("this is not on Earth", file=path, field=f"line {line}, lon, lat")
+    x, y, z, first, second, third = values
+    return Pose(str(path), f"line {line}", geographic, (x, y, z), (first, second, third))
+
+
+def _table(path: str | PathLike[str]) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    lines = [(n, line) for n, line in enumerate(_text(path).splitlines(), start=1) if line.strip() and line[0] != "#"]
+    if not lines:
+        raise InputError("the table is empty", file=path)
+    first = lines[0][1]
+    delimiter = next((sign for sign in (",", ";", "\t") if sign in first), " ")
+    quote = "'" if first.lstrip().startswith("'") else '"'
+    rows = []
+    for number, line in lines:
+        try:
+            cells = next(csv.reader([line.strip()], delimiter=delimiter, quotechar=quote, skipinitialspace=True))
+        except (csv.Error, StopIteration) as error:
+            raise InputError(f"this is no row ({error})", file=path, field=f"line {number}") from error
+        rows.append((number, [cell.strip() for cell in cells]))
+    return [cell.lower() for cell in rows[0][1]], rows[1:]
+
+
+def _columns(path: str | PathLike[str], header: list[str]) -> tuple[bool, list[tuple[str, int]]]:
+    for geographic, wanted in ((False, MAP_COLUMNS), (True, GEOGRAPHIC_COLUMNS)):
+        found = [(names[0], header.index(name)) for names in wanted for name in names if name in header]
+        if len(found) == len(wanted):
+            return geographic, found
+    raise InputError(
+        f"the columns are {', '.join(header)[:120]}",
+        file=path,
+        field="header",
+        remedy="filename, then x y z omega phi kappa, or lon lat alt roll pitch yaw",
+    )
+
+
+# -- text ------------------------------------------------------------------------------------------------------------
+
+
+def _text(path: str | PathLike[str]) -> str:
+    try:
+        if Path(path).stat().st_size > MAX_BYTES:
+            raise InputError("a file of more than 5 MB is not read here", file=path)
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", file=path, remedy="check the path") from error
+    except ValueError as error:
+        raise InputError("this is no text in UTF-8", file=path) from error
+    if "\0" in text:
+        raise InputError("this is no text", file=path)
+    return text
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ValueError("a field stands twice")
+    return found
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a number")

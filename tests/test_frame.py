@@ -1,0 +1,286 @@
+"""Frame camera: contract, truth, honest covariance, self-calibration, start from nothing, refraction, RPC export."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyproj
+import pytest
+
+from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
+from ortho_pipeline.estimation import Prior, fit
+from ortho_pipeline.geometry import angles_of_rotation, geocentric, geodetic, meet_height, rotation_of_angles
+from ortho_pipeline.models import model_from_dict
+from ortho_pipeline.models.frame import EXTERIOR, MAP, PARAMETERS, FrameCamera
+from ortho_pipeline.models.lens import Interior
+from ortho_pipeline.models.resection import resect
+from ortho_pipeline.points import Points
+from ortho_pipeline.testing import check_sensor_model
+
+BILSAT = Interior(2048, 2048, 0.180, 27.6 * 0.180 / 686e3, 27.6 * 0.180 / 686e3)
+AERIAL = Interior(1000, 1500, 0.120, 1e-4, 1e-4)
+DISTORTED = Interior(2048, 2048, 0.18, 7.3e-6, 7.2e-6, 3e-5, -2e-5, -0.2, 0.05, 0.01, 1e-3, -5e-4)
+PLACE = (32.8, 39.9)
+
+
+def satellite(tilt: float, heading: float, interior: Interior = BILSAT, **others) -> FrameCamera:
+    """A camera 686 km over Ankara; angles in degrees."""
+    angles = np.radians([2.0, tilt, heading])
+    return FrameCamera.from_roll_pitch_yaw(interior, (*PLACE, 686e3), *angles, heights=(700.0, 1900.0), **others)
+
+
+def aerial(**others) -> FrameCamera:
+    angles = np.radians([3.0, -5.0, 140.0])
+    return FrameCamera.from_roll_pitch_yaw(AERIAL, (*PLACE, 6000.0), *angles, heights=(700.0, 1900.0), **others)
+
+
+def measured(
+    camera: FrameCamera, count: int, noise: float = 0.0, seed: int = 0, heights: tuple[float, float] | None = None
+) -> Points:
+    random = np.random.default_rng(seed)
+    image = random.uniform(0.03, 0.97, (count, 2)) * (camera.interior.width, camera.interior.height)
+    ground = camera.image_to_ground(image, random.uniform(*(heights or camera.heights), count))
+    assert np.isfinite(ground).all()
+    return points_of(ground, camera.ground_to_image(ground) + noise * random.normal(size=(count, 2)), noise)
+
+
+def points_of(ground: np.ndarray, image: np.ndarray, noise: float, crs: str = "EPSG:4326") -> Points:
+    count = len(ground)
+    return Points(
+        ids=tuple(f"p{i}" for i in range(count)), image=image, ground=ground, roles=np.full(count, "control"),
+        sigma_image=np.full(count, noise or 0.5), sigma_ground=np.zeros((count, 3)), crs=pyproj.CRS(crs), source="test",
+    )  # fmt: skip
+
+
+def apart(first: FrameCamera, second: FrameCamera) -> tuple[float, float]:
+    """Return how far two topocentric cameras are apart (m) and how much one is turned to the other (rad)."""
+    shift = geocentric(first.perspective_centre[None]) - geocentric(second.perspective_centre[None])
+    turn = first.rotation @ first._local[0] @ (second.rotation @ second._local[0]).T
+    return float(np.linalg.norm(shift)), float(np.linalg.norm(turn - np.eye(3)) / np.sqrt(2))
+
+
+# -- the map ---------------------------------------------------------------------------------------------------------
+
+
+def box_of(camera: FrameCamera, reach: float = 0.6) -> np.ndarray:
+    centre, half = camera.domain
+    ground = centre + half * np.random.default_rng(1).uniform(-reach, reach, (40, 3))
+    return ground[np.isfinite(camera.ground_to_image(ground)).all(axis=1)]
+
+
+@pytest.mark.parametrize("refraction", [False, True])
+@pytest.mark.parametrize(("tilt", "heading"), [(0, 0), (8, 192), (30, 77), (60, 180), (60, 300)])
+def test_contract(tilt, heading, refraction):
+    camera = satellite(tilt, heading, DISTORTED, refraction=refraction, free=PARAMETERS)
+    ground = box_of(camera)
+    assert len(ground) > 20
+    check_sensor_model(camera, ground)
+
+
+@pytest.mark.parametrize("refraction", [False, True])
+def test_contract_in_a_map_projection(refraction):
+    camera = FrameCamera.from_map(
+        DISTORTED, "EPSG:32636", [480e3, 4.42e6, 686e3, 0.1, 0.05, 2.5],
+        frame=MAP, heights=(700, 1900), refraction=refraction, free=PARAMETERS,
+    )  # fmt: skip
+    check_sensor_model(camera, box_of(camera))
+
+
+def test_collinearity_as_a_textbook_writes_it():
+    # Written out for one point, in the map frame, with nothing of the package.
+    x_l, y_l, z_l, omega, phi, kappa = 480000.0, 4420000.0, 5000.0, 0.10, -0.07, 2.0
+    rx = np.array([[1, 0, 0], [0, np.cos(omega), np.sin(omega)], [0, -np.sin(omega), np.cos(omega)]])
+    ry = np.array([[np.cos(phi), 0, -np.sin(phi)], [0, 1, 0], [np.sin(phi), 0, np.cos(phi)]])
+    rz = np.array([[np.cos(kappa), np.sin(kappa), 0], [-np.sin(kappa), np.cos(kappa), 0], [0, 0, 1]])
+    w = rz @ ry @ rx @ [480300.0 - x_l, 4420700.0 - y_l, 900.0 - z_l]
+    x, y = -0.12 * w[0] / w[2] + 0.0002, -0.12 * w[1] / w[2] - 0.0003
+    interior = Interior(1000, 1500, 0.12, 1e-4, 1e-4, x0=0.0002, y0=-0.0003)
+    camera = FrameCamera.from_map(interior, "EPSG:32636", [x_l, y_l, z_l, omega, phi, kappa], frame=MAP)
+    image = camera.ground_to_image([[480300.0, 4420700.0, 900.0]])
+    np.testing.assert_allclose(image, [[500 + x / 1e-4, 750 - y / 1e-4]], atol=1e-9)
+
+
+def test_north_up_image_has_rows_down_and_columns_right():
+    camera = FrameCamera.from_geocentric(AERIAL, geocentric(np.array([[*PLACE, 6000.0]]))[0], heights=(0, 1000))
+    lon, lat = PLACE
+    here, east, north = camera.ground_to_image([[lon, lat, 0], [lon + 0.01, lat, 0], [lon, lat + 0.01, 0]])
+    np.testing.assert_allclose(here, [500, 750], atol=1e-6)
+    assert east[0] > here[0] + 100
+    assert north[1] < here[1] - 100
+
+
+def test_points_behind_the_camera_or_the_earth_have_no_image():
+    camera = satellite(0, 0)
+    ground = [[*PLACE, 700e3], [PLACE[0] + 180, -PLACE[1], 0.0], [np.nan, 39.9, 0.0], [*PLACE, 900.0]]
+    image = camera.ground_to_image(ground)
+    assert np.isnan(image[:3]).all()
+    assert np.isfinite(image[3]).all()
+
+
+def test_a_lens_that_folds_over_gives_no_second_image():
+    interior = Interior.of_square_pixels(1000, 1000, 900, k1=-0.3)
+    fold = 1 / np.sqrt(3 * 0.3)
+    assert np.isnan(interior.image_of(np.array([[fold * 1.01, 0.0]]))).all()
+    inside = np.array([[fold * 0.99, 0.0], [0.3, -0.4]])
+    np.testing.assert_allclose(interior.directions_of(interior.image_of(inside)), inside, atol=1e-8)
+    # A pixel beyond the largest image radius is seen by no ray.
+    assert np.isnan(interior.directions_of(np.array([[5000.0, 500.0]]))).all()
+
+
+def test_ellipsoid_in_closed_form_agrees_with_proj():
+    random = np.random.default_rng(2)
+    ground = np.column_stack(
+        [random.uniform(-180, 180, 500), random.uniform(-90, 90, 500), random.uniform(-1e3, 9e5, 500)]
+    )
+    ground[:2, 1] = (90.0, -90.0)
+    ecef = np.column_stack(pyproj.Transformer.from_crs(4979, 4978, always_xy=True).transform(*ground.T))
+    np.testing.assert_allclose(geocentric(ground), ecef, atol=2e-9)
+    back = geodetic(ecef)
+    np.testing.assert_allclose(back[2:, 0], ground[2:, 0], atol=1e-10)
+    np.testing.assert_allclose(back[:, 1:], ground[:, 1:], atol=3e-9)
+
+
+def test_rays_that_miss_the_earth_end_nowhere():
+    origin = geocentric(np.array([[*PLACE, 686e3]] * 2))
+    down = -origin / np.linalg.norm(origin, axis=1)[:, None]
+    met = meet_height(origin, np.stack([down[0], -down[1]]), np.array([1000.0, 1000.0]))
+    assert met[0, 2] == pytest.approx(1000.0, abs=1e-8)
+    assert np.isnan(met[1]).all()
+
+
+def test_angles_and_rotation_are_inverse():
+    for angles in np.random.default_rng(0).uniform(-1.2, 1.2, (50, 3)) * (2.5, 1, 2.5):
+        np.testing.assert_allclose(angles_of_rotation(rotation_of_angles(*angles)), angles, atol=1e-12)
+
+
+def test_refraction_is_that_of_the_tables():
+    # Saastamoinen 1972 for a ground at sea level: 13 H (1 - 0.04 H) µrad per tan z, H in km.
+    for height in (1500.0, 3000.0, 6000.0, 9000.0):
+        bent = FrameCamera.from_geocentric(
+            AERIAL, geocentric(np.array([[*PLACE, height]]))[0], heights=(-1, 1), refraction=True
+        )
+        ground = bent.image_to_ground([[900.0, 750.0]], 0.0)
+        straight = bent._replace(refraction=False).ground_to_image(ground)
+        tangent = 400 * 1e-4 / 0.12
+        moved = (bent.ground_to_image(ground) - straight)[0, 0] * 1e-4 / 0.12 / (1 + tangent**2)
+        km = height / 1000
+        assert moved == pytest.approx(13e-6 * km * (1 - 0.04 * km) * tangent, rel=0.12)
+
+
+def test_serialisation_and_wrong_fields():
+    camera = satellite(8, 20, DISTORTED, free=("omega", "k1"))
+    data = camera.to_dict()
+    assert data["interior"]["k1"] == -0.2
+    assert model_from_dict(data).free == ("omega", "k1")
+    wrong = (
+        {"frame": "tangent"}, {"free": ["omega", "speed"]}, {"heights": [5.0, 5.0]}, {"exterior": {"X_L": 1}},
+        {"interior": {**data["interior"], "focal_length": 0.0}}, {"ground_crs": "EPSG:32636"},
+        {"interior": {**data["interior"], "k1": float("nan")}}, {"interior": {"width": 5}},
+    )  # fmt: skip
+    for change in wrong:
+        with pytest.raises(InputError):
+            model_from_dict({**data, **change})
+
+
+# -- adjustment ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kappa", [0, 12, 90, 170])
+@pytest.mark.parametrize("tilt", [0, 8, 30, 60])
+def test_noise_free_from_the_start_of_equation_5(tilt, kappa):
+    truth = satellite(tilt, kappa)
+    ephemeris = geocentric(truth.perspective_centre[None])[0] + (800.0, -500.0, 300.0)
+    start = FrameCamera.from_geocentric(BILSAT, ephemeris, heights=truth.heights)
+    assert not start.exterior[3:].any()
+    adjusted = fit(start, measured(truth, 44), robust=False).model
+    metres, radians = apart(adjusted, truth)
+    assert metres < 1e-6
+    assert radians < 1e-10
+
+
+@pytest.mark.parametrize("make", ["satellite", "aerial", "flat"])
+def test_noise_free_from_nothing(make):
+    random = np.random.default_rng(5)
+    for tilt, heading in zip((0, 8, 35, 60, 60, 60), random.uniform(0, 360, 6), strict=True):
+        truth = aerial() if make == "aerial" else satellite(tilt, heading)
+        points = measured(truth, 20, heights=(900.0, 900.5) if make == "flat" else None, seed=int(heading))
+        adjusted = fit(resect(points, truth.interior), points, robust=False).model
+        metres, radians = apart(adjusted, truth)
+        assert metres < 1e-6
+        assert radians < 1e-10
+
+
+def test_from_nothing_with_noise_and_gross_errors():
+    random = np.random.default_rng(6)
+    for seed in range(8):
+        truth = satellite(random.uniform(0, 60), random.uniform(0, 360))
+        points = measured(truth, 30, 0.5, seed)
+        points.image[:5] += random.choice([-1, 1], (5, 2)) * random.uniform(60, 400, (5, 2))
+        adjusted = fit(resect(points, BILSAT), points)
+        assert {name for name, _ in adjusted.rejected} == {f"p{i}" for i in range(5)}
+        assert adjusted.sigma0 < 1.7
+
+
+def test_four_points_are_enough_and_fewer_are_an_error():
+    truth = aerial()
+    points = measured(truth, 4)
+    assert apart(fit(resect(points, AERIAL), points, robust=False).model, truth)[0] < 1e-5
+    with pytest.raises(TooFewPoints):
+        resect(points.select([0, 1, 2]), AERIAL)
+    line = points.ground[0] + np.linspace(0, 1, 8)[:, None] * (points.ground[1] - points.ground[0])
+    with pytest.raises(DegeneratePoints):
+        resect(points_of(line, truth.ground_to_image(line), 0.0), AERIAL)
+    scrambled = measured(truth, 20)
+    with pytest.raises(NotConverged):
+        resect(points_of(scrambled.ground, scrambled.image[::-1].copy(), 0.0), AERIAL)
+
+
+def test_a_known_position_and_a_map_frame_start_as_well():
+    truth = satellite(60, 180)
+    points = measured(truth, 12, 0.3)
+    start = resect(points, BILSAT, position=truth.perspective_centre + np.array([0.01, -0.01, 900.0]))
+    assert fit(start, points, robust=False).sigma0 < 2
+    in_map = FrameCamera.from_map(AERIAL, "EPSG:32636", [480e3, 4.42e6, 6000, 0.1, 0.4, 2.5], frame=MAP)
+    points = measured(in_map, 20)
+    points = points_of(points.ground, points.image, 0.0, "EPSG:32636")
+    found = fit(resect(points, AERIAL, map_crs="EPSG:32636"), points, robust=False).model
+    np.testing.assert_allclose(found.exterior[:3], in_map.exterior[:3], atol=1e-6)
+    np.testing.assert_allclose(found.exterior[3:], in_map.exterior[3:], atol=1e-10)
+
+
+def test_covariance_is_honest():
+    truth = satellite(8, 12)
+    exact = measured(truth, 44)
+    random = np.random.default_rng(11)
+    pulls = []
+    for _ in range(1000):
+        points = points_of(exact.ground, exact.image + random.normal(0, 0.7, exact.image.shape), 0.7)
+        result = fit(truth, points, robust=False)
+        pulls.append((result.values - truth.params) / result.sigmas)
+    # 1,000 samples of a t distribution with 82 degrees of freedom: spread 1.012 within 5 sigma.
+    np.testing.assert_allclose(np.std(pulls, axis=0), 1.012, atol=5 / np.sqrt(2000))
+    np.testing.assert_allclose(np.mean(pulls, axis=0), 0.0, atol=5 / np.sqrt(1000))
+
+
+def test_self_calibration_with_priors():
+    lens = Interior(1000, 1500, 0.1203, 1e-4, 1e-4, x0=2e-4, y0=-1e-4, k1=-0.05, k2=0.02, p1=5e-4)
+    truth = FrameCamera.from_roll_pitch_yaw(lens, (*PLACE, 6000.0), 0.05, -0.1, 0.02, heights=(700.0, 1900.0))
+    free = (*EXTERIOR, "focal_length", "x0", "y0", "k1", "k2", "p1", "p2")
+    points = measured(truth, 120, 0.2, seed=4)
+    start = resect(points, AERIAL)._replace(free=free)
+    priors = {"focal_length": Prior(0.12, 5e-4), "x0": Prior(0.0, 5e-4), "y0": Prior(0.0, 5e-4), "p2": Prior(0, 1e-6)}
+    result = fit(start, points, priors=priors, robust=False)
+    wanted = np.array([getattr(lens, name) for name in free[6:]])
+    assert (np.abs(result.values[6:] - wanted) < 4 * result.sigmas[6:]).all()
+    assert result.sigma0 == pytest.approx(1, abs=0.2)
+    # The prior holds what the points cannot: a fixed pitch and a free one together with the focal length.
+    with pytest.raises(DegeneratePoints):
+        fit(start._replace(free=(*free, "pitch_x", "pitch_y")), points, robust=False)
+
+
+def test_map_frame_is_worse_over_a_large_scene():
+    # The curvature of the Earth bends a scene of 55 km by 60 m at its edge; the projection alone cannot follow it.
+    truth = satellite(8, 12)
+    points = measured(truth, 44)
+    in_map = fit(resect(points, BILSAT, map_crs="EPSG:32636"), points, robust=False)
+    assert 0.01 < in_map.rmse("control")["total"] < 2.0
+    assert fit(resect(points, BILSAT), points, robust=False).rmse("control")["total"] < 1e-6
