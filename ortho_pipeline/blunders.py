@@ -137,7 +137,7 @@ def _snooping_start(
     problem: Problem, solution: Solution, keep: np.ndarray | None = None, *, linear: bool = False
 ) -> np.ndarray:
     """Return the points ``(n,)`` that are left when the one that fits the others worst is taken out, over and over."""
-    from scipy.stats import f as fisher
+    from scipy.special import fdtrc
 
     count = len(problem.rows)
     keep = np.ones(count, dtype=bool) if keep is None else keep.copy()
@@ -153,7 +153,7 @@ def _snooping_start(
         if solution.sigma0 is None or freedom < 1:
             break
         others = np.maximum((solution.sigma0**2 * solution.freedom - squares) / freedom, _SCALE_FLOOR**2)
-        chances = fisher.sf(squares / 2 / others, 2, freedom)
+        chances = fdtrc(2, freedom, squares / 2 / others)
         # Where chances underflow to zero, the ratio still tells which is worst.
         worst = int(np.argmax(squares / others))
         if chances[worst] >= BLUNDER_RISK / count:
@@ -168,7 +168,7 @@ def _snooping_start(
 
 def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
     """Return for each point the chance of lying so far from the fit of the kept ones, and that distance in pixels."""
-    from scipy.stats import f as fisher
+    from scipy.special import fdtrc
 
     try:
         solution = problem.solve(keep)
@@ -183,4 +183,4 @@ def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
     distance = (standardised * np.linalg.solve(spread, standardised[:, :, None])[:, :, 0]).sum(axis=1)
     freedom = max(solution.freedom, 1.0)
     scale = max(solution.sigma0 or 0.0, _SCALE_FLOOR)
-    return fisher.sf(distance / 2 / scale**2, 2, freedom), np.hypot(miss[:, 0], miss[:, 1])
+    return fdtrc(2, freedom, distance / 2 / scale**2), np.hypot(miss[:, 0], miss[:, 1])

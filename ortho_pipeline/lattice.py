@@ -33,7 +33,7 @@ from ortho_pipeline.raster import Grid
 #: Side of a block in output pixels.
 BLOCK = 256
 #: (lattice spacing in output pixels, number of heights), tried one after the other.
-REFINEMENTS = ((64, 3), (32, 3), (16, 3), (16, 5), (8, 5), (4, 5), (2, 5), (1, 5))
+REFINEMENTS = ((64, 3), (32, 3), (16, 3), (16, 5), (8, 5), (8, 7), (4, 7), (2, 7), (1, 9))
 #: Points per block at which the lattice is verified.
 VERIFIED = 24
 #: Source pixels beyond the lattice nodes of a window, for what lies higher or lower between the nodes.

@@ -41,9 +41,11 @@ def student_of(values: Array, covariance: Array, degrees_of_freedom: float) -> t
 
     Without redundancy (0 degrees of freedom) the covariance is a priori, and the normal distribution is taken.
     """
-    from scipy.stats import norm, t
+    if not len(values):
+        return np.zeros(0), np.zeros(0)
+    from scipy.special import ndtr, stdtr  # scipy.stats would take most of the start-up of a command
 
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = values / np.sqrt(np.diag(covariance))
-    chance = 2 * (t.sf(np.abs(ratio), degrees_of_freedom) if degrees_of_freedom > 0 else norm.sf(np.abs(ratio)))
-    return ratio, np.asarray(chance)
+    tail = stdtr(degrees_of_freedom, -np.abs(ratio)) if degrees_of_freedom > 0 else ndtr(-np.abs(ratio))
+    return ratio, np.asarray(2 * tail)
