@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.crs import ground_transform, parse_crs
-from ortho_pipeline.dem import SANE_HEIGHTS, Surface
+from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import SensorModel
 
@@ -49,11 +49,11 @@ def intersect(model: SensorModel, image: ArrayLike, surface: Surface, *, toleran
     if surface.constant_height is not None:
         return model.image_to_ground(image, surface.constant_height)
     ray = _Ray(model, image, surface)
-    window = ray.window()
-    seen = None if window is None else ray.height_range(window)
-    if window is None or seen is None:
+    reach = ray.reach()
+    if reach is None:
         return np.full((len(image), 3), np.nan)
-    low, high = seen[0] - 1.0, seen[1] + 1.0
+    window, (lowest, highest) = reach
+    low, high = lowest - 1.0, highest + 1.0
     height = _march_many(ray, window, low, high, tolerance) if len(image) >= MANY else None
     if height is None:
         height = _narrow(ray, *_bracket(ray, low, high), tolerance)
@@ -86,30 +86,41 @@ class _Ray:
         """Height of the ray above the terrain; NaN off the DEM."""
         return height - self.surface.heights(self.plan(index, height))
 
-    def window(self) -> tuple[int, int, int, int] | None:
-        """Samples (column, row, columns, rows) of the DEM that the rays may meet; None if they miss it."""
-        # A frame around the points stands for all of them: rays do not cross between the heights of the Earth.
+    def reach(self) -> tuple[tuple[int, int, int, int], tuple[float, float]] | None:
+        """Samples (column, row, columns, rows) of the DEM that the rays may meet, and the range of heights there.
+
+        The window follows from a range of heights and the range from a window: from the model's own range on, until
+        the terrain lies within it. None if the rays miss the DEM.
+        """
+        low, high = self.model.height_range
+        for _ in range(4):
+            window = self._window(low, high)
+            if window is None:
+                return None
+            try:
+                lowest, highest = self.surface.range_within(*window)
+            except InputError:
+                return None
+            if low <= lowest and highest <= high:
+                break
+            low, high = min(low, lowest - 1.0), max(high, highest + 1.0)
+        return window, (lowest, highest)
+
+    def _window(self, low: float, high: float) -> tuple[int, int, int, int] | None:
+        """Samples under the rays between two heights; a frame around the points stands for all of them."""
         if not self.any:
             return None
-        steps = self.low + (self.high - self.low) * np.linspace(0, 1, 17)[:, None]
+        steps = self.low + (self.high - self.low) * np.linspace(0, 1, 9)[:, None]
         columns, rows = np.meshgrid(steps[:, 0], steps[:, 1])
         frame = np.column_stack([columns.ravel(), rows.ravel()])
-        ends = [self.model.image_to_ground(frame, height) for height in (*SANE_HEIGHTS, *self.model.height_range)]
-        uv = self.surface.samples_at(self._transform(np.concatenate(ends))[:, :2])
+        uv = np.concatenate([self.samples(frame, np.full(len(frame), height)) for height in (low, high)])
         uv = uv[np.isfinite(uv).all(axis=1)]
         size = np.array(self.surface.shape[::-1])
-        low = np.clip(np.floor(uv.min(axis=0, initial=np.inf)) - 2, 0, size)
-        high = np.clip(np.ceil(uv.max(axis=0, initial=-np.inf)) + 3, 0, size)
-        if (high - low < 2).any():
+        first = np.clip(np.floor(uv.min(axis=0, initial=np.inf)) - 2, 0, size)
+        last = np.clip(np.ceil(uv.max(axis=0, initial=-np.inf)) + 3, 0, size)
+        if (last - first < 2).any():
             return None
-        return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
-
-    def height_range(self, window: tuple[int, int, int, int]) -> tuple[float, float] | None:
-        """Lowest and highest terrain in a window; None if there is none."""
-        try:
-            return self.surface.range_within(*window)
-        except InputError:
-            return None
+        return int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1])
 
 
 def _march_many(
