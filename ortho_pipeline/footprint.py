@@ -22,7 +22,7 @@ from ortho_pipeline.raster import Grid
 from ortho_pipeline.rays import intersect
 
 #: Points per side of the image at which the DEM is asked for.
-_COVERAGE_SIDE = 65
+_COVERAGE_SIDE = 33
 _BORDER_SIDE = 65
 #: Samples of the DEM per side of the blocks in which voids are counted.
 _BLOCK = 1024
