@@ -1,4 +1,4 @@
-"""Draw the pictures of README.md from a run on the sample scene: ``make images``."""
+"""Draw the pictures of README.md (from a run on the sample scene) and of performance.md: ``make images``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ MAGNIFIED = 12.0
 
 
 def main() -> None:
-    """Rectify the sample and write docs/images/sample.png."""
+    """Rectify the sample and write docs/images/sample.png; draw docs/images/performance.png."""
+    draw_performance()
     image, points = SAMPLE / "scene.tif", PointOptions(gcps=SAMPLE / "gcps.geojson")
     with tempfile.TemporaryDirectory() as folder:
         surface = SurfaceOptions(dem=SAMPLE / "dem.tif")
@@ -45,6 +46,23 @@ def main() -> None:
     path = ROOT / "docs" / "images" / "sample.png"
     path.parent.mkdir(exist_ok=True)
     figure.savefig(path, dpi=80)
+
+
+def draw_performance() -> None:
+    """Draw wall and CPU time of docs/performance.json, which benchmarks/warp.py --json made."""
+    runs = json.loads((ROOT / "docs" / "performance.json").read_text())["headline"]
+    names = sorted(runs, key=lambda name: np.median([run["wall"] for run in runs[name]]))
+    figure, axes = plt.subplots(figsize=(8, 3), layout="constrained")
+    for k, (part, color) in enumerate((("wall", "tab:blue"), ("cpu", "tab:orange"))):
+        medians = [float(np.median([run[part] for run in runs[name]])) for name in names]
+        bars = axes.barh(np.arange(len(names)) + 0.2 - 0.4 * k, medians, 0.38, color=color, label=f"{part} seconds")
+        axes.bar_label(bars, fmt="%.1f", padding=3, fontsize=8)
+    axes.set_yticks(np.arange(len(names)), names)
+    axes.invert_yaxis()
+    axes.set_title("12000 x 12000 UInt16, RPC, rough 30 m DEM, 160 Mpx out, 2 cores")
+    axes.legend(loc="center right")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(ROOT / "docs" / "images" / "performance.png", dpi=90)
 
 
 def draw_residuals(axes: plt.Axes, scene: np.ndarray, fit: dict) -> None:
