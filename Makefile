@@ -3,7 +3,7 @@
 #   make demo     set up, orthorectify the sample scene, say where the ortho and the report are
 #   make test     set up, run all tests
 #   make check    formatting, lint, types, tests
-#   make bench    speed and memory against gdalwarp
+#   make bench    speed and memory against gdalwarp, speed of adjustments
 #   make images   draw the pictures of README.md again
 #   make clean    remove .venv, caches and out/
 #
@@ -53,6 +53,7 @@ check: setup
 
 bench: setup
 	@$(BIN)/python benchmarks/warp.py
+	$(BIN)/python benchmarks/fit.py
 
 images: setup
 	@$(BIN)/python docs/make_images.py

@@ -52,6 +52,14 @@ scene_options = _grouped(
         "--rpc", "scene_rpc", metavar="tag|sidecar|FILE", help="Which RPC, where there are several, or an RPC file."
     ),
     click.option("--model", "scene_model", type=_FILE, help="A saved *_model.json in place of the image's model."),
+    click.option(
+        "--sensor-option",
+        "scene_sensor_options",
+        multiple=True,
+        metavar="K=V",
+        callback=lambda ctx, parameter, values: _key_values(values),
+        help="Option of the sensor (see 'ortho sensors'); may be repeated.",
+    ),
     click.option("--allow-network", "scene_allow_network", is_flag=True, help="Open URLs and /vsi paths too."),
 )
 
@@ -89,8 +97,9 @@ point_options = _grouped(
     click.option(
         "--correction",
         "points_correction",
-        type=click.Choice(["none", "shift", "shift-drift", "affine"]),
-        help="What is adjusted, in image space  [default: shift if there are control points]",
+        type=click.Choice(["none", "shift", "shift-drift", "affine", "model"]),
+        help="What is adjusted: the image points, or the parameters of the model itself, such as the exterior "
+        "orientation of a frame  [default: shift if there are control points]",
     ),
     click.option(
         "--fit-model",
@@ -161,9 +170,17 @@ output_options = _grouped(
         "--resampling",
         "-r",
         "output_resampling",
-        type=click.Choice(["nearest", "bilinear", "cubic"]),
+        type=click.Choice(["nearest", "bilinear", "cubic", "lanczos", "average"]),
         default="bilinear",
         show_default=True,
+    ),
+    click.option(
+        "--dem-interpolation",
+        "output_dem_interpolation",
+        type=click.Choice(["bilinear", "cubic"]),
+        default="bilinear",
+        show_default=True,
+        help="Between the samples of the DEM.",
     ),
     click.option(
         "--format", "-of", "output_format", type=click.Choice(["COG", "GTiff"]), default="COG", show_default=True
@@ -210,6 +227,14 @@ image_argument = click.argument("image", type=click.Path())
 folder_option = click.option(
     "--output", "-o", "folder", type=click.Path(file_okay=False), required=True, metavar="DIR", help="Output folder."
 )
+
+
+def _key_values(texts: tuple[str, ...]) -> dict[str, str]:
+    pairs = [_key_value(text) for text in texts]
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise click.BadParameter("one key is given twice")
+    return found
 
 
 def _key_value(text: str) -> tuple[str, str]:

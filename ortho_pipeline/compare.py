@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.estimation import Fit, fit
+from ortho_pipeline.estimation import Fit, Prior, fit
 from ortho_pipeline.ground_error import rmse_metres
-from ortho_pipeline.model_choice import fit_family
+from ortho_pipeline.model_choice import OWN, fit_family, fit_own
 from ortho_pipeline.models import ImageCorrection, SensorModel, families
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points
@@ -110,13 +110,15 @@ def available_models(own: SensorModel | None = None) -> dict[str, tuple[int, int
     Parameters
     ----------
     own : SensorModel, optional
-        The scene's own model: it comes first, as delivered and with each correction.
+        The scene's own model: it comes first, as delivered, with each correction, and with parameters of its own.
     """
     found: dict[str, tuple[int, int, int]] = {}
     if own is not None:
         for correction in CORRECTIONS:
             count = len(ImageCorrection.identity(own, correction, (0.0, 0.0)).param_names)
             found[own_name(own, correction)] = count, max(1, math.ceil(count / 2)), 3
+        if own.param_names:
+            found[own_name(own, OWN)] = len(own.param_names), own.minimum_points, 3
     for family in families():
         found[family.name] = family.parameters, family.minimum_points, family.dimensions
     return found
@@ -154,6 +156,7 @@ def compare(
     models: Sequence[str],
     *,
     own: SensorModel | None = None,
+    priors: Mapping[str, Prior] | None = None,
     size: tuple[int, int] | None = None,
     crs: str | None = None,
     heights: tuple[float, float] | None = None,
@@ -166,6 +169,8 @@ def compare(
         From `choose_models`.
     own : SensorModel, optional
         The scene's own model, for names such as ``rpc+shift``.
+    priors : mapping of parameter name to Prior, optional
+        How well its own parameters are known.
     size : (int, int), optional
         Columns and rows of the image.
     crs : str, optional
@@ -174,7 +179,7 @@ def compare(
         Heights (m) for which the models are meant.
     """
     known = available_models(own)
-    job = _Job(own, size, crs, heights)
+    job = _Job(own, dict(priors or {}), size, crs, heights)
     first = {name: job.attempt(name, points, robust=True) for name in models}
     blunders = _blunders([found for found in first.values() if isinstance(found, Fit)])
     kept = points.select(~np.isin(np.array(points.ids), list(blunders))) if blunders else points
@@ -198,6 +203,7 @@ def compare(
 @dataclass(frozen=True)
 class _Job:
     own: SensorModel | None
+    priors: Mapping[str, Prior]
     size: tuple[int, int] | None
     crs: str | None
     heights: tuple[float, float] | None
@@ -205,9 +211,12 @@ class _Job:
     def attempt(self, name: str, points: Points, robust: bool) -> Fit | str:
         """Return the fit, or why there is none."""
         try:
-            for correction in CORRECTIONS if self.own is not None else ():
-                if self.own is not None and name == own_name(self.own, correction):
-                    return self._correct(self.own, correction, points, robust)
+            if self.own is not None:
+                if name == own_name(self.own, OWN):
+                    return fit_own(self.own, points, self.priors, robust=robust)
+                for correction in CORRECTIONS:
+                    if name == own_name(self.own, correction):
+                        return self._correct(self.own, correction, points, robust)
             return fit_family(name, points, crs=self.crs, size=self.size, heights=self.heights, robust=robust)
         except OrthoError as error:
             return f"{error.message}{f' ({error.remedy})' if error.remedy else ''}"

@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
-from osgeo import gdal
+from osgeo import gdal, osr
 from pyproj.exceptions import CRSError
 
 from ortho_pipeline.crs import Vertical, declared_vertical, ground_transform, horizontal, parse_crs
 from ortho_pipeline.datum import dem_unit, dem_vertical, dem_vertical_remedy
 from ortho_pipeline.errors import CrsError, DatumError, InputError
+from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.raster import open_dataset
 
 Array = NDArray[np.float64]
@@ -476,3 +477,33 @@ def _parse_fill(fill: str | float) -> str | float:
 
 
 # -- rays ------------------------------------------------------------------------------------------------------------
+
+
+# -- writing ---------------------------------------------------------------------------------------------------------
+
+
+def write_dem(path: str | os.PathLike[str], heights: Array, corner: tuple[float, float], step: float, crs: str) -> None:
+    """Write a DEM as GeoTIFF, north up; whole or not at all.
+
+    Parameters
+    ----------
+    heights : (rows, columns)
+        Metres above the vertical datum of `crs`, from the northwest; rounded, they pack much better.
+    corner : (float, float)
+        Outer corner of the first sample.
+    crs : str
+        Compound CRS such as EPSG:32636+5773, so that nobody has to say the datum.
+    """
+    system = osr.SpatialReference()
+    system.SetFromUserInput(crs)
+    rows, columns = heights.shape
+    options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9", "TILED=YES"]
+    with whole_or_nothing(path) as temporary:
+        dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, 1, gdal.GDT_Float32, options)
+        dataset.SetGeoTransform((corner[0], step, 0.0, corner[1], 0.0, -step))
+        dataset.SetProjection(system.ExportToWkt())
+        band = dataset.GetRasterBand(1)
+        band.SetNoDataValue(-32768.0)
+        band.WriteArray(heights.astype(np.float32))
+        dataset.FlushCache()
+        del band, dataset

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -24,7 +23,8 @@ from ortho_pipeline.statistics import correlation_of, student_of, total_correlat
 
 __all__ = ["Fit", "Prior", "fit", "root_mean_square"]
 
-#: Refuse where some corner of the model's domain would be predicted so many times worse than a point is measured ...
+#: Refuse where some corner of the image (of the model's domain without one) would be predicted so many times worse than
+#: a point is measured ...
 EXTRAPOLATION_LIMIT = 100.0
 #: ... and say so from here on.
 EXTRAPOLATION_WARNING = 10.0
@@ -299,15 +299,13 @@ def _refuse_many(points: Points, rejected: dict[int, str], count: int) -> None:
 
 
 def _uncertain_edge(solution: Solution, source: str, strength: float | None) -> list[str]:
-    """Refuse, or warn of, a model that is much less certain at a corner of its domain than a measured point.
+    """Refuse, or warn of, a model that is much less certain at a corner of its image than a measured point.
 
     A regularised one is never refused: what the points leave open, the user has decided.
     """
     if not len(solution.model.params) or not len(solution.sigma):
         return []
-    centre, half = solution.model.domain
-    corners = centre + half * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    partials = solution.model.param_partials(corners)
+    partials = solution.model.param_partials(solution.model.corners)
     spread = np.sqrt(((partials @ solution.cofactors) * partials).sum(axis=2))
     factor = float(np.nanmax(spread, initial=0.0) / np.median(solution.sigma))
     if np.isnan(spread).all():

@@ -23,12 +23,7 @@ def units_per_metre(crs: pyproj.CRS, ground: Array) -> Array:
     """
     scale = np.ones((len(ground), 3))
     if crs.is_geographic:
-        lat = np.radians(ground[:, 1])
-        w2 = 1.0 - ECCENTRICITY_SQUARED * np.sin(lat) ** 2
-        prime_vertical = SEMI_MAJOR / np.sqrt(w2)
-        meridian = prime_vertical * (1.0 - ECCENTRICITY_SQUARED) / w2
-        scale[:, 0] = np.degrees(1.0) / (prime_vertical * np.cos(lat))
-        scale[:, 1] = np.degrees(1.0) / meridian
+        scale[:, :2] = 1.0 / metres_per_degree(ground * (1.0, 1.0, 0.0))
     else:
         scale[:, :2] = 1.0 / crs.axis_info[0].unit_conversion_factor
     return scale
@@ -82,6 +77,18 @@ def metres_per_degree(ground: Array) -> Array:
     prime_vertical = SEMI_MAJOR / np.sqrt(w2)
     meridian = prime_vertical * (1.0 - ECCENTRICITY_SQUARED) / w2
     return np.radians(np.stack([(prime_vertical + ground[:, 2]) * np.cos(lat), meridian + ground[:, 2]], axis=1))
+
+
+def horizon_from_geodetic(ground: Array, origin: Array) -> tuple[Array, Array]:
+    """Return east, north, up (m) of points ``(N, 3)`` lon, lat (deg), h about an origin, and derivatives ``(N, 3, 3)``.
+
+    A Cartesian system: the geocentric one, turned into the horizon of `origin` ``(3,)`` and moved there.
+    """
+    turn = enu_from_ecef(origin[None])[0]
+    # Columns: how a point moves with longitude, latitude and height.
+    slopes = turn @ np.swapaxes(enu_from_ecef(ground), 1, 2)
+    slopes[:, :, :2] *= metres_per_degree(ground)[:, None, :]
+    return (geocentric(ground) - geocentric(origin[None])) @ turn.T, slopes
 
 
 def meet_height(origin: Array, direction: Array, height: Array) -> Array:
@@ -170,37 +177,3 @@ def rotation_between(from_vectors: Array, to_vectors: Array) -> Array:
 
 def _sin_cos(angle: float) -> tuple[float, float]:
     return float(np.sin(angle)), float(np.cos(angle))
-
-
-def horizon_from_geodetic(ground: Array, origin: Array) -> tuple[Array, Array]:
-    """Return east, north, up (m) of points ``(N, 3)`` lon, lat (deg), h about an origin, and derivatives ``(N, 3, 3)``.
-
-    A Cartesian system: the geocentric one, turned into the horizon of `origin` ``(3,)`` and moved there.
-    """
-    turn = _horizon(*np.radians(origin[:2]))
-    points, slopes = _geocentric(ground)
-    centre, _ = _geocentric(origin[None])
-    return (points - centre) @ turn.T, np.einsum("ij,njk->nik", turn, slopes)
-
-
-def _horizon(lon: float, lat: float) -> Array:
-    """Return the rotation from geocentric axes to east, north, up."""
-    east = (-np.sin(lon), np.cos(lon), 0.0)
-    north = (-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat))
-    return np.array([east, north, (np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat))])
-
-
-def _geocentric(ground: Array) -> tuple[Array, Array]:
-    """Return geocentric X, Y, Z ``(N, 3)`` on WGS84 and their derivatives by lon, lat (degrees), h ``(N, 3, 3)``."""
-    lon, lat, h = np.radians(ground[:, 0]), np.radians(ground[:, 1]), ground[:, 2]
-    w2 = 1.0 - ECCENTRICITY_SQUARED * np.sin(lat) ** 2
-    across = SEMI_MAJOR / np.sqrt(w2)
-    along = across * (1.0 - ECCENTRICITY_SQUARED) / w2
-    up = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
-    points = up * (across + h)[:, None]
-    points[:, 2] -= ECCENTRICITY_SQUARED * across * np.sin(lat)
-    east = np.stack([-np.sin(lon), np.cos(lon), np.zeros_like(lon)], axis=1)
-    north = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)], axis=1)
-    degree = np.radians(1.0)
-    slopes = [east * ((across + h) * np.cos(lat) * degree)[:, None], north * ((along + h) * degree)[:, None], up]
-    return points, np.stack(slopes, axis=2)

@@ -33,6 +33,7 @@ from typing import Any
 import pluggy
 
 from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.problem import Prior
 
 PROJECT_NAME = "ortho_pipeline"
 hookspec = pluggy.HookspecMarker(PROJECT_NAME)
@@ -59,6 +60,8 @@ class Scene:
         What is worth showing to people (acquisition time, sun elevation, cloud cover ...): JSON values.
     warnings : tuple of str
         What the user ought to know before trusting the result.
+    priors : mapping of str to Prior
+        How well the vendor knows parameters of the first model, for ``--correction model``.
     """
 
     sensor: str
@@ -69,6 +72,7 @@ class Scene:
     model_source: str
     facts: Mapping[str, object] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    priors: Mapping[str, Prior] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", Path(self.path))

@@ -42,12 +42,17 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
         If no sensor recognises the image, or the model file belongs to an image of another size.
     """
     if options.model is None:
-        given = {} if options.rpc is None else {"rpc": options.rpc}
+        given: dict[str, Any] = dict(options.sensor_options)
+        if options.rpc is not None:
+            if "rpc" in given:
+                raise InputError("the RPC is chosen twice", field="--rpc", remedy="leave out --sensor-option rpc=...")
+            given["rpc"] = options.rpc
         return plugins.open_scene(image, options.sensor, given, allow_network=options.allow_network)
-    if options.rpc is not None or options.sensor is not None:
+    if options.rpc is not None or options.sensor is not None or options.sensor_options:
         raise InputError(
-            "a model file takes the place of the image's model", field="--model", remedy="leave out --rpc and --sensor"
-        )
+            "a model file takes the place of the image's model", field="--model",
+            remedy="leave out --rpc, --sensor and --sensor-option",
+        )  # fmt: skip
     dataset = raster.open_dataset(image, allow_network=options.allow_network)
     plugins.Host.discover()  # model families of plugins, which the file may name
     saved = read_model_file(options.model)
@@ -80,7 +85,7 @@ def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_mo
     Scene
         Without models and of the sensor "points only" where no sensor recognises the image.
     """
-    asked = options.model is not None or options.rpc is not None or options.sensor is not None
+    asked = bool(options.model or options.rpc or options.sensor or options.sensor_options)
     if needs_model or asked:
         return open_scene(image, options)
     dataset = raster.open_dataset(image, allow_network=options.allow_network)
@@ -198,7 +203,7 @@ def check_paths(
     InputError
         With the path that is in the way.
     """
-    given = (image, scene.model, scene.rpc, points.gcps, surface.dem)
+    given = (image, *scene.files.values(), points.gcps, surface.dem)
     inputs = {Path(path).resolve() for path in given if path is not None}
     for path in files.values():
         if path.resolve() in inputs:
@@ -241,8 +246,8 @@ def hash_inputs(
 
     add("image", [image])
     add("image", _files_of(image, scene.allow_network))
-    add("RPC", [scene.rpc])
-    add("model", [scene.model])
+    for role, path in scene.files.items():
+        add(role, [path])
     add("points", [points.gcps])
     if surface.dem is not None:
         add("DEM", [surface.dem, *_files_of(surface.dem, scene.allow_network)])

@@ -10,10 +10,36 @@ import numpy as np
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, OrthoError
 from ortho_pipeline.estimation import Fit, Prior, fit
 from ortho_pipeline.models import family_of, start_model
-from ortho_pipeline.models.base import Array
+from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.problem import Problem
 from ortho_pipeline.ridge import regularised
+
+#: What is adjusted when it is the parameters that a scene's model has of its own.
+OWN = "model"
+
+
+def fit_own(
+    model: SensorModel, points: Points, priors: Mapping[str, Prior] | None = None, *, robust: bool = True
+) -> Fit:
+    """Adjust the parameters that a scene's model has of its own, such as the exterior orientation of a frame.
+
+    Parameters
+    ----------
+    priors : mapping of parameter name to Prior, optional
+        How well the vendor knows them.
+
+    Raises
+    ------
+    InputError
+        If the model has no such parameters.
+    """
+    if not model.param_names:
+        raise InputError(
+            f"a model {model.kind!r} has no parameters of its own to adjust", field="--correction",
+            remedy="take shift, shift-drift or affine",
+        )  # fmt: skip
+    return fit(model, points, priors=priors, robust=robust, name=f"{model.kind}+{OWN}")
 
 
 def fit_family(

@@ -21,12 +21,22 @@ class SceneOptions:
         A model file that takes the place of the image's own model.
     allow_network : bool
         Whether URLs and GDAL's virtual file systems may be opened.
+    sensor_options : mapping of str to str
+        Options that the sensor declares (`ortho sensors`).
     """
 
     sensor: str | None = None
     rpc: str | None = None
     model: str | os.PathLike[str] | None = None
     allow_network: bool = False
+    sensor_options: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def files(self) -> dict[str, str | os.PathLike[str]]:
+        """Files besides the image that the scene is read from, by what they are."""
+        given = {name: value for name, value in self.sensor_options.items() if os.path.isfile(value)}
+        own = {"RPC": self.rpc, "model": self.model}
+        return {**{role: path for role, path in own.items() if path is not None}, **given}
 
 
 @dataclass(frozen=True)
@@ -45,7 +55,8 @@ class PointOptions:
         ``every:N`` or ``ids:a,b``: which points only check.
     select : str, optional
         ``even:N``, ``cluster:N``, ``ids:a,b`` or ``random:N:seed``: which points control; the others check.
-    correction : {'none', 'shift', 'shift-drift', 'affine'}, optional
+    correction : {'none', 'shift', 'shift-drift', 'affine', 'model'}, optional
+        A correction in image space, or 'model': the model's own parameters, weighted by what the sensor says of them.
         Default: shift if there are control points.
     fit_model : str, optional
         A model family (`ortho models`) that is fitted to the points alone, in place of the image's own model.
@@ -94,6 +105,7 @@ class OutputOptions:
     resolution: float | None = None
     extent: Sequence[float] | None = None
     resampling: str = "bilinear"
+    dem_interpolation: str = "bilinear"
     format: str = "COG"
     creation_options: Mapping[str, str] = field(default_factory=dict)
     engine: str = "ortho"

@@ -44,6 +44,12 @@ class Prior:
             raise InputError("a prior has a finite mean and a positive sigma", field="prior")
 
 
+def priors_at(model: SensorModel, sigmas: Mapping[str, float]) -> dict[str, Prior]:
+    """Return priors that hold parameters at their values in `model`, with these sigmas by name."""
+    values = dict(zip(model.param_names, model.params.tolist(), strict=True))
+    return {name: Prior(values[name], sigma) for name, sigma in sigmas.items()}
+
+
 @dataclass(frozen=True, eq=False)
 class Solution:
     """What an adjustment found; `jacobian` ``(n, 2, P)`` and `residuals` ``(n, 2)`` are those of its control points.

@@ -15,7 +15,7 @@ from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import Fit, fit
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.model_choice import Removed, fit_family, prune
+from ortho_pipeline.model_choice import OWN, Removed, fit_family, fit_own, prune
 from ortho_pipeline.models import ImageCorrection, SensorModel, families
 from ortho_pipeline.options import PointOptions, SceneOptions
 from ortho_pipeline.points import Points
@@ -131,7 +131,9 @@ def adjust(scene: Scene, options: PointOptions, opened: SceneOptions, surface: S
 def _corrected(
     scene: Scene, options: PointOptions, opened: SceneOptions, points: Points, surface: Surface | None
 ) -> Adjusted:
-    refuse_swapped(scene.model, points, scene.height)
+    if options.correction != OWN:
+        # What adjusts its own parameters may start anywhere.
+        refuse_swapped(scene.model, points, scene.height)
     points = inputs.with_heights(points, surface)
     correction = options.correction
     if correction is None:
@@ -142,6 +144,8 @@ def _corrected(
             field="--correction",
             remedy="adjust the scene's own model with all points (leave out --model)",
         )
+    if correction == OWN:
+        return Adjusted(scene, fit_own(scene.model, points, scene.priors))
     start = ImageCorrection.identity(scene.model, correction, (scene.width / 2, scene.height / 2))
     name = scene.model.kind if correction == "none" else f"{scene.model.kind}+{correction}"
     return Adjusted(scene, fit(start, points, robust=correction != "none", name=name))

@@ -1,5 +1,7 @@
 """Make the sample data: a simulated satellite scene, its RPC, a DEM, ground control, and the truth behind them.
 
+Beside it a small BILSAT-1 frame with its imaging survey, in a folder of its own.
+
 Run ``python sample_data/make.py [FOLDER]``; without a folder the files of this one are written again. Everything comes
 from seeds, so that the pixels and numbers are the same every time.
 """
@@ -14,9 +16,11 @@ from typing import Any
 
 import numpy as np
 import pyproj
-from osgeo import gdal, osr
+from ortho_bilsat.simulation import write_product
+from osgeo import gdal
 
 from ortho_pipeline.crs import Vertical
+from ortho_pipeline.dem import write_dem as write_dem_file
 from ortho_pipeline.files import whole_or_nothing, write_text
 from ortho_pipeline.landscape import Landscape, Terrain
 from ortho_pipeline.models import ImageCorrection
@@ -25,7 +29,6 @@ from ortho_pipeline.rpc import RpcExport, fit_rpc, write_rpc_txt
 from ortho_pipeline.simulate import LineScanner, SimulatedPoints, render, simulate_points
 
 gdal.UseExceptions()
-osr.UseExceptions()
 
 #: Middle of the scene (degrees, degrees, ellipsoidal metres); the place is made up, its geoid is not.
 CENTRE = (33.35, 37.25, 850.0)
@@ -46,6 +49,8 @@ NOISE_DN = 4.0
 DEM_STEP = 20.0
 DEM_MARGIN = 400.0
 EGM96 = "EPSG:5773"
+#: The BILSAT-1 frame: pixels eight times as wide as the real ones, and a coarse DEM, to keep it small.
+BILSAT_SIZE, BILSAT_DEM_STEP = 256, 250.0
 
 
 def main(folder: Path) -> None:
@@ -70,6 +75,7 @@ def main(folder: Path) -> None:
     write_points(delivered_points, folder / "gcps.csv")
     truth = truth_of(camera, terrain, delivered, points)
     write_text(folder / "truth.json", json.dumps(truth, indent=1) + "\n")
+    write_product(folder / "bilsat", seed=1, size=BILSAT_SIZE, dem_step=BILSAT_DEM_STEP)
 
 
 def vendor_rpc(camera: LineScanner) -> RpcExport:
@@ -113,18 +119,9 @@ def write_dem(camera: LineScanner, terrain: Terrain, path: Path) -> None:
     posts = np.stack([x.ravel(), y.ravel()], axis=1)
     lon, lat = pyproj.Transformer.from_crs(MAP_CRS, "EPSG:4326", always_xy=True).transform(*posts.T)
     heights = terrain.heights(posts) - Vertical.parse("egm96").undulation(lon, lat)
-    options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9", "TILED=YES"]
-    system = osr.SpatialReference()
-    system.SetFromUserInput(f"{MAP_CRS}+{EGM96.split(':')[1]}")
-    with whole_or_nothing(path) as temporary:
-        dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), cols, rows, 1, gdal.GDT_Float32, options)
-        dataset.SetGeoTransform((west, DEM_STEP, 0.0, north, 0.0, -DEM_STEP))
-        dataset.SetProjection(system.ExportToWkt())
-        band = dataset.GetRasterBand(1)
-        band.SetNoDataValue(-32768.0)
-        # A centimetre is finer than any DEM, and packs four times better than full Float32 noise.
-        band.WriteArray(np.round(heights, 2).reshape(rows, cols).astype(np.float32))
-        dataset = None
+    # A centimetre is finer than any DEM, and packs four times better than full Float32 noise.
+    crs = f"{MAP_CRS}+{EGM96.split(':')[1]}"
+    write_dem_file(path, np.round(heights, 2).reshape(rows, cols), (west, north), DEM_STEP, crs)
 
 
 def truth_of(camera: LineScanner, terrain: Terrain, delivered: RpcExport, points: SimulatedPoints) -> dict[str, Any]:

@@ -85,7 +85,7 @@ def test_the_level_of_the_paper_comes_from_tilt_and_noise():
 
 
 def test_the_tables_of_the_paper_come_out_in_its_order():
-    document = reproduce(5)
+    document = reproduce(8)
     medians = {
         (line["label"], line["quantity"]): line["median"] for table in document["tables"] for line in table["rows"]
     }
@@ -98,7 +98,10 @@ def test_the_tables_of_the_paper_come_out_in_its_order():
     ranking = sorted(with_twenty, key=with_twenty.__getitem__)
     assert ranking[-1] == "poly1"
     assert set(ranking[:3]) == {"dlt", "rfm1", "rigorous"}
-    assert within_factor(document) > 0.75
+    assert within_factor(document) > 0.8
+    # With all points, from which the free settings were chosen, every number of the paper comes out.
+    rows = [line for table in document["tables"] for line in table["rows"] if line["label"].endswith("even:44")]
+    assert within_factor({"tables": [{"rows": rows}]}, 1.25) == 1
     image, residuals = error_vectors()
     assert image.shape == residuals.shape == (44, 2)
 

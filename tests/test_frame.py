@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pyproj
 import pytest
@@ -9,11 +11,13 @@ import pytest
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
 from ortho_pipeline.estimation import Prior, fit
 from ortho_pipeline.geometry import angles_of_rotation, geocentric, geodetic, meet_height, rotation_of_angles
-from ortho_pipeline.models import model_from_dict
+from ortho_pipeline.models import ImageCorrection, model_from_dict
+from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.frame import EXTERIOR, MAP, PARAMETERS, FrameCamera
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.resection import resect
 from ortho_pipeline.points import Points
+from ortho_pipeline.problem import Problem
 from ortho_pipeline.testing import check_sensor_model
 
 BILSAT = Interior(2048, 2048, 0.180, 27.6 * 0.180 / 686e3, 27.6 * 0.180 / 686e3)
@@ -250,20 +254,30 @@ def test_a_known_position_and_a_map_frame_start_as_well():
 def test_covariance_is_honest():
     truth = satellite(8, 12)
     exact = measured(truth, 44)
+    points = points_of(exact.ground, exact.image, 0.7)
+    everything = np.ones(44, dtype=bool)
+    problem = Problem.of(truth, points, everything, {})
     random = np.random.default_rng(11)
     pulls = []
-    for _ in range(1000):
-        points = points_of(exact.ground, exact.image + random.normal(0, 0.7, exact.image.shape), 0.7)
-        result = fit(truth, points, robust=False)
-        pulls.append((result.values - truth.params) / result.sigmas)
+    for number in range(1000):
+        noisy = exact.image + random.normal(0, 0.7, exact.image.shape)
+        # What `fit` does, without its leave-one-out residuals and warnings, which are most of its time.
+        solution = replace(problem, image=noisy).solve(everything)
+        sigmas = solution.sigma0 * np.sqrt(np.diag(solution.cofactors))
+        pulls.append((solution.model.params - truth.params) / sigmas)
+        if number == 0:
+            result = fit(truth, replace(points, image=noisy), robust=False)
+            np.testing.assert_allclose(result.sigmas, sigmas, rtol=1e-9)
     # 1,000 samples of a t distribution with 82 degrees of freedom: spread 1.012 within 5 sigma.
     np.testing.assert_allclose(np.std(pulls, axis=0), 1.012, atol=5 / np.sqrt(2000))
     np.testing.assert_allclose(np.mean(pulls, axis=0), 0.0, atol=5 / np.sqrt(1000))
 
 
-def test_self_calibration_with_priors():
+@pytest.mark.parametrize("heading_deg", [1.0, 115.0])
+def test_self_calibration_with_priors(heading_deg):
     lens = Interior(1000, 1500, 0.1203, 1e-4, 1e-4, x0=2e-4, y0=-1e-4, k1=-0.05, k2=0.02, p1=5e-4)
-    truth = FrameCamera.from_roll_pitch_yaw(lens, (*PLACE, 6000.0), 0.05, -0.1, 0.02, heights=(700.0, 1900.0))
+    angles = 0.05, -0.1, np.radians(heading_deg)
+    truth = FrameCamera.from_roll_pitch_yaw(lens, (*PLACE, 6000.0), *angles, heights=(700.0, 1900.0))
     free = (*EXTERIOR, "focal_length", "x0", "y0", "k1", "k2", "p1", "p2")
     points = measured(truth, 120, 0.2, seed=4)
     start = resect(points, AERIAL)._replace(free=free)
@@ -275,6 +289,21 @@ def test_self_calibration_with_priors():
     # The prior holds what the points cannot: a fixed pitch and a free one together with the focal length.
     with pytest.raises(DegeneratePoints):
         fit(start._replace(free=(*free, "pitch_x", "pitch_y")), points, robust=False)
+
+
+def test_corners_are_those_of_the_image_and_not_of_the_box():
+    camera = satellite(8, 115)
+    corners = camera.corners
+    np.testing.assert_allclose(
+        camera.ground_to_image(corners), [[0, 0], [2048, 0], [2048, 2048], [0, 2048]] * 2, atol=1e-6
+    )
+    np.testing.assert_allclose(corners[:, 2], np.repeat(camera.heights, 4))
+    # The corners of the box see nothing of the image.
+    box = SensorModel.corners.fget(camera)
+    assert box.shape == (8, 3)
+    assert (np.abs(camera.ground_to_image(box) - 1024).max(axis=1) > 1300).all()
+    corrected = ImageCorrection.identity(camera, "shift", (1024.0, 1024.0))
+    np.testing.assert_array_equal(corrected.corners, corners)
 
 
 def test_map_frame_is_worse_over_a_large_scene():

@@ -33,6 +33,10 @@ LON, LAT = 32.85, 39.92
 LOW, HIGH = 700.0, 1900.0
 POINTS = 44
 MAP_CRS = "EPSG:32636"
+#: Free settings of the experiment: see `ortho_pipeline.experiments.bilsat`.
+OFF_NADIR_DEG, SIGMA_IMAGE, SIGMA_GROUND = 7.3, 0.7, 0.7
+#: How much the plains roll, and among how many places of a cell the lowest is measured: see there as well.
+ROUGHNESS, PLACES = 0.65, 3
 #: The four XS cameras: misalignment to the right, downwards and about the axis (rad), relative focal length, k1.
 XS_CAMERAS = {
     "red": (0.0, 0.0, 0.0, 1.0, 0.0),
@@ -62,8 +66,9 @@ class Hills:
         waves = np.zeros_like(east)
         for k in range(len(kx)):
             waves += amplitude[k] * np.sin(kx[k] * east + ky[k] * north + phase[k])
+        mountains = np.exp(-((east - 18e3) ** 2 + (north + 12e3) ** 2) / (2 * 6e3**2))
         # Squashed between the bounds without ever reaching them.
-        return self.low + (self.high - self.low) / (1 + np.exp(-(1.1 * waves - 0.9 + east / 30e3)))
+        return self.low + (self.high - self.low) / (1 + np.exp(-(ROUGHNESS * waves - 1.4 + 3.0 * mountains)))
 
     @cached_property
     def _waves(self) -> Array:
@@ -134,7 +139,7 @@ class Snapshot:
     k1: float = 0.0
 
     @classmethod
-    def over_ankara(cls, off_nadir_deg: float = 8.0, *, size: int = SIZE, ascending: bool = False) -> Self:
+    def over_ankara(cls, off_nadir_deg: float = OFF_NADIR_DEG, *, size: int = SIZE, ascending: bool = False) -> Self:
         """Aim the camera at the scene from a circular orbit, by a roll; a positive one looks to the right.
 
         A smaller `size` has larger pixels, so that the frame covers the same ground.
@@ -256,16 +261,23 @@ class BilsatScene:
     ground: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
-    def make(cls, off_nadir_deg: float = 8.0, *, size: int = SIZE, points: int = POINTS, seed: int = 1) -> Self:
-        """Make the scene: the tilt is free, the points are spread over the frame."""
+    def make(
+        cls, off_nadir_deg: float = OFF_NADIR_DEG, *, size: int = SIZE, points: int = POINTS, seed: int = 1
+    ) -> Self:
+        """Make the scene: the tilt is free, the points are spread over the frame by `seed`.
+
+        People measure road crossings, which lie in plains and valleys: of some places in each cell, the lowest.
+        """
         if points < 4:
             raise InputError("a scene has at least 4 points", field="points")
         camera, hills = Snapshot.over_ankara(off_nadir_deg, size=size), Hills()
-        image = _spread(points, size, np.random.default_rng(seed))
-        ground = camera.meet(image, hills)
-        return cls(camera, hills, image, ground)
+        random = np.random.default_rng(seed)
+        image = np.stack([_spread(points, size, random) for _ in range(PLACES)])
+        ground = camera.meet(image.reshape(-1, 2), hills).reshape(PLACES, points, 3)
+        lowest = ground[:, :, 2].argmin(axis=0), np.arange(points)
+        return cls(camera, hills, image[lowest], ground[lowest])
 
-    def measure(self, seed: int, *, sigma_image: float = 0.7, sigma_ground: float = 0.7) -> Points:
+    def measure(self, seed: int, *, sigma_image: float = SIGMA_IMAGE, sigma_ground: float = SIGMA_GROUND) -> Points:
         """Return the points as somebody measured them: noise in the image (px) and on the ground (m) from `seed`."""
         random = np.random.default_rng(seed)
         count = len(self.image)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
@@ -58,6 +59,15 @@ class SensorModel(ABC):
     def reference_height(self) -> float:
         """Ellipsoidal height (m) in the middle of `height_range`."""
         return float(self.domain[0][2])
+
+    @property
+    def corners(self) -> Array:
+        """Ground points ``(N, 3)`` at the rim of what the model is meant for, at its lowest and highest height.
+
+        Here the corners of `domain`; a model that knows the frame of its image gives the corners of that.
+        """
+        centre, half = self.domain
+        return centre + half * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
     # -- parameters --------------------------------------------------------------------------------------------------
 

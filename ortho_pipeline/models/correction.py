@@ -91,6 +91,10 @@ class ImageCorrection(SensorModel):
         return self.model.domain
 
     @property
+    def corners(self) -> Array:
+        return self.model.corners
+
+    @property
     def param_names(self) -> tuple[str, ...]:
         return tuple(name for name in FREE[self.correction] if name not in self.removed)
 

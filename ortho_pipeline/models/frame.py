@@ -42,6 +42,7 @@ from ortho_pipeline.geometry import (
     enu_from_ecef,
     geocentric,
     geodetic,
+    horizon_from_geodetic,
     meet_height,
     metres_per_degree,
     rotation_of_angles,
@@ -209,6 +210,16 @@ class FrameCamera(SensorModel):
         return (low + high) / 2, (high - low) / 2
 
     @property
+    def corners(self) -> Array:
+        """Ground points ``(8, 3)`` of the corners of the image at both ends of `heights`; NaN where none is seen.
+
+        The box of `domain` lies along the axes of the ground: its corners are far outside of an image that is not.
+        """
+        size = (self.interior.width, self.interior.height)
+        image = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]) * size
+        return np.concatenate([self.image_to_ground(image, height) for height in self.heights])
+
+    @property
     def perspective_centre(self) -> Array:
         """Position ``(3,)`` of the camera in the CRS of the ground."""
         if self.frame == MAP:
@@ -370,9 +381,7 @@ class FrameCamera(SensorModel):
 
     def _spread(self, ground: Array) -> Array:
         """Return d(topocentric)/d(lon, lat, height) as ``(N, 3, 3)``."""
-        axes = np.swapaxes(self._local[0] @ np.swapaxes(enu_from_ecef(ground), 1, 2), 1, 2)
-        axes[:, :2] *= metres_per_degree(ground)[:, :, None]
-        return np.swapaxes(axes, 1, 2)
+        return horizon_from_geodetic(ground, np.array(self.origin))[1]
 
     def _in_camera(self, ground: Array) -> Array:
         """Return the vectors ``(N, 3)`` from camera to points in its axes; NaN where it cannot see them."""
@@ -441,6 +450,12 @@ class FrameCamera(SensorModel):
         degrees = np.ones(2) if self.frame == MAP else metres_per_degree(np.array([[*centre[:2], 0.0]]))[0]
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * reach / degrees
         return np.column_stack([centre[:2] + corners, np.full(4, self.heights[0])])
+
+
+def exterior_sigmas(position: float | None, angle: float | None) -> dict[str, float]:
+    """Return standard deviations by parameter: of the position (m) and the angles (rad), as far as they are known."""
+    known = {EXTERIOR[:3]: position, EXTERIOR[3:]: angle}
+    return {name: sigma for names, sigma in known.items() if sigma is not None for name in names}
 
 
 def camera_from_platform(roll: float, pitch: float, yaw: float) -> Array:

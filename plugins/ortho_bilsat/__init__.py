@@ -13,7 +13,8 @@ from ortho_bilsat.survey import MARK, Survey, read_survey
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geometry import geodetic, orbital_from_ecef
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-from ortho_pipeline.models.frame import FrameCamera, camera_from_platform
+from ortho_pipeline.models.frame import FrameCamera, camera_from_platform, exterior_sigmas
+from ortho_pipeline.problem import priors_at
 
 
 @hookimpl
@@ -64,7 +65,8 @@ def open_scene(dataset: gdal.Dataset, *, survey: str | None = None, attitude: st
         raise InputError(f"{attitude!r} is no source of the attitude", field="attitude", remedy="survey or zero")
     model = rigorous_model(read, use_attitude=attitude == "survey")
     warnings = []
-    if read.attitude is None or attitude == "zero":
+    known = read.attitude is not None and attitude == "survey"
+    if not known:
         warnings.append("the attitude is not known: the model only starts an adjustment to ground control points")
     return Scene(
         sensor="bilsat",
@@ -75,6 +77,7 @@ def open_scene(dataset: gdal.Dataset, *, survey: str | None = None, attitude: st
         model_source=str(path),
         facts=_facts(read, model),
         warnings=tuple(warnings),
+        priors=priors_at(model, exterior_sigmas(read.position_sigma, read.attitude_sigma if known else None)),
     )
 
 

@@ -49,7 +49,7 @@ def stack_bands(
     # Splines overshoot; a dark pixel that is there is not nodata.
     low, high = 1, np.iinfo(dtype).max
     filled = np.where(np.isfinite(stack), np.clip(np.rint(stack), low, high), 0).astype(dtype)
-    _write(filled, names, output)
+    write_bands(filled, names, output)
     return registrations
 
 
@@ -60,7 +60,10 @@ def _read(path: str | PathLike[str]) -> np.ndarray[Any, Any]:
     return np.asarray(dataset.ReadAsArray())
 
 
-def _write(stack: np.ndarray[Any, Any], names: list[str], output: str | PathLike[str]) -> None:
+def write_bands(
+    stack: np.ndarray[Any, Any], names: list[str], output: str | PathLike[str], *, nodata: int | None = 0
+) -> None:
+    """Write pixels ``(bands, rows, columns)``, 8 or 16 bit, as a GeoTIFF whose bands have names."""
     count, rows, columns = stack.shape
     kind = gdal.GDT_Byte if stack.dtype == np.uint8 else gdal.GDT_UInt16
     with whole_or_nothing(output) as temporary:
@@ -69,7 +72,8 @@ def _write(stack: np.ndarray[Any, Any], names: list[str], output: str | PathLike
         for index, name in enumerate(names, start=1):
             band = dataset.GetRasterBand(index)
             band.SetDescription(name)
-            band.SetNoDataValue(0)
+            if nodata is not None:
+                band.SetNoDataValue(nodata)
             band.WriteArray(stack[index - 1])
         dataset.FlushCache()
         del band, dataset

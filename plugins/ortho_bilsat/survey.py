@@ -19,10 +19,10 @@ MAX_BYTES = 100_000
 #: How many numbers each key has; those in OPTIONAL may be missing.
 NUMBERS = {
     "position_m": 3, "velocity_m_s": 3, "attitude_deg": 3, "focal_length_mm": 1, "pixel_pitch_um": 1, "columns": 1,
-    "rows": 1, "position_sigma_m": 1, "heights_m": 2,
+    "rows": 1, "position_sigma_m": 1, "attitude_sigma_deg": 1, "heights_m": 2,
 }  # fmt: skip
 TEXTS = ("scene", "camera", "acquired")
-OPTIONAL = ("attitude_deg", "position_sigma_m", "heights_m")
+OPTIONAL = ("attitude_deg", "position_sigma_m", "attitude_sigma_deg", "heights_m")
 HEIGHTS = (-500.0, 9000.0)
 
 
@@ -42,6 +42,7 @@ class Survey:
     interior: Interior
     position_sigma: float | None = None
     heights: tuple[float, float] = HEIGHTS
+    attitude_sigma: float | None = None
 
 
 def read_survey(path: str | PathLike[str]) -> Survey:
@@ -64,17 +65,20 @@ def read_survey(path: str | PathLike[str]) -> Survey:
     attitude, heights = numbers.get("attitude_deg"), numbers.get("heights_m", HEIGHTS)
     if not heights[0] < heights[1]:
         raise InputError("the lower height comes first", file=path, field="heights_m")
-    sigma = numbers.get("position_sigma_m", (None,))[0]
-    if sigma is not None and not sigma > 0:
-        raise InputError("a standard deviation is positive", file=path, field="position_sigma_m")
+    sigmas = {key: numbers.get(key, (None,))[0] for key in ("position_sigma_m", "attitude_sigma_deg")}
+    for key, sigma in sigmas.items():
+        if sigma is not None and not sigma > 0:
+            raise InputError("a standard deviation is positive", file=path, field=key)
+    turn = sigmas["attitude_sigma_deg"]
     return Survey(
         **texts,
         position=_triple(numbers["position_m"]),
         velocity=_triple(numbers["velocity_m_s"]),
         attitude=None if attitude is None else _triple(tuple(math.radians(angle) for angle in attitude)),
         interior=_interior(path, numbers),
-        position_sigma=sigma,
+        position_sigma=sigmas["position_sigma_m"],
         heights=(heights[0], heights[1]),
+        attitude_sigma=None if turn is None else math.radians(turn),
     )
 
 
@@ -88,6 +92,8 @@ def write_survey(survey: Survey, path: str | PathLike[str]) -> None:
     values |= {"columns": (interior.width,), "rows": (interior.height,), "heights_m": survey.heights}
     if survey.position_sigma is not None:
         values["position_sigma_m"] = (survey.position_sigma,)
+    if survey.attitude_sigma is not None:
+        values["attitude_sigma_deg"] = (math.degrees(survey.attitude_sigma),)
     lines = [MARK, *(f"{key} = {getattr(survey, key)}" for key in TEXTS)]
     lines += [f"{key} = {' '.join(map(repr, numbers))}" for key, numbers in values.items()]
     write_text(path, "\n".join([*lines, "END"]) + "\n")

@@ -16,8 +16,9 @@ from ortho_pipeline.crs import Vertical, ground_transform
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.models.frame import TOPOCENTRIC, FrameCamera
+from ortho_pipeline.models.frame import TOPOCENTRIC, FrameCamera, exterior_sigmas
 from ortho_pipeline.models.lens import Interior
+from ortho_pipeline.problem import Prior, priors_at
 
 OPTIONS = {
     "camera": "camera file: JSON (docs/formats/frame.md) or OpenSfM's cameras.json or reconstruction.json",
@@ -26,6 +27,7 @@ OPTIONS = {
     "vertical": "what the camera heights are above: ellipsoid, egm96, egm2008, EPSG:n or a grid file",
     "frame": "work in a topocentric frame (default) or directly in the map projection: topocentric, map",
     "heights": "lowest and highest ground in ellipsoidal metres: low,high",
+    "sigmas": "standard deviations of position and angles for --correction model: metres,degrees",
     "refraction": "bend rays by the standard atmosphere: yes or no (default)",
 }
 
@@ -52,6 +54,7 @@ def open_scene(
     vertical: str | None = None,
     frame: str = TOPOCENTRIC,
     heights: str | None = None,
+    sigmas: str | None = None,
     refraction: str = "no",
 ) -> Scene:
     """Open a frame image with its camera and its row of the table of exterior orientations."""
@@ -76,6 +79,7 @@ def open_scene(
         models={"frame": model},
         model_source=exterior,
         facts=_facts(model, pose),
+        priors=_priors(model, sigmas),
     )
 
 
@@ -113,13 +117,28 @@ def _heights(text: str | None, camera: float) -> tuple[float, float]:
         # What is known is only that the ground is below the camera.
         low = min(-100.0, camera - 1000.0)
         return low, min(9000.0, camera - 0.1 * (camera - low))
-    try:
-        low, high = (float(part) for part in text.split(","))
-    except ValueError:
-        low = high = math.nan
-    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+    low, high = _pair(text)
+    if not low < high:
         raise InputError(f"{text!r} is no range of heights", field="heights", remedy="give low,high in metres")
     return low, high
+
+
+def _priors(model: FrameCamera, sigmas: str | None) -> dict[str, Prior]:
+    if sigmas is None:
+        return {}
+    metres, degrees = _pair(sigmas)
+    if not (metres > 0 and degrees > 0):
+        raise InputError(f"{sigmas!r} are no standard deviations", field="sigmas", remedy="give metres,degrees")
+    return priors_at(model, exterior_sigmas(metres, math.radians(degrees)))
+
+
+def _pair(text: str) -> tuple[float, float]:
+    """Return two finite numbers; NaN for what is none."""
+    try:
+        first, second = (float(part) for part in text.split(","))
+    except ValueError:
+        return math.nan, math.nan
+    return (first, second) if math.isfinite(first) and math.isfinite(second) else (math.nan, math.nan)
 
 
 def _facts(model: FrameCamera, pose: Pose) -> dict[str, object]:
