@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import hashlib
 import os
 import tempfile
@@ -47,7 +48,7 @@ def whole_or_nothing(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(temporary, final)
         _sync_folder(final.parent)
     finally:
-        for left in temporary.parent.glob(f"{temporary.name}*"):
+        for left in temporary.parent.glob(f"{glob.escape(temporary.name)}*"):
             left.unlink(missing_ok=True)
 
 

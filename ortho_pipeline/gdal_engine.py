@@ -13,6 +13,7 @@ import pyproj
 from numpy.typing import NDArray
 from osgeo import gdal
 
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster import Grid, Profile, RasterSource, RasterWriter
 
 
@@ -39,26 +40,31 @@ def warp_with_gdal(
     heights : (array (rows, columns), geotransform, crs) or float
         Ellipsoidal heights of the surface with NaN for voids, or one height.
     """
+    if len(source.paths) > 1:
+        raise InputError(
+            "GDAL's warper takes one file", file=source.paths[1], field="engine", remedy="use our own engine"
+        )
     view = gdal.GetDriverByName("VRT").CreateCopy("", source.dataset)
     view.SetGCPs([], "")
     view.SetMetadata(dict(rpc), "RPC")
     profile = Profile.of(source)
     dem = f"/vsimem/ortho_dem_{os.getpid()}_{threading.get_ident()}.tif"
     options = ["METHOD=RPC"]  # GDAL would otherwise prefer GCPs
-    if isinstance(heights, tuple):
-        _write_dem(dem, *heights)
-        options += [f"RPC_DEM={dem}", "RPC_DEMINTERPOLATION=bilinear", "RPC_DEM_APPLY_VDATUM_SHIFT=NO"]
-    else:
-        options += [f"RPC_HEIGHT={heights!r}"]
     writer = RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads)
+    target = writer.path.with_name(f".{writer.path.stem}.{os.getpid()}.gdal.part.tif")
     with writer, writer.disk_errors():
-        target = writer.path.with_name(f".{writer.path.stem}.gdal.part.tif")
         try:
+            if isinstance(heights, tuple):
+                _write_dem(dem, *heights)
+                options += [f"RPC_DEM={dem}", "RPC_DEMINTERPOLATION=bilinear", "RPC_DEM_APPLY_VDATUM_SHIFT=NO"]
+            else:
+                options += [f"RPC_HEIGHT={heights!r}"]
             _warp_exactly(view, target, source, profile, grid, options, resampling, memory, threads, progress)
             return writer.copy(target)
         finally:
             target.unlink(missing_ok=True)
-            gdal.Unlink(dem)
+            if isinstance(heights, tuple):
+                gdal.Unlink(dem)
 
 
 def _write_dem(path: str, heights: NDArray[np.float64], geotransform: Sequence[float], crs: pyproj.CRS) -> None:

@@ -27,7 +27,8 @@ _inline = numba.njit(nogil=True, cache=True, inline="always", boundscheck=False,
 
 @_inline
 def _between(first, second, share):
-    return first + (second - first) * share
+    # A node without weight may be NaN (outside of the model) and must not count.
+    return first if share == 0.0 else first + (second - first) * share
 
 
 @_jit
@@ -62,11 +63,13 @@ def block_coordinates(
             for axis in range(2):
                 begin = _between(nodes[cell_row, cell, k, axis], nodes[cell_row + 1, cell, k, axis], ty)
                 end = _between(nodes[cell_row, cell + 1, k, axis], nodes[cell_row + 1, cell + 1, k, axis], ty)
-                start[2 * k + axis], slope[2 * k + axis] = begin, end - begin
+                start[2 * k + axis], slope[2 * k + axis] = begin, end - begin if spacing > 1 else 0.0
         u0 = _between(dem_nodes[cell_row, cell, 0], dem_nodes[cell_row + 1, cell, 0], ty)
         v0 = _between(dem_nodes[cell_row, cell, 1], dem_nodes[cell_row + 1, cell, 1], ty)
         du = _between(dem_nodes[cell_row, cell + 1, 0], dem_nodes[cell_row + 1, cell + 1, 0], ty) - u0
         dv = _between(dem_nodes[cell_row, cell + 1, 1], dem_nodes[cell_row + 1, cell + 1, 1], ty) - v0
+        if spacing == 1:
+            du, dv = 0.0, 0.0  # the only pixel of the cell is its first node
         first, last = max(left, cell * spacing), min(right, (cell + 1) * spacing)
         tx, cols, lines = ticks[first:last], columns[first - left : last - left], rows[first - left : last - left]
         # First the heights, kept in `cols`; then both coordinates: two simple loops are faster than one long one.
@@ -197,6 +200,9 @@ def _bilinear(source, x, y, left, top, full_width, full_height):
 def _bilinear_valid(source, valid, x, y, left, top, full_width, full_height):
     """As `_bilinear`, of the valid pixels only, with weights that sum to one; NaN if none is."""
     i, j = int(np.floor(x)), int(np.floor(y))
+    if i >= 0 and j >= 0 and i + 1 < full_width and j + 1 < full_height and _all_valid(valid, i - left, j - top, 2):
+        # To the last bit what the window would give without any invalid pixel in it.
+        return _bilinear(source, x, y, left, top, full_width, full_height)
     fx, fy = x - i, y - j
     total, weights = 0.0, 0.0
     for b in range(2):
@@ -272,8 +278,8 @@ def warp_block(
     low, high, integer, fill
         Range of the output type, whether it is an integer type, and the value of invalid pixels.
     block : (4,) first row, last row + 1, first column, last column + 1 within the block
-    out : (bands, rows, columns), out_valid : (rows, columns)
-        Where the pixels go.
+    out : (bands, rows, columns), out_valid : the same
+        Where the pixels go, and whether they are valid.
     reach : int
         How many pixels around a point the kernel reads.
     box : (2,)
@@ -320,12 +326,12 @@ def warp_block(
                 kernel, source[band], columns[begin:end], rows[begin:end], left, top, low, high, integer, box,
                 out[band, line, begin:end]
             )  # fmt: skip
-        out_valid[line, begin:end] = True
+        out_valid[:, line, begin:end] = True
         for start, stop in ((0, begin), (end, count)):
             if stop > start:
                 short += _row_with_edges(
                     kernel, source, valid, masked, columns[start:stop], rows[start:stop], left, top, full_width,
-                    full_height, low, high, integer, fill, out[:, line, start:stop], out_valid[line, start:stop],
+                    full_height, low, high, integer, fill, out[:, line, start:stop], out_valid[:, line, start:stop],
                     reach, box
                 )  # fmt: skip
     return short
@@ -527,11 +533,9 @@ def _row_with_edges(
     short = 0
     for k in range(columns.size):
         col, line = columns[k], rows[k]
-        found = False
         if not (0.0 <= col <= full_width and 0.0 <= line <= full_height):
             for band in range(bands):
-                out[band, k] = fill
-            out_valid[k] = False
+                out[band, k], out_valid[band, k] = fill, False
             continue
         here_col, here_row = min(int(col), full_width - 1), min(int(line), full_height - 1)
         if (
@@ -544,9 +548,9 @@ def _row_with_edges(
             continue
         for band in range(bands):
             if masked and not valid[band, here_row - top, here_col - left]:
-                out[band, k] = fill
+                out[band, k], out_valid[band, k] = fill, False
                 continue
-            found = True
+            out_valid[band, k] = True
             if kernel == NEAREST:
                 out[band, k] = source[band, here_row - top, here_col - left]
                 continue
@@ -555,5 +559,4 @@ def _row_with_edges(
                 full_height, box
             )  # fmt: skip
             out[band, k] = min(max(np.floor(value + 0.5), low), high) if integer else value
-        out_valid[k] = found
     return short

@@ -26,7 +26,7 @@ import numpy as np
 
 from ortho_pipeline.crs import GroundTransform
 from ortho_pipeline.dem import Surface
-from ortho_pipeline.errors import ModelError
+from ortho_pipeline.errors import InputError, ModelError
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster import Grid
 
@@ -264,6 +264,8 @@ class Lattices:
     def _verify(self, blocks: list[Block]) -> Array:
         """Return the worst error (source px) of each block's lattice at its verification points ``(blocks,)``."""
         columns, rows, t = _scatter(blocks)
+        if blocks[0].spacing == 1:
+            columns, rows = np.floor(columns), np.floor(rows)  # nothing between the nodes is ever used
         corner_columns = np.array([block.column for block in blocks])[:, None] * BLOCK + 0.5
         corner_rows = np.array([block.row for block in blocks])[:, None] * BLOCK + 0.5
         middle = np.array([block.middle for block in blocks])[:, None]
@@ -279,7 +281,8 @@ class Lattices:
         errors[np.isnan(errors)] = np.inf
         worst = np.where(inside[0] | inside[1], errors, 0.0).max(axis=1)
         for k, block in enumerate(blocks):
-            if block.spacing > 1 and self._in_domain(block) and np.isnan(block.lattice).any():
+            beside = block.window is not None or self._in_domain(block)
+            if block.spacing > 1 and beside and np.isnan(block.lattice).any():
                 worst[k] = np.inf  # the scene may hide between nodes that lie outside of the model's domain
         return worst
 
@@ -304,18 +307,37 @@ class Terrain:
             return []
         together = np.array([windows[k] for k in present])
         whole = (*together[:, :2].min(axis=0), *together[:, 2:].max(axis=0))
-        if (whole[2] - whole[0]) * (whole[3] - whole[1]) * 8 <= self._window_bytes:
+        if self._fits(whole):
             self._whole = self._read(whole), (int(whole[0]), int(whole[1]))
         return [k for k in present if self._range(blocks[k], windows[k])]
 
-    def groups(self, blocks: list[Block]) -> Iterator[tuple[list[Block], Array, tuple[int, int]]]:
-        """Yield blocks with the window of heights that they share and the place of its first sample."""
+    def groups(
+        self, blocks: list[Block]
+    ) -> Iterator[tuple[list[Block], Array, tuple[int, int], tuple[int, int, int, int]]]:
+        """Yield blocks with the heights that they share, the place of the first sample, and the part of the block.
+
+        The part (first row, last row + 1, first column, last column + 1) is the whole block, or a cell of its lattice
+        where the DEM is so much finer than the output that even a block's heights do not fit into the memory.
+        """
+        whole = (0, BLOCK, 0, BLOCK)
         if self._whole is not None:
             if blocks:
-                yield blocks, *self._whole
+                yield blocks, *self._whole, whole
             return
         for block in blocks:
-            yield [block], self._read(block.terrain), block.terrain[:2]
+            if self._fits(block.terrain):
+                yield [block], self._read(block.terrain), block.terrain[:2], whole
+                continue
+            step = block.spacing
+            for j in range(BLOCK // step):
+                for i in range(BLOCK // step):
+                    window = self._window(block.dem_lattice[j : j + 2, i : i + 2])
+                    if window is not None:
+                        cell = (j * step, (j + 1) * step, i * step, (i + 1) * step)
+                        yield [block], self._read(window), window[:2], cell
+
+    def _fits(self, window: Any) -> bool:
+        return (window[2] - window[0]) * (window[3] - window[1]) * 8 <= self._window_bytes
 
     def _window(self, nodes: Array) -> tuple[int, int, int, int] | None:
         """Return the samples (left, top, right, bottom) under lattice nodes, with those that interpolation needs."""
@@ -340,13 +362,16 @@ class Terrain:
     def _range(self, block: Block, window: Any) -> bool:
         left, top, right, bottom = block.terrain = window
         if self._whole is None:
-            under = self._read(window)
+            try:
+                lowest, highest = self._surface.range_within(left, top, right - left, bottom - top)
+            except InputError:
+                return False
         else:
             heights, (first, above) = self._whole
             under = heights[top - above : bottom - above, left - first : right - first]
-        if not np.isfinite(under).any():
-            return False
-        lowest, highest = float(np.nanmin(under)), float(np.nanmax(under))
+            if not np.isfinite(under).any():
+                return False
+            lowest, highest = float(np.nanmin(under)), float(np.nanmax(under))
         # A cubic DEM overshoots between its samples by up to a quarter of their range.
         extra = 0.25 * (highest - lowest) if self._cubic else 0.0
         block.middle = (lowest + highest) / 2
@@ -366,15 +391,21 @@ def _interpolate(blocks: list[Block], columns: Array, rows: Array, t: Array) -> 
     def plan(nodes: Array) -> Array:
         shape = (*fx.shape, *[1] * (nodes.ndim - 3))
         across, down = fx.reshape(shape), fy.reshape(shape)
-        upper = nodes[which, j, i] * (1 - across) + nodes[which, j, i + 1] * across
-        lower = nodes[which, j + 1, i] * (1 - across) + nodes[which, j + 1, i + 1] * across
-        return upper * (1 - down) + lower * down
+        # A node without weight may be NaN (outside of the model) and must not count.
+        upper = np.where(across == 0, nodes[which, j, i], _mean(nodes[which, j, i], nodes[which, j, i + 1], across))
+        below = nodes[which, j + 1, i]
+        lower = np.where(across == 0, below, _mean(below, nodes[which, j + 1, i + 1], across))
+        return np.where(down == 0, upper, _mean(upper, lower, down))
 
     coefficients = plan(np.stack([block.lattice for block in blocks]))
     powers = t[:, :, None] ** np.arange(coefficients.shape[2])
     image = np.einsum("bnk,bnka->bna", powers, coefficients)
     parallax = 2 * np.hypot(coefficients[:, :, 1, 0], coefficients[:, :, 1, 1])
     return image, plan(np.stack([block.dem_lattice for block in blocks])), parallax
+
+
+def _mean(first: Array, second: Array, share: Array) -> Array:
+    return first + (second - first) * share
 
 
 def _box(block: Block) -> tuple[float, float]:

@@ -93,10 +93,14 @@ def _check_size(dataset: gdal.Dataset, name: str) -> None:
         )
 
 
-def _check_vrt(path: Path) -> None:
+def _check_vrt(path: Path, seen: frozenset[Path] = frozenset()) -> None:
+    """Refuse a VRT that is more than a view of files in its own folder, whatever names its sources have."""
     from defusedxml import ElementTree
     from defusedxml.common import DefusedXmlException
 
+    here = path.resolve()
+    if here in seen:
+        raise InputError("this VRT is a source of itself", file=path)
     if path.stat().st_size > _MAX_VRT:
         raise InputError("a VRT of more than 5 MB is not opened", file=path)
     try:
@@ -107,23 +111,25 @@ def _check_vrt(path: Path) -> None:
         raise InputError(
             "only plain VRTs are opened", file=path, remedy="make a file of it first (gdal_translate in.vrt out.tif)"
         )
-    folder = path.resolve().parent
     for element in root.iter():
         if element.tag in ("SourceFilename", "SourceDataset"):
-            _check_vrt_source(path, folder, element.text or "", element.get("relativeToVRT") == "1")
+            name = element.text or ""
+            source = (here.parent / name if element.get("relativeToVRT") == "1" else Path(name)).resolve()
+            if not source.is_relative_to(here.parent) or name.startswith("/vsi") or ":" in name.replace(":\\", ""):
+                raise InputError(
+                    f"this VRT reads {name!r}, which is outside of its own folder",
+                    file=path,
+                    field="SourceFilename",
+                    remedy="put the VRT beside its sources, or make a file of it (gdal_translate in.vrt out.tif)",
+                )
+            if source.is_file() and _is_vrt(source):
+                _check_vrt(source, seen | {here})
 
 
-def _check_vrt_source(path: Path, folder: Path, name: str, relative: bool) -> None:
-    source = (folder / name if relative else Path(name)).resolve()
-    if not source.is_relative_to(folder) or name.startswith("/vsi") or ":" in name.replace(":\\", ""):
-        raise InputError(
-            f"this VRT reads {name!r}, which is outside of its own folder",
-            file=path,
-            field="SourceFilename",
-            remedy="put the VRT beside its sources, or make a file of it (gdal_translate in.vrt out.tif)",
-        )
-    if source.suffix.lower() == ".vrt" and source != path.resolve() and source.is_file():
-        _check_vrt(source)
+def _is_vrt(path: Path) -> bool:
+    # GDAL goes by the content, so a VRT may have any name.
+    with path.open("rb") as file:
+        return path.suffix.lower() == ".vrt" or b"<VRTDataset" in file.read(10_000)
 
 
 def _first_line(error: BaseException) -> str:
@@ -210,6 +216,8 @@ class _RasterFile:
         self.nodata = tuple(_nodata(band, self.dtype) for band in bands)
         self.palette = any(band.GetColorTable() is not None for band in bands)
         flags = bands[0].GetMaskFlags()
+        # GDAL's own order: a mask of the dataset stands beside nodata.
+        self._masked = bool(flags & gdal.GMF_PER_DATASET and not flags & (gdal.GMF_NODATA | gdal.GMF_ALPHA))
         if any(value is not None for value in self.nodata):
             self.validity = "nodata"
         elif flags & gdal.GMF_ALPHA:
@@ -242,9 +250,9 @@ class _RasterFile:
             for band, value in enumerate(self.nodata):
                 if value is not None and not math.isnan(value):
                     np.not_equal(pixels[band], pixels.dtype.type(value), out=valid[band])
-        elif self.validity in ("mask", "alpha"):
-            mask = self._io(self.bands[0].GetMaskBand().ReadAsArray, left, top, width, height)
-            valid = np.broadcast_to(mask != 0, pixels.shape).copy()
+        if self._masked or self.validity in ("mask", "alpha"):
+            mask = self._io(self.bands[0].GetMaskBand().ReadAsArray, left, top, width, height) != 0
+            valid = np.broadcast_to(mask, pixels.shape).copy() if valid is None else valid & mask
         if pixels.dtype.kind == "f":
             numbers = ~np.isnan(pixels)
             if not numbers.all():
@@ -293,6 +301,7 @@ class RasterSource:
     ) -> None:
         self._files = [_RasterFile(name, allow_network) for name in (path, *others)]
         first = self._files[0]
+        self.paths = tuple(file.path for file in self._files)
         self.path, self.width, self.height = first.path, first.width, first.height
         for file in self._files:
             if (file.width, file.height) != (self.width, self.height):
@@ -377,9 +386,12 @@ class Profile:
         """Return the profile of an ortho of `source`.
 
         Nodata stays nodata (one value for all bands, as GeoTIFF has it), alpha stays alpha; everything else gets a
-        mask, because no pixel value may be given a meaning that it did not have.
+        mask, because no pixel value may be given a meaning that it did not have. Under a mask, bands of floating point
+        without a value are NaN; integers cannot say that, so there a pixel is valid only if all of its bands are.
         """
-        bands, values = source.bands, set(source.nodata)
+        # NaN is not equal to itself, and would make a set of several.
+        bands = source.bands
+        values = {"nan" if value is not None and math.isnan(value) else value for value in source.nodata}
         if source.validity == "nodata" and len(values) == 1:
             validity, nodata = "nodata", source.nodata[0]
         else:
@@ -502,7 +514,9 @@ class RasterWriter:
                 size = min(step, self.grid.width - left), min(step, self.grid.height - top)
                 pixels = dataset.ReadAsArray(left, top, *size).reshape(-1, size[1], size[0])
                 if self.profile.validity == "nodata":
-                    valid = (pixels != self.profile.nodata).any(axis=0)
+                    nodata = self.profile.nodata
+                    empty = np.isnan(pixels) if nodata is not None and math.isnan(nodata) else pixels == nodata
+                    valid = ~empty.all(axis=0)
                 else:
                     valid = pixels[-1] > 0
                 self.write(left, top, pixels[: self.profile.count].astype(self.profile.dtype, copy=False), valid)

@@ -54,7 +54,9 @@ def intersect(model: SensorModel, image: ArrayLike, surface: Surface, *, toleran
         return np.full((len(image), 3), np.nan)
     window, (lowest, highest) = reach
     low, high = lowest - 1.0, highest + 1.0
-    height = _march_many(ray, window, low, high, tolerance) if len(image) >= MANY else None
+    # The window ends where the DEM does; a fill rule goes on beyond.
+    many = len(image) >= MANY and surface.fill in ("error", "mask")
+    height = _march_many(ray, window, low, high, tolerance) if many else None
     if height is None:
         height = _narrow(ray, *_bracket(ray, low, high), tolerance)
     ground = model.image_to_ground(image, height)
@@ -92,7 +94,11 @@ class _Ray:
         The window follows from a range of heights and the range from a window: from the model's own range on, until
         the terrain lies within it. None if the rays miss the DEM.
         """
+        if self.any and self.surface.fill not in ("error", "mask"):
+            rows, columns = self.surface.shape
+            return (0, 0, columns, rows), self.surface.height_range
         low, high = self.model.height_range
+        found = None
         for _ in range(4):
             window = self._window(low, high)
             if window is None:
@@ -101,10 +107,11 @@ class _Ray:
                 lowest, highest = self.surface.range_within(*window)
             except InputError:
                 return None
+            found = window, (lowest, highest)
             if low <= lowest and highest <= high:
                 break
             low, high = min(low, lowest - 1.0), max(high, highest + 1.0)
-        return window, (lowest, highest)
+        return found
 
     def _window(self, low: float, high: float) -> tuple[int, int, int, int] | None:
         """Samples under the rays between two heights; a frame around the points stands for all of them."""

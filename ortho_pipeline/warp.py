@@ -143,6 +143,7 @@ def rectify_gdal(
     """
     begin = time.monotonic()
     _check(source, resampling, "bilinear", 1.0)
+    surface = _seamless(surface, grid)
     valid = warp_with_gdal(
         source, rpc, _heights_under(surface, grid), grid, path, resampling=resampling, driver=driver,
         creation_options=creation_options, memory=memory, threads=threads or os.cpu_count() or 1, progress=progress,
@@ -193,6 +194,13 @@ def _check(source: RasterSource, resampling: str, dem_interpolation: str, tolera
     if dem_interpolation not in ("bilinear", "cubic"):
         raise InputError(
             f"DEMs are not interpolated by {dem_interpolation!r}", field="dem-interpolation", remedy="bilinear or cubic"
+        )
+    if source.dtype.kind in "iu" and source.dtype.itemsize == 8 and resampling != "nearest":
+        raise InputError(
+            "integers of 64 bits are not interpolated without loss",
+            file=source.path,
+            field="resampling",
+            remedy="use --resampling nearest, or convert the pixels first (gdal_translate -ot Float64)",
         )
     if source.palette and resampling != "nearest":
         raise InputError(
@@ -252,6 +260,7 @@ class _Job:
         self.cubic_dem, self.window_bytes = cubic_dem, window_bytes
         self.profile = Profile.of(source)
         self.low, self.high, self.integer, self.fill = _range(source.dtype, self.profile)
+        self.any_band = self.profile.validity == "nodata" or not self.integer
         self._lock = threading.Lock()
         self.valid_pixels = 0
 
@@ -261,7 +270,7 @@ class _Job:
         """Compute one tile (top, left, height, width) and write it."""
         top, left, height, width = tile
         out = np.full((self.source.count, height, width), self.fill, dtype=self.source.dtype)
-        valid = np.zeros((height, width), dtype=bool)
+        valid = np.zeros(out.shape, dtype=bool)
         blocks = [
             Block(row, column)
             for row in range(top // BLOCK, -(-(top + height) // BLOCK))
@@ -269,13 +278,15 @@ class _Job:
         ]
         terrain = Terrain(self.surface, self.cubic_dem, self.window_bytes)
         seen = self.lattices.build(blocks, terrain)
-        for group, heights, origin in terrain.groups(seen):
-            self._warp(group, heights, origin, tile, out, valid)
+        for group, heights, origin, area in terrain.groups(seen):
+            self._warp(group, heights, origin, area, tile, out, valid)
         if self.profile.validity == "nodata":
             _keep_off_nodata(out, valid, self.fill, self.high)
+        # NaN says for itself which band has no value; an integer cannot, so there a pixel needs all of its bands.
+        mask = np.asarray((np.any if self.any_band else np.all)(valid, axis=0))
         with self._lock:
-            self.valid_pixels += int(np.count_nonzero(valid))
-        writer.write(left, top, out, valid)
+            self.valid_pixels += int(np.count_nonzero(mask))
+        writer.write(left, top, out, mask)
 
     # -- pixels ------------------------------------------------------------------------------------------------------
 
@@ -284,6 +295,7 @@ class _Job:
         blocks: list[Block],
         heights: Array,
         origin: tuple[int, int],
+        area: tuple[int, int, int, int],
         tile: tuple[int, int, int, int],
         out: NDArray[Any],
         valid: NDArray[np.bool_],
@@ -294,31 +306,32 @@ class _Job:
         if (right - left) * (bottom - top) * self.source.count * self.source.dtype.itemsize > self.window_bytes:
             for block in blocks:
                 if len(blocks) > 1:
-                    self._warp([block], heights, origin, tile, out, valid)
+                    self._warp([block], heights, origin, area, tile, out, valid)
                 else:
-                    self._warp_cells(block, heights, origin, tile, out, valid)
+                    self._warp_cells(block, heights, origin, area, tile, out, valid)
             return
         pixels = _Pixels(self.source, int(left), int(top), int(right), int(bottom))
         for block in blocks:
-            self._warp_block(block, pixels, heights, origin, (0, BLOCK, 0, BLOCK), tile, out, valid)
+            self._warp_block(block, pixels, heights, origin, area, tile, out, valid)
 
     def _warp_cells(
         self,
         block: Block,
         heights: Array,
         origin: tuple[int, int],
+        area: tuple[int, int, int, int],
         tile: tuple[int, int, int, int],
         out: NDArray[Any],
         valid: NDArray[np.bool_],
     ) -> None:
         """Make a block whose window of the source is too large for the memory, one cell of its lattice at a time."""
         step = block.spacing
-        for j in range(BLOCK // step):
-            for i in range(BLOCK // step):
+        for j in range(area[0] // step, area[1] // step):
+            for i in range(area[2] // step, area[3] // step):
                 window = self.lattices.source_window(block, slice(j, j + 2), slice(i, i + 2))
                 if window is not None:
-                    area = j * step, (j + 1) * step, i * step, (i + 1) * step
-                    self._warp_block(block, _Pixels(self.source, *window), heights, origin, area, tile, out, valid)
+                    cell = j * step, (j + 1) * step, i * step, (i + 1) * step
+                    self._warp_block(block, _Pixels(self.source, *window), heights, origin, cell, tile, out, valid)
 
     def _warp_block(
         self,
@@ -342,7 +355,7 @@ class _Job:
                 self.kernel, pixels.values, pixels.valid, pixels.masked, pixels.left, pixels.top,
                 self.source.width, self.source.height, block.spacing, block.nodes, block.dem_nodes, heights,
                 origin[0], origin[1], self.cubic_dem, block.middle, block.half, self.low, self.high, self.integer,
-                self.fill, np.array(area), out[:, rows, columns], valid[rows, columns], block.reach,
+                self.fill, np.array(area), out[:, rows, columns], valid[:, rows, columns], block.reach,
                 np.array(block.box),
             )  # fmt: skip
             if not short:
@@ -373,7 +386,8 @@ class _Pixels:
 
 def _range(dtype: np.dtype[Any], profile: Profile) -> tuple[float, float, bool, Any]:
     """Return lowest and highest value of the output type, whether it is an integer type, and the fill value."""
-    fill = dtype.type(0 if profile.nodata is None else profile.nodata)
+    empty = 0 if dtype.kind in "iu" else math.nan
+    fill = dtype.type(empty if profile.nodata is None else profile.nodata)
     if dtype.kind in "iu":
         limits = np.iinfo(dtype)
         return float(limits.min), float(limits.max), True, fill
@@ -384,8 +398,8 @@ def _keep_off_nodata(out: NDArray[Any], valid: NDArray[np.bool_], fill: Any, hig
     """Move valid pixels that happened to get the nodata value to the next value, as GDAL does."""
     if np.isnan(fill):
         return
-    for band in out:
-        clash = (band == fill) & valid
+    for band, good in zip(out, valid, strict=True):
+        clash = (band == fill) & good
         if clash.any():
             if band.dtype.kind in "iu":
                 band[clash] = fill + 1 if fill < high else fill - 1

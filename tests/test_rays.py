@@ -89,3 +89,16 @@ def test_the_surface_may_be_in_any_crs(tmp_path, model, surface):
     image = np.random.default_rng(2).uniform(100, 500, (MANY, 2))
     ground = intersect(model, image, Surface.open(path, "ellipsoid"))
     np.testing.assert_allclose(ground, model.image_to_ground(image, 512.5), atol=2e-8)
+
+
+@pytest.mark.parametrize("fill", ["nearest", 444.0])
+def test_a_fill_rule_goes_on_beyond_the_dem_for_many_points_too(model, surface, fill):
+    """Half of the points look past the DEM, which covers half of the image."""
+    path = str(Path(surface.provenance["path"]).with_name("half.tif"))
+    gdal.Translate(path, surface.provenance["path"], srcWin=[0, 0, 65, 130])
+    half = Surface.open(path, "ellipsoid", fill=fill)
+    image = np.random.default_rng(3).uniform(20, 580, (MANY, 2))
+    ground = intersect(model, image, half)
+    # The compiled inverse of many points and the one of few agree to rounding.
+    np.testing.assert_allclose(ground[:2000], intersect(model, image[:2000], half), atol=1e-9)
+    assert np.isfinite(ground).all()

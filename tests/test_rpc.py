@@ -209,7 +209,8 @@ def test_tagged_copy_keeps_pixels_nodata_mask_and_colours(tmp_path):
     assert tuple(copy.GetRasterBand(band).GetColorInterpretation() for band in (1, 2, 3)) == colours
     assert sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("b")) == ["b.tif"]
     write_tagged_copy(gdal.Open(str(make_image(tmp_path / "c.tif"))), make_rpc(), tmp_path / "d.tif")
-    assert gdal.Open(str(tmp_path / "d.tif")).GetRasterBand(2).GetNoDataValue() == 0
+    dataset = gdal.Open(str(tmp_path / "d.tif"))  # a band does not keep its dataset alive
+    assert dataset.GetRasterBand(2).GetNoDataValue() == 0
 
 
 def test_tagged_copy_refuses_a_side_car_that_would_win(tmp_path):
