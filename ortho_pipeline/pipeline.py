@@ -7,19 +7,20 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyproj
 
 from ortho_pipeline import compare as comparing
 from ortho_pipeline import crs as crs_module
-from ortho_pipeline import dem, footprint, gcp_export, inputs, plugins, raster, report, rpc, warp
+from ortho_pipeline import dem, footprint, gcp_export, inputs, plugins, raster, report, rpc
 from ortho_pipeline.crs import parse_crs
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import Fit
@@ -31,6 +32,9 @@ from ortho_pipeline.models import SensorModel, families
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.scene_fit import Adjusted, adjust, heights_around, heights_where_wanted, open_adjustable
 from ortho_pipeline.swaps import refuse_swapped
+
+if TYPE_CHECKING:
+    from ortho_pipeline import warp
 
 SCHEMA_VERSION = 1
 
@@ -264,6 +268,7 @@ def rectify(
         )
     opened = open_adjustable(image, scene, points)
     heights = open_surface(surface, scene.allow_network)
+    hashing = _beside(inputs.hash_inputs, image, scene, points, surface)
     adjusted = adjust(opened, points, scene, heights)
     opened, model, size = adjusted.scene, adjusted.model, (opened.width, opened.height)
     heights = footprint.facing(model, heights, *size)
@@ -272,12 +277,9 @@ def rectify(
     grid = footprint.choose_grid(model, heights, size, crs=crs, resolution=output.resolution, extent=output.extent)
     exported, complaints = _as_rpc(model)
     source = raster.RasterSource(image, allow_network=scene.allow_network)
-    with ThreadPoolExecutor(1) as pool:
-        hashing = pool.submit(inputs.hash_inputs, image, scene, points, surface)
-        warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
-        hashed = hashing.result()
+    warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
     record = inputs.provenance(
-        opened, points, heights, hashed, command, {"scene": scene, "surface": surface, "output": output}
+        opened, points, heights, hashing.result(), command, {"scene": scene, "surface": surface, "output": output}
     )  # fmt: skip
     _write_models(model, exported, opened, source, files, {**record, "adjustment": adjusted.fit.to_json()})
     document = report.build_report(
@@ -483,6 +485,20 @@ def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[str]]:
     return exported, list(exported.warnings)
 
 
+def _beside(work: Callable[..., Any], *given: Any) -> Future[Any]:
+    """Start `work` beside what follows; an error in the meantime does not wait for its end."""
+    future: Future[Any] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(work(*given))
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True, name="beside").start()
+    return future
+
+
 def _warp(
     model: SensorModel,
     exported: rpc.RpcExport | None,
@@ -493,6 +509,8 @@ def _warp(
     output: OutputOptions,
     progress: Callable[[float], None] | None,
 ) -> warp.WarpResult:
+    from ortho_pipeline import warp  # the compiled kernels take a while to load: beside the checksums
+
     common: dict[str, Any] = {
         "resampling": output.resampling,
         "memory": output.memory,

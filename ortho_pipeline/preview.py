@@ -50,7 +50,7 @@ def _png(pixels: NDArray[np.uint8]) -> bytes:
     lines = np.full((rows, 1 + columns * channels), 2, dtype=np.uint8)
     lines[:, 1:] = (pixels - before).reshape(rows, -1)
     header = struct.pack(">IIBBBBB", columns, rows, 8, 4 if channels == 2 else 6, 0, 0, 0)
-    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 6)), (b"IEND", b"")]
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 4)), (b"IEND", b"")]
     body = b"".join(
         struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
     )
