@@ -259,10 +259,6 @@ class FrameCamera(SensorModel):
             interior = replace(interior, **{name: values[name] for name in INTERIOR})
         return self._replace(interior=interior, exterior=exterior)
 
-    def with_free(self, *names: str) -> Self:
-        """Return the same camera with these parameters free."""
-        return self._replace(free=names)
-
     @property
     def _values(self) -> dict[str, float]:
         known = dict(zip(EXTERIOR, self.exterior.tolist(), strict=True))
