@@ -48,6 +48,15 @@ LOOKS = {
     "plus": Look(None, "control"),
     "minus": Look(None, "check"),
     "chosen": Look(None, "control", fill_opacity=0.1),
+    "series-0": Look("control", None, 1.9),
+    "series-1": Look("check", None, 1.9),
+    "series-2": Look("ink", None, 1.6, 0.75),
+    "series-3": Look("control", None, 1.9, dash="7 3"),
+    "series-4": Look("check", None, 1.9, dash="7 3"),
+    "series-5": Look("ink", None, 1.6, 0.75, dash="7 3"),
+    "series-6": Look("control", None, 1.9, dash="2 3"),
+    "series-7": Look("check", None, 1.9, dash="2 3"),
+    "series-8": Look("ink", None, 1.6, 0.75, dash="2 3"),
 }
 _FONT = 'system-ui,-apple-system,"Segoe UI",Roboto,sans-serif'
 
@@ -254,3 +263,55 @@ def _rgba(name: str | None, opacity: float) -> Any:
         return "none"
     code = _COLOURS[name]
     return (*(int(code[k : k + 2], 16) / 255 for k in (1, 3, 5)), opacity)
+
+
+# -- axes --------------------------------------------------------------------------------------------------------------
+
+
+class Axes:
+    """A frame (x, y, width, height) in a drawing, and the values that its sides stand for."""
+
+    def __init__(
+        self, drawing: Drawing, frame: tuple[float, ...], x: tuple[float, float], y: tuple[float, float]
+    ) -> None:
+        self.drawing, self.frame, self.x, self.y = drawing, frame, x, y
+
+    def at(self, x: float, y: float) -> tuple[float, float]:
+        left, top, wide, tall = self.frame
+        return (
+            left + wide * (x - self.x[0]) / (self.x[1] - self.x[0]),
+            top + tall * (self.y[1] - y) / (self.y[1] - self.y[0]),
+        )
+
+    def draw(self, x_name: str, y_name: str) -> None:
+        """Draw frame, grid and numbers."""
+        left, top, wide, tall = self.frame
+        for value in ticks(*self.x):
+            x, _ = self.at(value, self.y[0])
+            self.drawing.line("guide" if value == 0 else "grid", x, top, x, top + tall)
+            self.drawing.text(x, top + tall + 16, number(value), anchor="middle", quiet=True)
+        for value in ticks(*self.y):
+            _, y = self.at(self.x[0], value)
+            self.drawing.line("guide" if value == 0 else "grid", left, y, left + wide, y)
+            self.drawing.text(left - 6, y + 4, number(value), anchor="end", quiet=True)
+        self.drawing.rect("frame", left, top, wide, tall)
+        self.drawing.text(left + wide / 2, top + tall + 36, x_name, anchor="middle")
+        self.drawing.text(13, top + tall / 2, y_name, anchor="middle", turn=True)
+
+
+def ticks(low: float, high: float, about: int = 5) -> list[float]:
+    """Return round numbers between two values, some `about` of them."""
+    step = round_down((high - low) / about * 1.6)
+    first = math.ceil(low / step - 1e-9)
+    return [round(k * step, 12) for k in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def number(value: float) -> str:
+    """Return a tick as people write it."""
+    return f"{value:g}".replace("-", "−")
+
+
+def round_down(value: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not above a positive value."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return float(f"{max(step * power for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)):.6g}")

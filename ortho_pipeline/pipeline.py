@@ -357,68 +357,6 @@ def write_plots(report_file: str | os.PathLike[str], folder: str | os.PathLike[s
     return Result(files, {}, f"{len(files)} plots of {document['scene']['name']}")
 
 
-def simulate_bilsat(
-    folder: str | os.PathLike[str],
-    *,
-    seed: int = 0,
-    off_nadir_deg: float | None = None,
-    size: int | None = None,
-    all_cameras: bool = False,
-) -> Result:
-    """Write a simulated BILSAT-1 scene: image, imaging survey, DEM, 44 points, truth.
-
-    Parameters
-    ----------
-    off_nadir_deg, size : optional
-        Tilt, and columns and rows; those of the paper's reproduction and of the real camera without them.
-    all_cameras : bool
-        Take the image with each of the four XS cameras.
-
-    Raises
-    ------
-    InputError
-        If such a scene is not possible, or the folder cannot be written.
-    """
-    from ortho_bilsat.simulation import write_product
-
-    from ortho_pipeline.experiments.bilsat_scene import OFF_NADIR_DEG, SIZE, XS_CAMERAS
-
-    files = write_product(
-        folder, seed=seed, off_nadir_deg=OFF_NADIR_DEG if off_nadir_deg is None else off_nadir_deg,
-        size=size or SIZE, cameras=tuple(XS_CAMERAS) if all_cameras else ("red",),
-    )  # fmt: skip
-    return Result(files, {}, f"A simulated BILSAT-1 scene (seed {seed}); try\n  ortho rectify {files['image']} "
-                  f"--gcps {files['gcps']} --dem {files['dem']} --correction model -o out")  # fmt: skip
-
-
-def reproduce_bilsat(
-    folder: str | os.PathLike[str] | None = None,
-    *,
-    realisations: int = 100,
-    progress: Callable[[float], None] | None = None,
-) -> Result:
-    """Compute the tables of the BILSAT-1 paper on a simulated scene, beside the paper's numbers.
-
-    Parameters
-    ----------
-    folder : path, optional
-        Where ``bilsat.json`` and the page ``bilsat.html`` go.
-
-    Returns
-    -------
-    Result
-        `document` has paper, settings, summary and tables (docs/formats.md).
-    """
-    from ortho_pipeline.experiments import bilsat, bilsat_page
-
-    document = bilsat.reproduce(realisations, progress=progress)
-    files = {} if folder is None else {name: Path(folder) / f"bilsat.{name}" for name in ("json", "html")}
-    if files:
-        write_text(files["json"], json.dumps(document, indent=1, allow_nan=False) + "\n")
-        write_text(files["html"], bilsat_page.page(document, *bilsat.error_vectors()))
-    return Result(files, document, bilsat_page.text(document))
-
-
 def doctor() -> dict[str, Any]:
     """Return versions of GDAL, PROJ and the compiled parts, geoid grids, and plugins with their distributions."""
     host = plugins.Host.discover()

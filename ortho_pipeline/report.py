@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.crs import Vertical, ground_transform
-from ortho_pipeline.drawing import style_sheet
+from ortho_pipeline.drawing import round_down, style_sheet
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.estimation import Fit, root_mean_square
 from ortho_pipeline.files import whole_or_nothing, write_text
 from ortho_pipeline.ground_error import along_view, in_metres, metre_partials, rmse_metres
 from ortho_pipeline.preview import preview_png
-from ortho_pipeline.report_plots import plots, round_down
+from ortho_pipeline.report_plots import plots
 from ortho_pipeline.report_text import fixed, flat, headline, metres, plain_size, px, share, short, signed, summary_text
 
 if TYPE_CHECKING:

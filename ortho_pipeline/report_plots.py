@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.drawing import Drawing
+from ortho_pipeline.drawing import Axes, Drawing, number, round_down
 
 #: Drawing area of the plot of vectors in CSS pixels, and the space around it.
 _PLOT_WIDTH, _PLOT_HEIGHT, _PAD = 452.0, 460.0, 19.0
@@ -139,7 +139,7 @@ def plot_directions(report: Mapping[str, Any]) -> Drawing | None:
     reach = 1.12 * max(max(abs(value) for value in p["view_residual"]) for p in kept) or 1.0
     inside = [p for p in points if max(abs(value) for value in p["view_residual"]) <= reach]
     drawing = Drawing(420, 420, "Residuals along and across the direction of view", "directions")
-    axes = _Axes(drawing, (52.0, 14.0, 354.0, 316.0), (-reach, reach), (-reach, reach))
+    axes = Axes(drawing, (52.0, 14.0, 354.0, 316.0), (-reach, reach), (-reach, reach))
     axes.draw("along the direction of view, px", "across, px")
     for point in inside:
         with drawing.titled(_title(point)):
@@ -162,62 +162,13 @@ def plot_heights(report: Mapping[str, Any]) -> Drawing | None:
     low, high = min(heights) - margin, max(heights) + margin
     inside = [p for p in points if (kind_of(p) != "out" or (abs(value(p)) <= reach and low <= p["height_m"] <= high))]
     drawing = Drawing(420, 420, "Residuals against the height of the points", "heights")
-    axes = _Axes(drawing, (52.0, 14.0, 354.0, 316.0), (low, high), (-reach, reach))
+    axes = Axes(drawing, (52.0, 14.0, 354.0, 316.0), (low, high), (-reach, reach))
     axes.draw("height above the ellipsoid, m", "along the view, px" if viewed else "row, px")
     for point in inside:
         with drawing.titled(f"{_title(point)}\nheight {point['height_m']:.1f} m"):
             drawing.mark(kind_of(point), *axes.at(point["height_m"], value(point)))
     _legend(drawing, inside, 406)
     return drawing
-
-
-class _Axes:
-    """A frame (x, y, width, height) in a drawing, and the values that its sides stand for."""
-
-    def __init__(
-        self, drawing: Drawing, frame: tuple[float, ...], x: tuple[float, float], y: tuple[float, float]
-    ) -> None:
-        self.drawing, self.frame, self.x, self.y = drawing, frame, x, y
-
-    def at(self, x: float, y: float) -> tuple[float, float]:
-        left, top, wide, tall = self.frame
-        return (
-            left + wide * (x - self.x[0]) / (self.x[1] - self.x[0]),
-            top + tall * (self.y[1] - y) / (self.y[1] - self.y[0]),
-        )
-
-    def draw(self, x_name: str, y_name: str) -> None:
-        """Draw frame, grid and numbers."""
-        left, top, wide, tall = self.frame
-        for value in ticks(*self.x):
-            x, _ = self.at(value, self.y[0])
-            self.drawing.line("guide" if value == 0 else "grid", x, top, x, top + tall)
-            self.drawing.text(x, top + tall + 16, number(value), anchor="middle", quiet=True)
-        for value in ticks(*self.y):
-            _, y = self.at(self.x[0], value)
-            self.drawing.line("guide" if value == 0 else "grid", left, y, left + wide, y)
-            self.drawing.text(left - 6, y + 4, number(value), anchor="end", quiet=True)
-        self.drawing.rect("frame", left, top, wide, tall)
-        self.drawing.text(left + wide / 2, top + tall + 36, x_name, anchor="middle")
-        self.drawing.text(13, top + tall / 2, y_name, anchor="middle", turn=True)
-
-
-def ticks(low: float, high: float, about: int = 5) -> list[float]:
-    """Return round numbers between two values, some `about` of them."""
-    step = round_down((high - low) / about * 1.6)
-    first = math.ceil(low / step - 1e-9)
-    return [round(k * step, 12) for k in range(first, math.floor(high / step + 1e-9) + 1)]
-
-
-def number(value: float) -> str:
-    """Return a tick as people write it."""
-    return f"{value:g}".replace("-", "−")
-
-
-def round_down(value: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is not above a positive value."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return float(f"{max(step * power for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)):.6g}")
 
 
 # -- correlations ----------------------------------------------------------------------------------------------------

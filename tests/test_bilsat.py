@@ -15,7 +15,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.estimation import fit
-from ortho_pipeline.experiments.bilsat import error_vectors, reproduce, within_factor
+from ortho_pipeline.experiments.bilsat import error_vectors, reproduce
 from ortho_pipeline.experiments.bilsat_scene import (
     FOCAL_LENGTH,
     MAP_CRS,
@@ -27,6 +27,7 @@ from ortho_pipeline.experiments.bilsat_scene import (
     Snapshot,
     render,
 )
+from ortho_pipeline.experiments.tables import within_factor
 from ortho_pipeline.geometry import geocentric, geodetic
 from ortho_pipeline.models.frame import FrameCamera
 from ortho_pipeline.models.lens import Interior

@@ -19,9 +19,11 @@ from ortho_pipeline.crs import parse_crs
 from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import fit
-from ortho_pipeline.experiments.bilsat import ROWS, is_within, reproduce
-from ortho_pipeline.experiments.bilsat_page import page, text
+from ortho_pipeline.experiments.bilsat import ROWS, reproduce
+from ortho_pipeline.experiments.bilsat_page import page
 from ortho_pipeline.experiments.bilsat_scene import FOCAL_LENGTH, PITCH, SIZE
+from ortho_pipeline.experiments.page import text
+from ortho_pipeline.experiments.tables import is_within
 from ortho_pipeline.geometry import geocentric
 from ortho_pipeline.models.frame import FrameCamera
 from ortho_pipeline.models.lens import Interior

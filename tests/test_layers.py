@@ -22,20 +22,22 @@ problem
 ridge
 blunders
 registration estimation hookspecs swaps model_file kernels ray_kernel landscape rpc_files
-model_choice selection ground_error drawing report_text
-compare report_plots
+model_choice selection ground_error drawing report_text covariance
+compare report_plots adjustment
 raster
-rpc dem preview
+rpc dem preview edge
 plugins testing rays gdal_engine
 footprint lattice simulate inputs
-gcp_export scene_fit warp
-report experiments
+gcp_export scene_fit warp mosaic
+report experiments stac
 pipeline
+studies blocks batch
 cli_options cli_text
+cli_studies cli_blocks cli_batch
 cli
 """
 LINE = {name: number for number, line in enumerate(LAYERS.split("\n")) for name in line.split()}
-GDAL_MODULES = {"rpc", "raster", "gdal_engine", "dem", "plugins", "gcp_export"}
+GDAL_MODULES = {"rpc", "raster", "gdal_engine", "dem", "plugins", "gcp_export", "mosaic"}
 NUMBA_MODULES = {"kernels", "ray_kernel", "models"}
 MAX_LINES, MAX_FUNCTION = 600, 50
 
@@ -100,11 +102,12 @@ def test_the_package_itself_imports_nothing_of_its_own() -> None:
 
 
 def test_the_command_line_defers_heavy_imports() -> None:
-    light = {f"ortho_pipeline.{name}" for name in ("errors", "options", "cli_options", "cli_text")}
-    tree = parse(PACKAGE / "cli.py")
-    for imported, at_top in imports(tree):
-        if at_top and imported.startswith("ortho_pipeline"):
-            assert imported in light
+    names = ("errors", "options", "cli_options", "cli_text", "cli_studies", "cli_blocks", "cli_batch")
+    light = {f"ortho_pipeline.{name}" for name in names}
+    for path in PACKAGE.glob("cli*.py"):
+        for imported, at_top in imports(parse(path)):
+            if at_top and imported.startswith("ortho_pipeline"):
+                assert imported in light
 
 
 @pytest.mark.parametrize("path", FILES + PLUGIN_FILES, ids=lambda path: str(path.relative_to(ROOT)))
