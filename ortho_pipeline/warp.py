@@ -175,6 +175,11 @@ def _heights_under(surface: Surface, grid: Grid) -> tuple[Array, tuple[float, ..
     columns, rows = np.meshgrid(np.linspace(0, grid.width, 65), np.linspace(0, grid.height, 65))
     x, y = grid.xy(columns.ravel(), rows.ravel())
     plan = GroundTransform(grid.crs, surface.crs)(np.stack([x, y, np.zeros(x.size)], axis=1))
+    if surface.crs.is_geographic and np.ptp(plan[:, 0]) > 180:
+        raise InputError(
+            "GDAL's warper loses the pixels on one side of the antimeridian with a DEM in longitude and latitude",
+            field="--engine", remedy="take our own engine (--engine ortho), or a DEM in a projected CRS",
+        )  # fmt: skip
     samples = surface.samples_at(plan[:, :2])
     low = np.floor(np.nanmin(samples, axis=0)).astype(int) - 3
     size = np.ceil(np.nanmax(samples, axis=0)).astype(int) + 4 - low

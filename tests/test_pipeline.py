@@ -398,26 +398,53 @@ def test_a_void_between_the_rays_is_reported_with_its_share(tiny, tmp_path):
     assert any("were filled" in text for text in filled["warnings"])
 
 
-@pytest.mark.parametrize("lon", [179.995, -179.995])
-def test_a_scene_at_the_antimeridian_with_a_global_dem(tiny, tmp_path, lon):
+def moved(tiny, tmp_path, lon):
+    """Return the tiny scene at another longitude."""
     image = tmp_path / "far.tif"
     gdal.Translate(str(image), str(tiny.image))
     dataset = gdal.Open(str(image), gdal.GA_Update)
     dataset.SetMetadata(rpc_metadata(tiny.model._replace(lon_off=lon)), "RPC")
     dataset = None
+    return image
+
+
+def global_dem(tmp_path, west, rise=0.0):
+    """Return the surface of a DEM of the whole Earth, 500 m high and rising with the latitude."""
     world = tmp_path / "world.tif"
     dem = gdal.GetDriverByName("GTiff").Create(str(world), 720, 360, 1, gdal.GDT_Float32)
-    dem.SetGeoTransform((-180, 0.5, 0, 90, 0, -0.5))
+    dem.SetGeoTransform((west, 0.5, 0, 90, 0, -0.5))
     dem.SetProjection("EPSG:4326")
-    dem.GetRasterBand(1).Fill(500.0)
+    dem.WriteArray(np.tile(500.0 + rise * np.arange(360)[:, None], 720))
     dem = None
-    surface = SurfaceOptions(dem=world, vertical="ellipsoid")
+    return SurfaceOptions(dem=world, vertical="ellipsoid")
+
+
+@pytest.mark.parametrize("lon", [179.995, -179.995])
+def test_a_scene_at_the_antimeridian_with_a_global_dem(tiny, tmp_path, lon):
+    image, surface = moved(tiny, tmp_path, lon), global_dem(tmp_path, -180)
     result = pipeline.rectify(image, tmp_path / "out", surface=surface)
     assert result.document["report"]["surface"]["coverage"] == 1.0
     flat = pipeline.rectify(image, tmp_path / "flat", surface=SurfaceOptions(height=500.0))
     one, other = (gdal.Open(str(made.files["ortho"])) for made in (result, flat))
     assert one.GetGeoTransform() == other.GetGeoTransform()
     np.testing.assert_array_equal(one.ReadAsArray(), other.ReadAsArray())
+    # GDAL itself would lose one side without a word.
+    with pytest.raises(InputError, match="antimeridian"):
+        pipeline.rectify(image, tmp_path / "gdal", surface=surface, output=OutputOptions(engine="gdal"))
+
+
+def test_gdal_s_engine_over_the_seam_of_a_global_dem(tiny, tmp_path):
+    image, surface = moved(tiny, tmp_path, 0.0), global_dem(tmp_path, 0, rise=3.0)
+    pixels = {}
+    for engine in ("ortho", "gdal"):
+        result = pipeline.rectify(image, tmp_path / engine, surface=surface, output=OutputOptions(engine=engine))
+        made = gdal.Open(str(result.files["ortho"]))
+        pixels[engine] = made.ReadAsArray().astype(float)
+    assert (pixels["ortho"] > 0).mean() > 0.7
+    np.testing.assert_array_equal(pixels["ortho"] > 0, pixels["gdal"] > 0)
+    assert np.abs(pixels["ortho"] - pixels["gdal"]).max() <= 3
+    # The heights that were handed to GDAL in its own memory are gone.
+    assert not [name for name in gdal.ReadDir("/vsimem/") or () if "ortho_dem" in name]
 
 
 def test_provenance_has_the_checksum_of_every_input_and_the_command(tiny, tmp_path):
