@@ -238,6 +238,8 @@ class Host:
         for plugin, offered in self._returned("ortho_sensors"):
             for sensor in offered:
                 _check_sensor_type(plugin, sensor)
+                if sensor.name in sensors and self._owner[sensor.name] == plugin:
+                    raise PluginError(f"plugin {plugin} offers two sensors {sensor.name!r}")
                 self._claim(plugin, sensor.name)
                 sensors[sensor.name] = sensor
         return dict(sorted(sensors.items()))
@@ -261,7 +263,8 @@ class Host:
                 f"plugin {plugin} offers {name!r}, but that name belongs to {BUNDLED}",
                 remedy="uninstall that plugin, or ask its author for another name",
             )
-        if name in self._owner:
+        # A sensor and a model family of one plugin may share a name.
+        if self._owner.get(name, plugin) != plugin:
             raise PluginError(
                 f"two plugins offer {name!r}: {self._owner[name]} and {plugin}", remedy="uninstall one of the two"
             )

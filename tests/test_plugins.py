@@ -126,7 +126,7 @@ def test_name_of_a_broken_bundled_plugin_stays_reserved(install):
 def test_two_sensors_of_one_name_are_an_error():
     with pytest.raises(PluginError, match="two plugins offer 'alpha': one and two"):
         Host([make_plugin(make_sensor(), name="one"), make_plugin(make_sensor(), name="two")])
-    with pytest.raises(PluginError, match="two plugins offer 'alpha'"):
+    with pytest.raises(PluginError, match="plugin offers two sensors 'alpha'"):
         Host([make_plugin(make_sensor(), make_sensor())])
 
 

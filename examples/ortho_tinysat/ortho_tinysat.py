@@ -1,0 +1,95 @@
+"""Sensor plugin for TinySat-1: an image `scene.tif` with its flight in `scene.tinysat.json` beside it."""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geometry import geocentric
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.models import SensorModel
+from ortho_pipeline.problem import Prior
+
+
+@dataclass(frozen=True, eq=False)
+class StraightScanner(SensorModel):
+    """A line scanner that flies straight on: one row every `line_period`, one column every `pixel_angle`."""
+
+    kind: ClassVar[str] = "tinysat"
+
+    position: tuple[float, float, float]  # ECEF metres, when the middle row is taken
+    velocity: tuple[float, float, float]  # ECEF metres per second
+    size: tuple[int, int]  # columns, rows
+    pixel_angle: float  # radians
+    line_period: float  # seconds
+    box: tuple[tuple[float, float], ...]  # lowest and highest longitude, latitude (degrees), ellipsoidal height (m)
+    roll: float = 0.0  # radians, positive to the right of the flight
+    delay: float = 0.0  # seconds by which the clock is late
+
+    @property
+    def crs(self) -> str:
+        return "EPSG:4979"  # longitude, latitude, ellipsoidal height on WGS84
+
+    @property
+    def domain(self) -> tuple[np.ndarray, np.ndarray]:
+        low, high = np.array(self.box).T
+        return (low + high) / 2, (high - low) / 2
+
+    def ground_to_image(self, ground) -> np.ndarray:
+        position, velocity = np.array(self.position), np.array(self.velocity)
+        speed = np.linalg.norm(velocity)
+        forward = velocity / speed
+        down = -position + position @ forward * forward
+        down /= np.linalg.norm(down)
+        look = geocentric(np.asarray(ground, dtype=float)) - position
+        angle = np.arctan2(look @ np.cross(down, forward), look @ down) - self.roll
+        time = look @ forward / speed + self.delay
+        columns, rows = self.size
+        return np.stack([columns / 2 + angle / self.pixel_angle, rows / 2 + time / self.line_period], axis=1)
+
+    @property
+    def param_names(self) -> tuple[str, ...]:
+        return ("roll", "delay")
+
+    @property
+    def params(self) -> np.ndarray:
+        return np.array([self.roll, self.delay])
+
+    def with_params(self, params) -> "StraightScanner":
+        roll, delay = (float(value) for value in params)
+        return replace(self, roll=roll, delay=delay)
+
+
+@hookimpl
+def ortho_models() -> Mapping[str, type[SensorModel]]:
+    return {StraightScanner.kind: StraightScanner}
+
+
+@hookimpl
+def ortho_sensors() -> Iterable[Sensor]:
+    yield Sensor("tinysat", "TinySat-1 level 1A scenes", recognises, open_scene, {"roll": "mounting angle, degrees"})
+
+
+def recognises(dataset: Any) -> bool:
+    return flight_file(dataset).is_file()
+
+
+def flight_file(dataset: Any) -> Path:
+    return Path(dataset.GetDescription()).with_suffix(".tinysat.json")
+
+
+def open_scene(dataset: Any, *, roll: str = "0") -> Scene:
+    path, size = flight_file(dataset), (dataset.RasterXSize, dataset.RasterYSize)
+    try:
+        flight = json.loads(path.read_text())
+        model = StraightScanner(size=size, roll=np.radians(float(roll)), **flight["camera"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"not a TinySat-1 flight: {error}", file=path, remedy="ask for the delivery again") from error
+    known = {"roll": Prior(model.roll, np.radians(0.05)), "delay": Prior(0.0, 0.1)}
+    facts = {"acquired": flight.get("acquired", "unknown")}
+    return Scene("tinysat", path.with_name(Path(dataset.GetDescription()).name), *size, {"tinysat": model},
+                 str(path), facts=facts, priors=known)  # fmt: skip

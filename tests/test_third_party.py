@@ -1,0 +1,103 @@
+"""A sensor of somebody else: built, installed beside the host in a fresh environment, used from the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline import hookspecs
+
+ROOT = Path(__file__).resolve().parent.parent
+EXAMPLE = ROOT / "examples" / "ortho_tinysat"
+TUTORIAL = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
+
+
+def run(*command, **options) -> str:
+    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False, **options)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def fresh(tmp_path_factory):
+    """Return the folder of the programs of a new environment that has host and plugin, both from wheels."""
+    folder = tmp_path_factory.mktemp("fresh")
+    wheels, home = folder / "wheels", folder / "venv"
+    run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", wheels, ROOT, EXAMPLE)
+    run(sys.executable, "-m", "venv", "--without-pip", home)
+    python = home / "bin" / "python"
+    run(sys.executable, "-m", "pip", "--python", python, "install", "-q", "--no-deps", "--no-index",
+        *wheels.glob("*.whl"))  # fmt: skip
+    # Everything that host and plugin need is taken from where the tests run; they themselves are not.
+    site = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").strip()
+    Path(site, "needs.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
+    where = run(python, "-c", "import ortho_pipeline, ortho_tinysat as t; print(ortho_pipeline.__file__, t.__file__)",
+                cwd=folder)  # fmt: skip
+    assert all(Path(path).is_relative_to(home) for path in where.split())
+    return home / "bin"
+
+
+@pytest.fixture
+def tinysat(tmp_path):
+    """Return an image with the flight that the tutorial prints."""
+    image = tmp_path / "scene.tif"
+    dataset = gdal.GetDriverByName("GTiff").Create(str(image), 120, 90)
+    dataset.GetRasterBand(1).Fill(100)
+    dataset = None
+    (flight,) = re.findall(r"```json\n(.*?)```", TUTORIAL, re.DOTALL)
+    (tmp_path / "scene.tinysat.json").write_text(flight, encoding="utf-8")
+    return image
+
+
+def test_the_plugin_is_not_there_unless_it_is_installed():
+    assert subprocess.run([sys.executable, "-c", "import ortho_tinysat"], check=False, capture_output=True).returncode
+
+
+def test_its_own_tests_pass(fresh, tmp_path):
+    run(fresh / "python", "-m", "pytest", "-q", "-p", "no:cacheprovider", EXAMPLE / "tests", cwd=tmp_path)
+
+
+def test_the_command_line_has_the_sensor(fresh, tinysat):
+    listed = json.loads(run(fresh / "ortho", "sensors", "--json"))["sensors"]
+    (sensor,) = [sensor for sensor in listed if sensor["name"] == "tinysat"]
+    assert sensor["distribution"] == "ortho-tinysat"
+    found = json.loads(run(fresh / "ortho", "info", tinysat, "--json"))
+    assert found["sensor"] == "tinysat"
+    assert found["gsd_m"] == pytest.approx(10, rel=0.01)
+    # Compiled parts are compiled once more for an environment of its own: only one kernel is wanted.
+    out = tinysat.parent / "out"
+    made = json.loads(run(fresh / "ortho", "rectify", tinysat, "--height", "0", "-r", "nearest", "-o", out, "--json"))
+    ortho = gdal.Open(made["files"]["ortho"])
+    assert (ortho.ReadAsArray() == 100).sum() == pytest.approx(120 * 90, rel=0.02)
+
+
+# -- the tutorial ----------------------------------------------------------------------------------------------------
+
+
+def test_the_tutorial_is_the_example():
+    blocks = re.findall(r"<!-- (\S+) -->\n```\w+\n(.*?)```", TUTORIAL, re.DOTALL)
+    for name in ("pyproject.toml", "ortho_tinysat.py"):
+        parts = [text.strip("\n") for file, text in blocks if file == name]
+        assert "\n\n\n".join(parts) + "\n" == (EXAMPLE / name).read_text(encoding="utf-8"), name
+
+
+def test_everything_that_an_author_can_use_is_in_the_tutorial():
+    hooks = [name for name, value in vars(hookspecs).items() if hasattr(value, "ortho_pipeline_spec")]
+    assert len(hooks) == 2
+    fields = [field.name for kind in (hookspecs.Sensor, hookspecs.Scene) for field in dataclasses.fields(kind)]
+    for name in hooks + fields:
+        assert f"`{name}`" in TUTORIAL, f"{name} is not explained in docs/plugins.md"
+
+
+def test_the_example_stays_small():
+    assert len((EXAMPLE / "ortho_tinysat.py").read_text(encoding="utf-8").splitlines()) < 100
+    assert not os.access(EXAMPLE / "__init__.py", os.F_OK)
