@@ -16,7 +16,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import pyproj
 
-from ortho_pipeline.compare import compare
+from ortho_pipeline.comparison import compare
 from ortho_pipeline.estimation import fit
 from ortho_pipeline.experiments.bilsat_scene import FOCAL_LENGTH, MAP_CRS, PITCH, SIZE, BilsatScene
 from ortho_pipeline.model_choice import fit_family

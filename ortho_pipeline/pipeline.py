@@ -18,13 +18,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyproj
 
-from ortho_pipeline import compare as comparing
+from ortho_pipeline import comparison as comparing
 from ortho_pipeline import crs as crs_module
 from ortho_pipeline import dem, footprint, gcp_export, inputs, plugins, raster, report, rpc
 from ortho_pipeline.crs import parse_crs
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import Fit
 from ortho_pipeline.files import write_text
+from ortho_pipeline.ground_error import viewing
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.inputs import has_surface, open_scene, open_surface
 from ortho_pipeline.model_file import SavedModel, write_model_file
@@ -136,6 +137,7 @@ def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) 
         "reference_height": model.reference_height,
         "utm": crs_text(crs),
         "gsd_m": footprint.ground_sample_distance(model, crs, *size),
+        "view": viewing(model, *size)["view"],
         "corners_lon_lat": [[_number(value) for value in row] for row in ground[:, :2]],
         "facts": dict(scene.facts),
         "warnings": list(scene.warnings),
@@ -241,10 +243,12 @@ def rectify(
     output: OutputOptions = OutputOptions(),
     progress: Callable[[float], None] | None = None,
     command: str | None = None,
+    hashed: list[dict[str, Any]] | None = None,
 ) -> Result:
     """Make the orthoimage of a scene, its adjusted model in every format, and the accuracy report.
 
-    Nothing is written before all that can be checked is checked.
+    Nothing is written before all that can be checked is checked. `hashed` are the checksums of the inputs
+    (`inputs.hash_inputs`), where they were taken already.
 
     Returns
     -------
@@ -268,7 +272,7 @@ def rectify(
         )
     opened = open_adjustable(image, scene, points)
     heights = open_surface(surface, scene.allow_network)
-    hashing = _beside(inputs.hash_inputs, image, scene, points, surface)
+    hashing = _beside(lambda: hashed if hashed is not None else inputs.hash_inputs(image, scene, points, surface))
     adjusted = adjust(opened, points, scene, heights)
     opened, model, size = adjusted.scene, adjusted.model, (opened.width, opened.height)
     heights = footprint.facing(model, heights, *size)

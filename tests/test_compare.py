@@ -12,7 +12,7 @@ from osgeo import gdal
 
 from ortho_pipeline import pipeline
 from ortho_pipeline.cli import cli
-from ortho_pipeline.compare import Row, available_models, compare, recommend
+from ortho_pipeline.comparison import Row, available_models, compare, recommend
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.landscape import Terrain
 from ortho_pipeline.models import families
