@@ -4,6 +4,7 @@
 #   make test     set up, run all tests
 #   make check    formatting, lint, types, tests
 #   make bench    speed and memory against gdalwarp, speed of adjustments
+#   make docs     the documentation as a site in out/site, links checked
 #   make images   draw the pictures of README.md again
 #   make clean    remove .venv, caches and out/
 #
@@ -23,7 +24,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check bench images clean
+.PHONY: help setup demo test check bench docs images clean
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
@@ -54,6 +55,10 @@ check: setup
 bench: setup
 	@$(BIN)/python benchmarks/warp.py
 	$(BIN)/python benchmarks/fit.py
+
+docs: setup
+	@$(BIN)/mkdocs build --strict --quiet
+	echo "Site:    $(CURDIR)/out/site/index.html"
 
 images: setup
 	@$(BIN)/python docs/make_images.py

@@ -11,7 +11,7 @@ import io
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 DEFAULT_SIGMA_IMAGE = 0.5
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Points:
     """Points that were measured in an image and on the ground.
 
@@ -92,6 +92,10 @@ class Points:
         if len(set(self.ids)) != count:
             twice = sorted({name for name in self.ids if self.ids.count(name) > 1})
             raise InputError(f"the id {twice[0]!r} stands twice", file=self.source or None, field="id")
+
+    def __repr__(self) -> str:
+        roles = ", ".join(f"{(self.roles == role).sum()} {role}" for role in ROLES if (self.roles == role).any())
+        return f"<{len(self.ids)} points: {roles or 'none'}; {self.crs.name}; {self.source}>"
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -158,6 +162,7 @@ def read_points(
     vertical: str | Vertical | None = None,
     pixel_origin: str = "corner",
     image_name: str | None = None,
+    pieces: Mapping[str, tuple[float, float]] | None = None,
 ) -> Points:
     """Read points of any known format (see `ortho_pipeline.point_files`).
 
@@ -169,6 +174,8 @@ def read_points(
         Where (0, 0) is in the first pixel, for CSV and ODM files; the others have a convention of their own.
     image_name : str, optional
         Keep the points of this image, where a file holds points of several.
+    pieces : mapping of str to (float, float), optional
+        Further images whose points are kept, with the column and row of their first corner in this image.
 
     Raises
     ------
@@ -177,7 +184,7 @@ def read_points(
     """
     if pixel_origin not in ("corner", "center"):
         raise InputError(f"{pixel_origin!r} is not a pixel origin", field="--pixel-origin", remedy="corner or center")
-    table = read_table(path, image_name)
+    table = read_table(path, image_name, pieces)
     ids = _ids(path, table.rows)
     image = np.array([row.image for row in table.rows])
     if pixel_origin == "center" and table.centre_origin_allowed:

@@ -1,0 +1,58 @@
+"""How results look in a notebook: plain HTML that takes the notebook's own colours."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+#: In a notebook, pages of reports are this high (CSS pixels).
+_PAGE_HEIGHT = 640
+
+
+def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table with a title; the first column is text, the others are numbers."""
+
+    def line(kind: str, texts: Sequence[str]) -> str:
+        sides = ["left"] + ["right;font-variant-numeric:tabular-nums"] * (len(texts) - 1)
+        cells = (
+            f'<{kind} style="text-align:{side}">{escape(text)}</{kind}>'
+            for side, text in zip(sides, texts, strict=True)
+        )
+        return f"<tr>{''.join(cells)}</tr>"
+
+    body = "".join(line("td", row) for row in rows)
+    return f"<p><b>{escape(title)}</b></p><table><thead>{line('th', head)}</thead><tbody>{body}</tbody></table>"
+
+
+def fit_html(document: Mapping[str, Any]) -> str:
+    """Return the document of a fit (`Fit.to_json`) as HTML: RMSE, parameters, warnings, and what was left out."""
+    names = {"control": "control points", "check": "check points", "loo": "control points, each left out in turn"}
+    rmse = [
+        (names[role], str(found["n"]), *(f"{found[key]:.3f}" for key in ("col", "row", "total")))
+        for role, found in document["rmse"].items()
+        if role in names and found
+    ]
+    parts = [table(f"{document['model']}: RMSE, pixels", ("", "points", "column", "row", "both"), rmse)]
+    values = [(name, f"{one['value']:.6g}", f"{one['sigma']:.2g}") for name, one in document["parameters"].items()]
+    if values:
+        parts.append(table("Parameters", ("", "value", "sigma"), values))
+    said = [f"left out: point {one['id']} ({one['reason']})" for one in document["rejected"]] + document["warnings"]
+    if said:
+        parts.append("<ul>" + "".join(f"<li>{escape(text)}</li>" for text in said) + "</ul>")
+    return "".join(parts)
+
+
+def page_html(page: str) -> str:
+    """Return a page of its own (a report) as a frame in the notebook."""
+    encoded = base64.b64encode(page.encode()).decode()
+    return (
+        f'<iframe src="data:text/html;base64,{encoded}" style="width:100%;height:{_PAGE_HEIGHT}px;border:0" '
+        'sandbox="allow-scripts" title="Report"></iframe>'
+    )
+
+
+def text_html(text: str) -> str:
+    """Return plain text as HTML that keeps its lines."""
+    return f"<pre>{escape(text)}</pre>"

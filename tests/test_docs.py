@@ -1,0 +1,63 @@
+"""What the documentation says is run: Python as doctests, commands as far as they can be."""
+
+from __future__ import annotations
+
+import doctest
+import os
+import re
+import shlex
+from pathlib import Path
+
+import click
+import pytest
+
+import ortho_pipeline
+from ortho_pipeline.cli import cli
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("sample_data/**/*.md")])
+OPTIONS = doctest.NORMALIZE_WHITESPACE
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if ">>> " in page.read_text()], ids=lambda page: page.name)
+def test_python_examples(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    done = doctest.testfile(str(page), module_relative=False, globs={"out": tmp_path}, optionflags=OPTIONS)
+    assert done.attempted
+    assert not done.failed
+
+
+def test_every_public_name_is_on_the_page():
+    page = (ROOT / "docs" / "api.md").read_text()
+    missing = [name for name in ortho_pipeline.__all__ if f"`{name}" not in page and f"op.{name}" not in page]
+    assert not missing
+
+
+def commands(page: Path) -> list[str]:
+    """Return the lines of code blocks that start with `ortho`, continued lines joined."""
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    blocks = re.findall(r"^```(?:\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    return [line.strip() for block in blocks for line in block.splitlines() if line.strip().startswith("ortho ")]
+
+
+COMMANDS = [pytest.param(line, id=f"{page.name}: {line[:60]}") for page in PAGES for line in commands(page)]
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_commands_are_understood(line):
+    words = shlex.split(line, comments=True)[1:]
+    command, context = cli, click.Context(cli, info_name="ortho")
+    while isinstance(command, click.Group):
+        name, words = words[0], words[1:]
+        found = command.get_command(context, name)
+        assert found, f"there is no command {name}"
+        command, context = found, click.Context(found, info_name=name, parent=context)
+    # Files that do not exist are no fault of the example; options that do not exist are.
+    command.parse_args(context, words)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        if not re.match(r"[a-z]+:", target):
+            assert os.path.exists(page.parent / target), f"{page.name} links to {target}"

@@ -1,0 +1,58 @@
+"""What results look like in a notebook, and the scripts of examples/."""
+
+from __future__ import annotations
+
+import base64
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import ortho_pipeline as op
+
+ROOT = Path(__file__).resolve().parent.parent
+SAMPLE = ROOT / "sample_data"
+
+
+def test_a_fit_shows_itself():
+    scene = op.open_scene(SAMPLE / "scene.tif")
+    points = op.read_points(SAMPLE / "gcps.geojson")
+    assert repr(points).startswith("<18 points: 12 control, 6 check; WGS 84; ")
+    fit = op.fit(op.ImageCorrection.identity(scene.model, "shift", (500.0, 500.0)), points)
+    assert re.fullmatch(r"<fit of .* to 12 control points: RMSE control 0\.221 px, check .* px, loo .* px>", repr(fit))
+    html = fit._repr_html_()
+    assert html.count("<table>") == 2
+    assert "col_shift" in html
+    assert "0.221" in html
+
+
+def test_names_from_files_are_text_and_not_html():
+    from ortho_pipeline.notebook import fit_html, text_html
+
+    document = {
+        "model": "<b>", "rmse": {"control": {"n": 1, "col": 0.1, "row": 0.1, "total": 0.14}, "check": None},
+        "parameters": {}, "rejected": [{"id": "<script>", "reason": "&"}], "warnings": [],
+    }  # fmt: skip
+    html = fit_html(document)
+    assert "<script>" not in html
+    assert "&lt;b&gt;" in html
+    assert text_html("a < b") == "<pre>a &lt; b</pre>"
+
+
+def test_a_result_shows_its_report(tmp_path):
+    result = op.rectify(
+        SAMPLE / "scene.tif", tmp_path, points=op.PointOptions(gcps=SAMPLE / "gcps.geojson"),
+        surface=op.SurfaceOptions(dem=SAMPLE / "dem.tif"), output=op.OutputOptions(resolution=20.0),
+    )  # fmt: skip
+    shown = result._repr_html_()
+    page = base64.b64decode(re.search(r"base64,([^\"]+)", shown)[1]).decode()
+    assert page == result.files["html"].read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("script", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.name)
+def test_scripts_run(script, tmp_path):
+    done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert list(tmp_path.glob("out/*/*_report.html"))
