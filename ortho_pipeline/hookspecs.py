@@ -41,6 +41,28 @@ hookimpl = pluggy.HookimplMarker(PROJECT_NAME)
 
 
 @dataclass(frozen=True)
+class Piece:
+    """Another file cut from the same acquisition: what is measured in it counts for the scene as well.
+
+    Parameters
+    ----------
+    path : path
+        The file; points name it as the image that they were measured in.
+    offset : (float, float)
+        Column and row of its first corner in the pixels of the scene; (0, 0) for another band.
+    size : (int, int), optional
+        Its columns and rows, where it has a model of its own.
+    model : SensorModel, optional
+        In its own pixels, where the first model of the scene does not reach as far.
+    """
+
+    path: str | PathLike[str]
+    offset: tuple[float, float] = (0.0, 0.0)
+    size: tuple[int, int] | None = None
+    model: SensorModel | None = None
+
+
+@dataclass(frozen=True)
 class Scene:
     """One opened product: its image and the models that suit it.
 
@@ -62,6 +84,12 @@ class Scene:
         What the user ought to know before trusting the result.
     priors : mapping of str to Prior
         How well the vendor knows parameters of the first model, for ``--correction model``.
+    rasters : tuple of path
+        Files of one size whose bands the ortho stacks, in this order; without them the image alone.
+    pieces : tuple of Piece
+        Other bands and components of the same acquisition, which share one adjustment with this image.
+    sources : tuple of path
+        Files that were read besides the image and `model_source`, for the record.
     """
 
     sensor: str
@@ -73,9 +101,13 @@ class Scene:
     facts: Mapping[str, object] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     priors: Mapping[str, Prior] = field(default_factory=dict)
+    rasters: tuple[str | PathLike[str], ...] = ()
+    pieces: tuple[Piece, ...] = ()
+    sources: tuple[str | PathLike[str], ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", Path(self.path))
+        object.__setattr__(self, "rasters", tuple(map(Path, self.rasters)))
 
     @property
     def model(self) -> SensorModel:

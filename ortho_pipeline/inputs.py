@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -151,6 +151,7 @@ def read_control(scene: Scene, options: PointOptions, allow_network: bool = Fals
             vertical=None if options.vertical is None else Vertical.parse(options.vertical),
             pixel_origin=options.pixel_origin,
             image_name=Path(scene.path).name,
+            pieces={Path(piece.path).name: piece.offset for piece in scene.pieces},
         )
     if options.select is not None and options.check is not None:
         raise InputError(
@@ -235,8 +236,14 @@ def hash_inputs(
     scene: SceneOptions = SceneOptions(),
     points: PointOptions = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
+    digest: Callable[[Path], str] = sha256,
+    rasters: Iterable[str | os.PathLike[str]] = (),
+    sources: Iterable[str | os.PathLike[str]] = (),
 ) -> list[dict[str, Any]]:
-    """Return path, role, bytes and SHA-256 of every file that is read, side-cars and sources of a VRT included."""
+    """Return path, role, bytes and SHA-256 of every file that is read, side-cars and sources of a VRT included.
+
+    `digest` may know checksums that were taken before; `rasters` and `sources` are those of the `Scene`.
+    """
     read: dict[Path, str] = {}
 
     def add(role: str, paths: Iterable[str | os.PathLike[str] | None]) -> None:
@@ -246,6 +253,8 @@ def hash_inputs(
 
     add("image", [image])
     add("image", _files_of(image, scene.allow_network))
+    add("image", rasters)
+    add("metadata", sources)
     for role, path in scene.files.items():
         add(role, [path])
     add("points", [points.gcps])
@@ -254,7 +263,7 @@ def hash_inputs(
     if surface.vertical is not None:
         add("geoid", [surface.vertical])
     return [
-        {"role": role, "path": str(path), "bytes": path.stat().st_size, "sha256": sha256(path)}
+        {"role": role, "path": str(path), "bytes": path.stat().st_size, "sha256": digest(path)}
         for path, role in read.items()
     ]
 
@@ -304,8 +313,9 @@ def provenance(
 
 
 def _as_asked(options: Any) -> dict[str, Any]:
-    """Return options as JSON values."""
+    """Return options as JSON values, without the budget of the machine, on which no result depends."""
     return {
         key: os.fspath(value) if isinstance(value, os.PathLike) else value
         for key, value in dataclasses.asdict(options).items()
+        if key not in ("memory", "threads")
     }

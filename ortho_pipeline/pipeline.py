@@ -20,11 +20,12 @@ import pyproj
 
 from ortho_pipeline import comparison as comparing
 from ortho_pipeline import crs as crs_module
-from ortho_pipeline import dem, footprint, gcp_export, inputs, plugins, raster, report, rpc
+from ortho_pipeline import dem, footprint, gcp_export, inputs, notebook, plugins, raster, report, resolution, rpc
+from ortho_pipeline import stac as stac_items
 from ortho_pipeline.crs import parse_crs
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import Fit
-from ortho_pipeline.files import write_text
+from ortho_pipeline.files import sha256, write_text
 from ortho_pipeline.ground_error import viewing
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.inputs import has_surface, open_scene, open_surface
@@ -77,6 +78,12 @@ class Result:
         """Return files and document as JSON values."""
         files = {name: str(path) for name, path in self.files.items()}
         return {"schema_version": SCHEMA_VERSION, "files": files, **self.document}
+
+    def _repr_html_(self) -> str:
+        """Show the report in a notebook, or the summary where there is none."""
+        if "html" in self.files:
+            return notebook.page_html(self.files["html"].read_text(encoding="utf-8"))
+        return notebook.text_html(self.summary)
 
 
 @dataclass(frozen=True)
@@ -243,18 +250,19 @@ def rectify(
     output: OutputOptions = OutputOptions(),
     progress: Callable[[float], None] | None = None,
     command: str | None = None,
-    hashed: list[dict[str, Any]] | None = None,
+    name: str | None = None,
+    digest: Callable[[Path], str] = sha256,
 ) -> Result:
     """Make the orthoimage of a scene, its adjusted model in every format, and the accuracy report.
 
-    Nothing is written before all that can be checked is checked. `hashed` are the checksums of the inputs
-    (`inputs.hash_inputs`), where they were taken already.
+    Nothing is written before all that can be checked is checked. `name` is the id of the STAC item (the
+    image's stem without one), `digest` takes checksums of the inputs, which it may know.
 
     Returns
     -------
     Result
         `files` has ortho, model, rpc, vrt (unless no RPC stands for the model), residuals and style (with points
-        only), report and html.
+        only), report, html and stac (if asked for).
 
     Raises
     ------
@@ -262,7 +270,10 @@ def rectify(
         For whatever the user can correct: no heights, a DEM that does not cover the scene, a path that is read and
         written, an old side-car that would attach to the ortho.
     """
-    files = {name: Path(folder) / f"{Path(image).stem}{ending}" for name, ending in _ENDINGS.items()}
+    stem = Path(image).stem
+    files = {
+        kind: Path(folder) / f"{stem}{ending}" for kind, ending in _ENDINGS.items() if kind != "stac" or output.stac
+    }
     inputs.check_paths(files, image, scene, points, surface)
     if not has_surface(surface):
         raise InputError(
@@ -272,7 +283,8 @@ def rectify(
         )
     opened = open_adjustable(image, scene, points)
     heights = open_surface(surface, scene.allow_network)
-    hashing = _beside(lambda: hashed if hashed is not None else inputs.hash_inputs(image, scene, points, surface))
+    acquired = stac_items.acquisition_time(opened.facts, output.acquired) if output.stac else None
+    hashing = _beside(inputs.hash_inputs, image, scene, points, surface, digest, opened.rasters, opened.sources)
     adjusted = adjust(opened, points, scene, heights)
     opened, model, size = adjusted.scene, adjusted.model, (opened.width, opened.height)
     heights = footprint.facing(model, heights, *size)
@@ -280,17 +292,20 @@ def rectify(
     crs = parse_crs(output.crs) if output.crs else None
     grid = footprint.choose_grid(model, heights, size, crs=crs, resolution=output.resolution, extent=output.extent)
     exported, complaints = _as_rpc(model)
-    source = raster.RasterSource(image, allow_network=scene.allow_network)
+    source = raster.RasterSource(*(opened.rasters or (image,)), allow_network=scene.allow_network)
     warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
     record = inputs.provenance(
         opened, points, heights, hashing.result(), command, {"scene": scene, "surface": surface, "output": output}
     )  # fmt: skip
-    _write_models(model, exported, opened, source, files, {**record, "adjustment": adjusted.fit.to_json()})
+    whole = raster.open_dataset(image, allow_network=scene.allow_network)
+    _write_models(model, exported, opened, whole, files, {**record, "adjustment": adjusted.fit.to_json()})
     document = report.build_report(
         scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=share, grid=grid, warp=warped,
         provenance=record, warnings=[*adjusted.warnings(heights), *notes, *complaints],
     )  # fmt: skip
     _write_report(document, adjusted.fit, files)
+    if acquired is not None:
+        stac_items.write_item(files["stac"], document, files, acquired, name or stem)
     return Result(files, {"report": document}, report.summary_text(document))
 
 
@@ -361,6 +376,42 @@ def write_plots(report_file: str | os.PathLike[str], folder: str | os.PathLike[s
     return Result(files, {}, f"{len(files)} plots of {document['scene']['name']}")
 
 
+def edge(
+    image: str | os.PathLike[str],
+    folder: str | os.PathLike[str] | None = None,
+    *,
+    edge: str | None = None,
+    band: int = 1,
+    allow_network: bool = False,
+) -> Result:
+    """Measure the effective resolution of an image from one edge, or from those that are found.
+
+    Parameters
+    ----------
+    folder : path, optional
+        Where the document and a plot of the typical edge go.
+    edge : str, optional
+        ``x1,y1,x2,y2``, columns and rows of its ends.
+
+    Raises
+    ------
+    InputError
+        If there is no such edge, or none is found.
+    """
+    given = None if edge is None else resolution.parse_edge(edge)
+    found = resolution.measure(image, edge=given, band=band, allow_network=allow_network)
+    document, stem = resolution.document(found, image, band), Path(image).stem
+    files = (
+        {}
+        if folder is None
+        else {"json": Path(folder) / f"{stem}_edges.json", "svg": Path(folder) / f"{stem}_edge.svg"}
+    )
+    if files:
+        write_text(files["json"], json.dumps(document, indent=1, allow_nan=False) + "\n")
+        write_text(files["svg"], resolution.plot(resolution.typical(found)).svg(alone=True) + "\n")
+    return Result(files, document, resolution.text(document))
+
+
 def doctor() -> dict[str, Any]:
     """Return versions of GDAL, PROJ and the compiled parts, geoid grids, and plugins with their distributions."""
     host = plugins.Host.discover()
@@ -394,6 +445,7 @@ _ENDINGS = {
     "style": "_residuals.qml",
     "report": "_report.json",
     "html": "_report.html",
+    "stac": "_stac.json",
 }
 
 
@@ -477,7 +529,7 @@ def _write_models(
     model: SensorModel,
     exported: rpc.RpcExport | None,
     scene: Scene,
-    source: raster.RasterSource,
+    dataset: raster.gdal.Dataset,
     files: dict[str, Path],
     provenance: Mapping[str, Any],
 ) -> None:
@@ -488,7 +540,7 @@ def _write_models(
         del files["rpc"], files["vrt"]
         return
     rpc.write_rpc_txt(exported.rpc, files["rpc"])
-    rpc.write_vrt(source.dataset, exported.rpc, files["vrt"])
+    rpc.write_vrt(dataset, exported.rpc, files["vrt"])
 
 
 def _write_report(document: Mapping[str, Any], fit: Fit, files: dict[str, Path]) -> None:

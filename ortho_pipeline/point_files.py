@@ -11,8 +11,8 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +23,22 @@ MAX_FILE = 32_000_000
 MAX_LINE = 100_000
 ROLES = ("control", "check", "tie")
 CSV_COLUMNS = ("id", "col", "row", "x", "y", "h", "role", "sigma_image", "sigma_xy", "sigma_h")
+#: Column of a CSV of several images: the file that a point was measured in.
+CSV_IMAGE = "image"
+
+
+class Layout(NamedTuple):
+    """Columns that a CSV may have, those that every line fills, and the role of lines that give none."""
+
+    columns: tuple[str, ...]
+    needed: tuple[str, ...]
+    role: str
+
+
+#: Points of one image; rays of a block, whose ground may be known; ground alone.
+OF_IMAGE = Layout((*CSV_COLUMNS, CSV_IMAGE), CSV_COLUMNS[:5], "control")
+OF_BLOCK = Layout(("id", CSV_IMAGE, *CSV_COLUMNS[1:]), ("id", CSV_IMAGE, "col", "row"), "")
+OF_GROUND = Layout(("id", *CSV_COLUMNS[3:7], *CSV_COLUMNS[8:]), ("id", "x", "y"), "")
 #: Columns of a CSV that are for people.
 CSV_IGNORED = ("info", "note", "comment", "description")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -66,13 +82,19 @@ class Line(NamedTuple):
     text: str
 
 
-def read_table(path: str | os.PathLike[str], image_name: str | None = None) -> Table:
+def read_table(
+    path: str | os.PathLike[str],
+    image_name: str | None = None,
+    pieces: Mapping[str, tuple[float, float]] | None = None,
+) -> Table:
     """Read a point file; its format is known by its content, then by its suffix.
 
     Parameters
     ----------
     image_name : str, optional
         Keep the points of this image, where a file holds points of several.
+    pieces : mapping of str to (float, float), optional
+        Further images whose points are kept, with the column and row of their first corner in this image.
 
     Raises
     ------
@@ -83,10 +105,36 @@ def read_table(path: str | os.PathLike[str], image_name: str | None = None) -> T
     table = _reader(path, text)(path, text)
     if not table.rows:
         raise InputError("this file holds no points", file=path, remedy=f"give one of: {_FORMATS}")
-    return _of_image(path, table, image_name)
+    return _of_image(path, table, image_name, pieces or {})
 
 
-def _reader(path: str | os.PathLike[str], text: str) -> Callable[[str | os.PathLike[str], str], Table]:
+def read_block_table(path: str | os.PathLike[str], layout: Layout = OF_BLOCK) -> Table:
+    """Read the rays of a block, or with `OF_GROUND` ground alone: CSV, GeoJSON, and rays as ODM list.
+
+    Raises
+    ------
+    InputError
+        As `read_table`; also for a line that does not say which image it is of.
+    """
+    text = load_text(path)
+    reader = _reader(path, text, layout)
+    if reader is read_csv or reader is read_geojson:
+        table = reader(path, text, layout)
+    elif reader is read_odm and layout is OF_BLOCK:
+        table = read_odm(path, text)
+    else:
+        raise InputError(
+            "points of several images do not stand in this format", file=path,
+            remedy="give CSV (id,image,col,row[,x,y,h,...]), GeoJSON with 'ji' by image, or an ODM gcp_list.txt",
+        )  # fmt: skip
+    if not table.rows:
+        raise InputError("this file holds no points", file=path, remedy="add points to it")
+    return table
+
+
+def _reader(
+    path: str | os.PathLike[str], text: str, layout: Layout = OF_IMAGE
+) -> Callable[[str | os.PathLike[str], str], Table]:
     suffix = Path(path).suffix.lower()
     start = text.lstrip()[:4096]
     if start.startswith(("{", "[")) or suffix in (".geojson", ".json"):
@@ -97,19 +145,28 @@ def _reader(path: str | os.PathLike[str], text: str) -> Callable[[str | os.PathL
         return read_envi
     lines = [line.lower() for line in start.splitlines() if line.strip() and not line.startswith("#")]
     names = set(re.split(r"[\s,;|]+", lines[0].replace('"', "").strip())) if lines else set()
-    if suffix in (".csv", ".tsv") or {"col", "row"} <= names:
+    if suffix in (".csv", ".tsv") or set(layout.needed) <= names or {"col", "row"} <= names:
         return read_csv
     if lines and _odm_crs(lines[0]) is not None:
         return read_odm
     raise InputError("the format of this point file is not known", file=path, remedy=f"give one of: {_FORMATS}")
 
 
-def _of_image(path: str | os.PathLike[str], table: Table, image_name: str | None) -> Table:
+def _of_image(
+    path: str | os.PathLike[str], table: Table, image_name: str | None, pieces: Mapping[str, tuple[float, float]]
+) -> Table:
     named = {row.image_name for row in table.rows if row.image_name}
     if image_name is None or not named:
         return table
-    wanted = Path(image_name).stem.lower()
-    kept = [row for row in table.rows if row.image_name and Path(row.image_name).stem.lower() == wanted]
+    kept: list[Row] = []
+    for name, offset in {image_name: (0.0, 0.0), **pieces}.items():
+        wanted, ids = Path(name).stem.lower(), {row.id for row in kept} - {None}
+        # A point that was measured in several of the images counts once: where it was measured first, this image ahead.
+        kept += [
+            replace(row, image=(row.image[0] + offset[0], row.image[1] + offset[1]))
+            for row in table.rows
+            if row.image_name and Path(row.image_name).stem.lower() == wanted and row.id not in ids
+        ]
     if not kept and table.format == "GeoJSON" and len(named) == 1:
         # The 'filename' of a GeoJSON is a remark; a renamed image still has these points.
         return table
@@ -200,8 +257,8 @@ def _sigma(text: Any, path: str | os.PathLike[str], where: str, *, zero: bool) -
 # -- CSV and TSV -----------------------------------------------------------------------------------------------------
 
 
-def read_csv(path: str | os.PathLike[str], text: str) -> Table:
-    """Read our own table: header ``id,col,row,x,y,h[,role][,sigma_image][,sigma_xy][,sigma_h]``.
+def read_csv(path: str | os.PathLike[str], text: str, layout: Layout = OF_IMAGE) -> Table:
+    """Read our own table: header ``id,col,row,x,y,h[,role][,sigma_image][,sigma_xy][,sigma_h][,image]``.
 
     The delimiter (comma, semicolon, tab, bar) is that of the header. Lines that start with ``#`` are comments; of these
     ``#CRS: ...`` and ``#vertical: ...`` state what the coordinates are. An empty `h` is a height that is not given.
@@ -219,9 +276,9 @@ def read_csv(path: str | os.PathLike[str], text: str) -> Table:
             continue
         if not names:
             delimiter = max("\t;,|", key=line.text.count)
-            names = _csv_header(path, line, delimiter)
+            names = _csv_header(path, line, delimiter, layout)
             continue
-        table.rows.append(_csv_row(path, line, delimiter, names))
+        table.rows.append(_csv_row(path, line, delimiter, names, layout))
     return table
 
 
@@ -232,16 +289,16 @@ def _cells(path: str | os.PathLike[str], line: Line, delimiter: str) -> list[str
         raise InputError(f"the line cannot be split ({error})", file=path, field=f"line {line.number}") from error
 
 
-def _csv_header(path: str | os.PathLike[str], line: Line, delimiter: str) -> list[str]:
+def _csv_header(path: str | os.PathLike[str], line: Line, delimiter: str, layout: Layout) -> list[str]:
     names = [name.lower() for name in _cells(path, line, delimiter)]
-    allowed = f"the columns are {', '.join(CSV_COLUMNS)}"
+    allowed = f"the columns are {', '.join(layout.columns)}"
     for name in names:
-        if name not in CSV_COLUMNS + CSV_IGNORED or names.count(name) > 1:
+        if name not in (*layout.columns, *CSV_IGNORED) or names.count(name) > 1:
             problem = "twice" if names.count(name) > 1 else "not known"
             raise InputError(
                 f"the column {_short(name)} is {problem}", file=path, field=f"line {line.number}", remedy=allowed
             )
-    missing = [name for name in CSV_COLUMNS[:5] if name not in names]
+    missing = [name for name in layout.needed if name not in names]
     if missing:
         raise InputError(
             f"no column {', '.join(missing)} in the header", file=path, field=f"line {line.number}", remedy=allowed
@@ -249,7 +306,9 @@ def _csv_header(path: str | os.PathLike[str], line: Line, delimiter: str) -> lis
     return names
 
 
-def _csv_row(path: str | os.PathLike[str], line: Line, delimiter: str, names: list[str]) -> Row:
+def _csv_row(
+    path: str | os.PathLike[str], line: Line, delimiter: str, names: list[str], layout: Layout
+) -> Row:  # fmt: skip
     cells = _cells(path, line, delimiter)
     where = f"line {line.number}"
     if len(cells) != len(names):
@@ -258,33 +317,38 @@ def _csv_row(path: str | os.PathLike[str], line: Line, delimiter: str, names: li
     given = {name: cell for name, cell in zip(names, cells, strict=True) if cell}
 
     def value(name: str) -> float:
+        if name not in given and name not in layout.needed:
+            return math.nan
         return number(given.get(name, ""), path, f"{where}, column {name}")
 
     def sigma(name: str, zero: bool) -> float | None:
         return _sigma(given[name], path, f"{where}, column {name}", zero=zero) if name in given else None
 
-    if "id" not in given:
-        raise InputError("a point without an id", file=path, field=f"{where}, column id")
+    for name, what in (("id", "an id"), (CSV_IMAGE, "an image")):
+        if (name in layout.needed or name == "id") and name not in given:
+            raise InputError(f"a point without {what}", file=path, field=f"{where}, column {name}")
     return Row(
         where=where,
         id=given["id"],
         image=(value("col"), value("row")),
-        ground=(value("x"), value("y"), value("h") if "h" in given else math.nan),
-        role=_role(given.get("role", "control"), path, f"{where}, column role"),
+        ground=(value("x"), value("y"), value("h")),
+        role=_role(given["role"], path, f"{where}, column role") if "role" in given else layout.role,
         sigma_image=sigma("sigma_image", False),
         sigma_xy=sigma("sigma_xy", True),
         sigma_h=sigma("sigma_h", True),
+        image_name=given.get(CSV_IMAGE),
     )
 
 
 # -- GeoJSON ---------------------------------------------------------------------------------------------------------
 
 
-def read_geojson(path: str | os.PathLike[str], text: str) -> Table:
+def read_geojson(path: str | os.PathLike[str], text: str, layout: Layout = OF_IMAGE) -> Table:
     """Read points with a property ``ji`` = [column, row] from the *centre* of the first pixel; lon, lat, height.
 
     Further properties: ``id``, ``role``, ``sigma_image``, ``sigma_xy``, ``sigma_h``, ``filename`` (the image).
-    Heights are ellipsoidal, as the format says.
+    Heights are ellipsoidal, as the format says. In a block ``ji`` may be a mapping of images to [column, row], and the
+    geometry of a tie point is null; where only ground is wanted, ``ji`` is ignored.
     """
 
     def refuse(constant: str) -> float:
@@ -299,7 +363,7 @@ def read_geojson(path: str | os.PathLike[str], text: str) -> Table:
         raise InputError("this is not a GeoJSON FeatureCollection", file=path, field="features")
     table = Table("GeoJSON", crs=_geojson_crs(path, document), assumed_vertical="ellipsoid")
     for count, feature in enumerate(features):
-        table.rows.append(_feature(path, f"features[{count}]", feature))
+        table.rows += _feature(path, f"features[{count}]", feature, layout)
     return table
 
 
@@ -315,20 +379,16 @@ def _geojson_crs(path: str | os.PathLike[str], document: dict[str, Any]) -> str:
     return "EPSG:4979"
 
 
-def _feature(path: str | os.PathLike[str], where: str, feature: Any) -> Row:
+def _feature(path: str | os.PathLike[str], where: str, feature: Any, layout: Layout) -> list[Row]:
+    """Return a row for each image that the point of a feature was measured in."""
     properties = feature.get("properties") if isinstance(feature, dict) else None
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
-    if not isinstance(properties, dict) or not isinstance(geometry, dict) or geometry.get("type") != "Point":
+    tie = geometry is None and layout is OF_BLOCK
+    if not isinstance(properties, dict) or not (
+        tie or (isinstance(geometry, dict) and geometry.get("type") == "Point")
+    ):
         raise InputError("this feature is not a Point with properties", file=path, field=where)
-    ji, place = properties.get("ji"), geometry.get("coordinates")
-    if not isinstance(ji, list) or len(ji) != 2:
-        raise InputError(
-            "no property 'ji' = [column, row]", file=path, field=f"{where}.properties.ji", remedy="measure the points"
-        )
-    if not isinstance(place, list) or len(place) not in (2, 3):
-        raise InputError("not [lon, lat, height]", file=path, field=f"{where}.geometry.coordinates")
-    column, row = (number(ji[k], path, f"{where}.properties.ji[{k}]") for k in range(2))
-    ground = [number(value, path, f"{where}.geometry.coordinates[{k}]") for k, value in enumerate(place)]
+    ground = (math.nan,) * 3 if geometry is None else _place(path, where, geometry)
 
     def sigma(name: str, zero: bool) -> float | None:
         value = properties.get(name)
@@ -337,19 +397,50 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any) -> Row:
     name = properties.get("id", feature.get("id"))
     if name is not None and not isinstance(name, str | int):
         raise InputError(f"{_short(name)} is not an id", file=path, field=f"{where}.properties.id")
-    file_name = properties.get("filename")
-    return Row(
+    role = properties.get("role") or layout.role
+    row = Row(
         where=where,
         id=" ".join(str(name).split()) or None if name is not None else None,
-        # From the centre of the first pixel to its corner.
-        image=(column + 0.5, row + 0.5),
-        ground=(ground[0], ground[1], ground[2] if len(ground) == 3 else math.nan),
-        role=_role(properties.get("role") or "control", path, f"{where}.properties.role"),
+        image=(math.nan, math.nan),
+        ground=ground,
+        role=_role(role, path, f"{where}.properties.role") if role else "",
         sigma_image=sigma("sigma_image", False),
         sigma_xy=sigma("sigma_xy", True),
         sigma_h=sigma("sigma_h", True),
-        image_name=file_name if isinstance(file_name, str) else None,
     )
+    if layout is OF_GROUND:
+        return [row]
+    return [replace(row, image=at, image_name=image) for image, at in _measured(path, where, properties, layout)]
+
+
+def _place(path: str | os.PathLike[str], where: str, geometry: dict[str, Any]) -> tuple[float, float, float]:
+    place = geometry.get("coordinates")
+    if not isinstance(place, list) or len(place) not in (2, 3):
+        raise InputError("not [lon, lat, height]", file=path, field=f"{where}.geometry.coordinates")
+    ground = [number(value, path, f"{where}.geometry.coordinates[{k}]") for k, value in enumerate(place)]
+    return ground[0], ground[1], ground[2] if len(ground) == 3 else math.nan
+
+
+def _measured(
+    path: str | os.PathLike[str], where: str, properties: dict[str, Any], layout: Layout
+) -> Iterator[tuple[str | None, tuple[float, float]]]:
+    """Yield image and column, row from the corner of the first pixel, for each image that a point was measured in."""
+    ji, file_name = properties.get("ji"), properties.get("filename")
+    field = f"{where}.properties.ji"
+    pairs = [(file_name if isinstance(file_name, str) else None, ji)]
+    if isinstance(ji, dict) and layout is OF_BLOCK:
+        pairs = list(ji.items())
+    elif layout is OF_BLOCK and not isinstance(file_name, str):
+        raise InputError(
+            "it is not said in which image this point was measured", file=path, field=field,
+            remedy="give 'ji' as {image: [column, row]}, or 'filename' beside [column, row]",
+        )  # fmt: skip
+    for image, pair in pairs:
+        if not isinstance(pair, list) or len(pair) != 2:
+            raise InputError("no property 'ji' = [column, row]", file=path, field=field, remedy="measure the points")
+        column, row = (number(pair[k], path, f"{field}[{k}]") for k in range(2))
+        # From the centre of the first pixel to its corner.
+        yield image, (column + 0.5, row + 0.5)
 
 
 # -- QGIS ------------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 import pyproj
@@ -189,24 +189,43 @@ def read_points(
     image = np.array([row.image for row in table.rows])
     if pixel_origin == "center" and table.centre_origin_allowed:
         image += 0.5
-    ground = np.array([row.ground for row in table.rows])
-    wheres = [row.where for row in table.rows]
-    full = _crs_of(path, table, crs)
-    plane = horizontal(full)
-    _check_places(path, plane, wheres, ground)
-    _refuse_duplicates(path, wheres, image, ground, [row.role for row in table.rows])
-    datum, unit = _vertical_of(path, table, full, vertical, bool(np.isfinite(ground[:, 2]).any()))
-    ground[:, 2] *= unit
+    ground, plane = ground_of(path, table, crs, vertical)
+    _refuse_duplicates(path, [row.where for row in table.rows], image, ground, [row.role for row in table.rows])
     return Points(
         ids=ids,
         image=image,
-        ground=_ellipsoidal(path, wheres, ground, plane, datum),
+        ground=ground,
         roles=np.array([row.role for row in table.rows], dtype="<U7"),
         sigma_image=np.array([_or(row.sigma_image, DEFAULT_SIGMA_IMAGE) for row in table.rows]),
         sigma_ground=np.array([[_or(row.sigma_xy, 0.0)] * 2 + [_or(row.sigma_h, 0.0)] for row in table.rows]),
         crs=plane,
         source=os.fspath(path),
     )
+
+
+def ground_of(
+    path: str | os.PathLike[str], table: Table, crs: str | pyproj.CRS | None, vertical: str | Vertical | None
+) -> tuple[Array, pyproj.CRS]:
+    """Return the ground ``(N, 3)`` of the rows of a table with ellipsoidal heights, and its horizontal CRS.
+
+    Parameters
+    ----------
+    crs, vertical : optional
+        What the coordinates and the heights are in, where the file does not say it.
+
+    Raises
+    ------
+    InputError, CrsError, DatumError
+        If that is not known or contradicts the file, or a place is not on Earth.
+    """
+    ground = np.array([row.ground for row in table.rows], dtype=float).reshape(-1, 3)
+    wheres = [row.where for row in table.rows]
+    full = _crs_of(path, table, crs)
+    plane = horizontal(full)
+    _check_places(path, plane, wheres, ground)
+    datum, unit = _vertical_of(path, table, full, vertical, bool(np.isfinite(ground[:, 2]).any()))
+    ground[:, 2] *= unit
+    return _ellipsoidal(path, wheres, ground, plane, datum), plane
 
 
 def gcps_of_dataset(
@@ -240,16 +259,12 @@ def gcps_of_dataset(
     if not (np.isfinite(image).all() and np.isfinite(ground[:, :2]).all()):
         raise InputError("a ground control point is not finite", file=path, field="GCP")
     table = Table("GCPs", rows, crs=dataset.GetGCPProjection() or None)
-    full = _crs_of(path, table, crs)
-    plane, wheres = horizontal(full), [row.where for row in rows]
-    _check_places(path, plane, wheres, ground)
-    _refuse_duplicates(path, wheres, image, ground, [row.role for row in rows])
-    datum, unit = _vertical_of(path, table, full, vertical, not flat)
-    ground[:, 2] *= unit
+    placed, plane = ground_of(path, table, crs, vertical)
+    _refuse_duplicates(path, [row.where for row in rows], image, placed, [row.role for row in rows])
     return Points(
         ids=tuple(str(row.id) for row in rows),
         image=image,
-        ground=_ellipsoidal(path, wheres, ground, plane, datum),
+        ground=placed,
         roles=np.full(len(rows), "control", dtype="<U7"),
         sigma_image=np.full(len(rows), DEFAULT_SIGMA_IMAGE),
         sigma_ground=np.zeros((len(rows), 3)),
@@ -401,7 +416,24 @@ def _refuse_duplicates(
 # -- roles -----------------------------------------------------------------------------------------------------------
 
 
-def assign_roles(points: Points, spec: str) -> Points:
+class HasRoles(Protocol):
+    """A table of points with roles: of one image, or of a block."""
+
+    @property
+    def ids(self) -> tuple[str, ...]: ...
+    @property
+    def roles(self) -> NDArray[np.str_]: ...
+    @property
+    def control(self) -> NDArray[np.bool_]: ...
+    @property
+    def source(self) -> str: ...
+    def with_roles(self, roles: ArrayLike) -> Self: ...
+
+
+AnyPoints = TypeVar("AnyPoints", bound=HasRoles)
+
+
+def assign_roles(points: AnyPoints, spec: str) -> AnyPoints:
     """Make check points of some control points.
 
     Parameters
@@ -427,7 +459,7 @@ def assign_roles(points: Points, spec: str) -> Points:
                 f"there is no point {', '.join(unknown)}",
                 file=points.source or None,
                 field="--check",
-                remedy=f"the ids are {', '.join(points.ids[:12])}{' ...' if len(points) > 12 else ''}",
+                remedy=f"the ids are {', '.join(points.ids[:12])}{' ...' if len(points.ids) > 12 else ''}",
             )
         roles[np.isin(np.array(points.ids), names)] = "check"
         return points.with_roles(roles)

@@ -327,6 +327,16 @@ class RasterSource:
         """The GDAL bands of the calling thread."""
         return [band for file in self._files for band in file.bands]
 
+    @property
+    def descriptions(self) -> tuple[str, ...]:
+        """Names of the bands; of several files, bands without one have the name of their file."""
+        several = len(self._files) > 1
+        return tuple(
+            band.GetDescription() or (Path(file.path).stem if several else "")
+            for file in self._files
+            for band in file.bands
+        )
+
     def read(self, left: int, top: int, width: int, height: int) -> NDArray[Any]:
         """Return the pixels ``(count, height, width)`` of a window that lies inside the raster."""
         pixels, start = np.empty((self.count, height, width), dtype=self.dtype), 0
@@ -401,7 +411,7 @@ class Profile:
             dtype=source.dtype,
             validity=validity,
             nodata=nodata,
-            descriptions=tuple(band.GetDescription() for band in bands),
+            descriptions=source.descriptions,
             interpretations=tuple(band.GetColorInterpretation() for band in bands),
             color_table=bands[0].GetColorTable(),
             scales=tuple((band.GetScale() or 1.0, band.GetOffset() or 0.0, band.GetUnitType()) for band in bands),

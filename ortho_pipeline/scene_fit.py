@@ -16,7 +16,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import Fit, fit
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.model_choice import OWN, Removed, fit_family, fit_own, prune
-from ortho_pipeline.models import ImageCorrection, SensorModel, families
+from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
 from ortho_pipeline.options import PointOptions, SceneOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.swaps import refuse_swapped
@@ -44,9 +44,12 @@ class Adjusted:
 
     @property
     def model(self) -> SensorModel:
-        """The adjusted model, without a correction that corrects nothing."""
+        """The adjusted model of the image, without a correction that corrects nothing."""
         model = self.fit.model
-        return model.model if isinstance(model, ImageCorrection) and model.correction == "none" else model
+        if not isinstance(model, ImageCorrection):
+            return model
+        inner = model.model.first if isinstance(model.model, Pieces) else model.model
+        return inner if model.correction == "none" else dataclasses.replace(model, model=inner)
 
     def removed_json(self) -> list[dict[str, Any]]:
         """Return the removed parameters as JSON values."""
@@ -133,7 +136,7 @@ def _corrected(
 ) -> Adjusted:
     if options.correction != OWN:
         # What adjusts its own parameters may start anywhere.
-        refuse_swapped(scene.model, points, scene.height)
+        refuse_swapped(shared_model(scene), points, scene.height)
     points = inputs.with_heights(points, surface)
     correction = options.correction
     if correction is None:
@@ -146,9 +149,22 @@ def _corrected(
         )
     if correction == OWN:
         return Adjusted(scene, fit_own(scene.model, points, scene.priors))
-    start = ImageCorrection.identity(scene.model, correction, (scene.width / 2, scene.height / 2))
+    start = ImageCorrection.identity(shared_model(scene), correction, (scene.width / 2, scene.height / 2))
     name = scene.model.kind if correction == "none" else f"{scene.model.kind}+{correction}"
     return Adjusted(scene, fit(start, points, robust=correction != "none", name=name))
+
+
+def shared_model(scene: Scene) -> SensorModel:
+    """Return the model of a scene, with those of the other pieces of its acquisition where they have their own."""
+    parts = {(0.0, 0.0): (scene.model, (scene.width, scene.height))}
+    for piece in scene.pieces:
+        if piece.model is not None and piece.size is not None:
+            # The bands of a component have the same geometry.
+            parts.setdefault(piece.offset, (piece.model, piece.size))
+    if len(parts) == 1:
+        return scene.model
+    models, sizes = zip(*parts.values(), strict=True)
+    return Pieces(models, tuple(parts), sizes)
 
 
 def _from_points(scene: Scene, options: PointOptions, points: Points, surface: Surface | None) -> Adjusted:

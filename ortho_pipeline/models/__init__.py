@@ -9,11 +9,16 @@ from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.families import Family, families, family_of
 from ortho_pipeline.models.frame import FrameCamera
+from ortho_pipeline.models.geo import MapPlane
+from ortho_pipeline.models.pieces import Pieces
+from ortho_pipeline.models.pushbroom import Pushbroom
 from ortho_pipeline.models.rational import RPC, Rational
 from ortho_pipeline.models.start import model_crs, start_model
 
 #: Model classes by the `kind` under which files name them; the hook `ortho_models` adds to it.
-KINDS: dict[str, type[SensorModel]] = {cls.kind: cls for cls in (RPC, Rational, ImageCorrection, FrameCamera)}
+KINDS: dict[str, type[SensorModel]] = {
+    cls.kind: cls for cls in (RPC, Rational, ImageCorrection, FrameCamera, MapPlane, Pieces, Pushbroom)
+}
 
 
 def model_from_dict(data: dict[str, Any]) -> SensorModel:
@@ -43,6 +48,9 @@ __all__ = [
     "Family",
     "FrameCamera",
     "ImageCorrection",
+    "MapPlane",
+    "Pieces",
+    "Pushbroom",
     "Rational",
     "SensorModel",
     "families",

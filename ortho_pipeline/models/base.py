@@ -23,6 +23,30 @@ _INVERSE_STEPS = 25
 
 
 @dataclass(frozen=True, eq=False)
+class Constraints:
+    """Pseudo-observations that a model brings with it: what is known of its parameters beyond image measurements.
+
+    An adjustment weights them by their sigma like any other observation and counts them in the redundancy.
+
+    Parameters
+    ----------
+    residuals : (k,)
+        Observed minus computed at the model's `params`.
+    jacobian : (k, P)
+        d(computed)/d(params).
+    sigma : (k,)
+        Standard deviations, positive, in the unit of the residuals.
+    """
+
+    residuals: Array
+    jacobian: Array
+    sigma: Array
+
+    def __len__(self) -> int:
+        return len(self.residuals)
+
+
+@dataclass(frozen=True, eq=False)
 class SensorModel(ABC):
     """Map from ground to image, steered by a named parameter vector.
 
@@ -105,6 +129,10 @@ class SensorModel(ABC):
     def without(self, names: Iterable[str]) -> Self:
         """Return this model with these parameters removed: zero, and no parameters any more."""
         raise InputError(f"parameters of a model {self.kind!r} cannot be removed", field=", ".join(names))
+
+    def constraints(self) -> Constraints:
+        """Return the pseudo-observations of the parameters, linearised at `params`; most models have none."""
+        return Constraints(np.zeros(0), np.zeros((0, len(self.param_names))), np.zeros(0))
 
     # -- derived maps ------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,265 @@
+"""Sensor plugin for IKONOS Geo products: ``po_<order>_<band>_<component>`` images with their metadata file.
+
+Two models: the vendor's RPC where there is one, and ``geo``, the plane at Reference Height from the metadata alone
+(docs/formats/ikonos.md). Bands in files of their own are stacked on request; points that were measured in another
+band or component of the same acquisition count for this image as well.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from osgeo import gdal
+
+from ortho_ikonos.metadata import Component, Delivery, SourceImage, read_metadata
+from ortho_ikonos.order import ImageFile, Position, bands_of, position_of, rpc_file
+from ortho_pipeline.crs import ground_transform
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.hookspecs import Piece, Scene, Sensor, hookimpl
+from ortho_pipeline.models import MapPlane, SensorModel
+from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.problem import Prior, priors_at
+from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.rpc import has_rpc, read_rpc, rpc_of_dataset
+
+OPTIONS = {
+    "metadata": "the metadata file, where it is not po_<order>_metadata.txt beside the image",
+    "rpc": "which RPC to use: tag, sidecar, or an RPC file",
+    "geometry": "the model to start from: rpc (default where there is one) or geo, the plane at Reference Height",
+    "bands": "files to stack in the ortho: one (default), all separate bands, or names such as red,grn,blu",
+    "heights": "lowest and highest ground in ellipsoidal metres for geo: low,high",
+}
+#: Products on the plane at Reference Height.
+PRODUCT_LINE, LEVEL = "Geo", "Standard Geometrically Corrected"
+#: Half the range of heights that `geo` is meant for where nothing else is known (m).
+HALF_RANGE = 500.0
+#: What the vendor states of the first years is 50 m at 90 %: 23 m for each coordinate. Direction of relief: by how much
+#: it differs from the nominal one within a real scene (docs/formats/ikonos.md).
+SIGMAS = {"shift_x": 25.0, "shift_y": 25.0, "relief_x": 0.01, "relief_y": 0.01}
+#: RPC and metadata that differ by more than this on the plane (px) belong to different images.
+DISAGREEMENT = 1.0
+
+
+@hookimpl
+def ortho_sensors() -> Iterable[Sensor]:
+    """Offer the sensor ``ikonos``."""
+    yield Sensor("ikonos", "IKONOS Geo products (po_* with metadata.txt, with or without RPC)", recognises, open_scene,
+                 options=OPTIONS)  # fmt: skip
+
+
+def recognises(dataset: gdal.Dataset) -> bool:
+    """Tell whether it is named like an image of an order whose metadata, which lie beside it, are of IKONOS."""
+    image = ImageFile.of(Path(dataset.GetDescription()))
+    if image is None:
+        return False
+    try:
+        with open(image.metadata, "rb") as file:
+            return b"IKONOS" in file.read(100_000)
+    except (OSError, ValueError):
+        return False
+
+
+def open_scene(
+    dataset: gdal.Dataset,
+    *,
+    metadata: str | None = None,
+    rpc: str | None = None,
+    geometry: str | None = None,
+    bands: str = "one",
+    heights: str | None = None,
+) -> Scene:
+    """Open an image of an IKONOS order."""
+    path = Path(dataset.GetDescription())
+    image = ImageFile.of(path)
+    if image is None and (metadata is None or bands != "one"):
+        raise InputError(
+            "this is no name of an image of an order", file=path, field="metadata",
+            remedy="name it po_<order>_<band>_<component of 7 digits>.tif, or give the option metadata=FILE",
+        )  # fmt: skip
+    delivery = read_metadata(metadata or (image.metadata if image else ""))
+    component = delivery.component(image.component if image else None)
+    source = delivery.source_of(component)
+    position = position_of(dataset, delivery, component)
+    vendor = _rpc(dataset, rpc)
+    lacking = _lacking(position, source)
+    models: dict[str, SensorModel] = {} if vendor is None else {"rpc": vendor[0]}
+    if not lacking:
+        models["geo"] = _plane(dataset, position, source, _heights(heights, position, vendor and vendor[0]))
+    first = _first(geometry, models, lacking, delivery.file, component)
+    models = {first: models[first], **models}
+    return Scene(
+        sensor="ikonos",
+        path=path,
+        width=dataset.RasterXSize,
+        height=dataset.RasterYSize,
+        models=models,
+        model_source=vendor[1] if vendor and first == "rpc" else delivery.file,
+        facts=_facts(image, delivery, component, source, position, models, lacking),
+        warnings=(*_level_warnings(delivery), *delivery.notes, *position.warnings, *_disagreement(models)),
+        priors=_priors(models[first]),
+        rasters=bands_of(image, bands) if image else (),
+        pieces=_pieces(image, delivery, component, position, with_models=first == "rpc") if image else (),
+        sources=position.sources,
+    )
+
+
+# -- models ----------------------------------------------------------------------------------------------------------
+
+
+def _rpc(dataset: gdal.Dataset, choice: str | None) -> tuple[RPC, str] | None:
+    """Return the RPC and where it is from; GDAL does not attach a side-car to every format."""
+    if choice is not None or has_rpc(dataset):
+        return rpc_of_dataset(dataset, choice)
+    found = rpc_file(Path(dataset.GetDescription()))
+    return None if found is None else (read_rpc(found), str(found))
+
+
+def _lacking(position: Position, source: SourceImage) -> list[str]:
+    """Return the keys without which there is no plane."""
+    wanted = {
+        "Map Projection (UTM on WGS84, or of the image)": position.crs,
+        "UL Map X, UL Map Y": position.corner,
+        "Pixel Size X, Pixel Size Y": position.pixel,
+        "Reference Height": position.reference_height,
+        "Nominal Collection Azimuth": source.azimuth,
+        "Nominal Collection Elevation": source.elevation,
+    }
+    return [key for key, value in wanted.items() if value is None]
+
+
+def _plane(dataset: gdal.Dataset, position: Position, source: SourceImage, heights: tuple[float, float]) -> MapPlane:
+    return MapPlane.from_view(
+        position.crs, position.corner, position.pixel, (dataset.RasterXSize, dataset.RasterYSize),
+        position.reference_height, math.radians(source.azimuth), math.radians(source.elevation), heights,
+    )  # fmt: skip
+
+
+def _heights(text: str | None, position: Position, vendor: RPC | None) -> tuple[float, float]:
+    plane = position.reference_height or 0.0
+    if text is not None:
+        try:
+            low, high = (float(part) for part in text.split(","))
+        except ValueError:
+            low = high = math.nan
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise InputError(f"{text!r} is no range of heights", field="heights", remedy="give low,high in metres")
+    else:
+        low, high = vendor.height_range if vendor else (plane - HALF_RANGE, plane + HALF_RANGE)
+    return min(low, plane), max(high, plane)
+
+
+def _first(
+    geometry: str | None, models: dict[str, SensorModel], lacking: list[str], file: str, component: Component
+) -> str:
+    """Return the name of the model to start from."""
+    if geometry not in (None, "rpc", "geo"):
+        raise InputError(f"{geometry!r} is no geometry", field="geometry", remedy="rpc or geo")
+    first = geometry or next(iter(models), "geo")
+    if first == "rpc" and "rpc" not in models:
+        raise InputError("there is no RPC", file=file, field="geometry", remedy="give it with --rpc, or take geo")
+    if first not in models:
+        raise InputError(
+            f"there is no plane of Reference Height without {'; '.join(lacking)}", file=file,
+            field=f"component {component.component}: {lacking[0]}",
+            remedy="give the whole metadata file, an RPC (--rpc), or fit a model to points (--fit-model)",
+        )  # fmt: skip
+    return first
+
+
+def _priors(model: SensorModel) -> dict[str, Prior]:
+    return priors_at(model, SIGMAS) if isinstance(model, MapPlane) else {}
+
+
+def _pieces(
+    image: ImageFile, delivery: Delivery, component: Component, position: Position, *, with_models: bool
+) -> tuple[Piece, ...]:
+    """Return the other files of the acquisition whose pixels are those of this image, moved by whole pixels."""
+    found = []
+    for other in image.others():
+        known = [one for one in delivery.components if one.component == other.component]
+        if len(known) != 1 or known[0].product_image != component.product_image:
+            continue
+        if other.component == component.component:
+            found.append(Piece(other.path))
+            continue
+        opened = open_dataset(other.path)
+        offset = position.offset_of(position_of(opened, delivery, known[0]))
+        if offset is None:
+            continue
+        vendor = _rpc(opened, None) if with_models else None
+        found.append(Piece(other.path, offset, (opened.RasterXSize, opened.RasterYSize), vendor[0] if vendor else None))
+    return tuple(found)
+
+
+# -- what to say -----------------------------------------------------------------------------------------------------
+
+
+def _level_warnings(delivery: Delivery) -> list[str]:
+    line, level = delivery.product_line, delivery.level
+    if line is None and level is None:
+        return ["the metadata do not state the processing level: the models are those of a Geo product"]
+    if (line is None or line.lower().startswith(PRODUCT_LINE.lower())) and (level or LEVEL).lower() == LEVEL.lower():
+        return []
+    return [
+        f"this is a product {line or 'of an unknown line'}, {level or 'level not stated'}, not {PRODUCT_LINE}, {LEVEL}:"
+        " where the vendor has already corrected the relief it would be corrected twice"
+    ]
+
+
+def _disagreement(models: dict[str, SensorModel]) -> list[str]:
+    """Hold the RPC against the metadata on the plane, where both state the same."""
+    vendor, plane = models.get("rpc"), models.get("geo")
+    if vendor is None or not isinstance(plane, MapPlane):
+        return []
+    middle = np.array([plane.size]) / 2
+    ground = ground_transform(plane.crs, vendor.crs)(plane.image_to_ground(middle, plane.plane))
+    off = float(np.abs(vendor.ground_to_image(ground) - middle).max())
+    if off <= DISAGREEMENT:
+        return []
+    apart = f"{off:.1f} px" if math.isfinite(off) else "the whole scene"
+    return [f"RPC and metadata differ by {apart} at Reference Height: one of them belongs to another image"]
+
+
+def _facts(
+    image: ImageFile | None,
+    delivery: Delivery,
+    component: Component,
+    source: SourceImage,
+    position: Position,
+    models: dict[str, SensorModel],
+    lacking: list[str],
+) -> dict[str, object]:
+    facts: dict[str, object] = {
+        "satellite": source.sensor,
+        "acquired": source.acquired,
+        "order": delivery.order,
+        "product": ", ".join(filter(None, (delivery.product_line, delivery.level))) or None,
+        "band": image.band if image else None,
+        "bits_per_pixel": delivery.bits,
+        "component": component.component,
+        "components": len(delivery.components),
+        "product_image": component.product_image,
+        "source_image": source.source_image,
+        "azimuth_deg": source.azimuth,
+        "elevation_deg": source.elevation,
+        "scan_azimuth_deg": source.scan_azimuth,
+        "sun_azimuth_deg": source.sun_azimuth,
+        "sun_elevation_deg": source.sun_elevation,
+        "cloud_cover_percent": _known(source.cloud_percent),
+        "map_projection": delivery.projection or position.crs,
+        "pixel_m": None if position.pixel is None else list(position.pixel),
+        "reference_height_m": position.reference_height,
+        "geo_model_lacks": lacking or None,
+    }
+    plane = models.get("geo")
+    if isinstance(plane, MapPlane):
+        facts["relief_px_per_100_m"] = round(100 * math.hypot(*plane.relief) / plane.pixel[0], 2)
+    return {key: value for key, value in facts.items() if value is not None}
+
+
+def _known(percent: float | None) -> float | None:
+    # 999 is the vendor's word for a cloud cover that is not known.
+    return percent if percent is not None and 0 <= percent <= 100 else None

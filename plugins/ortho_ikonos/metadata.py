@@ -1,0 +1,459 @@
+"""The metadata file of an IKONOS order (``po_<order>_metadata.txt``) and the header of one image (``_hdr.txt``).
+
+Sections stand between lines of ``=``, are nested by blanks, and hold records that begin at ``Source Image ID`` or
+``Component ID`` (older orders: ``Tile ID``). A component names its product image, and that a source image
+(docs/formats/ikonos.md). What is not known is left alone; what is wanted and is not there is an error.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from os import PathLike
+
+from ortho_pipeline.errors import InputError
+
+MAX_BYTES = 2_000_000
+MAX_LINE = 10_000
+_RULE = re.compile(r"={10,}|-{10,}")
+_NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([A-Za-z/]*)\.?\s*", re.ASCII)
+_TIME = re.compile(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d(?::\d\d(?:\.\d+)?)?)\s*(?:GMT|UTC|Z)?", re.ASCII)
+#: Keys at which a record begins.
+RECORDS = ("Source Image ID", "Component ID", "Tile ID")
+ORDER, SOURCES = "Product Order Metadata", "Source Image Metadata"
+SPACE, COMPONENTS = "Product Space Metadata", "Product Component Metadata"
+METRES = ("", "m", "meter", "meters", "metre", "metres")
+DEGREES = ("", "deg", "degs", "degree", "degrees")
+PIXELS = ("", "pixel", "pixels")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One line ``key: value`` and the headings above it."""
+
+    line: int
+    groups: tuple[str, ...]
+    key: str
+    value: str
+
+
+@dataclass(frozen=True)
+class Record:
+    """The entries of one record of a section, looked up by key wherever they are nested."""
+
+    file: str
+    name: str
+    entries: tuple[Entry, ...]
+
+    def text(self, *keys: str) -> str | None:
+        """Return the value of the first of these keys that is there and not empty; None without.
+
+        Raises
+        ------
+        InputError
+            If the key stands there twice with two values.
+        """
+        for key in keys:
+            found = [entry for entry in self.entries if entry.key.lower() == key.lower() and entry.value]
+            if len({entry.value for entry in found}) > 1:
+                lines = ", ".join(str(entry.line) for entry in found)
+                raise InputError(
+                    f"this key stands in lines {lines} with different values", file=self.file,
+                    field=f"{self.name}: {key}", remedy="remove the wrong one",
+                )  # fmt: skip
+            if found:
+                return found[0].value
+        return None
+
+    def number(self, *keys: str, units: tuple[str, ...] = ("",), low: float = -1e9, high: float = 1e9) -> float | None:
+        """Return the number of the first of these keys that is there; None without.
+
+        Raises
+        ------
+        InputError
+            If it is no number, has another unit, or is out of range.
+        """
+        value = self.text(*keys)
+        if value is None:
+            return None
+        shown = value if len(value) < 60 else f"{value[:60]}..."
+        match = _NUMBER.fullmatch(value[:200])
+        number = float(match[1]) if match else math.nan
+        problem = None
+        if not math.isfinite(number):
+            problem = f"{shown!r} is no number"
+        elif match is not None and match[2].lower() not in units:
+            problem = f"{shown!r} is in {match[2]}, not in {units[-1] or 'plain numbers'}"
+        elif not low <= number <= high:
+            problem = f"{shown} is not between {low:g} and {high:g}"
+        if problem:
+            raise InputError(problem, file=self.file, field=f"{self.name}: {keys[0]}", remedy="correct the file")
+        return number
+
+    def count(self, *keys: str, units: tuple[str, ...] = PIXELS) -> int | None:
+        """Return a whole number that is not negative; None without."""
+        value = self.number(*keys, units=units, low=0, high=1e7)
+        if value is not None and value != int(value):
+            raise InputError(
+                f"{value} is no whole number", file=self.file, field=f"{self.name}: {keys[0]}",
+                remedy="correct the file",
+            )  # fmt: skip
+        return None if value is None else int(value)
+
+
+@dataclass(frozen=True)
+class SourceImage:
+    """One acquisition; angles in degrees, None for what the file does not say.
+
+    `azimuth` and `elevation` are of the satellite as seen from the scene, `azimuth` from true north clockwise.
+    """
+
+    source_image: str
+    product_image: str
+    sensor: str | None
+    azimuth: float | None
+    elevation: float | None
+    sun_azimuth: float | None
+    sun_elevation: float | None
+    scan_azimuth: float | None
+    acquired: str | None
+    cloud_percent: float | None
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How an image lies on the map; None for what the file does not say.
+
+    `upper_left` is the map position of the *centre* of the first pixel, `size` columns and rows.
+    """
+
+    upper_left: tuple[float, float] | None
+    pixel: tuple[float, float] | None
+    size: tuple[int, int] | None
+    reference_height: float | None = None
+
+    def completed_by(self, other: Placement) -> Placement:
+        """Return this placement with what it does not say taken from another."""
+        return Placement(
+            self.upper_left or other.upper_left,
+            self.pixel or other.pixel,
+            self.size or other.size,
+            self.reference_height if self.reference_height is not None else other.reference_height,
+        )
+
+
+@dataclass(frozen=True)
+class Component:
+    """A rectangular piece of a product image, in files of its own."""
+
+    component: str
+    product_image: str
+    placement: Placement
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """What the metadata file of an order says.
+
+    `crs` is None where the projection is another than UTM on WGS84, `projection` what the file calls it. `product`
+    is what the whole product has in common, where it does not belong to one component.
+    """
+
+    file: str
+    order: str | None
+    product_line: str | None
+    level: str | None
+    image_type: str | None
+    bits: int | None
+    projection: str | None
+    crs: str | None
+    product: Placement
+    sources: tuple[SourceImage, ...]
+    components: tuple[Component, ...]
+    notes: tuple[str, ...] = ()
+
+    def component(self, name: str | None) -> Component:
+        """Return the component of this ID; without one the only one that there is.
+
+        Raises
+        ------
+        InputError
+            If there is none, or several.
+        """
+        found = [one for one in self.components if name is None or one.component == name]
+        if len(found) != 1:
+            known = ", ".join(one.component for one in self.components[:10])
+            raise InputError(
+                f"{'no' if not found else 'more than one'} component is called {name} (there are {known or 'none'})",
+                file=self.file, field=f"{COMPONENTS}: Component ID",
+                remedy="give the metadata file that belongs to this image",
+            )  # fmt: skip
+        return found[0]
+
+    def source_of(self, component: Component) -> SourceImage:
+        """Return the acquisition that a component shows, by its product image.
+
+        Raises
+        ------
+        InputError
+            If the link is broken.
+        """
+        found = [one for one in self.sources if one.product_image == component.product_image]
+        if len(found) != 1:
+            raise InputError(
+                f"component {component.component} is of product image {component.product_image}, which "
+                f"{'no source image has' if not found else 'several source images have'}",
+                file=self.file, field=f"{SOURCES}: Product Image ID", remedy="ask for the whole metadata file",
+            )  # fmt: skip
+        return found[0]
+
+
+def read_metadata(path: str | PathLike[str]) -> Delivery:
+    """Read the metadata file of an order.
+
+    Raises
+    ------
+    InputError
+        Names file, section, key and remedy: a file that is cut off or no such file at all, a missing section, a value
+        of a wrong kind or unit, a key with two values.
+    """
+    text = _text(path)
+    sections = _sections(str(path), text)
+    order = _head(path, sections, ORDER)
+    space = _head(path, sections, SPACE, needed=False)
+    sources = [_source(one) for one in _records(path, sections, SOURCES)[1:]]
+    title = COMPONENTS if COMPONENTS in sections else SPACE
+    parts = _records(path, sections, title)
+    components = [_component(one) for one in parts[1:]]
+    _check_counts(path, sections, len(sources), len(components))
+    notes = []
+    if not text.rstrip().endswith("====="):
+        if not text.endswith("\n"):
+            raise InputError(
+                "the file is cut off: its last line does not end", file=path, field=COMPONENTS, remedy="copy it again"
+            )
+        notes.append("the metadata file does not end with a line of =: was it cut off?")
+    projection, crs = _projection(order)
+    return Delivery(
+        file=str(path),
+        order=order.text("Product Order Number"),
+        product_line=order.text("Product Line"),
+        level=order.text("Processing Level"),
+        image_type=order.text("Image Type"),
+        bits=_bits(order),
+        projection=projection,
+        crs=crs,
+        product=_placement(space),
+        sources=tuple(sources),
+        components=tuple(components),
+        notes=tuple(notes),
+    )
+
+
+def read_header(path: str | PathLike[str]) -> Placement:
+    """Read how an image lies on the map from its ``_hdr.txt``; its keys are those of a component.
+
+    Raises
+    ------
+    InputError
+        As `read_metadata`.
+    """
+    entries = tuple(_entries(_lines(str(path), _text(path))))
+    return _placement(Record(str(path), "header", entries))
+
+
+# -- text ------------------------------------------------------------------------------------------------------------
+
+
+def _text(path: str | PathLike[str]) -> str:
+    try:
+        with open(path, "rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(
+            f"this file cannot be read ({reason})", file=path, field="metadata",
+            remedy="give the option metadata=FILE",
+        ) from error  # fmt: skip
+    problem = None
+    if len(data) > MAX_BYTES:
+        problem = f"a metadata file has not more than {MAX_BYTES // 1_000_000} MB"
+    elif data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        problem = "this file is UTF-16 text"
+    elif b"\0" in data:
+        problem = "this is a binary file, no metadata text"
+    if problem:
+        raise InputError(problem, file=path, field="metadata", remedy="give the _metadata.txt of the delivery")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        # Keys and numbers are ASCII in any case; names of projects need not be.
+        return data.decode("latin-1")
+
+
+def _lines(path: str, text: str) -> Iterator[tuple[int, str]]:
+    for number, line in enumerate(text.splitlines(), start=1):
+        if len(line) > MAX_LINE:
+            raise InputError(
+                f"a line of {len(line)} characters", file=path, field=f"line {number}", remedy="copy the file again"
+            )
+        if line.strip():
+            yield number, line.expandtabs(3)
+
+
+def _sections(path: str, text: str) -> dict[str, list[Record]]:
+    """Return by title the records of each section; the first is what stands before any record."""
+    blocks: list[list[tuple[int, str]]] = [[]]
+    for number, line in _lines(path, text):
+        if _RULE.fullmatch(line.strip()):
+            if line.lstrip()[0] == "=":
+                blocks.append([])
+        else:
+            blocks[-1].append((number, line))
+    sections: dict[str, list[Record]] = {}
+    for block in blocks:
+        if not block or ":" in block[0][1]:
+            continue
+        number, title = block[0][0], " ".join(block[0][1].split())
+        if title in sections:
+            raise InputError(
+                f"this section stands there twice, again in line {number}", file=path, field=title[:60],
+                remedy="remove one of them",
+            )  # fmt: skip
+        sections[title] = _split(path, title, list(_entries(iter(block[1:]))))
+    return sections
+
+
+def _entries(lines: Iterator[tuple[int, str]]) -> Iterator[Entry]:
+    above: list[tuple[int, str]] = []
+    for number, line in lines:
+        depth = len(line) - len(line.lstrip())
+        while above and above[-1][0] >= depth:
+            above.pop()
+        key, colon, value = (" ".join(part.split()) for part in line.partition(":"))
+        if colon:
+            yield Entry(number, tuple(name for _, name in above), key, value)
+        above.append((depth, " ".join(line.split())))
+
+
+def _split(path: str, title: str, entries: list[Entry]) -> list[Record]:
+    starts = [0, *(k for k, entry in enumerate(entries) if entry.key in RECORDS and not entry.groups), len(entries)]
+    records = []
+    for k, (start, end) in enumerate(itertools.pairwise(starts)):
+        name = title if k == 0 else f"{title}, {entries[start].key} {entries[start].value[:40]}"
+        records.append(Record(path, name, tuple(entries[start:end])))
+    return records
+
+
+def _records(path: str | PathLike[str], sections: dict[str, list[Record]], title: str) -> list[Record]:
+    if title not in sections:
+        raise InputError(
+            "this section is missing", file=path, field=title,
+            remedy="give the whole _metadata.txt of the delivery; a file that was cut off lacks the last sections",
+        )  # fmt: skip
+    return sections[title]
+
+
+def _head(path: str | PathLike[str], sections: dict[str, list[Record]], title: str, *, needed: bool = True) -> Record:
+    if not needed and title not in sections:
+        return Record(str(path), title, ())
+    return _records(path, sections, title)[0]
+
+
+def _check_counts(path: str | PathLike[str], sections: dict[str, list[Record]], sources: int, components: int) -> None:
+    for title, key, found in (
+        (SOURCES, "Number of Source Images", sources),
+        (COMPONENTS, "Number of Components", components),
+    ):
+        stated = _head(path, sections, title, needed=False).count(key, units=("",))
+        if found == 0 or (stated is not None and stated != found):
+            raise InputError(
+                f"{found} are described, {'at least one' if stated is None else stated} should be",
+                file=path, field=f"{title}: {key}", remedy="the file is cut off or was edited: copy it again",
+            )  # fmt: skip
+
+
+# -- meaning ---------------------------------------------------------------------------------------------------------
+
+
+def _source(record: Record) -> SourceImage:
+    time = record.text("Acquisition Date/Time")
+    match = _TIME.fullmatch(time) if time else None
+    return SourceImage(
+        source_image=_identity(record, "Source Image ID"),
+        product_image=_identity(record, "Product Image ID"),
+        sensor=record.text("Sensor"),
+        azimuth=record.number("Nominal Collection Azimuth", units=DEGREES, low=-360, high=360),
+        elevation=record.number("Nominal Collection Elevation", units=DEGREES, low=0, high=90),
+        sun_azimuth=record.number("Sun Angle Azimuth", units=DEGREES, low=-360, high=360),
+        sun_elevation=record.number("Sun Angle Elevation", units=DEGREES, low=-90, high=90),
+        scan_azimuth=record.number("Scan Azimuth", units=DEGREES, low=-360, high=360),
+        acquired=f"{match[1]}T{match[2]}Z" if match else time,
+        cloud_percent=record.number("Percent Cloud Cover", units=("", "percent"), low=-1, high=999),
+    )
+
+
+def _component(record: Record) -> Component:
+    return Component(
+        component=_identity(record, "Component ID", "Tile ID"),
+        product_image=_identity(record, "Product Image ID"),
+        placement=_placement(record),
+    )
+
+
+def _identity(record: Record, *keys: str) -> str:
+    value = record.text(*keys)
+    if value is None:
+        raise InputError(
+            "this key is missing", file=record.file, field=f"{record.name}: {keys[0]}",
+            remedy="it links components with acquisitions: give the whole metadata file",
+        )  # fmt: skip
+    return value
+
+
+def _placement(record: Record) -> Placement:
+    x = record.number("UL Map X (Easting)", "UL Map X", units=METRES)
+    y = record.number("UL Map Y (Northing)", "UL Map Y", units=METRES)
+    dx = record.number("Pixel Size X", units=METRES, low=0.01, high=1000)
+    dy = record.number("Pixel Size Y", units=METRES, low=0.01, high=1000)
+    columns, rows = record.count("Columns"), record.count("Rows")
+    for first, second, key in ((x, y, "UL Map X, UL Map Y"), (dx, dy, "Pixel Size X, Pixel Size Y"),
+                               (columns, rows, "Columns, Rows")):  # fmt: skip
+        if (first is None) != (second is None):
+            raise InputError(
+                "one of the two is missing", file=record.file, field=f"{record.name}: {key}",
+                remedy="the file is cut off or was edited: copy it again",
+            )  # fmt: skip
+    return Placement(
+        upper_left=None if x is None or y is None else (x, y),
+        pixel=None if dx is None or dy is None else (dx, dy),
+        size=None if columns is None or rows is None else (columns, rows),
+        reference_height=record.number("Reference Height", units=METRES, low=-1000, high=10_000),
+    )
+
+
+def _bits(order: Record) -> int | None:
+    text = order.text("Bits per Pixel per Band")
+    match = re.match(r"\d{1,3}\b", text, re.ASCII) if text else None
+    return int(match[0]) if match else None
+
+
+def _projection(order: Record) -> tuple[str | None, str | None]:
+    """Return what the file calls its map projection, and its CRS where that is UTM on WGS84."""
+    name, datum = order.text("Map Projection"), order.text("Datum")
+    if name is None:
+        return None, None
+    shown = f"{name}, datum {datum or 'not stated'}"
+    utm = name.lower() in ("universal transverse mercator", "utm")
+    if not utm or datum is None or re.sub(r"[\s_-]", "", datum).upper() not in ("WGS84", "WGS1984"):
+        return shown, None
+    zone, hemisphere = order.count("Zone Number", "Zone", units=("",)), (order.text("Hemisphere") or "").upper()[:1]
+    if zone is None or not 1 <= zone <= 60 or hemisphere not in ("N", "S"):
+        raise InputError(
+            f"zone {zone} {hemisphere or '(no hemisphere)'} is no UTM zone", file=order.file,
+            field=f"{order.name}: UTM Specific Parameters", remedy="Zone Number 1 to 60, Hemisphere N or S",
+        )  # fmt: skip
+    return shown, f"EPSG:{(32600 if hemisphere == 'N' else 32700) + zone}"

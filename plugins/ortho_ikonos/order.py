@@ -1,0 +1,218 @@
+"""The files of an IKONOS order: which bands and components lie beside an image, and where each lies on the map."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyproj
+from osgeo import gdal
+
+from ortho_ikonos.metadata import Component, Delivery, Placement, read_header
+from ortho_pipeline.crs import same_crs
+from ortho_pipeline.errors import InputError
+
+_NAME = re.compile(
+    r"(?P<order>po_[^/\\]+)_(?P<band>[a-z]{2,4})_(?P<component>\d{7})\.(?:tiff?|ntf|nitf)", re.IGNORECASE | re.ASCII
+)
+#: Bands that have a file of their own, in the vendor's order of a file of several.
+SEPARATE = ("blu", "grn", "red", "nir")
+#: Georeferencing and metadata that differ by more than this (pixels) are not the same.
+_SAME = 0.05
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """One image of an order by its name ``po_<order>_<band>_<component>.tif``."""
+
+    path: Path
+    order: str
+    band: str
+    component: str
+
+    @classmethod
+    def of(cls, path: Path) -> ImageFile | None:
+        """Return what the name says; None for a name that is not the vendor's."""
+        match = _NAME.fullmatch(path.name)
+        return match and cls(path, match["order"], match["band"].lower(), match["component"])
+
+    @property
+    def metadata(self) -> Path:
+        """Where the metadata file of the order is."""
+        return beside(self.path, f"{self.order}_metadata.txt")
+
+    @property
+    def panchromatic(self) -> bool:
+        """Whether it has the pixels of the panchromatic camera: alone, or sharpened bands with them."""
+        return self.band == "pan"
+
+    def others(self) -> Iterator[ImageFile]:
+        """Yield the other images of the order whose pixels are as large, by name."""
+        for path in sorted(self.path.parent.iterdir()):
+            other = ImageFile.of(path)
+            if other is None or other.path.name == self.path.name or other.order.lower() != self.order.lower():
+                continue
+            if other.panchromatic == self.panchromatic:
+                yield other
+
+
+def beside(path: Path, name: str) -> Path:
+    """Return the file of this name in the folder of `path`, whatever the case of its letters."""
+    exact = path.with_name(name)
+    if exact.exists() or not path.parent.is_dir():
+        return exact
+    return next((one for one in path.parent.iterdir() if one.name.lower() == name.lower()), exact)
+
+
+def rpc_file(path: Path) -> Path | None:
+    """Return the ``_rpc.txt`` of an image; None without one."""
+    found = beside(path, f"{path.stem}_rpc.txt")
+    return found if found.is_file() else None
+
+
+def bands_of(image: ImageFile, wanted: str) -> tuple[Path, ...]:
+    """Return the files whose bands are stacked: none for ``one``, ``all`` separate bands, or names with commas.
+
+    Raises
+    ------
+    InputError
+        If a band is not there, or the image itself is none of them.
+    """
+    if wanted == "one":
+        return ()
+    there = {image.band: image.path}
+    there |= {other.band: other.path for other in image.others() if other.component == image.component}
+    names = [name.strip().lower() for name in wanted.split(",")]
+    if wanted == "all":
+        names = [name for name in SEPARATE if name in there]
+    missing = [name for name in names if name not in there]
+    if missing or image.band not in names:
+        raise InputError(
+            f"there is no band {missing[0]!r} beside it" if missing else f"band {image.band!r} is not one of them",
+            file=image.path, field="bands",
+            remedy=f"all, one, or some of {', '.join(sorted(there))} with the band of this image among them",
+        )  # fmt: skip
+    return tuple(there[name] for name in names)
+
+
+# -- where an image lies ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where an image lies on the map; None for what nothing says.
+
+    `corner` is the outer corner of the first pixel, `pixel` the size of a pixel of this image, both in metres;
+    `sources` are the files that say so.
+    """
+
+    crs: str | None
+    corner: tuple[float, float] | None
+    pixel: tuple[float, float] | None
+    reference_height: float | None
+    warnings: tuple[str, ...] = ()
+    sources: tuple[Path, ...] = ()
+
+    def offset_of(self, other: Position) -> tuple[float, float] | None:
+        """Return the position of the first corner of another image in the pixels of this; None where unknown."""
+        if self.corner is None or self.pixel is None or other.corner is None or other.pixel is None:
+            return None
+        if not all(math.isclose(a, b, rel_tol=1e-9) for a, b in zip(self.pixel, other.pixel, strict=True)):
+            return None
+        column = (other.corner[0] - self.corner[0]) / self.pixel[0]
+        row = (self.corner[1] - other.corner[1]) / self.pixel[1]
+        return round(column, 6), round(row, 6)
+
+
+def position_of(dataset: gdal.Dataset, delivery: Delivery, component: Component) -> Position:
+    """Return where an image lies: by its header, its component, the product, and last by its own georeferencing.
+
+    Raises
+    ------
+    InputError
+        If the image has not the size that is stated.
+    """
+    path, size = Path(dataset.GetDescription()), (dataset.RasterXSize, dataset.RasterYSize)
+    header = beside(path, f"{path.stem}_hdr.txt")
+    stated, sources = component.placement, (Path(delivery.file),)
+    if header.is_file():
+        stated, sources = read_header(header).completed_by(stated), (*sources, header)
+    if len(delivery.components) == 1:
+        stated = stated.completed_by(delivery.product)
+    factor = _factor(stated, size, path)
+    stated = stated.completed_by(delivery.product)
+    corner, pixel = _corner(stated), stated.pixel and (factor * stated.pixel[0], factor * stated.pixel[1])
+    crs, own = delivery.crs, _georeferencing(dataset)
+    warnings = []
+    if own is not None:
+        own_crs, own_corner, own_pixel = own
+        crs = crs or own_crs.to_string()
+        if not same_crs(pyproj.CRS(crs), own_crs):
+            warnings.append(f"the image says it is in {own_crs.name}, the metadata {delivery.projection}")
+        elif corner is not None and pixel is not None:
+            off = _difference(corner, pixel, own_corner, own_pixel, size)
+            if off > _SAME:
+                warnings.append(
+                    f"the georeferencing of the image is {off:.2f} px off the metadata, which are believed "
+                    "(UL Map X and Y are the centre of the first pixel)"
+                )
+        corner, pixel = corner or own_corner, pixel or own_pixel
+    return Position(crs, corner, pixel, stated.reference_height, tuple(warnings), sources)
+
+
+def _factor(stated: Placement, size: tuple[int, int], path: Path) -> int:
+    """Return how many stated pixels are one pixel of the image: 4 for colours beside panchromatic metadata.
+
+    Colour and panchromatic images of one acquisition share their outer corner.
+    """
+    if stated.size is None or stated.size == size:
+        return 1
+    factor = round(stated.size[0] / size[0])
+    if factor < 2 or any(abs(whole - factor * part) >= factor for whole, part in zip(stated.size, size, strict=True)):
+        raise InputError(
+            f"the image has {size[0]} x {size[1]} pixels, the metadata are of {stated.size[0]} x {stated.size[1]}",
+            file=path, field="Columns, Rows", remedy="give the whole image as delivered, and its own metadata",
+        )  # fmt: skip
+    return factor
+
+
+def _corner(stated: Placement) -> tuple[float, float] | None:
+    """Return the outer corner of the first pixel, whose centre is stated."""
+    if stated.upper_left is None or stated.pixel is None:
+        return None
+    return stated.upper_left[0] - stated.pixel[0] / 2, stated.upper_left[1] + stated.pixel[1] / 2
+
+
+def _georeferencing(dataset: gdal.Dataset) -> tuple[pyproj.CRS, tuple[float, float], tuple[float, float]] | None:
+    """Return CRS, outer corner and pixel size of a north-up image in a map projection; None for any other."""
+    transform, reference = dataset.GetGeoTransform(can_return_null=True), dataset.GetSpatialRef()
+    if transform is None or reference is None or not reference.IsProjected():
+        return None
+    left, dx, skew_x, top, skew_y, dy = transform
+    if skew_x or skew_y or dx <= 0 or dy >= 0:
+        return None
+    try:
+        crs = pyproj.CRS.from_wkt(reference.ExportToWkt())
+    except pyproj.exceptions.CRSError:
+        return None
+    code = crs.to_epsg()
+    return pyproj.CRS.from_epsg(code) if code else crs, (left, top), (dx, -dy)
+
+
+def _difference(
+    corner: tuple[float, float],
+    pixel: tuple[float, float],
+    own_corner: tuple[float, float],
+    own_pixel: tuple[float, float],
+    size: tuple[int, int],
+) -> float:
+    """Return by how many pixels two placements of an image differ at its first and its last corner at most."""
+    signs, worst = (1, -1), 0.0
+    for axis in (0, 1):
+        first = own_corner[axis] - corner[axis]
+        last = first + signs[axis] * size[axis] * (own_pixel[axis] - pixel[axis])
+        worst = max(worst, abs(first / pixel[axis]), abs(last / pixel[axis]))
+    return worst
