@@ -32,6 +32,66 @@ def simulate_bilsat(
     print_result(result, as_json)
 
 
+@simulate.command("ikonos")
+@folder_option
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of hills, errors and noise.")
+@click.option(
+    "--off-nadir", type=click.FloatRange(0, 45), metavar="DEG", help="Tilt  [default: that of 'reproduce ikonos']"
+)
+@click.option("--size", type=int, default=1000, show_default=True, metavar="PX", help="Columns and rows.")
+@click.option("--pixel", type=float, metavar="M", help="Size of a pixel  [default: so that the image covers 11 km]")
+@click.option("--rpc/--no-rpc", default=True, help="Deliver _rpc.txt or not.")
+@click.option("--ms", "multispectral", is_flag=True, help="Four bands in files of their own beside pan.")
+@click.option("--components", type=int, default=1, show_default=True, help="Files that each image is cut into.")
+@json_option
+def simulate_ikonos(
+    folder: str,
+    seed: int,
+    off_nadir: float | None,
+    size: int,
+    pixel: float | None,
+    rpc: bool,
+    multispectral: bool,
+    components: int,
+    as_json: bool,
+) -> None:
+    """Write an IKONOS Geo delivery over Tehran: images, metadata, RPC, DEM, 20 control and 20 check points, truth."""
+    from ortho_pipeline import studies
+
+    result = studies.simulate_ikonos(
+        folder, seed=seed, off_nadir_deg=off_nadir, size=size, pixel=pixel, rpc=rpc, multispectral=multispectral,
+        components=components,
+    )  # fmt: skip
+    print_result(result, as_json)
+
+
+@simulate.command("cartosat")
+@folder_option
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of points and all noise.")
+@click.option(
+    "--size",
+    type=int,
+    default=1200,
+    show_default=True,
+    metavar="PX",
+    help="Columns and rows; 12000 are the real ones, fewer are larger.",
+)
+@click.option(
+    "--jitter",
+    type=click.FloatRange(0, 10),
+    default=0.0,
+    show_default=True,
+    metavar="PX",
+    help="Swinging of the pitch.",
+)
+@json_option
+def simulate_cartosat(folder: str, seed: int, size: int, jitter: float, as_json: bool) -> None:
+    """Write a CARTOSAT-1 stereo pair over Hobart: BANDF and BANDA with _MET.TXT and _RPC.TXT, DEM, 69 points, truth."""
+    from ortho_pipeline import studies
+
+    print_result(studies.simulate_cartosat(folder, seed=seed, size=size, jitter=jitter), as_json)
+
+
 @click.group()
 def reproduce() -> None:
     """Compute the tables of the papers that this package implements, beside the papers' numbers."""
@@ -49,4 +109,34 @@ def reproduce_bilsat(folder: str | None, realisations: int, as_json: bool) -> No
 
     with progress("Reproducing") as advance:
         result = studies.reproduce_bilsat(folder, realisations=realisations, progress=advance)
+    print_result(result, as_json)
+
+
+@reproduce.command("ikonos")
+@click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the page.")
+@click.option(
+    "--realisations", type=click.IntRange(min=1), default=100, show_default=True, help="How often a scene is drawn."
+)
+@json_option
+def reproduce_ikonos(folder: str | None, realisations: int, as_json: bool) -> None:
+    """Table 2 and figure 4 of Amini and Hashemi, on simulated IKONOS scenes; and what the paper did not have."""
+    from ortho_pipeline import studies
+
+    with progress("Reproducing") as advance:
+        result = studies.reproduce_ikonos(folder, realisations=realisations, progress=advance)
+    print_result(result, as_json)
+
+
+@reproduce.command("cartosat")
+@click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the page.")
+@click.option(
+    "--realisations", type=click.IntRange(min=1), default=50, show_default=True, help="How often a pair is drawn."
+)
+@json_option
+def reproduce_cartosat(folder: str | None, realisations: int, as_json: bool) -> None:
+    """Tables 2 to 6 of Willneff et al., on simulated CARTOSAT-1 stereo pairs; and curves over the control points."""
+    from ortho_pipeline import studies
+
+    with progress("Reproducing") as advance:
+        result = studies.reproduce_cartosat(folder, realisations=realisations, progress=advance)
     print_result(result, as_json)

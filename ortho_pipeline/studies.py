@@ -71,6 +71,108 @@ def reproduce_bilsat(
     return _written("bilsat", document, folder, lambda: bilsat_page.page(document, *bilsat.error_vectors()))
 
 
+def simulate_ikonos(
+    folder: str | os.PathLike[str],
+    *,
+    seed: int = 0,
+    off_nadir_deg: float | None = None,
+    size: int = 1000,
+    pixel: float | None = None,
+    rpc: bool = True,
+    multispectral: bool = False,
+    components: int = 1,
+) -> Result:
+    """Write a simulated IKONOS Geo delivery: images, metadata, RPC, DEM, 20 control and 20 check points, truth.
+
+    Parameters
+    ----------
+    off_nadir_deg : float, optional
+        Tilt; that of the paper's reproduction without it.
+    size, pixel : int, float, optional
+        Columns and rows, and metres of a pixel; without the latter they cover 11 km.
+    rpc, multispectral, components
+        Deliver RPCs; four bands beside pan; number of files that each image is cut into.
+
+    Raises
+    ------
+    InputError
+        If such a scene is not possible, or the folder cannot be written.
+    """
+    from ortho_ikonos.simulation import write_product
+
+    from ortho_pipeline.experiments.ikonos_scene import OFF_NADIR_DEG
+
+    files = write_product(
+        folder, seed=seed, off_nadir_deg=OFF_NADIR_DEG if off_nadir_deg is None else off_nadir_deg, size=size,
+        pixel=pixel, rpc=rpc, multispectral=multispectral, components=components,
+    )  # fmt: skip
+    return Result(files, {}, f"A simulated IKONOS Geo scene (seed {seed}); try\n  ortho rectify {files['image']} "
+                  f"--gcps {files['gcps']} --dem {files['dem']} -o out")  # fmt: skip
+
+
+def reproduce_ikonos(
+    folder: str | os.PathLike[str] | None = None,
+    *,
+    realisations: int = 100,
+    progress: Callable[[float], None] | None = None,
+) -> Result:
+    """Compute table 2 and figure 4 of the IKONOS paper on simulated scenes, beside the paper's numbers.
+
+    Parameters
+    ----------
+    folder : path, optional
+        Where ``ikonos.json`` and the page ``ikonos.html`` go.
+    """
+    from ortho_pipeline.experiments import ikonos, ikonos_page
+
+    document = ikonos.reproduce(realisations, progress=progress)
+    return _written("ikonos", document, folder, lambda: ikonos_page.page(document, ikonos.error_vectors()))
+
+
+def simulate_cartosat(
+    folder: str | os.PathLike[str], *, seed: int = 0, size: int = 1200, jitter: float = 0.0
+) -> Result:
+    """Write a simulated CARTOSAT-1 stereo pair: two images with metadata and RPCs, DEM, 69 points, truth.
+
+    Parameters
+    ----------
+    size : int
+        Columns and rows of both images; 12000 are the real ones, fewer are larger.
+    jitter : float
+        Swinging of the pitch, px of the full size.
+
+    Raises
+    ------
+    InputError
+        If such a pair is not possible, or the folder cannot be written.
+    """
+    from ortho_cartosat.simulation import write_product
+
+    files = write_product(folder, seed=seed, size=size, jitter=jitter)
+    return Result(files, {}, f"A simulated CARTOSAT-1 stereo pair (seed {seed}); try\n  ortho adjust {files['fore']} "
+                  f"{files['aft']} --points {files['points']} --model rpc --correction affine -o out")  # fmt: skip
+
+
+def reproduce_cartosat(
+    folder: str | os.PathLike[str] | None = None,
+    *,
+    realisations: int = 50,
+    progress: Callable[[float], None] | None = None,
+) -> Result:
+    """Compute tables 2 to 6 of the CARTOSAT-1 paper on simulated stereo pairs, beside the paper's numbers.
+
+    Parameters
+    ----------
+    folder : path, optional
+        Where ``cartosat.json`` and the page ``cartosat.html`` go.
+    """
+    from ortho_pipeline.experiments import cartosat, cartosat_page
+
+    document = cartosat.reproduce(realisations, progress=progress)
+    vectors = {model: cartosat.error_vectors(model) for model in cartosat_page.DRAWN}
+    return _written("cartosat", document, folder, lambda: cartosat_page.page(document, vectors))
+
+
 def _written(
     name: str, document: Mapping[str, Any], folder: str | os.PathLike[str] | None, page: Callable[[], str]
 ) -> Result:

@@ -1,6 +1,6 @@
 """Make the sample data: a simulated satellite scene, its RPC, a DEM, ground control, and the truth behind them.
 
-Beside it a small BILSAT-1 frame with its imaging survey, in a folder of its own.
+Beside it a small BILSAT-1 frame with its imaging survey, and a small IKONOS Geo delivery, in folders of their own.
 
 Run ``python sample_data/make.py [FOLDER]``; without a folder the files of this one are written again. Everything comes
 from seeds, so that the pixels and numbers are the same every time.
@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 import pyproj
 from ortho_bilsat.simulation import write_product
+from ortho_cartosat.simulation import write_product as write_cartosat
+from ortho_ikonos.simulation import write_product as write_ikonos
 from osgeo import gdal
 
 from ortho_pipeline.crs import Vertical
@@ -51,6 +53,11 @@ DEM_MARGIN = 400.0
 EGM96 = "EPSG:5773"
 #: The BILSAT-1 frame: pixels eight times as wide as the real ones, and a coarse DEM, to keep it small.
 BILSAT_SIZE, BILSAT_DEM_STEP = 256, 250.0
+#: The IKONOS delivery: pixels 12.5 times as wide as the real ones, and a coarse DEM, to keep it small.
+IKONOS_SIZE, IKONOS_PIXEL, IKONOS_DEM_STEP = 800, 12.5, 50.0
+
+#: The CARTOSAT-1 pair: pixels thirty times as wide as the real ones, and a coarse DEM, to keep it small.
+CARTOSAT_SIZE, CARTOSAT_DEM_STEP = 400, 120.0
 
 
 def main(folder: Path) -> None:
@@ -76,6 +83,10 @@ def main(folder: Path) -> None:
     truth = truth_of(camera, terrain, delivered, points)
     write_text(folder / "truth.json", json.dumps(truth, indent=1) + "\n")
     write_product(folder / "bilsat", seed=1, size=BILSAT_SIZE, dem_step=BILSAT_DEM_STEP)
+    write_ikonos(
+        folder / "ikonos", seed=1, size=IKONOS_SIZE, pixel=IKONOS_PIXEL, multispectral=True, dem_step=IKONOS_DEM_STEP
+    )
+    write_cartosat(folder / "cartosat", seed=1, size=CARTOSAT_SIZE, dem_step=CARTOSAT_DEM_STEP)
 
 
 def vendor_rpc(camera: LineScanner) -> RpcExport:

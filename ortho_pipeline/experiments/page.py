@@ -13,7 +13,9 @@ from ortho_pipeline.experiments.tables import is_within
 from ortho_pipeline.models.base import Array
 
 _SIDE, _MARGIN = 520.0, 18.0
-_UNITS = {"px": ("pixels", "pixel", "pixels"), "m": ("metres", "metre", "metres")}
+_UNITS = {
+    "px": ("pixels", "pixel", "pixels"), "m": ("metres", "metre", "metres"), "px, m": ("pixels and metres", "", ""),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

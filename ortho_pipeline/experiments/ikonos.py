@@ -1,0 +1,352 @@
+"""Table 2 and figure 4 of Amini and Hashemi on simulated IKONOS Geo scenes: the paper's numbers beside ours.
+
+Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws what the paper does
+not tell: the hills, the places of the points, the azimuth of the satellite and the vendor's error; and the noise.
+Nothing is tuned per row. Each free setting has the value that one row asks for:
+
+- pointing in the image 0.5 px (of a metre) per axis, from DLT (1.19 m); the 0.5 m per axis of the map are the paper's;
+- scan against the flight, from 3D affine (1.89 m): with a forward scan, in which the lines of sight are parallel along
+  the scan, it would be 1.4 m. Of three real products that were looked at, two were scanned in reverse;
+- how much steeper the city's slope is in the north, from 2D affine (13.79 m);
+- how much the hills rise, from the quadratic polynomial (7.31 m).
+
+The rows of the projective model and of the cubic polynomial set nothing. One choice was made in sight of all rows: how
+the hills fall off with their wavelength (the longest wave 25 km rather than 12 or 40) and how much the city rises.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.estimation import Fit, fit
+from ortho_pipeline.experiments.ikonos_scene import (
+    BEND,
+    MAP_CRS,
+    OFF_NADIR_DEG,
+    POINTING,
+    POINTS,
+    REFERENCE_HEIGHT,
+    ROUGHNESS,
+    SIGMA_GROUND,
+    GeoScene,
+    VendorModel,
+)
+from ortho_pipeline.experiments.tables import Curve, Number, Statement, make_document
+from ortho_pipeline.model_choice import fit_family, fit_own, prune
+from ortho_pipeline.models import family_of
+from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.models.correction import ImageCorrection
+from ortho_pipeline.models.geo import MapPlane
+from ortho_pipeline.points import Points
+from ortho_pipeline.rpc import fit_rpc
+from ortho_pipeline.selection import select_control
+
+PAPER = "Amini and Hashemi, Geometric correction in Ikonos images - case study: Tehran, Iran"
+#: RMS error of 20 check points, from 20 control points: table 2, in its order; pixels of 1 m are metres.
+TABLE_2 = {
+    "affine2d": 13.79014,
+    "affine3d": 1.889675,
+    "dlt": 1.188267,
+    "projective": 13.20788,
+    "poly2": 7.314452,
+    "poly3": 5.583822,
+}
+#: The paper's names of the models.
+NAMES = {
+    "affine2d": "2D affine",
+    "affine3d": "3D affine",
+    "dlt": "DLT",
+    "projective": "2D projective",
+    "poly2": "quadratic polynomial",
+    "poly3": "cubic polynomial",
+}
+#: What a vendor's model is good for: heights (m) of the RPC and of the model from metadata.
+HEIGHTS = (900.0, 2000.0)
+#: Own models of the scene by number of points: model, correction, points. ``own``: its own parameters are adjusted.
+OWN = (
+    ("geo", "none", 0),
+    ("geo", "shift", 1),
+    ("geo", "shift", POINTS),
+    ("geo", "own", POINTS),
+    ("rpc", "none", 0),
+    ("rpc", "shift", 1),
+    ("rpc", "shift", POINTS),
+    ("rpc", "affine", POINTS),
+)
+#: Curves by number of control points: a family, or own model and correction, and its least number of points.
+CURVES = {
+    **{NAMES[name].removesuffix(" polynomial"): (name, "", family_of(name).minimum_points) for name in TABLE_2},
+    "geo + shift": ("geo", "shift", 1),
+    "RPC + shift": ("rpc", "shift", 1),
+    "RPC + affine": ("rpc", "affine", 3),
+}
+#: How many of the realisations the curves are made from: they are ten times the work of a table.
+CURVE_REALISATIONS = 30
+#: Errors (m) beyond this are not drawn: with no redundancy polynomials swing by far more.
+DRAWN = 30.0
+TITLES: dict[int | str, str] = {
+    2: "RMS error of 20 check points, from 20 control points",
+    "A": "The same points: leave-one-out, and the share of parameters that the points justify (5 %)",
+    "B": "RMS error of the check points with the scene's own models",
+    "C": "RMS error of the check points in other circumstances",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Realisation:
+    """A scene, its measured points, and the models that its metadata give."""
+
+    scene: GeoScene
+    points: Points
+    own: dict[str, SensorModel]
+
+    @classmethod
+    def draw(cls, seed: int, **settings: Any) -> Realisation:
+        """Draw all that the paper does not tell; settings are those of `GeoScene.make`."""
+        scene = GeoScene.make(seed, **settings)
+        return cls(scene, scene.measure(seed), {"geo": geo_model(scene), "rpc": vendor_rpc(scene)})
+
+
+def geo_model(scene: GeoScene) -> MapPlane:
+    """Return the model from the metadata alone: plane, and the direction to the satellite."""
+    azimuth, elevation = np.radians(scene.view)
+    return MapPlane.from_view(
+        MAP_CRS, (scene.west, scene.north), (scene.pixel, scene.pixel), (scene.columns, scene.rows),
+        REFERENCE_HEIGHT, float(azimuth), float(elevation), HEIGHTS,
+    )  # fmt: skip
+
+
+def vendor_rpc(scene: GeoScene) -> SensorModel:
+    """Return the RPC as a vendor fits it to what is known of the scene, errors of the attitude included."""
+    vendor = VendorModel.of(scene, HEIGHTS)
+    (west, south, _), (east, north, _) = vendor.box.tolist()
+    return fit_rpc(vendor, (west, south, east, north), HEIGHTS).rpc
+
+
+def reproduce(realisations: int = 100, *, progress: Callable[[float], None] | None = None) -> dict[str, Any]:
+    """Run the experiment and return the document of ``ortho reproduce ikonos --json``.
+
+    Returns
+    -------
+    dict
+        As `tables.make_document` makes it. Besides table 2: leave-one-out errors and justified parameters (A), the
+        models from metadata with few points (B), a forward scan and geocentric coordinates (C), and the error over the
+        number of control points for each model.
+    """
+    numbers = _numbers()
+    found = np.full((realisations, len(numbers)), np.nan)
+    curves = np.full((min(realisations, CURVE_REALISATIONS), len(CURVES), POINTS), np.nan)
+    relief = np.full((realisations, 2), np.nan)
+    for seed in range(realisations):
+        drawn = Realisation.draw(seed)
+        values, relief[seed] = _evaluate(drawn), relief_check(drawn)
+        values |= _elsewhere(seed, drawn)
+        found[seed] = [values[number.table, number.label, number.quantity] for number in numbers]
+        if seed < CURVE_REALISATIONS:
+            curves[seed] = _curve_values(drawn)
+        if progress:
+            progress((seed + 1) / realisations)
+    table = found[:, : len(TABLE_2)]
+    return make_document(
+        PAPER,
+        sensor="ikonos",
+        units="m",
+        settings={
+            "off_nadir_deg": OFF_NADIR_DEG,
+            "pointing_m": POINTING,
+            "sigma_ground_m": SIGMA_GROUND,
+            "bend": BEND,
+            "roughness": ROUGHNESS,
+            "scan": "reverse",
+            "realisations": realisations,
+        },
+        settings_text=(
+            f"{realisations} realisations, {OFF_NADIR_DEG:g} degrees off nadir, scanned in reverse, noise of "
+            f"pointing {POINTING:g} px and of the map {SIGMA_GROUND:g} m, each per axis"
+        ),
+        numbers=numbers,
+        found=found,
+        titles=TITLES,
+        statements=statements(table),
+        curves=[_curve(curves)],
+        notes=[_relief_note(relief)],
+    )
+
+
+def error_vectors(seed: int = 0) -> dict[str, tuple[Array, Array]]:
+    """Return image points and errors ``(20, 2)`` (m) of the check points by family, for figure 4."""
+    drawn = Realisation.draw(seed)
+    check = drawn.points.check
+    fits = {name: fit_family(name, drawn.points, robust=False) for name in TABLE_2}
+    return {name: (drawn.points.image[check], found.residuals[check]) for name, found in fits.items()}
+
+
+def relief_check(drawn: Realisation) -> tuple[float, float]:
+    """Return the error (m) that 2D affine should have at the check points, and has.
+
+    It should be what a plane through the heights of the control points leaves of those of the check points, over the
+    tangent of the satellite's elevation.
+    """
+    points = drawn.points
+    design = np.column_stack([np.ones(len(points)), points.ground[:, :2] - points.ground[:, :2].mean(axis=0)])
+    plane = np.linalg.lstsq(design[points.control], points.ground[points.control, 2], rcond=None)[0]
+    left = (points.ground[:, 2] - design @ plane)[points.check]
+    expected = float(np.sqrt(np.mean(left**2)) / np.tan(np.radians(drawn.scene.view[1])))
+    return expected, _check_error(lambda: fit_family("affine2d", points, robust=False))
+
+
+# -- numbers ---------------------------------------------------------------------------------------------------------
+
+_Values = dict[tuple[int | str, str, str], float]
+
+
+def _numbers() -> list[Number]:
+    listed = [Number(2, NAMES[name], "RMS check", paper) for name, paper in TABLE_2.items()]
+    listed += [Number("A", NAMES[name], what) for name in TABLE_2 for what in ("leave-one-out", "share justified")]
+    listed += [Number("B", *_own_name(*row)) for row in OWN]
+    listed += [Number("C", NAMES[name], "forward scan") for name in ("affine3d", "dlt")]
+    return [*listed, Number("C", NAMES["affine3d"], "geocentric"), Number("C", NAMES["dlt"], "geocentric")]
+
+
+def _own_name(own: str, correction: str, count: int) -> tuple[str, str]:
+    shown = {"geo": "geo, from metadata", "rpc": "RPC"}[own]
+    added = {"none": "", "own": " + own parameters"}.get(correction, f" + {correction}")
+    return f"{shown}{added}", f"{count} point{'' if count == 1 else 's'}"
+
+
+def _evaluate(drawn: Realisation) -> _Values:
+    values: _Values = {}
+    for name in TABLE_2:
+        found = fit_family(name, drawn.points, robust=False)
+        values[2, NAMES[name], "RMS check"] = _rms(found, "check")
+        values["A", NAMES[name], "leave-one-out"] = _rms(found, "loo")
+        kept = len(prune(found).fit.param_names)
+        values["A", NAMES[name], "share justified"] = kept / len(found.param_names)
+    for row in OWN:
+        values["B", *_own_name(*row)] = _check_error(_own_fit, drawn, *row)
+    return values
+
+
+def _elsewhere(seed: int, drawn: Realisation) -> _Values:
+    forward = GeoScene.make(seed, reverse=False).measure(seed)
+    values: _Values = {}
+    for name in ("affine3d", "dlt"):
+        values["C", NAMES[name], "forward scan"] = _check_error(fit_family, name, forward, robust=False)
+        values["C", NAMES[name], "geocentric"] = _check_error(
+            fit_family, name, drawn.points, crs="geocentric", robust=False
+        )
+    return values
+
+
+def _own_fit(drawn: Realisation, own: str, correction: str, count: int) -> Fit:
+    """Correct a scene's own model with some of the control points."""
+    points, model = with_control(drawn.points, count), drawn.own[own]
+    if correction == "own":
+        return fit_own(model, points, robust=False)
+    middle = (drawn.scene.columns / 2, drawn.scene.rows / 2)
+    return fit(ImageCorrection.identity(model, correction, middle), points, robust=False)
+
+
+def with_control(points: Points, count: int) -> Points:
+    """Keep some of the control points, as far apart as can be, and all check points."""
+    if count == 0:
+        return points.select(points.check)
+    control = select_control(points.select(points.control), f"even:{count}")
+    chosen = {name for name, role in zip(control.ids, control.roles.tolist(), strict=True) if role == "control"}
+    return points.select(points.check | np.array([name in chosen for name in points.ids]))
+
+
+def _check_error(make: Callable[..., Fit], *given: Any, **options: Any) -> float:
+    try:
+        return _rms(make(*given, **options), "check")
+    except OrthoError:
+        return float("nan")
+
+
+def _rms(found: Fit, which: str) -> float:
+    numbers = found.rmse(which)
+    return float("nan") if numbers is None else float(numbers["total"])
+
+
+# -- what is said of them --------------------------------------------------------------------------------------------
+
+
+def statements(table: Array) -> list[Statement]:
+    """Return what the paper says of table 2, from our values ``(R, 6)`` in its order."""
+    names = list(TABLE_2)
+    medians = np.median(table, axis=0)
+    order = sorted(names, key=TABLE_2.__getitem__)
+    ours = sorted(names, key=lambda name: float(medians[names.index(name)]))
+    columns = [names.index(name) for name in order]
+    ordered = (np.diff(table[:, columns], axis=1) > 0).all(axis=1).mean()
+    groups = [table[:, [names.index(name) for name in group]] for group in (order[:2], order[2:4], order[4:])]
+    apart = [(one.max(axis=1) < other.min(axis=1)).mean() for one, other in pairwise(groups)]
+    best = (table.argmin(axis=1) == names.index("dlt")).mean()
+    said = {name: f"{NAMES[name]} {medians[names.index(name)]:.2f}" for name in names}
+    return [
+        Statement(
+            "The models rank: " + ", ".join(NAMES[name] for name in order) + ".",
+            ours == order,
+            ", ".join(said[name] for name in ours) + f" m; {100 * ordered:.0f} % of the realisations have all six so",
+        ),
+        Statement("The DLT model was the best model for the test area.", ours[0] == "dlt",
+                  f"in {100 * best:.0f} % of the realisations"),
+        Statement(
+            "An accuracy of 1.1 m is reached with DLT, 1.9 m with 3D affine: models with height reach 1 to 2 m.",
+            all(1 <= medians[names.index(name)] <= 2 for name in ("dlt", "affine3d")),
+            f"{said['dlt']}, {said['affine3d']} m",
+        ),
+        Statement(
+            "Models without height are worse than those with it; polynomials are better than 2D affine and projective.",
+            bool(min(apart) > 0.5),
+            " and ".join(f"{100 * share:.0f} %" for share in apart) + " of the realisations",
+        ),
+    ]  # fmt: skip
+
+
+def _relief_note(relief: Array) -> str:
+    expected, found = np.median(relief, axis=0)
+    spread = np.percentile(relief[:, 1] / relief[:, 0], (5, 95))
+    return (
+        "A check that needs no adjustment: the error of 2D affine should be what a plane does not explain of the "
+        f"heights, over the tangent of the satellite’s elevation. That is {expected:.2f} m; the adjustment has "
+        f"{found:.2f} m (ratio {spread[0]:.2f} to {spread[1]:.2f} in 90 % of the realisations)."
+    )
+
+
+def _curve_values(drawn: Realisation) -> Array:
+    """Return the check errors ``(models, points)`` for 1 to 20 control points."""
+    values = np.full((len(CURVES), POINTS), np.nan)
+    for count in range(1, POINTS + 1):
+        points = with_control(drawn.points, count)
+        for k, (name, correction, least) in enumerate(CURVES.values()):
+            if count < least:
+                continue
+            if correction:
+                values[k, count - 1] = _check_error(_own_fit, drawn, name, correction, count)
+            else:
+                values[k, count - 1] = _check_error(fit_family, name, points, robust=False)
+    return values
+
+
+def _curve(values: Array) -> Curve:
+    counts = list(range(1, POINTS + 1))
+    series: dict[str, tuple[Sequence[float], Sequence[float | None]]] = {}
+    for k, name in enumerate(CURVES):
+        # A model is drawn from where most realisations determine it.
+        known = np.isfinite(values[:, k]).mean(axis=0) > 0.5
+        medians = [float(np.nanmedian(values[:, k, n])) if known[n] else np.nan for n in range(POINTS)]
+        series[name] = (counts, [value if value <= DRAWN else None for value in medians])
+    return Curve(
+        f"Error of the 20 check points over the number of control points (medians of {len(values)} realisations; "
+        f"beyond {DRAWN:g} m not drawn)",
+        "control points",
+        "RMS error, m",
+        series,
+    )
