@@ -63,6 +63,18 @@ def print_fit(result: FitResult) -> None:
     print_warnings(document["warnings"])
 
 
+def view_text(view: Mapping[str, Any] | None) -> str:
+    """Return the direction of view and the size of a pixel along and across it."""
+    if view is None:
+        return "the middle of the image does not meet the ground"
+    azimuth = view["sensor_azimuth_deg"]
+    place = "straight down" if azimuth is None else (
+        f"{view['incidence_deg']:.1f} deg off the vertical, sensor in azimuth {azimuth:.0f} deg"
+    )  # fmt: skip
+    along, across = view["pixel_m"]["along_view"], view["pixel_m"]["across_view"]
+    return f"{place}; a pixel is {along:.3g} m along the view, {across:.3g} m across"
+
+
 @contextlib.contextmanager
 def progress(title: str) -> Iterator[Callable[[float], None] | None]:
     """Yield a callable that moves a progress bar on stderr; None where nobody is watching."""

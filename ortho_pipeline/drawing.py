@@ -47,6 +47,9 @@ LOOKS = {
     "bar": Look("ink", "ink", 1.7),
     "plus": Look(None, "control"),
     "minus": Look(None, "check"),
+    "control-dash": Look("control", None, 1.7, dash="6 4"),
+    "check-dash": Look("check", None, 1.7, dash="6 4"),
+    "chance": Look(None, "ink", fill_opacity=0.1),
     "chosen": Look(None, "control", fill_opacity=0.1),
     "series-0": Look("control", None, 1.9),
     "series-1": Look("check", None, 1.9),
@@ -283,8 +286,8 @@ class Axes:
             top + tall * (self.y[1] - y) / (self.y[1] - self.y[0]),
         )
 
-    def draw(self, x_name: str, y_name: str) -> None:
-        """Draw frame, grid and numbers."""
+    def draw(self, x_name: str, y_name: str, *, margin: float = 0.0) -> None:
+        """Draw frame, grid and numbers; `margin` is where the drawing's part for this frame begins."""
         left, top, wide, tall = self.frame
         for value in ticks(*self.x):
             x, _ = self.at(value, self.y[0])
@@ -296,7 +299,7 @@ class Axes:
             self.drawing.text(left - 6, y + 4, number(value), anchor="end", quiet=True)
         self.drawing.rect("frame", left, top, wide, tall)
         self.drawing.text(left + wide / 2, top + tall + 36, x_name, anchor="middle")
-        self.drawing.text(13, top + tall / 2, y_name, anchor="middle", turn=True)
+        self.drawing.text(margin + 13, top + tall / 2, y_name, anchor="middle", turn=True)
 
 
 def ticks(low: float, high: float, about: int = 5) -> list[float]:

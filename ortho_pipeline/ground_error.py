@@ -27,6 +27,53 @@ def metre_partials(model: SensorModel, ground: Array) -> tuple[Array, Array]:
     return partials[:, :, :2] * units[:, None, :2], partials[:, :, 2]
 
 
+def viewing(model: SensorModel, width: int, height: int) -> dict[str, Any]:
+    """Return how the middle of an image is seen: pixel size on the ground, and the direction of view.
+
+    All are None where the middle has no ground. `view` has the angle at the ground between ray and vertical, the
+    azimuth (clockwise from the y axis of the model's CRS) in which the sensor stands, and the size of a pixel along and
+    across that direction: the length on level ground that one pixel of the image covers. For a square pixel of the size
+    p straight down, the paper's formula gives p / cos^2 along and p / cos across; the model gives what is so, also
+    where lines follow each other at another distance.
+
+    Returns
+    -------
+    dict
+        `ground_pixel_m` [along the row, along the column], `lean_m_per_m` and `lean_azimuth_deg` (how far and whereto
+        the ortho moves per metre of height), `view` {incidence_deg, sensor_azimuth_deg, pixel_m {along_view,
+        across_view}}; `sensor_azimuth_deg` is None straight down, where along is y and across is x.
+
+    Source: Bueyueksalih et al. (OrbView-3), formula 1.
+    """
+    centre = model.image_to_ground(np.array([[width / 2, height / 2]]), model.reference_height)
+    nothing = {"ground_pixel_m": None, "lean_m_per_m": None, "lean_azimuth_deg": None, "view": None}
+    if not np.isfinite(centre).all():
+        return nothing
+    plan, up = metre_partials(model, centre)
+    try:
+        inverse = np.linalg.inv(plan[0])
+    except np.linalg.LinAlgError:
+        return nothing
+    lean = inverse @ up[0]
+    tangent = float(np.hypot(*lean))
+    seen = np.hypot(*up[0]) > _NADIR
+    along = lean / tangent if seen else np.array([0.0, 1.0])
+    across = np.array([along[1], -along[0]])
+    return {
+        "ground_pixel_m": np.linalg.norm(inverse, axis=0).tolist(),
+        "lean_m_per_m": tangent,
+        "lean_azimuth_deg": float(np.degrees(np.arctan2(lean[0], lean[1])) % 360),
+        "view": {
+            "incidence_deg": float(np.degrees(np.arctan(tangent))),
+            "sensor_azimuth_deg": float(np.degrees(np.arctan2(-lean[0], -lean[1])) % 360) if seen else None,
+            "pixel_m": {
+                "along_view": float(1.0 / np.linalg.norm(plan[0] @ along)),
+                "across_view": float(1.0 / np.linalg.norm(plan[0] @ across)),
+            },
+        },
+    }
+
+
 def with_reference_height(model: SensorModel, ground: Array) -> Array:
     """Return ground points with the model's reference height where they have none (2D models take such points)."""
     missing = np.isnan(ground[:, 2])

@@ -8,11 +8,11 @@ the assumption that the DEM is right there.
 from __future__ import annotations
 
 import base64
+import functools
 import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
-from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,14 +20,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ortho_pipeline.covariance import analyse_fit
 from ortho_pipeline.crs import Vertical, ground_transform
 from ortho_pipeline.drawing import round_down, style_sheet
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.estimation import Fit, root_mean_square
 from ortho_pipeline.files import whole_or_nothing, write_text
-from ortho_pipeline.ground_error import along_view, in_metres, metre_partials, rmse_metres
+from ortho_pipeline.ground_error import along_view, in_metres, rmse_metres, viewing
 from ortho_pipeline.preview import preview_png
-from ortho_pipeline.report_plots import plots
+from ortho_pipeline.report_plots import analysed_role, plots
 from ortho_pipeline.report_text import fixed, flat, headline, metres, plain_size, px, share, short, signed, summary_text
 
 if TYPE_CHECKING:
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
 
     from ortho_pipeline.dem import Surface
     from ortho_pipeline.hookspecs import Scene
-    from ortho_pipeline.models.base import SensorModel
     from ortho_pipeline.raster import Grid
     from ortho_pipeline.rpc import RpcExport
     from ortho_pipeline.warp import WarpResult
@@ -93,8 +93,8 @@ def build_report(
     warnings : iterable of str
         What the reader ought to know; a suspicious difference between control and DEM heights is added to them.
     """
-    viewing = _viewing(fit.model, scene.width, scene.height)
-    heights = None if surface is None else _heights_of_points(fit, surface, viewing)
+    seen = viewing(fit.model, scene.width, scene.height)
+    heights = None if surface is None else _heights_of_points(fit, surface, seen)
     noted = [*warnings, *([heights["warning"]] if heights and heights["warning"] else [])]
     adjustment = {**fit.to_json(), "warnings": noted}
     shifts, views = in_metres(fit, fit.residuals), along_view(fit)
@@ -106,49 +106,30 @@ def build_report(
     report = {
         "document": DOCUMENT,
         "schema_version": SCHEMA_VERSION,
-        "created": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
         "scene": {
             "name": Path(scene.path).name,
             "size": [scene.width, scene.height],
             "sensor": scene.sensor,
             "model_source": scene.model_source,
             "facts": {str(key): _plain(value) for key, value in scene.facts.items()},
-            **viewing,
+            **seen,
         },
         "adjustment": adjustment,
         "rmse_m": rmse_metres(fit),
         "view_rmse": _view_rmse(fit, views),
+        "covariance": {role: found and found.to_json() for role, found in analyse_fit(fit).items()},
         "control_hull": _control_hull(fit, scene.width, scene.height),
         "comparison": None if comparison is None else _plain(comparison),
         "heights": heights,
         "surface": None if surface is None else {"coverage": coverage, **_plain(surface.provenance)},
         "rpc": None if exported is None else {"exact": exported.exact, "max_error_px": exported.max_error_px},
         "ortho": None if grid is None else _ortho(grid, warp),
-        "warp": None if warp is None else asdict(warp),
+        "warp": None if warp is None else _warped(warp),
         "provenance": _plain(provenance or {}),
         "warnings": noted,
     }
     report["headline"] = headline(report)
     return report
-
-
-def _viewing(model: SensorModel, width: int, height: int) -> dict[str, Any]:
-    """Return pixel size on the ground (m) and how far and whereto (azimuth) the ortho moves per metre of height."""
-    centre = model.image_to_ground(np.array([[width / 2, height / 2]]), model.reference_height)
-    nothing = {"ground_pixel_m": None, "lean_m_per_m": None, "lean_azimuth_deg": None}
-    if not np.isfinite(centre).all():
-        return nothing
-    plan, up = metre_partials(model, centre)
-    try:
-        inverse = np.linalg.inv(plan[0])
-    except np.linalg.LinAlgError:
-        return nothing
-    lean = inverse @ up[0]
-    return {
-        "ground_pixel_m": np.linalg.norm(inverse, axis=0).tolist(),
-        "lean_m_per_m": float(np.hypot(*lean)),
-        "lean_azimuth_deg": float(np.degrees(np.arctan2(lean[0], lean[1])) % 360),
-    }
 
 
 def _view_rmse(fit: Fit, views: Array) -> dict[str, Any]:
@@ -173,7 +154,7 @@ def _control_hull(fit: Fit, width: int, height: int) -> dict[str, Any] | None:
     return {"share": float(inside.area) / (width * height), "n": int(fit.used.sum()), "outline": outline}
 
 
-def _heights_of_points(fit: Fit, surface: Surface, viewing: Mapping[str, Any]) -> dict[str, Any] | None:
+def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> dict[str, Any] | None:
     """Compare the heights of the points with the DEM's: a difference of datums shows here and nowhere else."""
     points = fit.points
     if surface.constant_height is not None or not len(points):
@@ -186,7 +167,7 @@ def _heights_of_points(fit: Fit, surface: Surface, viewing: Mapping[str, Any]) -
     spread = float(1.4826 * np.median(np.abs(difference - median)))
     warning = None
     if len(difference) >= 3 and abs(median) > max(_SUSPICIOUS_HEIGHT, 3 * spread):
-        lean = viewing["lean_m_per_m"]
+        lean = seen["lean_m_per_m"]
         moved = "" if lean is None else f"; that moves the ortho by {metres(abs(median) * lean)}"
         side = "above" if median > 0 else "below"
         warning = (
@@ -216,6 +197,11 @@ def _ortho(grid: Grid, warp: WarpResult | None) -> dict[str, Any]:
         "size": [grid.width, grid.height],
         "valid_share": None if warp is None else warp.valid_pixels / max(warp.pixels, 1),
     }
+
+
+def _warped(warp: WarpResult) -> dict[str, Any]:
+    """Return what the warp did without how long it took: the same inputs make the same report, byte by byte."""
+    return {name: value for name, value in asdict(warp).items() if name != "seconds"}
 
 
 def residuals_geojson(fit: Fit) -> dict[str, Any]:
@@ -255,7 +241,7 @@ def residuals_style(report: Mapping[str, Any]) -> str:
 
     QGIS takes it by itself, as it has the name of the GeoJSON file with the ending ``.qml``.
     """
-    template = _environment().get_template("residuals.qml.j2")
+    template = page_environment().get_template("residuals.qml.j2")
     lengths = [math.hypot(*point["residual_m"]) for point in report["adjustment"]["points"] if point["residual_m"]]
     ground = report["scene"]["ground_pixel_m"]
     extent = max(report["scene"]["size"]) * (max(ground) if ground else 1.0)
@@ -333,7 +319,7 @@ def write_report_html(
     """
     png = ortho if isinstance(ortho, bytes) or ortho is None else preview_png(ortho)
     page = (
-        _environment()
+        page_environment()
         .get_template("report.html.j2")
         .render(
             report=report,
@@ -346,6 +332,7 @@ def write_report_html(
             provenance=list(flat({**report["scene"]["facts"], **_brief(report["provenance"])})),
             inputs=report["provenance"].get("inputs") or [],
             plots={name: drawing.svg() for name, drawing in plots(report).items()},
+            plotted_role=analysed_role(report),
             plot_style=style_sheet(),
             preview=base64.b64encode(png).decode() if png else None,
         )
@@ -353,7 +340,8 @@ def write_report_html(
     write_text(path, page)
 
 
-def _environment() -> Any:
+def page_environment() -> Any:
+    """Return the templates of pages, with the filters that write numbers as people read them."""
     import jinja2
 
     environment = jinja2.Environment(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -29,6 +30,8 @@ def plots(report: Mapping[str, Any]) -> dict[str, Drawing]:
         "directions": plot_directions,
         "heights": plot_heights,
         "correlation": plot_correlation,
+        "neighbours": plot_neighbours,
+        "relative": plot_relative,
         "comparison": plot_comparison,
     }
     made = {name: make(report) for name, make in makers.items()}
@@ -207,6 +210,93 @@ def plot_correlation(report: Mapping[str, Any]) -> Drawing | None:
         drawing.rect("plus" if value >= 0 else "minus", x, base - 10, 12, 12, max(abs(value), 0.02))
         drawing.text(x + 15, base, number(value), quiet=True)
     return drawing
+
+
+# -- distances -------------------------------------------------------------------------------------------------------
+
+
+def analysed_role(report: Mapping[str, Any]) -> str | None:
+    """Return which points' covariance analysis is drawn: check points where they could be tested, else control."""
+    found = report.get("covariance") or {}
+    for role in ("check", "control"):
+        if found.get(role) and found[role]["p_joint"] is not None and len(found[role]["classes"]) > 1:
+            return role
+    return None
+
+
+def plot_neighbours(report: Mapping[str, Any]) -> Drawing | None:
+    """Draw the correlation of residuals against the distance of points, with what chance does to each class."""
+    role = analysed_role(report)
+    if role is None:
+        return None
+    found = report["covariance"][role]
+    classes = found["classes"]
+    reach = max(abs(value) for one in classes for value in (*one["correlation"], 2 / math.sqrt(one["pairs"])))
+    reach = max(1.08 * reach, 0.3)
+    drawing, axes = _distance_axes(found, (-reach, reach), "correlation of residuals", "neighbours")
+    # Products of independent residuals are uncorrelated among pairs: two standard deviations of their mean.
+    for one in classes:
+        chance = min(2 / math.sqrt(one["pairs"]), reach)
+        (left, top), (right, low) = axes.at(one["from_m"], chance), axes.at(one["to_m"], -chance)
+        drawing.rect("chance", left, top, right - left, low - top)
+    _series(axes, found, "correlation", role)
+    drawing.rect("chance", 236, 396, 14, 12)
+    drawing.text(256, 406, "chance (95 %)")
+    return drawing
+
+
+def plot_relative(report: Mapping[str, Any]) -> Drawing | None:
+    """Draw the relative standard deviation against the distance of points, and the fitted covariance function."""
+    role = analysed_role(report)
+    if role is None:
+        return None
+    found = report["covariance"][role]
+    high = 1.12 * max(max(one["relative"]) for one in found["classes"]) or 1.0
+    drawing, axes = _distance_axes(found, (0.0, high), f"relative standard deviation, {found['unit']}", "relative")
+    fitted = found["verdict"] == "systematic"
+    if fitted:
+        at = np.linspace(0.0, axes.x[1], 60)
+        for function, p in zip(found["functions"], found["p"], strict=True):
+            if function is None or p >= 0.05:
+                continue
+            shared = function["systematic"] ** 2 * -np.expm1(-at / function["range_m"])
+            curve = [axes.at(x, y) for x, y in zip(at, np.sqrt(function["noise"] ** 2 + shared), strict=True)]
+            for start, end in itertools.pairwise(curve):
+                drawing.line("axis", *start, *end)
+    _series(axes, found, "relative", role)
+    if fitted:
+        drawing.line("axis", 236, 402, 256, 402)
+        drawing.text(262, 406, "covariance function")
+    return drawing
+
+
+def _distance_axes(found: Mapping[str, Any], y: tuple[float, float], y_name: str, name: str) -> tuple[Drawing, Axes]:
+    """Return a drawing with axes for values of classes of distance."""
+    drawing = Drawing(420, 420, f"{y_name} against the distance of points", name)
+    axes = Axes(drawing, (52.0, 14.0, 354.0, 316.0), (0.0, found["classes"][-1]["to_m"]), y)
+    axes.draw("distance of points, m", y_name)
+    return drawing, axes
+
+
+def _series(axes: Axes, found: Mapping[str, Any], key: str, role: str) -> None:
+    """Draw the values of all classes, one line per axis of the ground: x filled and solid, y hollow and dashed."""
+    looks = {
+        "control": (("control", "control"), ("control-dash", "loo")),
+        "check": (("check-line", "check-head"), ("check-dash", "check")),
+    }  # fmt: skip
+    drawing = axes.drawing
+    for k, (line, mark) in enumerate(looks[role]):
+        at = [axes.at(one["distance_m"], one[key][k]) for one in found["classes"]]
+        for start, end in itertools.pairwise(at):
+            drawing.line(line, *start, *end)
+        for (x, y), one in zip(at, found["classes"], strict=True):
+            title = f"{'xy'[k]}: {one[key][k]:.2f}, {one['from_m']:.0f} to {one['to_m']:.0f} m, {one['pairs']} pairs"
+            with drawing.titled(title):
+                drawing.circle(mark, x, y, 3.4)
+        left = 58 + 84 * k
+        drawing.line(line, left - 12, 402, left + 12, 402)
+        drawing.circle(mark, left, 402, 3.4)
+        drawing.text(left + 18, 406, ("x (east)", "y (north)")[k])
 
 
 # -- comparison ------------------------------------------------------------------------------------------------------

@@ -70,6 +70,9 @@ def summary_text(report: Mapping[str, Any]) -> str:
     ground = f" ({head['metres']})" if head["metres"] else ""
     rows.append(("accuracy", f"{head['figure']}{ground}: {head['what']}"))
     rows += [("", note) for note in head["notes"]]
+    for role, found in (report.get("covariance") or {}).items():
+        if found and found["verdict"] == "systematic":
+            rows.append(("pattern", f"{role} points: {found['statement']}"))
     rows += [("left out", f"{entry['id']}: {entry['reason']}") for entry in adjustment["rejected"]]
     if surface := report["surface"]:
         rows.append(("heights", _surface_text(surface)))
@@ -77,7 +80,7 @@ def summary_text(report: Mapping[str, Any]) -> str:
         steps = " x ".join(short(step) for step in ortho["resolution"])
         rows.append(("ortho", f"{size_text(ortho['size'])} px of {steps} {ortho['unit']}, {ortho['crs']}"))
     if warp := report["warp"]:
-        rows.append(("warp", f"{px(warp['max_error_px'])} at worst from the exact model, {warp['seconds']:.1f} s"))
+        rows.append(("warp", f"{px(warp['max_error_px'])} at worst from the exact model"))
     # The headline and the rows above have said these already.
     said = " ".join(value for _, value in rows).lower()
     known = ("left out", "no redundancy", "check points: fewer")

@@ -360,7 +360,7 @@ def test_plots_of_a_whole_report_as_svg_and_png(tmp_path):
     again = report.read_report_json(tmp_path / "scene_report.json")
     for kind in ("svg", "png"):
         files = report.write_plots(again, tmp_path / "plots", "scene_report", kind)
-        assert set(files) == {"residuals", "directions", "heights", "correlation"}
+        assert set(files) == {"residuals", "directions", "heights", "correlation", "neighbours", "relative"}
     for path in (tmp_path / "plots").glob("*.svg"):
         text = path.read_text(encoding="utf-8")
         assert "var(" not in text

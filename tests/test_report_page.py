@@ -56,7 +56,8 @@ def test_plots_of_a_report_from_the_command_line(made, tmp_path):
     done = CliRunner().invoke(cli, ["report", report, "--plots", str(tmp_path / "plots"), "--json"])
     assert done.exit_code == 0, done.stderr
     files = json.loads(done.stdout)["files"]
-    assert set(files) == {"residuals", "directions", "heights", "correlation", "comparison"}
+    drawn = {"residuals", "directions", "heights", "correlation", "neighbours", "relative", "comparison"}
+    assert set(files) == drawn
     assert all(Path(path).read_text().startswith("<svg") for path in files.values())
 
 
@@ -80,7 +81,7 @@ def test_page_opens_in_a_browser_without_errors_or_requests(made, tmp_path, whic
     done = browse(made[which].files["html"], tmp_path, "--dump-dom", f"--log-net-log={log}")
     assert "CONSOLE" not in done.stderr
     plots = set(re.findall(r'<svg[^>]*data-plot="(\w+)"', done.stdout))
-    assert {"residuals", "directions", "heights", "correlation"} <= plots
+    assert {"residuals", "directions", "heights", "correlation", "neighbours", "relative"} <= plots
     assert ("comparison" in plots) is (which == "compare")
     asked = set(re.findall(r'"url":"((?:http|ws|ftp)s?://[^/"]*)', log.read_text()))
     assert {url.split("://")[1] for url in asked} <= BROWSERS_OWN
