@@ -16,6 +16,7 @@ import numpy as np
 from ortho_pipeline.blunders import REJECTED_LIMIT, find_blunders
 from ortho_pipeline.errors import DegeneratePoints
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.notebook import fit_html
 from ortho_pipeline.points import Points
 from ortho_pipeline.problem import Prior, Problem, Solution
 from ortho_pipeline.ridge import regularised
@@ -34,7 +35,7 @@ _UNSTABLE = 1e4
 _INSEPARABLE = 0.9995
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit:
     """Result of an adjustment.
 
@@ -132,6 +133,14 @@ class Fit:
             "ridge": self.ridge,
             "condition": self.condition if math.isfinite(self.condition) else None,
         }
+
+    def __repr__(self) -> str:
+        total = {role: found["total"] for role in ("control", "check", "loo") if (found := self.rmse(role))}
+        said = ", ".join(f"{role} {value:.3f} px" for role, value in total.items())
+        return f"<fit of {self.model_name} to {int(self.used.sum())} control points: RMSE {said or 'unknown'}>"
+
+    def _repr_html_(self) -> str:
+        return fit_html(self.to_json())
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho fit --json`` (docs/formats.md)."""

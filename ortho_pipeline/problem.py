@@ -1,15 +1,17 @@
 r"""The least-squares problem of one image: image measurements of control points, priors, and a regularisation.
 
-With image residuals :math:`v = l - f(x)` (measured minus predicted), weights :math:`W = \Sigma^{-1}` and any `Prior` as
-one more observation of its parameter, the estimate minimises :math:`v^T W v`. Then
+With image residuals :math:`v = l - f(x)` (measured minus predicted), weights :math:`W = \Sigma^{-1}`, and as further
+observations each `Prior` and each of the model's own (`SensorModel.constraints`), the estimate minimises
+:math:`v^T W v`. Then
 
 - redundancy :math:`r` = observations - parameters, :math:`\sigma_0^2 = v^T W v / r`,
 - covariance :math:`C = \sigma_0^2 (J^T W J)^{-1}` (a-priori :math:`\sigma_0 = 1` where :math:`r = 0`),
 - leave-one-out residual of point i, without a refit: :math:`(I - H_{ii})^{-1} v_i` with the 2 x 2 block
   :math:`H_{ii} = J_i (J^T W J)^{-1} J_i^T W_i` of the hat matrix (exact for models linear in their parameters).
 
-A regularisation adds pseudo-observations of zero; then the effective number of parameters, the trace of the hat matrix
-of the true observations, takes the place of their number.
+A regularisation adds pseudo-observations of zero, and the soft constraints of a model are as fictitious: they have no
+part in :math:`v^T W v`, and the effective number of parameters, the trace of the hat matrix of the true observations,
+takes the place of their number. Else constraints that are never violated would make every sigma too small.
 
 Source: Cook and Weisberg 1982 (leave-one-out); Hansen 1998 (regularisation, effective degrees of freedom).
 """
@@ -151,27 +153,28 @@ class Problem:
         model = self._adjusted(ground, image, sigma) if count and not linear else self.model
         residuals = image - model.ground_to_image(ground)
         jacobian = model.param_partials(ground) if count else np.zeros((len(ground), 2, 0))
-        believed, rows = self._pseudo(model)
+        believed, rows, true = self._pseudo(model)
         data = (jacobian / sigma[:, :, None]).reshape(2 * len(ground), count)
-        known = len(self.priors)
         design = np.vstack([data, rows])
         solved = solve_linear(design, np.concatenate([(residuals / sigma).ravel(), believed]), refine=False)
-        condition = condition_of(design[: len(data) + known]) if self.ridge else solved.condition
+        condition = condition_of(design[: len(design) - len(self.ridge)]) if self.ridge else solved.condition
         self._determined(solved.condition)
         if linear:
             residuals = residuals - jacobian @ solved.values
             believed = believed - rows @ solved.values
-        observed = np.concatenate([(residuals / sigma).ravel(), believed[:known]])
+        observed = np.concatenate([(residuals / sigma).ravel(), believed[true]])
         effective = float(count)
-        if self.ridge:
-            true = design[: len(observed)]
-            effective = float(np.einsum("ij,ij->", true @ solved.cofactors, true))
+        if not true.all():
+            known = np.vstack([data, rows[true]])
+            effective = float(np.einsum("ij,ij->", known @ solved.cofactors, known))
         freedom = len(observed) - effective
-        sigma0 = math.sqrt(float(observed @ observed) / freedom) if freedom > 1e-6 else None
+        # Fictitious observations make the count a fraction; below half an observation it is none.
+        sigma0 = math.sqrt(float(observed @ observed) / freedom) if freedom > 0.5 else None
         return Solution(model, jacobian, residuals, sigma, solved.cofactors, freedom, effective, sigma0, condition)
 
     def _enough(self, points: int) -> None:
         count, known = len(self.model.params), len(self.priors)
+        known += len(self.model.constraints()) if known else 0
         least = self.model.minimum_points if not known else math.ceil((count - known) / 2)
         if points < least:
             raise TooFewPoints(
@@ -188,10 +191,14 @@ class Problem:
                 remedy="spread the points over the image (and over height, for 3D models), or take a simpler model",
             )
 
-    def _pseudo(self, model: SensorModel) -> tuple[Array, Array]:
-        """Return misclosures and design rows of priors, then of the regularisation."""
+    def _pseudo(self, model: SensorModel) -> tuple[Array, Array, np.ndarray]:
+        """Return misclosures and design rows of the model's constraints, of priors, then of the regularisation.
+
+        The mask at the end tells which of them are true observations.
+        """
         wanted = [(name, prior.mean, prior.sigma) for name, prior in self.priors.items()]
         wanted += [(name, 0.0, sigma) for name, sigma in self.ridge.items()]
+        own = model.constraints()
         index = {name: k for k, name in enumerate(model.param_names)}
         rows = np.zeros((len(wanted), len(index)))
         params = model.params
@@ -199,20 +206,22 @@ class Problem:
         for i, (name, mean, sigma) in enumerate(wanted):
             rows[i, index[name]] = 1.0 / sigma
             believed[i] = (mean - params[index[name]]) / sigma
-        return believed, rows
+        scaled = own.jacobian / own.sigma[:, None]
+        true = np.concatenate([~own.fictitious, np.arange(len(wanted)) < len(self.priors)])
+        return np.concatenate([own.residuals / own.sigma, believed]), np.vstack([scaled, rows]), true
 
     def _adjusted(self, ground: Array, image: Array, sigma: Array) -> SensorModel:
         start = self.model
-        believed, rows = self._pseudo(start)
         origin = start.params
 
         def misfit(params: Array) -> Array:
-            image_part = ((image - start.with_params(params).ground_to_image(ground)) / sigma).ravel()
-            return np.concatenate([image_part, believed - rows @ (params - origin)])
+            model = start.with_params(params)
+            return np.concatenate([((image - model.ground_to_image(ground)) / sigma).ravel(), self._pseudo(model)[0]])
 
         def slopes(params: Array) -> Array:
-            image_part = start.with_params(params).param_partials(ground) / sigma[:, :, None]
-            return np.vstack([image_part.reshape(-1, len(params)), rows])
+            model = start.with_params(params)
+            image_part = model.param_partials(ground) / sigma[:, :, None]
+            return np.vstack([image_part.reshape(-1, len(params)), self._pseudo(model)[1]])
 
         # Far from singular at the start, or the iteration would only wander: say so at once.
         self._determined(condition_of(slopes(origin)))

@@ -26,7 +26,9 @@ _INVERSE_STEPS = 25
 class Constraints:
     """Pseudo-observations that a model brings with it: what is known of its parameters beyond image measurements.
 
-    An adjustment weights them by their sigma like any other observation and counts them in the redundancy.
+    An adjustment weights them by their sigma like any other observation. Those that somebody measured count in the
+    redundancy; fictitious ones, soft constraints with a sigma that somebody chose, do not: their residuals say nothing
+    of how good the measurements are.
 
     Parameters
     ----------
@@ -36,11 +38,18 @@ class Constraints:
         d(computed)/d(params).
     sigma : (k,)
         Standard deviations, positive, in the unit of the residuals.
+    fictitious : (k,) of bool, optional
+        All are measured if it is not given.
     """
 
     residuals: Array
     jacobian: Array
     sigma: Array
+    fictitious: NDArray[np.bool_] = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.fictitious is None:
+            object.__setattr__(self, "fictitious", np.zeros(len(self.residuals), dtype=bool))
 
     def __len__(self) -> int:
         return len(self.residuals)

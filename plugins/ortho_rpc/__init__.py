@@ -1,21 +1,28 @@
 """Sensor plugin for every product that comes with an RPC: TIFF tag, side-car, DIMAP, NITF, VRT, or a file given.
 
-It is a fallback: a plugin that knows the product itself goes first.
+It is a fallback: a plugin that knows the product itself goes first. Where DIMAP metadata with the rigorous model of the
+same image lie beside it, the scene has the model ``pushbroom`` as well.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from osgeo import gdal
 
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.models import SensorModel
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.rpc import has_rpc, rpc_of_dataset
+from ortho_rpc.dimap import has_dimap_pushbroom, read_dimap_pushbroom
 
 # What GDAL's readers of vendor metadata agree on, and what it is called here.
 IMAGERY = {"SATELLITEID": "satellite", "ACQUISITIONDATETIME": "acquired", "CLOUDCOVER": "cloud_cover_percent"}
+_DIMAP = re.compile(r"(DIM|PHRDIMAP)[\w.-]*\.XML", re.IGNORECASE)
 
 
 @hookimpl
@@ -35,16 +42,39 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
     """Open an image with its RPC, or with the one given."""
     model, source = rpc_of_dataset(dataset, rpc)
     width, height = dataset.RasterXSize, dataset.RasterYSize
+    rigorous, remarks = _rigorous(Path(dataset.GetDescription()), width, height)
     return Scene(
         sensor="rpc",
         path=dataset.GetDescription(),
         width=width,
         height=height,
-        models={"rpc": model},
+        models={"rpc": model, **rigorous},
         model_source=source,
         facts=_facts(dataset, model),
-        warnings=_warnings(dataset, model),
+        warnings=(*_warnings(dataset, model), *remarks),
     )
+
+
+def _rigorous(image: Path, width: int, height: int) -> tuple[dict[str, SensorModel], tuple[str, ...]]:
+    """Return the rigorous model of DIMAP metadata beside an image of the same size, and what is to be said of it."""
+    try:
+        beside = [path for path in image.parent.iterdir() if _DIMAP.match(path.name) and has_dimap_pushbroom(path)]
+    except OSError:
+        return {}, ()
+    found: dict[Path, SensorModel] = {}
+    remarks = []
+    for path in sorted(beside):
+        try:
+            model = read_dimap_pushbroom(path)
+        except InputError as error:
+            remarks.append(f"the rigorous model beside the image is left out: {error}")
+            continue
+        if (model.camera.width, model.camera.height) == (width, height):
+            found[path] = model
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        return {}, (*remarks, f"several rigorous models of this size lie beside the image, none is taken: {names}")
+    return dict(zip(("pushbroom",), found.values(), strict=False)), tuple(remarks)
 
 
 def _facts(dataset: gdal.Dataset, model: RPC) -> dict[str, Any]:

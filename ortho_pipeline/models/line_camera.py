@@ -1,0 +1,146 @@
+r"""Camera of a line scanner: which direction a column looks into.
+
+With c_F = (x0, y0, F), the position of the projection centre relative to the line, and corrections
+:math:`\delta x(x), \delta y(x)`, the column x looks in camera axes along (u, v, 1):
+
+.. math:: u = (x + \delta x - x_0) / F, \qquad v = (\delta y - y_0) / F .
+
+Both corrections are polynomials in :math:`\xi = 2 x / N - 1` (N columns), in pixels, so that look directions given as
+polynomials of the column (Pleiades: degree 1 and 0) are expressed without loss.
+
+Source: Willneff et al., equation 3, left side. There the third component of :math:`p_F - c_F` is -F with a scale
+:math:`\lambda` of any sign; here camera z points to the ground, and columns run along +x, the left of the flight, as in
+a picture that is not mirrored and has its first line on top. A negative F is a mirrored line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Self
+
+import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval
+from numpy.typing import ArrayLike
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.models.base import Array
+
+#: Names of c_F as parameters; the corrections are ``dx_0``, ``dx_1`` ... and ``dy_0`` ...
+PRINCIPAL = ("principal_column", "principal_line", "focal_length")
+
+
+@dataclass(frozen=True, eq=False)
+class LineCamera:
+    """Interior orientation of a line scanner, in pixels.
+
+    Parameters
+    ----------
+    width, height : int
+        Columns and rows of the image.
+    principal_column, principal_line, focal_length : float
+        c_F; a negative focal length mirrors the line.
+    dx, dy : (k,)
+        Coefficients of the corrections, lowest power first; may be empty.
+    """
+
+    width: int
+    height: int
+    principal_column: float
+    principal_line: float
+    focal_length: float
+    dx: Array = field(default_factory=lambda: np.zeros(0))
+    dy: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.height) < 1:
+            raise InputError(f"{self.width} x {self.height} is no size of an image", field="width, height")
+        for name in ("dx", "dy"):
+            value = np.array(getattr(self, name), dtype=np.float64).ravel()
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        numbers = [self.principal_column, self.principal_line, self.focal_length, *self.dx, *self.dy]
+        if not np.isfinite(numbers).all() or self.focal_length == 0:
+            raise InputError("a camera has finite numbers and a focal length", field="focal_length")
+
+    @classmethod
+    def of_polynomials(cls, width: int, height: int, across: ArrayLike, along: ArrayLike) -> Self:
+        """Make the camera whose column x looks along (u, v, 1) with polynomials u(x), v(x) of the column.
+
+        Parameters
+        ----------
+        across, along : (k,)
+            Coefficients, lowest power first, of u and v in x, the column from the outer corner of the first pixel. u
+            has a linear term, which becomes the focal length.
+
+        Raises
+        ------
+        InputError
+            If u does not change with the column.
+        """
+        u, v = (np.asarray(value, dtype=np.float64).ravel() for value in (across, along))
+        if len(u) < 2 or u[1] == 0:
+            raise InputError("a line whose look angle does not change with the column is no image", field="across")
+        focal, half = 1.0 / float(u[1]), width / 2
+        # x = half (1 + xi): the polynomials in xi that the terms beyond the linear one make.
+        shifted = np.polynomial.Polynomial([half, half])
+
+        def in_xi(terms: Array) -> Array:
+            return focal * np.asarray(np.polynomial.Polynomial(terms)(shifted).coef, dtype=np.float64)
+
+        rest = in_xi(np.array([0.0, 0.0, *u[2:]])) if len(u) > 2 else np.zeros(0)
+        along_rest = in_xi(np.array([0.0, *v[1:]])) if len(v) > 1 else np.zeros(0)
+        line = -float(v[0]) * focal if len(v) else 0.0
+        return cls(width, height, -float(u[0]) * focal, line, focal, rest, along_rest)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all parameters."""
+        return (*PRINCIPAL, *(f"dx_{k}" for k in range(len(self.dx))), *(f"dy_{k}" for k in range(len(self.dy))))
+
+    @property
+    def values(self) -> Array:
+        """Values of all parameters, in the order of `names`."""
+        return np.array([*(getattr(self, name) for name in PRINCIPAL), *self.dx, *self.dy])
+
+    def with_values(self, values: Array) -> Self:
+        """Return the camera with other values of its parameters."""
+        x0, y0, focal = values[:3].tolist()
+        split = 3 + len(self.dx)
+        return type(self)(self.width, self.height, x0, y0, focal, values[3:split], values[split:])
+
+    def directions(self, column: Array) -> Array:
+        """Return u, v as ``(N, 2)`` of columns ``(N,)``."""
+        xi = self._xi(column)
+        u = (column + polyval(xi, self._full(self.dx)) - self.principal_column) / self.focal_length
+        v = (polyval(xi, self._full(self.dy)) - self.principal_line) / self.focal_length
+        return np.stack([u, v], axis=1)
+
+    def slopes(self, column: Array) -> Array:
+        """Return d(u, v)/d(column) as ``(N, 2)``."""
+        xi = self._xi(column)
+        by_x, by_y = (
+            polyval(xi, polyder(self._full(terms))) * 2 / self.width / self.focal_length for terms in (self.dx, self.dy)
+        )
+        return np.stack([1 / self.focal_length + by_x, by_y], axis=1)
+
+    def partials(self, column: Array) -> Array:
+        """Return d(u, v)/d(parameters) as ``(N, 2, len(names))``."""
+        out = np.zeros((len(column), 2, len(self.names)))
+        out[:, 0, 0] = out[:, 1, 1] = -1 / self.focal_length
+        out[:, :, 2] = -self.directions(column) / self.focal_length
+        xi, split = self._xi(column)[:, None], 3 + len(self.dx)
+        out[:, 0, 3:split] = xi ** np.arange(len(self.dx)) / self.focal_length
+        out[:, 1, split:] = xi ** np.arange(len(self.dy)) / self.focal_length
+        return out
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the camera as plain data."""
+        data = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {**data, "dx": self.dx.tolist(), "dy": self.dy.tolist()}
+
+    def _xi(self, column: Array) -> Array:
+        return 2 * column / self.width - 1
+
+    @staticmethod
+    def _full(terms: Array) -> Array:
+        return terms if len(terms) else np.zeros(1)

@@ -1,0 +1,569 @@
+"""The rigorous line scanner, against a camera of known truth that shares no code with it."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+import pyproj
+import pytest
+
+from ortho_pipeline.errors import DegeneratePoints, InputError
+from ortho_pipeline.estimation import fit
+from ortho_pipeline.geometry import geocentric
+from ortho_pipeline.models import Pushbroom, model_from_dict
+from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.models.line_camera import LineCamera
+from ortho_pipeline.models.pushbroom import angles_of, rotations
+from ortho_pipeline.models.pushbroom_constraints import Observations, OrbitShape
+from ortho_pipeline.models.pushbroom_start import (
+    mounting_of_angles,
+    pushbroom_of_metadata,
+    pushbroom_of_tables,
+    rotations_of_angles,
+    rotations_of_quaternions,
+)
+from ortho_pipeline.models.splines import Spline
+from ortho_pipeline.points import Points
+from ortho_pipeline.problem import Prior
+from ortho_pipeline.rpc import fit_rpc
+from ortho_pipeline.simulate import LineScanner
+from ortho_pipeline.testing import check_sensor_model
+
+FOCAL, PIXEL = 1.945, 7e-6
+HEIGHTS = (0.0, 1260.0)
+
+
+def scanner(seed: int = 1, size: int = 12000, pitch_deg: float = -26.0, lon: float | None = None) -> LineScanner:
+    """Return a camera as CARTOSAT-1's, somewhere; a negative pitch looks forward."""
+    random = np.random.default_rng(seed)
+    place = random.uniform(-175, 175) if lon is None else lon
+    camera = LineScanner.over(
+        place,
+        random.uniform(-65, 65),
+        300.0,
+        image_width=size,
+        image_height=size,
+        gsd=2.5,
+        off_nadir_deg=random.uniform(-3, 3),
+        heading_deg=random.choice([192.0, -12.0]) + random.normal(0, 2),
+        altitude=618e3,
+        heights=HEIGHTS,
+    )
+    return replace(camera, pitch=math.radians(pitch_deg) + random.normal(0, 1e-3), yaw=random.normal(0, 2e-3))
+
+
+def tables_of(camera: LineScanner, rows: Array) -> tuple[Array, Array, Array]:
+    """Return times, positions and camera axes in ECEF, as a vendor would deliver them, from the camera's rays."""
+    middle, left = (np.column_stack([np.full(len(rows), column), rows]) for column in (camera.width / 2, 0.0))
+    positions, z = camera.rays(middle)
+    across = camera.rays(left)[1]
+    across = across / (across * z).sum(axis=1)[:, None] - z
+    x = -across / np.linalg.norm(across, axis=1)[:, None]
+    return rows * camera.line_period, positions, np.stack([x, np.cross(z, x), z], axis=2)
+
+
+def exact(camera: LineScanner, **options: object) -> Pushbroom:
+    """Return the pushbroom of the vendor's tables of a camera."""
+    rows = np.linspace(-0.6, 1.6, 45) * camera.height
+    times, positions, turns = tables_of(camera, rows)
+    return pushbroom_of_tables(
+        LineCamera(camera.width, camera.height, camera.width / 2, 0.0, 1 / camera.pixel_tan),
+        line_period=camera.line_period,
+        first_time=0.0,
+        orbit=(times, positions),
+        attitude=(times, turns),
+        heights=camera.heights,
+        **options,  # type: ignore[arg-type]
+    )
+
+
+def metadata_start(camera: LineScanner, seed: int = 0, **options: object) -> Pushbroom:
+    """Return the start from what a metadata file says: rounded angles, height off by kilometres, corners by 80 m."""
+    random = np.random.default_rng(seed)
+    image = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
+    corners = camera.image_to_ground(image.astype(float), 200.0)[:, :2] + random.normal(0, 80, 2) / 111e3
+    return pushbroom_of_metadata(
+        corners,
+        camera.width,
+        camera.height,
+        altitude=618e3 + random.normal(0, 5e3),
+        along_deg=-round(math.degrees(camera.pitch)),
+        across_deg=round(math.degrees(camera.roll), 1),
+        focal_length=1 / camera.pixel_tan * PIXEL,
+        pixel_size=PIXEL,
+        heights=HEIGHTS,
+        **options,  # type: ignore[arg-type]
+    )
+
+
+def sample(camera: SensorModel, count: int, seed: int = 0, noise: float = 0.0) -> tuple[Array, Array]:
+    """Return image points with noise, and their true ground at heights all over the range."""
+    random = np.random.default_rng(seed)
+    size = (camera.width, camera.height) if isinstance(camera, LineScanner) else (12000, 12000)
+    image = random.uniform(0, 1, (count, 2)) * size
+    ground = camera.image_to_ground(image, random.uniform(*HEIGHTS, count))
+    return image + random.normal(0, noise, image.shape), ground
+
+
+def points_of(image: Array, ground: Array, sigma: float = 0.5) -> Points:
+    count = len(image)
+    return Points(
+        ids=tuple(f"p{k}" for k in range(count)),
+        image=image,
+        ground=ground,
+        roles=np.array(["control"] * count),
+        sigma_image=np.full(count, sigma),
+        sigma_ground=np.zeros((count, 3)),
+        crs=pyproj.CRS(4326),
+        source="points.csv",
+    )
+
+
+# -- the map ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_tables_of_an_independent_camera_give_its_projections(seed: int) -> None:
+    camera = scanner(seed, pitch_deg=(-26.0, 5.0)[seed % 2])
+    model = exact(camera)
+    image, ground = sample(camera, 300, seed)
+    assert np.abs(model.ground_to_image(ground) - image).max() < 1e-6
+    assert np.abs(geocentric(model.image_to_ground(image, ground[:, 2])) - geocentric(ground)).max() < 1e-5
+    origin, direction = model.rays(image)
+    true_origin, true_direction = camera.rays(image)
+    assert np.abs(origin - true_origin).max() < 1e-4
+    assert np.abs(direction - true_direction).max() < 1e-11
+
+
+def everything(model: Pushbroom) -> Pushbroom:
+    """Return a model that uses all that there is: lever arm, corrections, offsets and drifts; all of it free."""
+    camera = replace(model.camera, dx=[1.5, -2.0, 3.0, 0.7], dy=[0.3, 2.0, -1.0], principal_line=-400.0)
+    odd = replace(
+        model,
+        camera=camera,
+        lever=np.array([1.0, 2.0, -3.0]),
+        path_line=np.array([[30.0, -20.0, 10.0], [0.5, -0.3, 0.1]]),
+        attitude_line=np.array([[1e-4, -2e-4, 3e-4], [1e-5, 2e-5, -1e-5]]),
+    )
+    return odd.freed(*odd.groups)
+
+
+@pytest.mark.parametrize("lon", [None, 179.99, -180.0])
+def test_it_keeps_the_contract(lon: float | None) -> None:
+    camera = scanner(3, lon=lon)
+    ground = sample(camera, 40, 1)[1]
+    check_sensor_model(exact(camera), ground)
+    check_sensor_model(metadata_start(camera), ground)
+    check_sensor_model(everything(metadata_start(camera, degree=3, segments=2)), ground)
+
+
+def test_closed_partials_against_differences_of_a_third_of_a_pixel() -> None:
+    """To 1e-6, which a sign or a neglected term would miss by far."""
+    model = everything(metadata_start(scanner(3), degree=3, segments=2))
+    ground = sample(scanner(3), 30, 1)[1]
+    partials = model.param_partials(ground)
+    for k, name in enumerate(model.param_names):
+        step = np.zeros(len(model.params))
+        step[k] = 0.3 / np.abs(partials[:, :, k]).max()
+        ahead, behind = model.with_params(model.params + step), model.with_params(model.params - step)
+        moved = (ahead.ground_to_image(ground) - behind.ground_to_image(ground)) / 2
+        assert np.abs(moved - partials[:, :, k] * step[k]).max() < 3e-7, name
+
+
+def test_a_mirrored_line() -> None:
+    model = exact(scanner())
+    mirrored = replace(model, camera=replace(model.camera, focal_length=-model.camera.focal_length))
+    image, ground = sample(scanner(), 30)
+    flipped = mirrored.ground_to_image(ground)
+    assert np.abs(flipped[:, 0] - (12000 - image[:, 0])).max() < 1e-6
+    assert np.abs(flipped[:, 1] - image[:, 1]).max() < 1e-6
+    check_sensor_model(mirrored, ground)
+
+
+def test_what_is_not_seen_is_nan() -> None:
+    model = exact(scanner())
+    ground = sample(scanner(), 1)[1]
+    antipode = ground * (1, -1, 1) + (180.0, 0.0, 0.0)
+    elsewhere = ground + np.array([0.0, 8.0, 0.0])
+    holed = np.where(np.eye(3, dtype=bool), np.nan, ground)
+    assert np.isnan(model.ground_to_image(np.concatenate([antipode, elsewhere, holed]))).all()
+    for point in ([[-12_001.0, 5.0]], [[5.0, 24_001.0]], [[np.nan, 5.0]]):
+        assert np.isnan(model.image_to_ground(point, 0.0)).all()
+    assert np.isnan(model.image_to_ground([[5.0, 5.0]], 700e3)).all()
+    # Outside of the image is legal.
+    outside = model.image_to_ground([[-3000.0, 16_000.0]], 100.0)
+    assert np.abs(model.ground_to_image(outside) - (-3000.0, 16_000.0)).max() < 1e-6
+
+
+def test_a_million_points_per_second_on_one_core() -> None:
+    model = exact(scanner())
+    ground = np.tile(sample(scanner(), 2000)[1], (100, 1))
+    model.ground_to_image(ground[:10])
+    taken = []
+    for _ in range(5):
+        begin = time.process_time()
+        model.ground_to_image(ground)
+        taken.append(time.process_time() - begin)
+    assert len(ground) / min(taken) > 1e6
+
+
+# -- conventions -----------------------------------------------------------------------------------------------------
+
+
+def test_signs_of_the_angles() -> None:
+    down = np.array([0.0, 0.0, -1.0])
+    angle = 0.1
+    roll, pitch, yaw = (rotations(angle * axis[None])[0] for axis in np.eye(3))
+    assert np.allclose(roll @ down, [0, math.sin(angle), -math.cos(angle)])  # to the left
+    assert np.allclose(pitch @ down, [-math.sin(angle), 0, -math.cos(angle)])  # backwards
+    assert np.allclose(yaw @ [1, 0, 0], [math.cos(angle), math.sin(angle), 0])  # forward turns to the left
+    angles = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    assert np.allclose(angles_of(rotations(angles)), angles)
+
+
+def test_mounting_is_a_rotation_that_looks_forward_and_to_the_right() -> None:
+    mounting = mounting_of_angles(math.radians(26), math.radians(3))
+    assert np.allclose(mounting.T @ mounting, np.eye(3))
+    assert np.linalg.det(mounting) == pytest.approx(1)
+    forward, left, up = mounting[:, 2]
+    assert forward / -up == pytest.approx(math.tan(math.radians(26)))
+    assert left / up == pytest.approx(math.tan(math.radians(3)))
+    # The line runs to the left, and rows grow forward.
+    assert mounting[1, 0] > 0.99
+    assert mounting[0, 1] > 0.8
+
+
+def test_quaternions_scalar_first_or_last() -> None:
+    turn = rotations_of_quaternions([[2 * math.cos(0.3), 0, 0, 2 * math.sin(0.3)]])[0]
+    assert np.allclose(turn @ [1, 0, 0], [math.cos(0.6), math.sin(0.6), 0])
+    last = rotations_of_quaternions([[0, 0, math.sin(0.3), math.cos(0.3)]], scalar="last")[0]
+    assert np.allclose(last, turn)
+    with pytest.raises(InputError):
+        rotations_of_quaternions([[0.0, 0, 0, 0]])
+    with pytest.raises(InputError):
+        rotations_of_quaternions([[1.0, 0, 0, 0]], scalar="middle")
+
+
+def test_level_flight_of_angles_looks_to_the_centre_of_the_earth() -> None:
+    position, velocity = np.array([[7e6, 0.0, 0.0]]), np.array([[0.0, 0.0, 7500.0]])
+    turn = rotations_of_angles([[0.0, 0.0, 0.0]], position, velocity)[0]
+    assert np.allclose(turn[:, 2], [1, 0, 0])
+    assert turn[2, 0] > 0.99
+    assert np.linalg.det(turn) == pytest.approx(1)
+    rolled = rotations_of_angles([[0.1, 0.0, 0.0]], position, velocity)[0]
+    assert (rolled @ [0, 0, -1]) @ turn[:, 1] > 0
+
+
+def test_a_camera_of_polynomials() -> None:
+    across, along = np.array([-0.3, 2e-5, 3e-12, -2e-16]), np.array([1e-3, -4e-9, 1e-13])
+    camera = LineCamera.of_polynomials(30_000, 500, across, along)
+    column = np.array([0.0, 0.5, 12_345.6, 30_000.0])
+    powers = column[:, None] ** np.arange(4)
+    assert np.abs(camera.directions(column) - np.stack([powers @ across, powers[:, :3] @ along], axis=1)).max() < 1e-15
+    assert len(LineCamera.of_polynomials(10, 10, [0.0, 1e-5], []).dx) == 0
+    with pytest.raises(InputError):
+        LineCamera.of_polynomials(10, 10, [0.1], [0.0])
+
+
+# -- splines ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("degree", "beyond"), [(2, 1), (3, 2), (3, 1), (1, 0)])
+def test_splines_and_their_continuation(degree: int, beyond: int) -> None:
+    random = np.random.default_rng(degree)
+    spline = Spline(degree, np.array([0.0, 0.5, 2.0, 3.0]), random.normal(size=(3 + degree, 3)), beyond)
+    times = np.array([-2.0, -0.1, 0.0, 0.3, 0.5, 1.9, 2.999, 3.0, 4.5, np.nan])
+    origins = np.array([-1.0, *spline.breaks])
+    pieces = spline.pieces(origins)
+    found = np.searchsorted(spline.breaks, times, side="right")
+    d = times - origins[np.minimum(found, 4)]
+    expected = np.einsum("njk,nj->nk", pieces[np.minimum(found, 4)], d[:, None] ** np.arange(degree + 1))
+    assert np.allclose(spline(times)[:-1], expected[:-1], atol=1e-12)
+    assert np.isnan(spline(times)[-1]).all()
+    slope = (spline(times[:-1] + 1e-6) - spline(times[:-1] - 1e-6)) / 2e-6
+    smooth = [0, 1, 3, 5, 6, 8]
+    assert np.allclose(spline(times[:-1], 1)[smooth], slope[smooth], atol=1e-5)
+    line = spline.plus_line(np.array([1.0, 2, 3]), np.array([0.1, 0.2, 0.3]), 1.5)
+    inside = np.array([0.1, 1.5, 2.9])
+    assert np.allclose(line(inside) - spline(inside), [1, 2, 3] + (inside - 1.5)[:, None] * [0.1, 0.2, 0.3])
+
+
+def test_a_spline_needs_data_everywhere() -> None:
+    with pytest.raises(InputError, match="do not determine"):
+        Spline.fitted(np.linspace(0, 1, 20), np.zeros((20, 3)), 3, np.linspace(0, 4, 5))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("degree", 0),
+        ("breaks", [0.0]),
+        ("breaks", [0.0, 2.0, 1.0]),
+        ("coefficients", np.zeros((3, 3))),
+        ("coefficients", np.full((4, 3), np.nan)),
+        ("beyond", 4),
+    ],
+)
+def test_what_is_no_spline(name: str, value: object) -> None:
+    good = {"degree": 3, "breaks": [0.0, 1.0], "coefficients": np.zeros((4, 3)), "beyond": 1}
+    with pytest.raises(InputError):
+        Spline(**{**good, name: value})  # type: ignore[arg-type]
+
+
+# -- pseudo-observations ---------------------------------------------------------------------------------------------
+
+
+def test_partials_of_the_constraints() -> None:
+    model = everything(metadata_start(scanner(2), degree=3, segments=2))
+    table = Observations(np.array([0.1, 1.0]), np.zeros((2, 3)), np.ones((2, 3)))
+    model = replace(model, path_observations=(table,))
+    found = model.constraints()
+    assert len(found) == 2 + 2 + 1 + 3 + 6 + 6
+    assert found.jacobian.shape == (len(found), len(model.params))
+    for k, name in enumerate(model.param_names):
+        step = np.zeros(len(model.params))
+        step[k] = 1e-3 if name.startswith(("along", "across", "radial")) else 1e-6
+        ahead, behind = model.with_params(model.params + step), model.with_params(model.params - step)
+        change = (behind.constraints().residuals - ahead.constraints().residuals) / 2
+        allowed = 1e-5 * np.abs(found.jacobian[:, k] * step[k]).max() + 1e-7
+        assert np.abs(change - found.jacobian[:, k] * step[k]).max() < allowed, name
+
+
+def test_a_circle_about_the_earth_meets_its_constraints() -> None:
+    model = metadata_start(scanner(4))
+    misfit = model.constraints().residuals / model.constraints().sigma
+    assert np.abs(misfit).max() < 0.05
+    # A path that climbs, and one that bends out of its plane, do not.
+    climbing = model.freed("radial_drift").with_params([200.0]).constraints()
+    assert np.abs(climbing.residuals / climbing.sigma).max() > 5
+    middle = model.path.size // 2
+    bent = model.freed(f"across_{middle}").with_params([500.0]).constraints()
+    assert np.abs(bent.residuals / bent.sigma).max() > 5
+
+
+def test_what_is_measured_counts_and_what_is_fictitious_does_not() -> None:
+    camera = scanner(5)
+    points = points_of(*sample(camera, 12, 5, noise=0.5))
+    soft = fit(metadata_start(camera), points, robust=False)
+    # Twelve of the eighteen parameters are well seen in an image, six hardly: soft constraints decide those.
+    assert 24 - 18 < soft.degrees_of_freedom < 24 - 10
+    assert soft.redundancy == math.floor(soft.degrees_of_freedom)
+    held = fit(metadata_start(camera), points, robust=False, priors={"radial_0": Prior(0.0, 1e4)})
+    assert soft.degrees_of_freedom < held.degrees_of_freedom < soft.degrees_of_freedom + 1
+    tables = exact(camera, position_sigma=0.5, angle_sigma=1e-5, segments=(2, 4)).freed("path", "attitude")
+    hard = fit(tables, points, robust=False)
+    assert not tables.constraints().fictitious.any()
+    assert hard.redundancy == 24 + len(tables.constraints()) - len(tables.params)
+
+
+def test_tables_hold_the_coefficients_that_they_observe() -> None:
+    camera = scanner(6)
+    model = exact(camera, position_sigma=0.5, angle_sigma=1e-5).freed("path", "attitude", "attitude_offset")
+    image, ground = sample(camera, 9, 6)
+    turned = model.with_params(model.params + np.where(np.char.endswith(model.param_names, "_offset"), 3e-4, 0.0))
+    found = fit(turned, points_of(image, ground), robust=False)
+    check, place = sample(camera, 200, 60)
+    # The systematic part is found, the random one stays as the tables have it.
+    assert np.abs(found.values[-3:]).max() < 1e-7
+    assert np.abs(found.model.ground_to_image(place) - check).max() < 0.01
+
+
+# -- adjustment ------------------------------------------------------------------------------------------------------
+
+
+def test_hundred_of_hundred_scenes_converge_from_metadata_alone() -> None:
+    """Nine points of 0.5 px; forward, backward and nadir views by turns."""
+    starts, errors = [], []
+    for seed in range(100):
+        camera = scanner(seed, pitch_deg=(-26.0, 5.0, 0.0)[seed % 3])
+        start = metadata_start(camera, seed)
+        check, place = sample(camera, 100, 1000 + seed)
+        starts.append(np.abs(start.ground_to_image(place) - check).max())
+        found = fit(start, points_of(*sample(camera, 9, seed, noise=0.5)), robust=False)
+        errors.append(np.sqrt(((found.model.ground_to_image(place) - check) ** 2).mean()))
+    assert max(starts) < 500
+    # Points at random places leave corners to extrapolation: typically below a pixel, never far off.
+    assert np.median(errors) < 0.7
+    assert max(errors) < 5
+
+
+def test_perturbed_and_readjusted() -> None:
+    """Position bias and attitude drift are taken back by nine points, exactly without noise."""
+    for seed in range(3):
+        camera = scanner(seed)
+        good = exact(camera)
+        wrong = replace(
+            good,
+            path_line=np.array([[30.0, -20.0, 15.0], [0.0, 0.0, 0.0]]),
+            attitude_line=np.array([[2e-4, -1e-4, 3e-4], [2e-5, -1e-5, 3e-5]]),
+        )
+        check, place = sample(camera, 200, 100 + seed)
+        assert np.abs(wrong.ground_to_image(place) - check).max() > 20
+        found = fit(wrong, points_of(*sample(camera, 9, seed, noise=0.2), sigma=0.2), robust=False)
+        assert np.sqrt(((found.model.ground_to_image(place) - check) ** 2).mean()) < 0.4
+        turned = replace(wrong, path_line=np.zeros((2, 3)))
+        clean = fit(turned, points_of(*sample(camera, 9, seed)), robust=False)
+        assert np.abs(clean.residuals).max() < 1e-6
+        assert np.abs(clean.model.ground_to_image(place) - check).max() < 1e-6
+
+
+def test_honest_covariance() -> None:
+    """Estimates scatter about the truth of an independent camera as their covariance says."""
+    camera = scanner(8)
+    model = exact(camera)
+    parameters, predicted, weights = [], [], []
+    for seed in range(40):
+        found = fit(model, points_of(*sample(camera, 12, seed, noise=0.5)), robust=False)
+        parameters.append(found.values / found.sigmas)
+        predicted.append((found.predicted - sample(camera, 12, seed)[0]) / found.image_sigma(found.points.ground))
+        weights.append(found.sigma0)
+    # The truth of every offset and drift is zero. 240 values with t-tails: 1.05 +- 0.06.
+    assert 0.9 < np.sqrt(np.mean(np.square(parameters))) < 1.2
+    assert 0.9 < np.sqrt(np.mean(np.square(predicted))) < 1.2
+    assert 0.9 < np.sqrt(np.mean(np.square(weights))) < 1.1
+
+
+def test_honest_covariance_with_soft_constraints() -> None:
+    """Predictions from metadata and 15 points are as uncertain as they say, although constraints were only guessed."""
+    scaled, weights = [], []
+    for seed in range(20):
+        camera = scanner(seed, pitch_deg=(-26.0, 5.0, 0.0)[seed % 3])
+        found = fit(metadata_start(camera, seed), points_of(*sample(camera, 15, seed, noise=0.5)), robust=False)
+        check, place = sample(camera, 20, 1000 + seed)
+        scaled.append((found.model.ground_to_image(place) - check) / found.image_sigma(place))
+        weights.append(found.sigma0)
+    assert 0.8 < np.sqrt(np.mean(np.square(scaled))) < 1.3
+    assert 0.9 < np.sqrt(np.mean(np.square(weights))) < 1.1
+
+
+def test_points_that_do_not_determine_it_are_refused() -> None:
+    camera = scanner(9)
+    # In the middle row the derivatives by a drift are nothing but rounding.
+    for row in (6000.0, 2000.0):
+        image = np.column_stack([np.linspace(100, 11_900, 9), np.full(9, row)])
+        ground = camera.image_to_ground(image, 100.0)
+        with pytest.raises(DegeneratePoints):
+            fit(exact(camera), points_of(image, ground), robust=False)
+
+
+def test_an_rpc_of_a_pushbroom() -> None:
+    model = metadata_start(scanner(10))
+    centre, half = model.domain
+    low, high = centre - half, centre + half
+    found = fit_rpc(model, (low[0], low[1], high[0], high[1]), HEIGHTS)
+    assert found.max_error_px < 0.01
+    image = np.random.default_rng(0).uniform(0, 12_000, (500, 2))
+    ground = model.image_to_ground(image, np.random.default_rng(1).uniform(*HEIGHTS, 500))
+    assert np.abs(found.rpc.ground_to_image(ground) - image).max() < 0.01
+
+
+# -- metadata and files ----------------------------------------------------------------------------------------------
+
+
+def test_focal_length_from_the_rows() -> None:
+    camera = scanner(11)
+    image = np.array([[0.0, 0.0], [12_000, 0], [12_000, 12_000], [0, 12_000]])
+    corners = camera.image_to_ground(image, 0.0)
+    model = pushbroom_of_metadata(corners, 12_000, 12_000, altitude=618e3, along_deg=26.0, heights=HEIGHTS)
+    assert model.camera.focal_length == pytest.approx(1 / camera.pixel_tan, rel=0.03)
+    assert np.abs(model.ground_to_image(corners) - image).max() < 100
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"corners": [[0, 0], [1, 0], [1, 1]]}, "corners"),
+        ({"corners": [[0, 100], [0.2, 100], [0.2, 99], [0, 99]]}, "corners"),
+        ({"corners": [[0, 0.2], [0.2, 0.2], [0, 0], [0.2, 0]]}, "corners"),
+        ({"corners": [[0, np.nan], [0.2, 0.2], [0.2, 0], [0, 0]]}, "corners"),
+        ({"altitude": 618.0}, "altitude"),
+        ({"altitude": -5e3}, "altitude"),
+        ({"along_deg": 89.0}, "along_deg"),
+        ({"pixel_size": 7e-6}, "pixel_size"),
+        ({"focal_length": math.inf, "pixel_size": 7e-6}, "focal_length"),
+        ({"heights": (100.0, 0.0)}, "heights"),
+    ],
+)
+def test_impossible_metadata(change: dict[str, object], field: str) -> None:
+    good = {
+        "corners": [[0, 0.2], [0.2, 0.25], [0.25, 0.05], [0.05, 0]],
+        "width": 12_000,
+        "height": 12_000,
+        "altitude": 618e3,
+        "along_deg": 26.0,
+    }
+    with pytest.raises(InputError) as caught:
+        pushbroom_of_metadata(**{**good, **change})  # type: ignore[arg-type]
+    assert field in str(caught.value.field)
+
+
+@pytest.mark.parametrize("what", ["short", "unordered", "late", "holed", "few"])
+@pytest.mark.parametrize("table", ["orbit", "attitude"])
+def test_impossible_tables(table: str, what: str) -> None:
+    camera = scanner(12)
+    times, positions, turns = tables_of(camera, np.linspace(-0.6, 1.6, 20) * camera.height)
+    tables = {"orbit": (times, positions), "attitude": (times, turns)}
+    column, values = tables[table]
+    tables[table] = {
+        "short": (column[:10], values[:10]),
+        "unordered": (column[::-1], values),
+        "late": (column + 100.0, values),
+        "holed": (column, np.where(np.arange(20).reshape(-1, *[1] * (values.ndim - 1)) == 3, np.nan, values)),
+        "few": (column[[0, -1]], values[[0, -1]]),
+    }[what]
+    with pytest.raises(InputError) as caught:
+        pushbroom_of_tables(
+            LineCamera(12_000, 12_000, 6000.0, 0.0, 277_857.0),
+            line_period=camera.line_period,
+            first_time=0.0,
+            orbit=tables["orbit"],
+            attitude=tables["attitude"],
+        )
+    assert caught.value.field == table
+
+
+def test_sparse_tables_and_other_clocks() -> None:
+    """A table every ten seconds, in seconds of the day, is as good as a dense one."""
+    camera = scanner(13)
+    rows = np.arange(-4, 6) * 10.0 / camera.line_period
+    times, positions, turns = tables_of(camera, rows)
+    model = pushbroom_of_tables(
+        LineCamera(camera.width, camera.height, camera.width / 2, 0.0, 1 / camera.pixel_tan),
+        line_period=camera.line_period,
+        first_time=40_000.0,
+        orbit=(times + 40_000.0, positions),
+        attitude=(times + 40_000.0, turns),
+    )
+    image, ground = sample(camera, 50)
+    assert np.abs(model.ground_to_image(ground) - image).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"line_period": 0.0},
+        {"mounting": 2 * np.eye(3)},
+        {"orbital": np.diag([1.0, 1.0, -1.0])},
+        {"origin": [0.0, 0.0]},
+        {"lever": [np.nan, 0.0, 0.0]},
+        {"free": ("roll_0", "roll_0")},
+        {"free": ("no_such",)},
+        {"camera": {"width": 0, "height": 5, "principal_column": 0.0, "principal_line": 0.0, "focal_length": 1.0}},
+        {"path": None},
+        {"shape": {"plane": -1.0}},
+        {"shape": {"radius": 7e6}},
+        {"path_observations": [{"times": [0.0], "values": [[0.0, 0.0]], "sigma": [[1.0, 1.0]]}]},
+        {"attitude_observations": [{"times": [0.0], "values": [[0.0] * 3], "sigma": [[0.0] * 3]}]},
+    ],
+)
+def test_files_that_are_no_pushbroom(change: dict[str, object]) -> None:
+    data = metadata_start(scanner()).to_dict()
+    with pytest.raises(InputError):
+        model_from_dict({**data, **change})
+
+
+def test_a_shape_without_constraints_is_empty() -> None:
+    assert len(replace(metadata_start(scanner()), shape=OrbitShape(), attitude_observations=()).constraints()) == 0
