@@ -1,0 +1,240 @@
+"""An OrbView-3 Basic product: what its label says, translated, and its RPC from the label and from the text file."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from ortho_orbview3.label import Group, read_label
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.models.rational import RPC, rpc_terms
+from ortho_pipeline.rpc import read_rpc
+from ortho_pipeline.rpc_files import read_rpc_text, rpc_of_fields
+
+#: Keys of the label by the names that RPC text has for them.
+SCALAR_KEYS = {
+    "LINE_OFF": "lineOffset", "SAMP_OFF": "pixelOffset", "LAT_OFF": "latitudeOffset", "LONG_OFF": "longitudeOffset",
+    "HEIGHT_OFF": "heightOffset", "LINE_SCALE": "lineScale", "SAMP_SCALE": "pixelScale", "LAT_SCALE": "latitudeScale",
+    "LONG_SCALE": "longitudeScale", "HEIGHT_SCALE": "heightScale",
+}  # fmt: skip
+COEFFICIENT_KEYS = {
+    "LINE_NUM_COEFF": "lineNumeratorCoefficients", "LINE_DEN_COEFF": "lineDenominatorCoefficients",
+    "SAMP_NUM_COEFF": "pixelNumeratorCoefficients", "SAMP_DEN_COEFF": "pixelDenominatorCoefficients",
+}  # fmt: skip
+ERROR_KEYS = {"ERR_BIAS": "errorBias", "ERR_RAND": "errorRand"}
+#: Corners as the label names them, with the column and row of their pixel's centre in parts of the last one.
+CORNERS = {
+    "upperLeftCorner": (0, 0), "upperRightCorner": (1, 0), "lowerRightCorner": (1, 1), "lowerLeftCorner": (0, 1),
+}  # fmt: skip
+#: The vendor's word for a number that is not known.
+UNKNOWN = 999.0
+#: RPCs of label and text file that differ by more than the first (px) are reported, by more than the second refused.
+DIFFERENT, CONTRADICTORY = 1e-3, 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Product:
+    """What a label says.
+
+    Attributes
+    ----------
+    columns, rows : int
+    pixel_spacing, line_spacing : float
+        Distance (m) of the centres of neighbouring pixels on the ground, along a line and from line to line.
+    corners : (4, 3)
+        Longitude, latitude (degrees), ellipsoidal height of the centres of the corner pixels, as `CORNERS` has them.
+    rpc : RPC
+    acquired : datetime or None
+        UTC of the first line.
+    circular_error : float or None
+        Horizontal accuracy (m) at 90 %, without control.
+    cloud_cover : float or None
+        Percent.
+    """
+
+    file: str
+    columns: int
+    rows: int
+    pixel_spacing: float
+    line_spacing: float
+    corners: Array
+    rpc: RPC
+    satellite: str
+    sensor: str
+    acquired: datetime.datetime | None
+    circular_error: float | None
+    cloud_cover: float | None
+    orbit: str | None
+    bits: int | None
+
+    @property
+    def corner_misses(self) -> Array:
+        """How far (px) the RPC projects the corners from the centres of the corner pixels ``(4, 2)``."""
+        last = np.array([self.columns - 1, self.rows - 1])
+        return self.rpc.ground_to_image(self.corners) - (np.array(list(CORNERS.values())) * last + 0.5)
+
+
+def label_of(image: str | PathLike[str]) -> Path | None:
+    """Return the label beside an image, None if there is none."""
+    return _beside(Path(image), ".pvl")
+
+
+def rpc_text_of(image: str | PathLike[str]) -> Path | None:
+    """Return the RPC text beside an image, None if there is none."""
+    return _beside(Path(image), "_rpc.txt")
+
+
+def _beside(image: Path, end: str) -> Path | None:
+    wanted = f"{image.stem}{end}".lower()
+    exact = image.with_name(f"{image.stem}{end}")
+    try:
+        if exact.is_file():
+            return exact
+        # Archives that went through other systems come in capitals.
+        return next((path for path in sorted(image.parent.iterdir()) if path.name.lower() == wanted), None)
+    except (OSError, ValueError):
+        return None
+
+
+def read_product(path: str | PathLike[str]) -> Product:
+    """Read a label.
+
+    Raises
+    ------
+    InputError
+        For a damaged label; the field is group and key.
+    """
+    label = read_label(path)
+    product, image = label.group("productInfo"), label.group("inputImageInfo")
+    sensor = label.group("sensorInfo")
+    return Product(
+        file=str(path),
+        columns=product.whole("pixelsPerScanLine"),
+        rows=product.whole("numScanLines"),
+        pixel_spacing=_positive(product, "pixelSpacing"),
+        line_spacing=_positive(product, "lineSpacing"),
+        corners=_corners(product),
+        rpc=_rpc(product.group("rationalFunctions")),
+        satellite=sensor.text("satelliteName"),
+        sensor=sensor.text("sensorName"),
+        acquired=_time(image, "firstLineAcquisitionDateTime"),
+        circular_error=_known(image, "circularError"),
+        cloud_cover=_known(product, "productCloudCoverPercentage"),
+        orbit=image.text("acquisitionOrbitNumber") if image.has("acquisitionOrbitNumber") else None,
+        bits=product.whole("bitsPerPixel") if product.has("bitsPerPixel") else None,
+    )
+
+
+def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple[RPC, str, tuple[str, ...]]:
+    """Return the RPC to use, its file, and what there is to say about it.
+
+    Parameters
+    ----------
+    choice : {None, 'label', 'text', 'sidecar'} or path
+        Which one, where they differ; the text is the side-car that GDAL reads.
+
+    Raises
+    ------
+    InputError
+        If the text is damaged or absent, or both differ by more than a pixel and none is chosen.
+    """
+    if choice == "label":
+        return product.rpc, product.file, ()
+    if choice not in (None, "text", "sidecar"):
+        return read_rpc(choice), choice, ()
+    if text is None:
+        if choice is not None:
+            raise InputError("there is no RPC text beside the image", field="rpc", remedy="take --rpc label")
+        return product.rpc, product.file, ("there is no RPC text beside the label, whose own RPC is taken",)
+    rpc = _without_poles(read_rpc_text(text), str(text), "LINE_DEN_COEFF, SAMP_DEN_COEFF")
+    difference = _difference(product.rpc, rpc)
+    if choice is not None or difference <= DIFFERENT:
+        return rpc, str(text), ()
+    if not difference <= CONTRADICTORY:
+        raise InputError(
+            f"the RPC in this file and that of {Path(product.file).name} differ by {difference:.3g} px",
+            file=text, field="rpc", remedy="choose one: --rpc label, --rpc text, or --rpc FILE",
+        )  # fmt: skip
+    return rpc, str(text), (f"the RPCs of label and text differ by {difference:.2g} px; that of the text is taken",)
+
+
+def _difference(first: RPC, second: RPC) -> float:
+    """Return by how much two RPCs differ over the box of the first (px); infinite where one has no value."""
+    apart = np.abs(second.ground_to_image(_box(first)) - first.ground_to_image(_box(first)))
+    return float(apart.max()) if np.isfinite(apart).all() else np.inf
+
+
+def _box(rpc: RPC) -> Array:
+    centre, half = rpc.domain
+    signs = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 3), axis=-1).reshape(-1, 3)
+    return centre + signs * half
+
+
+def _positive(group: Group, key: str) -> float:
+    value = group.number(key)
+    if not value > 0:
+        raise InputError(f"{value:g} is no spacing", file=group.file, field=group.place(key))
+    return value
+
+
+def _known(group: Group, key: str) -> float | None:
+    if not group.has(key):
+        return None
+    value = group.number(key)
+    return None if value < 0 or value == UNKNOWN else value
+
+
+def _time(group: Group, key: str) -> datetime.datetime | None:
+    if not group.has(key):
+        return None
+    text = group.text(key)
+    try:
+        time = datetime.datetime.fromisoformat(re.sub(r"(\.\d{6})\d+", r"\1", text))
+    except ValueError as error:
+        raise InputError(f"{text[:40]!r} is no time", file=group.file, field=group.place(key)) from error
+    return time if time.tzinfo is not None else time.replace(tzinfo=datetime.UTC)
+
+
+def _corners(product: Group) -> Array:
+    group = product.group("geodeticCorners")
+    found = np.array([[group.group(name).number(key) for key in ("longitude", "latitude", "height")]
+                      for name in CORNERS])  # fmt: skip
+    for name, (lon, lat, height) in zip(CORNERS, found.tolist(), strict=True):
+        if abs(lat) > 90 or abs(lon) > 360 or not -1000 < height < 10_000:
+            raise InputError(
+                f"{lon:g}, {lat:g}, {height:g} m is not on Earth", file=group.file, field=group.place(name)
+            )
+    return found
+
+
+def _rpc(group: Group) -> RPC:
+    fields = {key: repr(group.number(name)) for key, name in SCALAR_KEYS.items()}
+    for key, name in COEFFICIENT_KEYS.items():
+        fields[key] = " ".join(map(repr, group.numbers(name, 20)))
+    fields |= {key: repr(group.number(name)) for key, name in ERROR_KEYS.items() if group.has(name)}
+    try:
+        rpc = rpc_of_fields(fields, group.file)
+    except InputError as error:
+        names = SCALAR_KEYS | COEFFICIENT_KEYS | ERROR_KEYS
+        keys = [names.get(key, key) for key in (error.field or "").split(", ")]
+        raise InputError(
+            error.message, file=group.file, field=", ".join(map(group.place, keys)), remedy=error.remedy
+        ) from error
+    return _without_poles(rpc, group.file, group.path)
+
+
+def _without_poles(rpc: RPC, file: str, field: str) -> RPC:
+    """Return the RPC if none of its denominators changes its sign within its box."""
+    terms = rpc_terms(*rpc.normalise(_box(rpc)))
+    for name in ("row_den", "col_den"):
+        values = getattr(rpc, name) @ terms
+        if not (values.min() > 0 or values.max() < 0):
+            which = "line" if name == "row_den" else "pixel"
+            raise InputError(f"the {which} denominator is zero within the scene", file=file, field=field)
+    return rpc
