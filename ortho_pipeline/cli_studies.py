@@ -74,7 +74,7 @@ def simulate_ikonos(
     default=1200,
     show_default=True,
     metavar="PX",
-    help="Columns and rows; 12000 are the real ones, fewer are larger.",
+    help="Columns and rows; 12000 are the real ones (25 min), fewer are larger.",
 )
 @click.option(
     "--jitter",
@@ -90,6 +90,20 @@ def simulate_cartosat(folder: str, seed: int, size: int, jitter: float, as_json:
     from ortho_pipeline import studies
 
     print_result(studies.simulate_cartosat(folder, seed=seed, size=size, jitter=jitter), as_json)
+
+
+@simulate.command("orbview3")
+@folder_option
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of points and all noise.")
+@click.option(
+    "--pixel", type=int, default=8, show_default=True, metavar="M", help="Metres; 1 is the real one, larger are fewer."
+)
+@json_option
+def simulate_orbview3(folder: str, seed: int, pixel: int, as_json: bool) -> None:
+    """Write two OrbView-3 scenes over Zonguldak: images with .pvl and _rpc.txt, DEM, 34 points, truth."""
+    from ortho_pipeline import studies
+
+    print_result(studies.simulate_orbview3(folder, seed=seed, pixel=pixel), as_json)
 
 
 @click.group()
@@ -139,4 +153,19 @@ def reproduce_cartosat(folder: str | None, realisations: int, as_json: bool) -> 
 
     with progress("Reproducing") as advance:
         result = studies.reproduce_cartosat(folder, realisations=realisations, progress=advance)
+    print_result(result, as_json)
+
+
+@reproduce.command("orbview3")
+@click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the page.")
+@click.option(
+    "--realisations", type=click.IntRange(min=1), default=100, show_default=True, help="How often a scene is drawn."
+)
+@json_option
+def reproduce_orbview3(folder: str | None, realisations: int, as_json: bool) -> None:
+    """Table 1 and figures 4 to 7 of Bueyueksalih et al., on simulated OrbView-3 scenes; and QuickBird beside them."""
+    from ortho_pipeline import studies
+
+    with progress("Reproducing") as advance:
+        result = studies.reproduce_orbview3(folder, realisations=realisations, progress=advance)
     print_result(result, as_json)

@@ -173,6 +173,45 @@ def reproduce_cartosat(
     return _written("cartosat", document, folder, lambda: cartosat_page.page(document, vectors))
 
 
+def simulate_orbview3(folder: str | os.PathLike[str], *, seed: int = 0, pixel: int = 8) -> Result:
+    """Write both simulated OrbView-3 scenes of the paper: images with labels and RPCs, DEM, 34 points, truth.
+
+    Parameters
+    ----------
+    pixel : int
+        Metres of a pixel; 1 m is the real one, larger ones are fewer.
+
+    Raises
+    ------
+    InputError
+        If such scenes are not possible, or the folder cannot be written.
+    """
+    from ortho_orbview3.simulation import write_product
+
+    files = write_product(folder, seed=seed, pixel=pixel)
+    return Result(files, {}, f"Two simulated OrbView-3 scenes (seed {seed}); try\n  ortho fit {files['image_471890']} "
+                  f"--gcps {files['gcps_471890']} --correction affine --prune")  # fmt: skip
+
+
+def reproduce_orbview3(
+    folder: str | os.PathLike[str] | None = None,
+    *,
+    realisations: int = 100,
+    progress: Callable[[float], None] | None = None,
+) -> Result:
+    """Compute table 1 and figures 4 to 7 of the OrbView-3 paper on simulated scenes, beside the paper's numbers.
+
+    Parameters
+    ----------
+    folder : path, optional
+        Where ``orbview3.json`` and the page ``orbview3.html`` go.
+    """
+    from ortho_pipeline.experiments import orbview3, orbview3_page
+
+    document = orbview3.reproduce(realisations, progress=progress)
+    return _written("orbview3", document, folder, lambda: orbview3_page.page(document, orbview3.error_vectors()))
+
+
 def _written(
     name: str, document: Mapping[str, Any], folder: str | os.PathLike[str] | None, page: Callable[[], str]
 ) -> Result:

@@ -1,6 +1,7 @@
 """Make the sample data: a simulated satellite scene, its RPC, a DEM, ground control, and the truth behind them.
 
-Beside it a small BILSAT-1 frame with its imaging survey, and a small IKONOS Geo delivery, in folders of their own.
+Beside it a small BILSAT-1 frame with its imaging survey, a small IKONOS Geo delivery, a CARTOSAT-1 pair and two
+OrbView-3 scenes, in folders of their own.
 
 Run ``python sample_data/make.py [FOLDER]``; without a folder the files of this one are written again. Everything comes
 from seeds, so that the pixels and numbers are the same every time.
@@ -19,6 +20,7 @@ import pyproj
 from ortho_bilsat.simulation import write_product
 from ortho_cartosat.simulation import write_product as write_cartosat
 from ortho_ikonos.simulation import write_product as write_ikonos
+from ortho_orbview3.simulation import write_product as write_orbview3
 from osgeo import gdal
 
 from ortho_pipeline.crs import Vertical
@@ -58,6 +60,8 @@ IKONOS_SIZE, IKONOS_PIXEL, IKONOS_DEM_STEP = 800, 12.5, 50.0
 
 #: The CARTOSAT-1 pair: pixels thirty times as wide as the real ones, and a coarse DEM, to keep it small.
 CARTOSAT_SIZE, CARTOSAT_DEM_STEP = 400, 120.0
+#: The OrbView-3 scenes: pixels 24 times as wide as the real ones, and a coarse DEM, to keep them small.
+ORBVIEW3_PIXEL, ORBVIEW3_DEM_STEP = 24, 150.0
 
 
 def main(folder: Path) -> None:
@@ -87,6 +91,7 @@ def main(folder: Path) -> None:
         folder / "ikonos", seed=1, size=IKONOS_SIZE, pixel=IKONOS_PIXEL, multispectral=True, dem_step=IKONOS_DEM_STEP
     )
     write_cartosat(folder / "cartosat", seed=1, size=CARTOSAT_SIZE, dem_step=CARTOSAT_DEM_STEP)
+    write_orbview3(folder / "orbview3", seed=1, pixel=ORBVIEW3_PIXEL, dem_step=ORBVIEW3_DEM_STEP)
 
 
 def vendor_rpc(camera: LineScanner) -> RpcExport:

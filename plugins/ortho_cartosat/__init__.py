@@ -1,0 +1,131 @@
+"""Sensor plugin for CARTOSAT-1 Ortho Kit images: RPC, and a pushbroom from what the metadata tells (cartosat.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from osgeo import gdal
+
+from ortho_cartosat.layout import metadata_of, partner_of, rpc_of, view_of
+from ortho_cartosat.metadata import Metadata, read_metadata
+from ortho_cartosat.start import pushbroom
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.rpc import rpc_of_dataset
+from ortho_pipeline.rpc_files import rpc_of_fields
+
+#: Ground for which the pushbroom is meant where no RPC tells it.
+HEIGHTS = (-500.0, 9000.0)
+#: The RPC that GDAL finds and the one used here are called different beyond this (px).
+DISAGREEMENT = 1.0
+FACTS = {
+    "product_id": "ProductID", "satellite": "SatID", "camera": "Sensor", "date_of_pass": "DateOfPass",
+}  # fmt: skip
+NUMBERS = {
+    "altitude_km": "SatelliteAltitude", "heading_deg": "SatelliteHeadingAngle",
+    "along_track_deg": "ViewAngleAlongTrack", "across_track_deg": "ViewAngleAcrossTrack",
+    "pixel_along_m": "InputResolutionAlong", "pixel_across_m": "InputResolutionAcross",
+    "sun_azimuth_deg": "SunAzimuthAtCenter", "sun_elevation_deg": "SunElevationAtCenter",
+}  # fmt: skip
+
+
+@hookimpl
+def ortho_sensors() -> Iterable[Sensor]:
+    """Offer the sensor ``cartosat``."""
+    yield Sensor(
+        "cartosat",
+        "CARTOSAT-1 Ortho Kit: BANDA/BANDF, <name>_A/_F or PRODUCT with _MET.TXT and _RPC.TXT",
+        recognises,
+        open_scene,
+        options={
+            "rpc": "which RPC to use: tag, sidecar, or an RPC file; by itself the first readable one of the delivery",
+            "rpc_origin": "line and sample that the RPC gives to the centre of the first pixel: 0 (default) or 1",
+            "view": "fore or aft, where neither name nor metadata say it",
+        },
+    )
+
+
+def recognises(dataset: gdal.Dataset) -> bool:
+    """Tell whether the metadata of a CARTOSAT-1 image lie beside this one."""
+    path = metadata_of(dataset.GetDescription())
+    try:
+        return path is not None and read_metadata(path).is_cartosat1
+    except InputError:
+        return False
+
+
+def open_scene(
+    dataset: gdal.Dataset, *, rpc: str | None = None, rpc_origin: str = "0", view: str | None = None
+) -> Scene:
+    """Open an image with the RPC of its delivery, and with a pushbroom to be adjusted to control points."""
+    name = dataset.GetDescription()
+    path = metadata_of(name)
+    if path is None:
+        raise InputError("there is no metadata beside this image", file=name, remedy=f"add {Path(name).stem}_MET.TXT")
+    if rpc_origin not in ("0", "1") or view not in (None, "fore", "aft"):
+        field, allowed = ("rpc_origin", "0 or 1") if rpc_origin not in ("0", "1") else ("view", "fore or aft")
+        raise InputError("there is no such choice", field=field, remedy=f"give {allowed}")
+    metadata = read_metadata(path)
+    size = dataset.RasterXSize, dataset.RasterYSize
+    view = view or view_of(name, metadata)
+    found, source, warnings = _rpc(dataset, rpc, rpc_origin)
+    models: dict[str, SensorModel] = {} if found is None else {"rpc": found}
+    try:
+        models["pushbroom"] = pushbroom(metadata, view, size, HEIGHTS if found is None else found.height_range)
+    except InputError as error:
+        if not models:
+            raise
+        warnings.append(f"there is no pushbroom model: {error.message}")
+    if metadata.size not in (None, size):
+        warnings.append(
+            "the metadata is for {} x {} pixels, this image has {} x {}: is it a crop?".format(*metadata.size, *size)
+        )
+    if found is None:
+        warnings.append("there is no readable RPC: the model only starts an adjustment to at least nine control points")
+    facts = _facts(name, metadata, warnings) | ({} if found is None else {"rpc_origin": int(rpc_origin)})
+    facts = {"view": view} | facts if view else facts
+    return Scene("cartosat", name, *size, models, source or str(path), facts, tuple(warnings), sources=(path,))
+
+
+def _facts(name: str, metadata: Metadata, warnings: list[str]) -> dict[str, object]:
+    """Return what the metadata tell people; what is damaged there is no reason to refuse the image."""
+    partner = partner_of(name, metadata)
+    facts: dict[str, object] = {"partner": None if partner is None else str(partner), "acquired": metadata.acquired}
+    for fact, key in {**FACTS, **NUMBERS}.items():
+        try:
+            facts[fact] = metadata.number(key) if fact in NUMBERS else metadata.text(key)
+        except InputError as error:
+            warnings.append(f"{metadata.path.name}, {key}: {error.message}")
+    return {fact: value for fact, value in facts.items() if value is not None}
+
+
+def _rpc(dataset: gdal.Dataset, choice: str | None, origin: str) -> tuple[RPC | None, str | None, list[str]]:
+    if choice is None:
+        found, path, warnings = rpc_of(dataset.GetDescription())
+        source = None if path is None else str(path)
+    else:
+        found, source = rpc_of_dataset(dataset, choice)
+        warnings = []
+    if found is not None and choice is None:
+        warnings += _compared_with_gdal(dataset, found, str(source))
+    if found is not None and origin == "1":
+        found = found._replace(col_off=found.col_off - 1.0, row_off=found.row_off - 1.0)
+    return found, source, warnings
+
+
+def _compared_with_gdal(dataset: gdal.Dataset, found: RPC, source: str) -> list[str]:
+    """Return a warning where GDAL's own readers took another RPC than this plugin."""
+    try:
+        other = rpc_of_fields(dataset.GetMetadata("RPC") or {})
+    except (InputError, RuntimeError):
+        # None, or an encrypted file, which GDAL takes for a damaged one.
+        return []
+    centre = np.array([[found.lon_off, found.lat_off, found.h_off]])
+    apart = float(np.abs(other.ground_to_image(centre) - found.ground_to_image(centre)).max())
+    if apart <= DISAGREEMENT:
+        return []
+    return [f"GDAL reads another RPC for this image than {Path(source).name}; they differ by {apart:.1f} px"]

@@ -1,0 +1,439 @@
+"""CARTOSAT-1: the simulated pair, the metadata, the layouts of a delivery, the plugin, and the start of a pushbroom."""
+
+from __future__ import annotations
+
+import ast
+import shutil
+from pathlib import Path
+
+import numpy as np
+import ortho_cartosat
+import pytest
+from ortho_cartosat.layout import partner_of, rpc_of
+from ortho_cartosat.metadata import read_metadata
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.experiments import cartosat_scene as simulated
+from ortho_pipeline.experiments.cartosat_scene import BIASES, Attitude, Scanner, StereoPair, aim, local_metres
+from ortho_pipeline.geometry import geocentric
+from ortho_pipeline.plugins import open_scene
+from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.rpc_files import read_rpc_text
+from ortho_pipeline.simulate import EARTH_A, LineScanner
+from ortho_pipeline.testing import check_sensor
+
+ROOT = Path(__file__).resolve().parent.parent
+SENSOR = next(iter(ortho_cartosat.ortho_sensors()))
+
+
+@pytest.fixture
+def pair_folder(sample):
+    """The small pair of the sample data."""
+    return sample / "cartosat"
+
+
+def deliver(source: Path, folder: Path, names: dict[str, str]) -> Path:
+    """Copy files of the sample under other names."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for old, new in names.items():
+        shutil.copy(source / old, folder / new)
+    return folder
+
+
+def named(stem: str, side: str = "A", met: str = "_MET.TXT", rpc: str = "_RPC.TXT") -> dict[str, str]:
+    band = f"BAND{side}"
+    return {f"{band}.tif": f"{stem}.tif", f"{band}_MET.TXT": f"{stem}{met}", f"{band}_RPC.TXT": f"{stem}{rpc}"}
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+# -- the simulated pair ----------------------------------------------------------------------------------------------
+
+
+def level(height: float):
+    return lambda lon, lat: np.full(len(lon), height)
+
+
+@pytest.mark.parametrize(("view", "width"), [("fore", 30.0), ("aft", 27.0)])
+def test_the_cameras_see_what_the_paper_says(view, width):
+    camera = aim(view)
+    size = camera.size
+    image = np.array([(0, 0), (size, 0), (0, size), (size, size), (size / 2, size / 2), (3000.3, 777.7)])
+    ground = camera.meet(image, level(100.0))
+    assert np.abs(camera.project(ground) - image).max() < 1e-6
+    east, north = local_metres(*ground.T[:2])
+    assert np.hypot(east[1] - east[0], north[1] - north[0]) / 1e3 == pytest.approx(width, abs=0.4)
+    assert np.hypot(east[2] - east[0], north[2] - north[0]) / size == pytest.approx(2.54, abs=0.02)
+    np.testing.assert_allclose([east[4], north[4]], 0.0, atol=60.0)
+    # The satellite is in front of the scene or behind it, by its tilt, on its orbit.
+    origin, direction = camera.rays(image[4:5])
+    down = -(origin * direction).sum() / np.linalg.norm(origin)
+    assert np.degrees(np.arccos(down)) == pytest.approx(abs(simulated.TILTS_DEG[view]), abs=0.1)
+    assert np.linalg.norm(origin) - np.linalg.norm(geocentric(ground[4:5])) == pytest.approx(618e3, abs=200)
+    # It flies south, so before the passage it is further north.
+    latitudes = [np.arcsin(place[0, 2] / np.linalg.norm(place)) for place in (origin, geocentric(ground[4:5]))]
+    assert np.sign(latitudes[0] - latitudes[1]) == np.sign(simulated.TILTS_DEG[view])
+
+
+def test_the_scanner_agrees_with_the_one_that_was_written_apart():
+    other = LineScanner.over(147.4, -42.9, 200.0, image_width=2000, image_height=2000, gsd=2.5, off_nadir_deg=0.0)
+    other = other.with_params((0.004, -np.radians(20.0), 0.02))
+    camera = Scanner(
+        2000, np.array(other.radial), np.array(other.along), other.radius, np.radians(20.0), 0.0, other.line_period,
+        other.pixel_tan, Attitude((0.004, 0.0, 0.02)),
+    )  # fmt: skip
+    image = np.random.default_rng(0).uniform(0, 2000, (50, 2))
+    ground = other.image_to_ground(image, 300.0)
+    origin, direction = camera.rays(image)
+    origin_there, direction_there = other.rays(image)
+    np.testing.assert_allclose(origin, origin_there, atol=1e-6)
+    np.testing.assert_allclose(direction, direction_there, atol=1e-14)
+    # Its steps are those of a scene elsewhere, so they end a little later.
+    assert np.abs(camera.project(ground) - image).max() < 1e-5
+
+
+def test_jitter_is_in_the_image_and_not_in_what_the_vendor_believes():
+    calm, swinging = (StereoPair.make(seed=2, jitter=jitter) for jitter in (0.0, 1.0))
+    moved = swinging.cameras["fore"].project(calm.ground) - calm.image("fore")
+    assert 0.5 < np.sqrt((moved[:, 1] ** 2).mean()) < 1.5
+    # What is seen of it across the track comes from the yaw of three degrees.
+    assert np.abs(moved[:, 0]).max() < 0.1 * np.abs(moved[:, 1]).max()
+    for view in ("fore", "aft"):
+        np.testing.assert_array_equal(swinging.rpc(view).row_num, calm.rpc(view).row_num)
+
+
+def test_the_rpcs_have_the_bias_of_table_3():
+    pair = StereoPair.make(seed=4)
+    for view, paper in (("fore", (0.91, 33.27)), ("aft", (15.92, 26.80))):
+        miss = pair.rpc(view).ground_to_image(pair.ground) - pair.image(view)
+        np.testing.assert_allclose(np.sqrt((miss**2).mean(axis=0)), paper, atol=0.15)
+        # "Almost constant": what varies is the slope that was asked for.
+        centred = pair.image(view) - pair.image(view).mean(axis=0)
+        slopes = np.linalg.lstsq(np.column_stack([np.ones(len(miss)), centred]), miss[:, 1])[0]
+        assert slopes[1] == pytest.approx(BIASES[view].row_per_col, abs=2e-5)
+        assert slopes[2] == pytest.approx(BIASES[view].row_per_row, abs=2e-5)
+
+
+def test_points_lie_low_in_the_upper_left_quarter_of_both_images():
+    pair = StereoPair.make(seed=6)
+    assert len(pair.ground) == 69
+    for view in ("fore", "aft"):
+        image = pair.image(view)
+        assert (image > 0).all()
+        assert (image < 0.55 * pair.size).all()
+    assert 0 < pair.ground[:, 2].min() < pair.ground[:, 2].max() < 500
+    grid = np.stack(np.meshgrid(np.linspace(147.2, 147.65, 90), np.linspace(-43.1, -42.8, 90)), axis=-1).reshape(-1, 2)
+    heights = pair.hills(*grid.T)
+    assert heights.min() < 15
+    assert 1200 < heights.max() < 1260
+
+
+def test_smaller_images_cover_the_same_ground():
+    small = aim("aft", size=500)
+    ends = np.array([(0.0, 0.0), (1.0, 1.0)])
+    near, far = (camera.meet(ends * camera.size, level(0.0)) for camera in (small, aim("aft")))
+    # The projection of a reduced pixel's corner is that of the corner of the pixels it stands for.
+    np.testing.assert_allclose(near[:, :2], far[:, :2], atol=2e-5)
+
+
+def test_the_truth_shares_no_code_with_the_models_and_no_estimator_sees_it():
+    scene = ast.parse((ROOT / "ortho_pipeline/experiments/cartosat_scene.py").read_text())
+    used = {
+        node.module: {one.name for one in node.names} for node in ast.walk(scene) if isinstance(node, ast.ImportFrom)
+    }
+    # The interface of what an RPC is fitted to, and the RPC that is delivered.
+    assert {name: what for name, what in used.items() if name.startswith("ortho_pipeline.models")} == {
+        "ortho_pipeline.models.base": {"SensorModel"}, "ortho_pipeline.models.rational": {"RPC"},
+    }  # fmt: skip
+    for name in ("__init__", "layout", "metadata", "start"):
+        text = (ROOT / f"plugins/ortho_cartosat/{name}.py").read_text()
+        assert "experiments" not in text
+        assert "simulat" not in text
+
+
+# -- metadata --------------------------------------------------------------------------------------------------------
+
+
+def metadata(tmp_path: Path, text: str):
+    path = tmp_path / "X_MET.TXT"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return read_metadata(path)
+
+
+def test_metadata_are_read_with_tolerance(tmp_path):
+    read = metadata(
+        tmp_path,
+        "\ufeffCARTOSAT-1 PRODUCT METADATA\r\n=====\r\nSatID=  IRS-P5 \r\n  sensor\t= PAN_F\r\nNoPixels   =12000 px\r\n"
+        'NoScans =12000\r\nSatelliteAltitude= +638.5E0 km\r\nSceneCenterRoll = -NA-\r\nProductID = "A = B"\r\n'
+        "SceneCenterTime = 01-OCT-2006  00:13:22.512345678\r\nDateOfPass=01-OCT-2006\r\nDateOfPass = 01-OCT-2006\r\n",
+    )
+    assert read.is_cartosat1
+    assert read.view == "fore"
+    assert read.size == (12000, 12000)
+    assert read.altitude == 638500.0
+    assert read.number("SceneCenterRoll") is None
+    assert read.text("PRODUCTID") == "A = B"
+    assert read.text("DateOfPass") == "01-OCT-2006"
+    assert read.acquired == "2006-10-01T00:13:22.512345Z"
+    assert read.corners is None
+
+
+@pytest.mark.parametrize(
+    ("name", "ours"),
+    [("CARTOSAT-1", True), ("Cartosat1A", True), ("IRS-P5", True), ("C1", True), ("CARTOSAT-2", False), ("P6", False),
+     ("CARTOSAT-12", False), ("-NA-", False)],
+)  # fmt: skip
+def test_the_satellite_decides(tmp_path, name, ours):
+    assert metadata(tmp_path, f"SatID = {name}\n").is_cartosat1 is ours
+
+
+@pytest.mark.parametrize(
+    ("text", "ask", "field"),
+    [
+        ("NoPixels = many\nNoScans = 1\n", lambda read: read.size, "NoPixels"),
+        ("NoPixels = 1e400\nNoScans = 1\n", lambda read: read.size, "NoPixels"),
+        ("NoPixels = nan\nNoScans = 1\n", lambda read: read.size, "NoPixels"),
+        ("SatelliteAltitude = 638,5\n", lambda read: read.altitude, "SatelliteAltitude"),
+        ("SatelliteAltitude = 638000\n", lambda read: read.altitude, "SatelliteAltitude"),
+        ("SatID = A\nSatID = B\n", lambda read: read.is_cartosat1, "SatID"),
+        ("ImageULLat = 1\nImageULLon = 2\nImageURLat = 1\n", lambda read: read.corners, "ImageUR"),
+        ("ImageULLat = 91\n", lambda read: read.corners, "ImageULLat"),
+        ("ViewAngleAlongTrack = 1_0\n", lambda read: read.view, "ViewAngleAlongTrack"),
+    ],
+)
+def test_errors_name_file_and_key(tmp_path, text, ask, field):
+    with pytest.raises(InputError) as caught:
+        ask(metadata(tmp_path, text))
+    assert caught.value.field == field
+    assert str(caught.value.file).endswith("X_MET.TXT")
+
+
+@pytest.mark.parametrize("data", [b"", b"no assignment\n", b"SatID = A\0", b"=\n", b"SatID = A\n" * 200_000])
+def test_what_is_no_metadata_is_a_typed_error(tmp_path, data):
+    with pytest.raises(InputError, match="X_MET"):
+        metadata(tmp_path, data)
+    with pytest.raises(InputError):
+        read_metadata(tmp_path / "absent_MET.TXT")
+
+
+def test_mutated_metadata_give_typed_errors_or_scenes(pair_folder, tmp_path):
+    folder = deliver(pair_folder, tmp_path / "own", named("BANDA"))
+    text = (folder / "BANDA_MET.TXT").read_bytes()
+    dataset = open_dataset(folder / "BANDA.tif")
+    random = np.random.default_rng(0)
+    opened = 0
+    for _ in range(150):
+        mutated = bytearray(text)
+        for place in random.integers(0, len(text), random.integers(1, 12)):
+            mutated[place] = random.choice(np.frombuffer(b"0123456789.-+eE=\n\t\0 \xffnaifLU", dtype=np.uint8))
+        (folder / "BANDA_MET.TXT").write_bytes(bytes(mutated))
+        SENSOR.recognises(dataset)
+        try:
+            scene = SENSOR.open_scene(dataset)
+        except InputError:
+            continue
+        opened += 1
+        for model in scene.models.values():
+            assert np.isfinite(model.params).all()
+    assert opened > 50
+
+
+def test_corners_of_the_product_stand_in_for_those_of_the_image(pair_folder, tmp_path):
+    read = read_metadata(pair_folder / "BANDA_MET.TXT")
+    assert read.corners.shape == (4, 2)
+    path = tmp_path / "B_MET.TXT"
+    path.write_text((pair_folder / "BANDA_MET.TXT").read_text().replace("Image", "Else"))
+    box = read_metadata(path).corners
+    np.testing.assert_array_equal(box.min(axis=0), read.corners.min(axis=0))
+    np.testing.assert_array_equal(box[0], [read.corners[:, 0].min(), read.corners[:, 1].max()])
+
+
+# -- the plugin ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("view", ["fore", "aft"])
+def test_the_sample_keeps_the_contract(pair_folder, view):
+    band, other = ("BANDF", "BANDA") if view == "fore" else ("BANDA", "BANDF")
+    scene = check_sensor(SENSOR, pair_folder / f"{band}.tif")
+    assert list(scene.models) == ["rpc", "pushbroom"]
+    assert scene.model_source == str(pair_folder / f"{band}_RPC.TXT")
+    assert scene.facts["view"] == view
+    assert scene.facts["partner"] == str(pair_folder / f"{other}.tif")
+    assert scene.facts["acquired"] == "2006-10-01T00:13:22.512345Z"
+    assert "heading_deg" not in scene.facts
+    assert scene.warnings == ()
+    assert open_scene(pair_folder / f"{band}.tif").sensor == "cartosat"
+
+
+@pytest.mark.parametrize("layout", ["names", "lower case", "folders", "products"])
+def test_every_layout_is_recognised_and_its_pair_found(pair_folder, tmp_path, layout):
+    if layout == "names":
+        folder = deliver(pair_folder, tmp_path, named("hobart_A") | named("hobart_F", "F"))
+        images = folder / "hobart_A.tif", folder / "hobart_F.tif"
+    elif layout == "lower case":
+        small = {"met": "_met.txt", "rpc": "_rpc.txt"}
+        folder = deliver(pair_folder, tmp_path, named("banda", **small) | named("bandf", "F", **small))
+        images = folder / "banda.tif", folder / "bandf.tif"
+    elif layout == "folders":
+        deliver(pair_folder, tmp_path / "one", named("BANDA"))
+        deliver(pair_folder, tmp_path / "two", named("BANDF", "F"))
+        images = tmp_path / "one" / "BANDA.tif", tmp_path / "two" / "BANDF.tif"
+    else:
+        for folder, side in (("aft", "A"), ("fore", "F")):
+            names = named("PRODUCT", side) | {f"BAND{side}_MET.TXT": "product_met.txt"}
+            deliver(pair_folder, tmp_path / folder, names)
+        images = tmp_path / "aft" / "PRODUCT.tif", tmp_path / "fore" / "PRODUCT.tif"
+    for image, other, view in ((*images, "aft"), (*images[::-1], "fore")):
+        scene = open_scene(image)
+        assert scene.sensor == "cartosat"
+        assert (scene.facts["view"], scene.facts["partner"]) == (view, str(other))
+        assert "rpc" in scene.models
+
+
+def test_another_pass_is_no_partner(pair_folder, tmp_path):
+    folder = deliver(pair_folder, tmp_path / "own", named("BANDA") | named("BANDF", "F"))
+    edit(folder / "BANDF_MET.TXT", "01-OCT-2006", "02-OCT-2006")
+    assert partner_of(folder / "BANDA.tif", read_metadata(folder / "BANDA_MET.TXT")) is None
+    assert "partner" not in open_scene(folder / "BANDA.tif").facts
+    # One in a folder beside is, of two copies nobody knows which.
+    copy = deliver(pair_folder, tmp_path / "copy", named("BANDF", "F"))
+    assert open_scene(folder / "BANDA.tif").facts["partner"] == str(copy / "BANDF.tif")
+    deliver(pair_folder, tmp_path / "second copy", named("BANDF", "F"))
+    assert "partner" not in open_scene(folder / "BANDA.tif").facts
+
+
+def test_the_first_rpc_that_can_be_read_is_taken(pair_folder, tmp_path):
+    folder = deliver(pair_folder, tmp_path, named("BANDA"))
+    image, plain = folder / "BANDA.tif", folder / "BANDA_RPC.TXT"
+    decrypted = folder / "DECRYPTED_BANDA_RPC.TXT"
+    plain.rename(decrypted)
+    plain.write_bytes(bytes(range(256)) * 20)
+    scene = check_sensor(SENSOR, image)
+    assert scene.model_source == str(decrypted)
+    original = folder / "BANDA_RPC_ORG.TXT"
+    original.write_text(decrypted.read_text().replace("LINE_OFF: 1", "LINE_OFF: 2"))
+    scene = open_scene(image)
+    assert scene.model_source == str(original)
+    assert scene.models["rpc"].row_off == read_rpc_text(decrypted).row_off + 100
+    original.write_text("LINE_OFF: nothing\n")
+    scene = open_scene(image)
+    assert scene.model_source == str(decrypted)
+    assert "BANDA_RPC_ORG.TXT" in scene.warnings[0]
+    assert "LINE_OFF" in scene.warnings[0]
+    # Whatever else lies there can be chosen.
+    assert open_scene(image, options={"rpc": str(decrypted)}).model_source == str(decrypted)
+
+
+def test_gdal_finds_another_rpc_than_the_plugin_and_that_is_said(pair_folder, tmp_path):
+    folder = deliver(pair_folder, tmp_path, named("BANDA"))
+    text = (folder / "BANDA_RPC.TXT").read_text()
+    # Without "pixels" and the like, as vendors write it as well, and moved by 7 lines.
+    offset = read_rpc_text(folder / "BANDA_RPC.TXT").row_off - 0.5
+    (folder / "BANDA_RPC_ORG.TXT").write_text(text.replace(f"LINE_OFF: {offset!r} pixels", f"LINE_OFF: {offset + 7!r}"))
+    # GDAL looks for <name>_RPC.TXT only beside products that it knows, or in the PAM file.
+    dataset = open_dataset(folder / "BANDA.tif")
+    if not dataset.GetMetadata("RPC"):
+        pytest.skip("this GDAL does not read _RPC.TXT beside a TIFF")
+    assert float(dataset.GetMetadataItem("LINE_OFF", "RPC").split()[0]) == pytest.approx(offset)
+    scene = open_scene(folder / "BANDA.tif")
+    assert any("GDAL reads another RPC" in warning and "7.0 px" in warning for warning in scene.warnings)
+
+
+def test_an_image_without_a_readable_rpc_opens_with_the_pushbroom(pair_folder, tmp_path):
+    folder = deliver(pair_folder, tmp_path, named("BANDF", "F"))
+    (folder / "BANDF_RPC.TXT").write_bytes(b"\x93\x11\x00encrypted" * 300)
+    scene = check_sensor(SENSOR, folder / "BANDF.tif")
+    assert list(scene.models) == ["pushbroom"]
+    assert scene.model_source == str(folder / "BANDF_MET.TXT")
+    assert any("BANDF_RPC.TXT" in warning for warning in scene.warnings)
+    assert any("nine control points" in warning for warning in scene.warnings)
+    edit(folder / "BANDF_MET.TXT", "SatelliteAltitude", "SatelliteAttitude")
+    with pytest.raises(InputError) as caught:
+        open_scene(folder / "BANDF.tif")
+    assert caught.value.field == "SatelliteAltitude"
+    # With an RPC that is only a warning.
+    shutil.copy(pair_folder / "BANDF_RPC.TXT", folder)
+    assert any("no pushbroom" in warning for warning in open_scene(folder / "BANDF.tif").warnings)
+
+
+def test_the_origin_of_the_rpc_is_a_choice(pair_folder):
+    image = pair_folder / "BANDA.tif"
+    zero, one = (open_scene(image, options={"rpc_origin": origin}).models["rpc"] for origin in ("0", "1"))
+    ground = np.array([[zero.lon_off, zero.lat_off, zero.h_off]])
+    np.testing.assert_allclose(zero.ground_to_image(ground) - one.ground_to_image(ground), 1.0, atol=1e-12)
+    for options, field in (({"rpc_origin": "2"}, "rpc_origin"), ({"view": "nadir"}, "view")):
+        with pytest.raises(InputError) as caught:
+            open_scene(image, options=options)
+        assert caught.value.field == field
+
+
+def test_name_and_metadata_may_not_contradict_each_other(pair_folder, tmp_path):
+    folder = deliver(pair_folder, tmp_path, named("BANDF", "A"))
+    with pytest.raises(InputError, match="the name of the image says fore, the metadata aft"):
+        open_scene(folder / "BANDF.tif")
+    assert open_scene(folder / "BANDF.tif", options={"view": "aft"}).facts["view"] == "aft"
+    # A name that says nothing leaves it to the sensor, that to the angle, and then there is no pushbroom.
+    folder = deliver(pair_folder, tmp_path / "b", named("hobart"))
+    assert open_scene(folder / "hobart.tif").facts["view"] == "aft"
+    edit(folder / "hobart_MET.TXT", "PAN_AFT", "PAN")
+    assert open_scene(folder / "hobart.tif").facts["view"] == "aft"
+    edit(folder / "hobart_MET.TXT", "ViewAngleAlongTrack", "Else")
+    scene = open_scene(folder / "hobart.tif")
+    assert "view" not in scene.facts
+    assert list(scene.models) == ["rpc"]
+
+
+def test_what_is_not_ours_is_not_recognised(pair_folder, tmp_path, sample):
+    assert not SENSOR.recognises(open_dataset(sample / "scene.tif"))
+    folder = deliver(pair_folder, tmp_path, named("BANDA"))
+    dataset = open_dataset(folder / "BANDA.tif")
+    edit(folder / "BANDA_MET.TXT", "CARTOSAT-1", "CARTOSAT-2")
+    assert not SENSOR.recognises(dataset)
+    (folder / "BANDA_MET.TXT").write_bytes(b"\0")
+    assert not SENSOR.recognises(dataset)
+    # Taken by name, it says what is missing.
+    (folder / "BANDA_MET.TXT").unlink()
+    with pytest.raises(InputError, match="no metadata"):
+        open_scene(folder / "BANDA.tif", "cartosat")
+    assert not SENSOR.recognises(gdal.GetDriverByName("MEM").Create("", 3, 3))
+    assert rpc_of("x" * 300 + ".tif") == (None, None, [])
+
+
+def test_crops_and_damaged_facts_are_warnings(pair_folder, tmp_path):
+    folder = deliver(pair_folder, tmp_path, named("BANDA"))
+    edit(folder / "BANDA_MET.TXT", "NoScans = 400", "NoScans = 12000")
+    edit(folder / "BANDA_MET.TXT", "41.650000", "high")
+    warnings = " ".join(open_scene(folder / "BANDA.tif").warnings)
+    assert "is it a crop" in warnings
+    assert "SunElevationAtCenter" in warnings
+
+
+# -- the start of a pushbroom ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("view", ["fore", "aft"])
+def test_metadata_place_an_image_within_500_pixels(view, tmp_path):
+    from ortho_cartosat.simulation import metadata_text
+    from ortho_cartosat.start import pushbroom
+
+    pair = StereoPair.make(seed=1)
+    path = tmp_path / "BAND_MET.TXT"
+    path.write_text(metadata_text(pair, view))
+    model = pushbroom(read_metadata(path), view, (pair.size, pair.size), (-50.0, 1400.0))
+    miss = model.ground_to_image(pair.ground) - pair.image(view)
+    assert 5 < np.abs(miss).max() < 500
+    # The sign of the angle differs between processors; the camera does not.
+    edit(path, f"{simulated.TILTS_DEG[view]:.6f}", f"{-simulated.TILTS_DEG[view]:.6f}")
+    other = pushbroom(read_metadata(path), view, (pair.size, pair.size), (-50.0, 1400.0))
+    np.testing.assert_array_equal(other.params, model.params)
+
+
+def test_heights_of_the_satellite_are_as_the_scene_has_them():
+    # What the experiments call 618 km is above the ground of the scene, not above the equator.
+    camera = aim("aft")
+    assert camera.radius < EARTH_A + 618e3
