@@ -20,6 +20,7 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.model_file import read_model_file
 from ortho_pipeline.options import PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, read_points
+from ortho_pipeline.rpc import files_of
 from ortho_pipeline.selection import select_control
 
 #: Side-cars that GDAL would attach to an image of this stem, whatever the image itself says.
@@ -270,7 +271,7 @@ def hash_inputs(
 
 def _files_of(path: str | os.PathLike[str], allow_network: bool) -> list[str]:
     try:
-        return list(raster.open_dataset(path, allow_network=allow_network).GetFileList() or [])
+        return files_of(raster.open_dataset(path, allow_network=allow_network))
     except OrthoError:
         return []
 

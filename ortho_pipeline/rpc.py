@@ -79,8 +79,11 @@ def read_rpc(path: str | PathLike[str]) -> RPC:
 
 
 def has_rpc(dataset: gdal.Dataset) -> bool:
-    """Tell whether GDAL found an RPC for this dataset, in it or beside it."""
-    return bool(dataset.GetMetadata("RPC"))
+    """Tell whether GDAL found an RPC for this dataset, in it or beside it, readable or not."""
+    try:
+        return bool(dataset.GetMetadata("RPC"))
+    except RuntimeError:
+        return True
 
 
 def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = None) -> tuple[RPC, str]:
@@ -102,7 +105,7 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
     if choice is not None and str(choice) not in ("tag", "sidecar"):
         return read_rpc(choice), os.fspath(choice)
     tag, sidecar = _own_fields(dataset), None
-    fields = dict(dataset.GetMetadata("RPC") or {})
+    fields = _fields_beside(dataset)
     beside = _sidecar_files(dataset)
     if fields and (fields != tag or any(_is_rpc_file(file) for file in beside)):
         sidecar = fields, _sidecar_source(fields, beside, name)
@@ -117,7 +120,11 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
     if tag:
         return rpc_of_fields(tag, name), f"{name} ({_own_kind(dataset)})"
     what = "RPC" if choice is None else {"tag": "RPC tag", "sidecar": "RPC side-car file"}[str(choice)]
-    raise InputError(f"there is no {what}", file=name, field="--rpc", remedy="give the RPC file with --rpc FILE")
+    damaged = ", ".join(_unreadable_beside(Path(name))) if choice != "tag" else ""
+    raise InputError(
+        f"there is no {what}" + (f" that can be read: {damaged} is damaged or encrypted" if damaged else ""),
+        file=name, field="--rpc", remedy="give the RPC file with --rpc FILE",
+    )  # fmt: skip
 
 
 def _begins_like_rpc(path: Path) -> bool:
@@ -128,6 +135,21 @@ def _begins_like_rpc(path: Path) -> bool:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"this file cannot be read ({reason})", file=path) from error
     return b"\0" not in head and b"<vrtdataset" not in head and (b"line_off" in head or b"lineoffset" in head)
+
+
+def _fields_beside(dataset: gdal.Dataset) -> dict[str, str]:
+    """Return the RPC domain as GDAL has it, which prefers side-cars; nothing where one is damaged or encrypted."""
+    try:
+        return dict(dataset.GetMetadata("RPC") or {})
+    except RuntimeError:
+        return {}
+
+
+def _unreadable_beside(path: Path) -> list[str]:
+    """Return the names of files that ought to hold the RPC of an image, by their names."""
+    if not path.parent.is_dir():
+        return []
+    return sorted(file.name for file in path.parent.iterdir() if file.stem.startswith(path.stem) and _is_rpc_file(file))
 
 
 def _own_fields(dataset: gdal.Dataset) -> dict[str, str]:
@@ -143,11 +165,19 @@ def _own_kind(dataset: gdal.Dataset) -> str:
     return {"GTiff": "TIFF tag", "COG": "TIFF tag", "VRT": "VRT metadata"}.get(driver, f"{driver} metadata")
 
 
+def files_of(dataset: gdal.Dataset) -> list[str]:
+    """Return the files that GDAL takes a dataset to consist of: itself alone where a side-car cannot be read."""
+    try:
+        return list(dataset.GetFileList() or [])
+    except RuntimeError:
+        return [dataset.GetDescription()]
+
+
 def _sidecar_files(dataset: gdal.Dataset) -> list[Path]:
     if dataset.GetDriver().ShortName == "VRT":
         return []
     own = os.path.normpath(dataset.GetDescription())
-    return [Path(file) for file in dataset.GetFileList() or [] if os.path.normpath(file) != own]
+    return [Path(file) for file in files_of(dataset) if os.path.normpath(file) != own]
 
 
 def _is_rpc_file(path: Path) -> bool:

@@ -141,6 +141,11 @@ def test_an_encrypted_rpc_leaves_the_pushbroom(product, tmp_path):
     assert said["model"] == "pushbroom+model"
     assert said["rmse"]["check"]["total"] < 1.0
     assert any("encrypted" in warning for warning in said["warnings"])
+    made = json.loads(
+        run("rectify", tmp_path / "BANDF.tif", "--gcps", product["points"], "--correction", "model", "--dem",
+            product["dem"], "-o", tmp_path / "out", "--json")
+    )  # fmt: skip
+    assert Path(made["files"]["ortho"]).is_file()
 
 
 def test_simulate_writes_a_pair_that_the_other_commands_take(tmp_path):

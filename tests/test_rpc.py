@@ -17,7 +17,9 @@ from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.models.base import SensorModel, as_ground
 from ortho_pipeline.rpc import (
     export_rpc,
+    files_of,
     fit_rpc,
+    has_rpc,
     read_rpc,
     rpc_metadata,
     rpc_of_dataset,
@@ -693,3 +695,19 @@ def test_quickbird_bias_is_what_was_measured():
     measured = np.array([feature["properties"]["ji"] for feature in features]) + 0.5
     bias = measured - rpc.ground_to_image(ground)
     assert np.abs(bias - np.array([-3.0, -2.11])).max() < 0.12
+
+
+def test_a_side_car_that_gdal_cannot_read_is_named(tmp_path):
+    image = tmp_path / "scene.tif"
+    gdal.GetDriverByName("GTiff").Create(str(image), 20, 16)
+    # GDAL takes this for damaged RPC text and raises at the first look, and only then.
+    (tmp_path / "scene_RPC.TXT").write_bytes(bytes(range(128, 256)) * 30)
+    for _ in range(2):
+        dataset = gdal.Open(str(image))
+        assert files_of(dataset)[0] == str(image)
+        with pytest.raises(InputError, match=r"scene_RPC\.TXT is damaged or encrypted"):
+            rpc_of_dataset(dataset)
+    dataset = gdal.Open(str(image))
+    assert has_rpc(dataset)
+    with pytest.raises(InputError, match="damaged or encrypted"):
+        rpc_of_dataset(dataset)
