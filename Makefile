@@ -57,7 +57,7 @@ bench: setup
 	$(BIN)/python benchmarks/fit.py
 
 docs: setup
-	@$(BIN)/mkdocs build --strict --quiet
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	echo "Site:    $(CURDIR)/out/site/index.html"
 
 images: setup

@@ -10,6 +10,7 @@ from typing import Any
 
 #: Public name -> module that holds it.
 _HOMES = {
+    "BlockPoints": "block_points",
     "Fit": "estimation",
     "Grid": "raster",
     "ImageCorrection": "models",
@@ -17,6 +18,7 @@ _HOMES = {
     "OutputOptions": "options",
     "PointOptions": "options",
     "Points": "points",
+    "Prior": "problem",
     "RPC": "models",
     "RasterSource": "raster",
     "Scene": "hookspecs",
@@ -26,15 +28,21 @@ _HOMES = {
     "Surface": "dem",
     "SurfaceOptions": "options",
     "Vertical": "crs",
+    "adjust": "adjustment",
+    "compare": "comparison",
+    "export_rpc": "rpc",
     "fit": "estimation",
     "hookimpl": "hookspecs",
     "load_model": "model_file",
+    "intersect": "intersection",
     "open_scene": "plugins",
+    "read_block_points": "block_points",
     "read_points": "points",
     "read_rpc": "rpc",
     "rectify": "pipeline",
     "save_model": "model_file",
     "write_points": "points",
+    "write_rpc_txt": "rpc",
 }
 
 __all__ = sorted(_HOMES)  # noqa: PLE0605
