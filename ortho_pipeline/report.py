@@ -340,6 +340,7 @@ def write_report_html(
     write_text(path, page)
 
 
+@functools.cache
 def page_environment() -> Any:
     """Return the templates of pages, with the filters that write numbers as people read them."""
     import jinja2

@@ -1,0 +1,348 @@
+"""Search for gross errors in a block: robust weights make the suspects, tests against all others decide.
+
+Weights fall with the standardised residual (Huber, then of Geman and McClure), so that bad rays lose their pull however
+many there are; what ends far off is a suspect. The block is then solved without the points of the suspects, and each of
+these is asked which of its parts agree with the others: all of them, all but one ray, all but the known ground, or
+none. Then all that takes part is tested once more, over and over until nothing changes.
+
+A ray of a point with only two can err along the other ray unnoticed: that is geometry, not statistics.
+
+Source: Baarda 1968 (data snooping); Huber 1981, Geman and McClure 1985 (weights).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ortho_pipeline.block_points import Index
+from ortho_pipeline.block_solver import BlockProblem, Eliminated, Mask, Selection, Solved
+from ortho_pipeline.blunders import BLUNDER_RISK, REJECTED_LIMIT
+from ortho_pipeline.errors import DegeneratePoints
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.problem import CONDITION_LIMIT
+
+#: Residuals are never tested at a finer scale than this part of their stated sigma (noise-free simulations).
+_SCALE_FLOOR = 1e-3
+#: Directions in which a part has less than this share of redundancy cannot be tested in it.
+_TESTABLE = 0.01
+_ROBUST_ROUNDS, _TEST_ROUNDS = 12, 8
+_HUBER, _REDESCENDING, _SUSPECT = 2.0, 3.0, 4.0
+#: Median and 95th percentile of chi squared of 1, 2 and 3 degrees of freedom.
+_MEDIANS = np.array([np.nan, 0.4549, 1.3863, 2.3660])
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """What was left out of an adjustment as a gross error.
+
+    Parameters
+    ----------
+    point : str
+        Its id.
+    what : {'ray', 'ground', 'point'}
+        One measurement, the known ground of a control point, or the point as a whole.
+    image : str or None
+        Of a ray.
+    reason : str
+        For people.
+    """
+
+    point: str
+    what: str
+    image: str | None
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Tests:
+    """Squared standardised residuals of rays ``(M,)`` and ground ``(N,)``, and their degrees of freedom."""
+
+    rays: Array
+    ray_rank: Index
+    ground: Array
+    ground_rank: Index
+
+    def scale(self) -> float:
+        """Return the robust standard error of unit weight."""
+        ratio = np.concatenate([
+            (self.rays / _MEDIANS[self.ray_rank])[self.ray_rank > 0],
+            (self.ground / _MEDIANS[self.ground_rank])[self.ground_rank > 0],
+        ])  # fmt: skip
+        return max(math.sqrt(float(np.median(ratio))) if len(ratio) else 1.0, _SCALE_FLOOR)
+
+
+def tests_of(problem: BlockProblem, solved: Solved) -> Tests:
+    """Return the tests of everything that takes part, one by one."""
+    points, linear = problem.points, solved.linear
+    rays, ray_rank = np.zeros(points.rays), np.zeros(points.rays, dtype=np.int64)
+    ground, ground_rank = np.zeros(len(points)), np.zeros(len(points), dtype=np.int64)
+    for rows in solved.eliminated:
+        product, inner = problem.taken(rows, solved.cofactors)
+        wide = linear.by_params.shape[2]
+        core = np.eye(3) + inner
+        for c in range(rows.chunk.rays.shape[1]):
+            used, q = rows.chunk.rays[:, c], rows.q[:, 2 * c : 2 * c + 2]
+            own = linear.by_params[used]
+            cross = own @ product[:, c * wide : (c + 1) * wide] @ q.swapaxes(1, 2)
+            own = own @ _blocks(problem, solved.cofactors, rows.chunk.images[:, c]) @ own.swapaxes(1, 2)
+            hat = q @ core @ q.swapaxes(1, 2) + own - cross - cross.swapaxes(1, 2)
+            rays[used], ray_rank[used] = _test(hat, linear.ray_misfit[used])
+        if rows.chunk.ground:
+            used, q = rows.chunk.points, rows.q[:, -3:]
+            ground[used], ground_rank[used] = _test(q @ core @ q.swapaxes(1, 2), linear.ground_misfit[used])
+    weights = linear.weights
+    return Tests(rays / weights.ray_weights, ray_rank, ground / weights.ground_weights, ground_rank)
+
+
+def _blocks(problem: BlockProblem, cofactors: Array, images: Index) -> Array:
+    """Return the cofactors ``(n, p, p)`` of the parameters of some images."""
+    columns = problem.columns
+    table = cofactors[columns[:, :, None], columns[:, None, :]]
+    real = columns >= 0
+    blocks: Array = np.where(real[:, :, None] & real[:, None, :], table, 0.0)[images]
+    return blocks
+
+
+def _test(hat: Array, misfit: Array) -> tuple[Array, Index]:
+    """Return squared standardised residuals ``(n,)`` of parts with a hat matrix, and their degrees of freedom."""
+    spare, axes = np.linalg.eigh(np.eye(hat.shape[1]) - hat)
+    turned = (axes.swapaxes(1, 2) @ misfit[:, :, None])[:, :, 0]
+    testable = spare > _TESTABLE
+    squares = np.where(testable, turned**2 / np.where(testable, spare, 1.0), 0.0).sum(axis=1)
+    return squares, testable.sum(axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What is kept of a selection, what is rejected, and the suspects that nothing could be decided about."""
+
+    kept: Selection
+    rejected: tuple[Rejected, ...] = ()
+    undecided: tuple[str, ...] = ()
+
+
+def find_blunders(problem: BlockProblem, solved: Solved, selection: Selection) -> Found:
+    """Look for gross errors in the selection.
+
+    Parameters
+    ----------
+    solved : Solved
+        The solution of everything in the selection.
+
+    Raises
+    ------
+    DegeneratePoints
+        If more than 30 % of the control points, or of the others, would have to go.
+    """
+    tests = tests_of(problem, solved)
+    if not _suspects(problem, tests).any() and not _significant(problem, solved, tests).any():
+        return Found(selection)
+    robust = _robust(problem, solved, selection)
+    suspects = _suspects(problem, tests_of(problem, robust))
+    kept, rejected = selection, dict[int, Rejected]()
+    for _ in range(_TEST_ROUNDS):
+        of_others = ~suspects[problem.points.point]
+        others = Selection.of(selection.rays & of_others, selection.ground & ~suspects)
+        if selection.ground.any() and not (problem.active(others) & others.ground).any():
+            # Without any control the rest has no datum to judge them by.
+            _refuse_many(problem, selection, np.flatnonzero(suspects).tolist())
+        trusted = problem.solve(robust.state, others)
+        if not trusted.condition <= CONDITION_LIMIT:
+            names = [problem.points.ids[i] for i in np.flatnonzero(suspects)]
+            return Found(kept, tuple(rejected.values()), tuple(names))
+        kept, rejected = _judged(problem, trusted, selection, suspects)
+        _refuse_many(problem, selection, list(rejected))
+        solved = problem.solve(trusted.state, kept)
+        more = suspects | _significant(problem, solved, tests_of(problem, solved))
+        if (more == suspects).all():
+            break
+        suspects = more
+    return Found(kept, tuple(rejected[number] for number in sorted(rejected)))
+
+
+def _robust(problem: BlockProblem, solved: Solved, selection: Selection) -> Solved:
+    """Return a solution that gross errors have little part in."""
+    state = solved.state
+    for turn in range(_ROBUST_ROUNDS):
+        tests = tests_of(problem, solved)
+        scale = tests.scale()
+        weigh = _huber if turn < _ROBUST_ROUNDS // 2 else _geman_mcclure
+        weights = replace(
+            selection,
+            ray_weights=weigh(np.sqrt(tests.rays) / scale),
+            ground_weights=weigh(np.sqrt(tests.ground) / scale),
+        )
+        found, ahead = problem.once(state, weights)
+        if not (math.isfinite(found.condition) and np.isfinite(found.linear.ray_misfit).all()):
+            break
+        solved, state = found, ahead
+    return replace(solved, linear=replace(solved.linear, state=state))
+
+
+def _huber(size: Array) -> Array:
+    return np.minimum(1.0, _HUBER / np.maximum(size, 1e-300))
+
+
+def _geman_mcclure(size: Array) -> Array:
+    return np.maximum(1.0 / (1.0 + (size / _REDESCENDING) ** 2) ** 2, 1e-8)
+
+
+def _points_of(problem: BlockProblem, rays: Mask, ground: Mask) -> Mask:
+    """Return the points ``(N,)`` that the rays or the ground of these masks belong to."""
+    found = ground.copy()
+    found[problem.points.point[rays]] = True
+    return found
+
+
+def _suspects(problem: BlockProblem, tests: Tests) -> Mask:
+    """Return the points with a part that lies far off by the robust scale."""
+    limit = _SUSPECT * tests.scale()
+    return _points_of(problem, np.sqrt(tests.rays) > limit, np.sqrt(tests.ground) > limit)
+
+
+def _significant(problem: BlockProblem, solved: Solved, tests: Tests) -> Mask:
+    """Return the points with a part that the others contradict."""
+    from scipy.special import fdtrc
+
+    sigma0, freedom = problem.unit_weight(solved)
+    scale, freedom = max(1.0 if sigma0 is None else sigma0, _SCALE_FLOOR), max(freedom, 1.0)
+    count = max(int((tests.ray_rank > 0).sum() + (tests.ground_rank > 0).sum()), 1)
+
+    def bad(squares: Array, rank: np.ndarray) -> Mask:
+        size = np.maximum(rank, 1)
+        return np.asarray((rank > 0) & (fdtrc(size, freedom, squares / size / scale**2) < BLUNDER_RISK / count))
+
+    return _points_of(problem, bad(tests.rays, tests.ray_rank), bad(tests.ground, tests.ground_rank))
+
+
+# -- judging suspects ------------------------------------------------------------------------------------------------
+
+
+def _judged(
+    problem: BlockProblem, trusted: Solved, selection: Selection, suspects: Mask
+) -> tuple[Selection, dict[int, Rejected]]:
+    """Return the selection without the parts of suspects that contradict the trusted solution, and these by point."""
+    of_suspects = suspects[problem.points.point]
+    alone = Selection.of(selection.rays & of_suspects, selection.ground & suspects)
+    rays, ground = selection.rays.copy(), selection.ground.copy()
+    rejected: dict[int, Rejected] = {}
+    linear = problem.linearise(trusted.state, problem.layout(alone), alone)
+    bar = _Bar.of(problem, trusted, int(problem.active(selection).sum()))
+    for rows in problem.eliminate(linear):
+        for group in rows.chunk.groups:
+            columns, real = problem.group_columns(rows.chunk, group)
+            design = rows.design(group)[:, :, real]
+            spread = np.eye(design.shape[1]) + design @ trusted.cofactors[np.ix_(columns, columns)] @ design.swapaxes(
+                1, 2
+            )
+            for k in range(group.start, group.stop):
+                suspect = _Suspect(problem, rows, k, spread[k - group.start])
+                if bar.passes(*suspect.contradiction(None)):
+                    continue
+                culprits = [part for part in suspect.parts if bar.passes(*suspect.contradiction(part))]
+                number = int(rows.chunk.points[k])
+                rejected[number] = suspect.rejected(culprits)
+                bad = culprits if len(culprits) == 1 else list(suspect.parts)
+                rays[[rows.chunk.rays[k, part] for part in bad if part != _GROUND]] = False
+                ground[number] &= _GROUND not in bad
+    return Selection.of(rays, ground), rejected
+
+
+@dataclass(frozen=True)
+class _Bar:
+    """How large the square of a contradiction may be, by its degrees of freedom."""
+
+    scale: float
+    freedom: float
+    risk: float
+
+    @classmethod
+    def of(cls, problem: BlockProblem, trusted: Solved, count: int) -> _Bar:
+        sigma0, freedom = problem.unit_weight(trusted)
+        return cls(max(1.0 if sigma0 is None else sigma0, _SCALE_FLOOR), max(freedom, 1.0), BLUNDER_RISK / count)
+
+    def passes(self, square: float, spare: int) -> bool:
+        from scipy.special import fdtri
+
+        return spare > 0 and square <= spare * self.scale**2 * fdtri(spare, self.freedom, 1 - self.risk)
+
+
+#: The part of a suspect that is its known ground; the others are its rays, counted from 0.
+_GROUND = -1
+
+
+class _Suspect:
+    """The rows of one point; its parts are its rays, and its ground if that is known."""
+
+    def __init__(self, problem: BlockProblem, rows: Eliminated, k: int, spread: Array) -> None:
+        self.problem, self.rows, self.k, self.spread = problem, rows, k, spread
+        self.design, self.misfit = rows.q[k] @ rows.r[k], rows.misfit[k]
+        self.parts = {c: np.arange(2 * c, 2 * c + 2) for c in range(rows.chunk.rays.shape[1])}
+        if rows.chunk.ground:
+            self.parts[_GROUND] = np.arange(len(self.misfit) - 3, len(self.misfit))
+
+    def contradiction(self, without: int | None) -> tuple[float, int]:
+        """Return the square by which all parts but one miss each other and the block, and its degrees of freedom."""
+        keep = self._all_but(without)
+        spare = len(keep) - 3
+        if spare < 1:
+            return math.inf, 0
+        half = np.linalg.cholesky(self.spread[np.ix_(keep, keep)])
+        q, _ = np.linalg.qr(np.linalg.solve(half, self.design[keep]))
+        misfit = np.linalg.solve(half, self.misfit[keep])
+        return float(((misfit - q @ (q.T @ misfit)) ** 2).sum()), spare
+
+    def _all_but(self, without: int | None) -> np.ndarray:
+        return np.concatenate([part for name, part in self.parts.items() if name != without])
+
+    def rejected(self, culprits: list[int]) -> Rejected:
+        """Return what is said of the point when it is these parts, each by itself, that could be wrong."""
+        points, chunk = self.problem.points, self.rows.chunk
+        name = points.ids[chunk.points[self.k]]
+        known = _GROUND in self.parts
+        if len(culprits) != 1:
+            who = "its ground and its measurements contradict each other" if known else "its rays miss each other"
+            size = float(np.abs(self._apart(None)[: 2 * chunk.rays.shape[1]]).max())
+            sigma = float(points.sigma_image[chunk.rays[self.k]].max())
+            return Rejected(
+                name,
+                "point",
+                None,
+                f"gross error: {who} by {size * sigma:.1f} px, and it cannot be decided which is wrong",
+            )
+        culprit = culprits[0]
+        apart = self._apart(culprit)[self.parts[culprit]]
+        if culprit == _GROUND:
+            sigmas = self.problem.ground_sigmas[chunk.points[self.k]]
+            metres = float(np.linalg.norm((apart * sigmas)[np.isfinite(sigmas)]))
+            return Rejected(name, "ground", None, f"gross error: {metres:.1f} m from where its rays meet")
+        ray = chunk.rays[self.k, culprit]
+        size = float(np.hypot(*apart) * points.sigma_image[ray])
+        image = points.images[points.image[ray]]
+        return Rejected(name, "ray", image, f"gross error: {size:.1f} px from where the other rays and points put it")
+
+    def _apart(self, without: int | None) -> Array:
+        """Return the misfits of all rows at the place that all parts but one give."""
+        keep = self._all_but(without)
+        place = np.linalg.lstsq(self.design[keep], self.misfit[keep], rcond=None)[0]
+        apart: Array = self.misfit - self.design @ place
+        return apart
+
+
+def _refuse_many(problem: BlockProblem, selection: Selection, rejected: list[int]) -> None:
+    """Refuse to clean up where so much contradicts that which part is wrong is a guess."""
+    active = problem.active(selection)
+    control = problem.points.control
+    for what, mask in (("control points", active & control), ("tie and check points", active & ~control)):
+        names = [problem.points.ids[i] for i in rejected if mask[i]]
+        if len(names) > REJECTED_LIMIT * int(mask.sum()):
+            some = ", ".join(names[:10]) + (" ..." if len(names) > 10 else "")
+            raise DegeneratePoints(
+                f"{len(names)} of {int(mask.sum())} {what} contradict the others ({some}): which of them are wrong "
+                "cannot be decided",
+                file=problem.points.source or None,
+                remedy="measure these points again, or remove the wrong ones",
+            )

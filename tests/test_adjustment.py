@@ -1,0 +1,492 @@
+"""Bundle adjustment and intersection, against simulated truth that the estimator never sees."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pyproj
+import pytest
+
+from ortho_pipeline.adjustment import BlockFit, adjust
+from ortho_pipeline.block_points import BlockPoints
+from ortho_pipeline.crs import ground_transform
+from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
+from ortho_pipeline.estimation import fit
+from ortho_pipeline.geometry import geocentric
+from ortho_pipeline.ground_frame import GroundFrame
+from ortho_pipeline.intersection import intersect
+from ortho_pipeline.models import RPC, FrameCamera, ImageCorrection, SensorModel, start_model
+from ortho_pipeline.models.base import Constraints
+from ortho_pipeline.models.lens import Interior
+from ortho_pipeline.models.pushbroom_start import pushbroom_of_metadata
+from ortho_pipeline.problem import Prior
+from ortho_pipeline.rpc import export_rpc
+from ortho_pipeline.simulate import LineScanner
+
+LON, LAT = 33.35, 37.25
+SIZE = 4000
+#: An image of 10 km: its half in degrees, a bit less than that.
+REACH = 0.045
+
+
+def camera(off_nadir_deg: float, heading_deg: float = 192.0) -> LineScanner:
+    return LineScanner.over(
+        LON, LAT, 850.0, off_nadir_deg=off_nadir_deg, heading_deg=heading_deg, image_width=SIZE, image_height=SIZE,
+        heights=(0.0, 1700.0),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def rpcs() -> dict[str, RPC]:
+    """RPCs of three line scanners over one place, good to 1e-3 px: the truth of most tests is their corrected form."""
+    return {
+        name: export_rpc(camera(angle, heading)).rpc
+        for name, angle, heading in (("left", 18.0, 192.0), ("right", -14.0, 191.0), ("down", 2.0, 200.0))
+    }
+
+
+def places(count: int, seed: int = 0) -> np.ndarray:
+    """Return ground points lon, lat, h in the images."""
+    random = np.random.default_rng(seed)
+    plan = np.column_stack([LON + REACH * random.uniform(-1, 1, count), LAT + REACH * random.uniform(-0.8, 0.8, count)])
+    return np.column_stack([plan, random.uniform(200, 1500, count)])
+
+
+def measured(
+    truth: dict[str, SensorModel],
+    ground: np.ndarray,
+    roles: str | list[str],
+    *,
+    noise: float = 0.0,
+    sigma_ground: float = 0.0,
+    seed: int = 2,
+    sigma_image: float = 0.5,
+) -> BlockPoints:
+    """Return points as a careful operator measures them: with noise in the image and errors of the ground."""
+    random = np.random.default_rng(seed)
+    count = len(ground)
+    image = {
+        name: model.ground_to_image(ground_transform("EPSG:4979", model.crs)(ground)) for name, model in truth.items()
+    }
+    seen = np.concatenate(list(image.values()))
+    frame = GroundFrame.about(ground)
+    known = frame.geodetic(frame.of_geodetic(ground) + random.normal(0, 1, ground.shape) * sigma_ground)
+    good = np.isfinite(seen).all(axis=1)
+    assert good.all(), "the test's own points lie outside of its images"
+    return BlockPoints(
+        ids=tuple(f"p{k}" for k in range(count)), ground=known,
+        roles=np.array([roles] * count if isinstance(roles, str) else roles, dtype="<U7"),
+        sigma_ground=np.full((count, 3), sigma_ground), crs=pyproj.CRS("EPSG:4326"), images=tuple(truth),
+        point=np.tile(np.arange(count), len(truth)), image=np.repeat(np.arange(len(truth)), count),
+        measured=seen + random.normal(0, 1, seen.shape) * noise, sigma_image=np.full(len(seen), sigma_image),
+    )  # fmt: skip
+
+
+def identity(model: SensorModel, correction: str) -> ImageCorrection:
+    return ImageCorrection.identity(model, correction, (SIZE / 2, SIZE / 2))
+
+
+def roles_of(control: int, check: int, tie: int = 0) -> list[str]:
+    return ["control"] * control + ["check"] * check + ["tie"] * tie
+
+
+def biased(
+    rpcs: dict[str, RPC], correction: str = "shift", size: float = 10.0, seed: int = 5
+) -> dict[str, ImageCorrection]:
+    """Return corrected RPCs as truth: shifts of some pixels, slopes that amount to as much at the edges."""
+    random = np.random.default_rng(seed)
+    found = {}
+    for name, rpc in rpcs.items():
+        start = identity(rpc, correction)
+        scale = np.array([size if key.endswith("_shift") else size / SIZE for key in start.param_names])
+        found[name] = start.with_params(random.normal(0, 1, len(scale)) * scale)
+    return found
+
+
+def starts(truth: dict[str, ImageCorrection]) -> dict[str, SensorModel]:
+    return {name: identity(model.model, model.correction) for name, model in truth.items()}
+
+
+# -- closure ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("correction", ["shift", "shift-drift", "affine"])
+def test_noise_free_stereo_closes(rpcs: dict[str, RPC], correction: str) -> None:
+    truth = biased({name: rpcs[name] for name in ("left", "right")}, correction)
+    points = measured(truth, places(40), roles_of(9, 21, 10))
+    found = adjust(starts(truth), points)
+    assert np.abs(found.residuals).max() < 1e-6
+    assert np.nanmax(np.abs(found.back_projected)) < 1e-6
+    assert np.nanmax(np.abs(found.object_residuals)) < 1e-5
+    wanted = np.concatenate([model.params for model in truth.values()])
+    np.testing.assert_allclose(found.values, wanted, rtol=0, atol=1e-6)
+    assert not found.rejected
+    assert found.redundancy == 2 * 80 + 3 * 9 - len(wanted) - 3 * 40
+
+
+def test_a_block_of_any_models_in_any_crs_closes(rpcs: dict[str, RPC]) -> None:
+    """RPC with a shift, affine families in geocentric, geographic and UTM ground, and a frame camera, all in one."""
+    ground = places(60, seed=3)
+    truth: dict[str, SensorModel] = {"rpc": biased({"left": rpcs["left"]})["left"]}
+    # An affine camera is its own truth: fitted once to the second RPC, then its projections are the measurements.
+    single = measured({"right": rpcs["right"]}, ground, "control").in_image("right")
+    for crs in ("geocentric", "geographic", "utm"):
+        start = start_model("affine3d", single, crs=crs, size=(SIZE, SIZE), heights=(0.0, 1700.0))
+        truth[crs] = fit(start, single, robust=False).model
+    interior = Interior(SIZE, SIZE, 0.04, 5e-6, 5e-6)
+    truth["frame"] = FrameCamera.from_geocentric(
+        interior, geocentric(np.array([[LON, LAT, 20e3]]))[0], heights=(0.0, 1700.0)
+    )
+    points = measured(truth, ground, roles_of(15, 25, 20))
+    moved = {name: model.with_params(model.params + 0.01 * np.abs(model.params)) for name, model in truth.items()}
+    nudge = np.array([200.0, -150.0, 90.0, 2e-3, -1e-3, 4e-3])
+    moved["frame"] = truth["frame"].with_params(truth["frame"].params + nudge)
+    found = adjust(moved, points)
+    assert np.abs(found.residuals).max() < 1e-6
+    assert np.nanmax(np.abs(found.object_residuals)) < 1e-4
+    for name, model in truth.items():
+        predicted = found.models[name].ground_to_image(ground_transform("EPSG:4979", model.crs)(ground))
+        wanted = model.ground_to_image(ground_transform("EPSG:4979", model.crs)(ground))
+        np.testing.assert_allclose(predicted, wanted, rtol=0, atol=1e-6)
+
+
+def test_a_pushbroom_and_an_rpc_in_one_block(rpcs: dict[str, RPC]) -> None:
+    """The pushbroom starts from what metadata tell, tens of pixels off; the truth is another camera, with noise."""
+    scanner = camera(18.0)
+    corners = scanner.image_to_ground([(0, 0), (SIZE, 0), (SIZE, SIZE), (0, SIZE)], 850.0)
+    start = pushbroom_of_metadata(
+        corners + np.array([8e-4, -6e-4, 0.0]),
+        SIZE,
+        SIZE,
+        altitude=652e3,
+        along_deg=0.0,
+        across_deg=17.9,
+        heights=(0.0, 1700.0),
+    )
+    truth: dict[str, SensorModel] = {"left": scanner, **biased({"right": rpcs["right"]})}
+    points = measured(truth, places(60), roles_of(12, 28, 20), noise=0.3, sigma_ground=0.3, sigma_image=0.3)
+    found = adjust({"left": start, "right": identity(rpcs["right"], "shift")}, points)
+    assert np.nanmedian(np.abs(found.raw_residuals[points.image == 0])) > 20
+    assert not found.rejected
+    assert found.sigma0 == pytest.approx(1.0, abs=0.2)
+    rms = found.object_rms("check")
+    assert rms is not None
+    # Noise of 0.3 px (0.75 m) in each image, rays that meet at 32 degrees.
+    assert rms["plan"] < 1.5
+    assert rms["h"] < 2.5
+    # Soft constraints on the shape of the orbit decide parameters, and are no observations.
+    rays_and_ground = 2 * points.rays + 3 * 12
+    assert found.degrees_of_freedom > rays_and_ground - len(found.parameters) - 3 * 60
+
+
+def test_one_image_with_perfect_ground_is_the_fit_of_one_image(rpcs: dict[str, RPC]) -> None:
+    truth = biased({"left": rpcs["left"]}, "affine")
+    points = measured(truth, places(20), "control", noise=0.4)
+    found = adjust(starts(truth), points)
+    alone = fit(starts(truth)["left"], points.in_image("left"))
+    np.testing.assert_allclose(found.values, alone.values, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(found.sigmas, alone.sigmas, rtol=1e-5)
+    assert found.sigma0 == pytest.approx(alone.sigma0, rel=1e-6)
+    assert found.redundancy == alone.redundancy
+    np.testing.assert_allclose(found.residuals, alone.residuals, atol=1e-5)
+
+
+def test_errors_of_the_ground_weigh_as_in_the_fit_of_one_image(rpcs: dict[str, RPC]) -> None:
+    truth = biased({"left": rpcs["left"]}, "shift-drift")
+    points = measured(truth, places(25), "control", noise=0.4, sigma_ground=1.0)
+    found = adjust(starts(truth), points, robust=False)
+    alone = fit(starts(truth)["left"], points.in_image("left"), robust=False)
+    # The fit turns errors of the ground into those of column and row without their correlation.
+    np.testing.assert_allclose(found.sigmas, alone.sigmas, rtol=0.2)
+    assert (np.abs(found.values - alone.values) < alone.sigmas).all()
+
+
+# -- honest covariance -----------------------------------------------------------------------------------------------
+
+
+def test_sigmas_are_honest(rpcs: dict[str, RPC]) -> None:
+    """(estimate - truth) / sigma has the spread 1, for orientation and for ground points, over 60 simulated blocks."""
+    truth = biased(rpcs, "shift-drift")
+    ground = places(24, seed=8)
+    orientation, ground_ratio, sigma0 = [], [], []
+    for seed in range(60):
+        points = measured(truth, ground, roles_of(6, 9, 9), noise=0.5, sigma_ground=0.8, seed=seed)
+        found = adjust(starts(truth), points, robust=False)
+        wanted = np.concatenate([model.params for model in truth.values()])
+        orientation.append((found.values - wanted) / found.sigmas)
+        frame = GroundFrame.about(ground)
+        apart = (frame.horizons(ground) @ (frame.of_geodetic(found.ground) - frame.of_geodetic(ground))[:, :, None])[
+            :, :, 0
+        ]
+        ground_ratio.append(apart / found.ground_sigmas)
+        sigma0.append(found.sigma0)
+    # Some hundred (correlated) ratios: their spread is known to about a tenth.
+    assert np.std(orientation) == pytest.approx(1.0, abs=0.12)
+    for axis in range(3):
+        assert np.std(np.array(ground_ratio)[:, :, axis]) == pytest.approx(1.0, abs=0.12)
+    assert np.mean(sigma0) == pytest.approx(1.0, abs=0.03)
+
+
+def test_a_stereo_block_recovers_biases_within_their_sigmas(rpcs: dict[str, RPC]) -> None:
+    truth = biased({name: rpcs[name] for name in ("left", "right")}, "shift", size=30.0)
+    points = measured(truth, places(69), roles_of(9, 60), noise=0.5, sigma_ground=0.3)
+    found = adjust(starts(truth), points)
+    wanted = np.concatenate([model.params for model in truth.values()])
+    assert (np.abs(found.values - wanted) < 4 * found.sigmas).all()
+    rms = found.object_rms("check")
+    assert rms is not None
+    assert rms["n"] == 60
+    # The bias is of 30 px (75 m); what is left is noise of half a pixel and the geometry of 32 degrees.
+    assert rms["plan"] < 2.5
+    assert rms["h"] < 4.0
+    before = found.image_rms("left", "check", "raw_residuals")
+    after = found.image_rms("left", "check")
+    assert before is not None
+    assert after is not None
+    assert after["total"] < 1.0 < before["total"]
+
+
+# -- check points and ties -------------------------------------------------------------------------------------------
+
+
+def test_check_points_have_no_influence_through_their_ground(rpcs: dict[str, RPC]) -> None:
+    truth = biased({name: rpcs[name] for name in ("left", "right")})
+    points = measured(truth, places(40), roles_of(6, 34), noise=0.5, sigma_ground=0.3)
+    found = adjust(starts(truth), points)
+    wrong = points.ground.copy()
+    wrong[points.check] += (0.01, -0.02, 400.0)
+    other = adjust(starts(truth), replace(points, ground=wrong))
+    assert (other.values == found.values).all()
+    np.testing.assert_array_equal(other.ground, found.ground)
+    assert np.abs(other.object_residuals[points.check]).min(axis=0)[2] > 300
+    # They are tie points as good as any.
+    ties = adjust(starts(truth), points.with_roles(np.where(points.check, "tie", points.roles)))
+    np.testing.assert_allclose(ties.values, found.values, rtol=0, atol=1e-8)
+    assert np.isnan(ties.object_residuals[points.check]).all()
+
+
+def test_ties_alone_bring_images_together_and_say_what_the_datum_is(rpcs: dict[str, RPC]) -> None:
+    truth = biased(rpcs, "shift", size=5.0)
+    points = measured(truth, places(50), "tie", noise=0.2)
+    apart = intersect(rpcs, points)
+    found = adjust(starts(truth), points)
+    assert np.median(np.hypot(*apart.residuals.T)) > 1.0
+    assert found.sigma0 == pytest.approx(0.4, abs=0.1)  # noise of 0.2 px, stated as 0.5
+    assert "no control points" in found.gauge
+    assert "10 px" in found.gauge
+    # Corrections stay as small as the ties let them: their mean over the images is about zero, not the truth's.
+    assert np.abs(found.values.reshape(3, 2).mean(axis=0)).max() < 1.0
+    # Positions are no more certain than the orientation that they hang on: some 10 px of 2.5 m.
+    assert 5.0 < np.median(found.ground_sigmas[:, 0]) < 100.0
+    loose = adjust(starts(truth), points, hold=1000.0)
+    assert np.median(np.hypot(*loose.residuals.T)) == pytest.approx(np.median(np.hypot(*found.residuals.T)), abs=0.02)
+
+
+def test_priors_define_the_datum_of_a_block_of_ties(rpcs: dict[str, RPC]) -> None:
+    truth = biased({name: rpcs[name] for name in ("left", "right")})
+    points = measured(truth, places(30), "tie", noise=0.2)
+    priors = {
+        name: {key: Prior(float(value), 0.5) for key, value in zip(model.param_names, model.params, strict=True)}
+        for name, model in truth.items()
+    }
+    found = adjust(starts(truth), points, priors=priors)
+    assert "priors" in found.gauge
+    wanted = np.concatenate([model.params for model in truth.values()])
+    assert np.abs(found.values - wanted).max() < 0.5
+
+
+def test_constraints_of_a_model_take_part(rpcs: dict[str, RPC]) -> None:
+    class Constrained(ImageCorrection):
+        """A shift whose column shift was observed by other means."""
+
+        def constraints(self) -> Constraints:
+            return Constraints(np.array([observed - self.params[0]]), np.array([[1.0, 0.0]]), np.array([1e-3]))
+
+    truth = biased({"left": rpcs["left"], "right": rpcs["right"]})
+    observed = float(truth["left"].params[0])
+    points = measured(truth, places(30), roles_of(8, 22), noise=0.5)
+    start = starts(truth)
+    plain = adjust(start, points)
+    start["left"] = Constrained(
+        **{key: getattr(start["left"], key) for key in ("model", "correction", "origin", "coefficients")}
+    )
+    found = adjust(start, points)
+    assert found.values[0] == pytest.approx(observed, abs=0.005)
+    assert found.redundancy == plain.redundancy + 1
+    assert found.sigmas[0] < plain.sigmas[0]
+
+
+# -- gross errors ----------------------------------------------------------------------------------------------------
+
+
+def test_gross_errors_in_five_percent_of_the_rays_are_found_and_named(rpcs: dict[str, RPC]) -> None:
+    truth = biased(rpcs, "affine")
+    points = measured(truth, places(200), roles_of(9, 0, 191), noise=0.3, sigma_ground=0.3, sigma_image=0.3)
+    random = np.random.default_rng(4)
+    bad = random.choice(np.flatnonzero(points.point >= 9), 28, replace=False)
+    bad = bad[np.unique(points.point[bad], return_index=True)[1]]  # one ray of a point: two of three cannot be told
+    spoiled = points.measured.copy()
+    angle = random.uniform(0, 2 * np.pi, len(bad))
+    spoiled[bad] += np.column_stack([np.cos(angle), np.sin(angle)]) * random.uniform(15, 200, (len(bad), 1))
+    found = adjust(starts(truth), replace(points, measured=spoiled))
+    listed = {one.point for one in found.rejected}
+    wanted = {points.ids[k] for k in points.point[bad]}
+    # With three nearly coplanar rays an error along the epipolar lines can hide; nothing good goes.
+    assert len(listed & wanted) >= 0.9 * len(wanted)
+    assert len(listed - wanted) <= 1
+    named = {(one.point, one.image) for one in found.rejected if one.what == "ray"}
+    assert len(named & {(points.ids[points.point[k]], points.images[points.image[k]]) for k in bad}) >= 0.7 * len(bad)
+    assert found.sigma0 == pytest.approx(1.0, abs=0.15)
+    clean = adjust(starts(truth), points)
+    assert (np.abs(found.values - clean.values) < 2 * clean.sigmas).all()
+
+
+@pytest.mark.parametrize("sigma_ground", [0.0, 0.3])
+def test_wrong_ground_of_a_control_point_is_named(rpcs: dict[str, RPC], sigma_ground: float) -> None:
+    truth = biased(rpcs)
+    points = measured(truth, places(40), roles_of(8, 32), noise=0.4, sigma_ground=sigma_ground)
+    ground = points.ground.copy()
+    ground[3, :2] += 30 / 111_000
+    found = adjust(starts(truth), replace(points, ground=ground))
+    assert [(one.point, one.what) for one in found.rejected] == [("p3", "ground")]
+    assert "m from where its rays meet" in found.rejected[0].reason
+    assert not found.used_ground[3]
+    assert "7 control points" in found.gauge
+    assert found.used_rays[points.point == 3].all()
+    clean = adjust(starts(truth), points)
+    assert (np.abs(found.values - clean.values) < 2 * clean.sigmas).all()
+
+
+def test_a_wrong_measurement_of_a_control_point_is_named(rpcs: dict[str, RPC]) -> None:
+    truth = biased(rpcs)
+    points = measured(truth, places(40), roles_of(8, 32), noise=0.4, sigma_ground=0.3)
+    spoiled = points.measured.copy()
+    ray = int(np.flatnonzero((points.point == 2) & (points.image == 1))[0])
+    spoiled[ray] += (-25.0, 18.0)
+    found = adjust(starts(truth), replace(points, measured=spoiled))
+    assert [(one.point, one.what, one.image) for one in found.rejected] == [("p2", "ray", "right")]
+    assert found.used_ground[2]
+    assert not found.used_rays[ray]
+
+
+def test_too_many_contradictions_are_an_error(rpcs: dict[str, RPC]) -> None:
+    truth = biased(rpcs)
+    points = measured(truth, places(30), roles_of(6, 24), noise=0.3, sigma_ground=0.1)
+    ground = points.ground.copy()
+    ground[:3, 0] += (0.002, -0.003, 0.004)
+    with pytest.raises(DegeneratePoints, match=r"of 6 control points contradict the others"):
+        adjust(starts(truth), replace(points, ground=ground))
+
+
+def test_noise_is_not_rejected(rpcs: dict[str, RPC]) -> None:
+    truth = biased(rpcs, "affine")
+    lost = 0
+    for seed in range(10):
+        points = measured(truth, places(60, seed), roles_of(9, 51), noise=0.5, sigma_ground=0.3, seed=seed)
+        lost += len(adjust(starts(truth), points).rejected)
+    assert lost <= 1
+
+
+# -- rank defects ----------------------------------------------------------------------------------------------------
+
+
+def test_undetermined_parameters_are_named(rpcs: dict[str, RPC]) -> None:
+    truth = biased({name: rpcs[name] for name in ("left", "right")}, "affine")
+    points = measured(truth, places(30), roles_of(1, 0, 29), noise=0.3)
+    with pytest.raises(DegeneratePoints, match=r"left|right"):
+        adjust(starts(truth), points)
+
+
+def test_an_image_with_too_few_points_is_named(rpcs: dict[str, RPC]) -> None:
+    truth = biased(rpcs, "affine")
+    points = measured(truth, places(20), roles_of(9, 11))
+    few = (points.image == 2) & (points.point >= 2)
+    less = replace(
+        points, point=points.point[~few], image=points.image[~few], measured=points.measured[~few],
+        sigma_image=points.sigma_image[~few],
+    )  # fmt: skip
+    with pytest.raises(TooFewPoints, match="2 points in the image 'down'"):
+        adjust(starts(truth), less)
+
+
+def test_images_without_points_and_points_without_images_are_errors(rpcs: dict[str, RPC]) -> None:
+    truth = biased(rpcs)
+    points = measured(truth, places(20), "tie")
+    two = {name: model for name, model in starts(truth).items() if name != "down"}
+    with pytest.raises(InputError, match="no model of the image 'down'"):
+        adjust(two, points)
+    with pytest.raises(InputError, match="no points of the image 'more'"):
+        adjust({**starts(truth), "more": rpcs["left"]}, points)
+
+
+def test_points_with_one_ray_or_parallel_rays_are_left_out_and_named(rpcs: dict[str, RPC]) -> None:
+    truth: dict[str, SensorModel] = {
+        **biased({"left": rpcs["left"]}),
+        "twin": biased({"left": rpcs["left"]}, seed=9)["left"],
+    }
+    points = measured(truth, places(20), roles_of(10, 5, 5), noise=0.3)
+    found = adjust({"left": identity(rpcs["left"], "shift"), "twin": identity(rpcs["left"], "shift")}, points)
+    assert np.isnan(found.ground[points.check]).all()
+    assert any("check points take no part" in text and "p10" in text for text in found.warnings)
+    crossed = intersect({"left": rpcs["left"], "twin": rpcs["left"]}, points)
+    assert np.isnan(crossed.ground).all()
+
+
+# -- intersection ----------------------------------------------------------------------------------------------------
+
+
+def test_intersection_closes_and_its_sigmas_are_honest(rpcs: dict[str, RPC]) -> None:
+    ground = places(300)
+    exact = intersect(rpcs, measured(rpcs, ground, "tie"))
+    assert np.abs(exact.residuals).max() < 1e-6
+    np.testing.assert_allclose(exact.ground, ground, rtol=0, atol=1e-6)
+    assert (exact.rays == 3).all()
+    assert (exact.angles_deg > 25).all()
+    noisy = intersect(rpcs, measured(rpcs, ground, "tie", noise=0.3))
+    assert noisy.sigma0 == pytest.approx(0.6, abs=0.05)
+    frame = GroundFrame.about(ground)
+    apart = (frame.horizons(ground) @ (frame.of_geodetic(noisy.ground) - frame.of_geodetic(ground))[:, :, None])[
+        :, :, 0
+    ]
+    np.testing.assert_allclose((apart / noisy.sigmas).std(axis=0), 1.0, atol=0.12)
+
+
+def test_models_without_parameters_are_only_intersected(rpcs: dict[str, RPC]) -> None:
+    """Direct georeferencing: the biased RPCs as they are, all points check (Table 3 of Willneff et al.)."""
+    truth = biased({name: rpcs[name] for name in ("left", "right")}, size=30.0)
+    points = measured(truth, places(40), "check", noise=0.3)
+    delivered = {name: rpcs[name] for name in ("left", "right")}
+    found = adjust(delivered, points)
+    crossed = intersect(delivered, points)
+    np.testing.assert_allclose(found.ground, crossed.ground, rtol=0, atol=1e-9)
+    assert found.sigma0 == pytest.approx(crossed.sigma0)
+    assert found.object_rms("check")["plan"] > 10  # type: ignore[index]
+    assert found.parameters == ()
+    assert found.covariance.shape == (0, 0)
+
+
+def test_heights_that_are_not_known_are_left_open(rpcs: dict[str, RPC]) -> None:
+    truth = biased({name: rpcs[name] for name in ("left", "right")})
+    points = measured(truth, places(30), roles_of(12, 18), noise=0.0)
+    ground = points.ground.copy()
+    ground[:6, 2] = np.nan
+    found = adjust(starts(truth), replace(points, ground=ground))
+    assert np.abs(found.residuals).max() < 1e-6
+    wanted = np.concatenate([model.params for model in truth.values()])
+    np.testing.assert_allclose(found.values, wanted, atol=1e-5)
+    assert found.used_ground[:12].all()
+
+
+def test_document_is_json_and_holds_everything(rpcs: dict[str, RPC]) -> None:
+    import json
+
+    truth = biased(rpcs)
+    points = measured(truth, places(12), roles_of(6, 3, 3), noise=0.3)
+    found: BlockFit = adjust(starts(truth), points, exclude=["p11"])
+    document = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert len(document["points"]) == 12
+    assert len(document["rays"]) == 36
+    assert document["points"][11]["ground"] == [None, None, None]
+    assert set(document["images"]) == set(rpcs)
+    assert document["images"]["left"]["rms"]["residuals"]["control"]["n"] == 6

@@ -1,0 +1,377 @@
+"""`ortho adjust` and `ortho intersect`, from files to files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from osgeo import gdal
+
+from ortho_pipeline.block_images import labels_of, points_of_images
+from ortho_pipeline.block_points import BlockPoints, read_block_points
+from ortho_pipeline.cli import cli
+from ortho_pipeline.errors import CrsError, DatumError, InputError
+from ortho_pipeline.model_file import load_model
+from ortho_pipeline.models import RPC
+from ortho_pipeline.rpc import export_rpc, read_rpc, rpc_metadata
+from ortho_pipeline.simulate import LineScanner
+
+LON, LAT, SIZE = 24.4, -33.65, 400
+#: Height of EGM96 there above the ellipsoid (field notes, trap 1).
+UNDULATION = 28.208
+BIAS = {"aft": (3.0, -2.0), "fore": (-4.0, 6.0)}
+
+
+class Stereo:
+    """A pair of small images, both called BAND.tif, in folders of their own; points with a bias of some pixels."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.rpcs: dict[str, RPC] = {}
+        for name, angle in (("aft", -12.0), ("fore", 16.0)):
+            camera = LineScanner.over(
+                LON,
+                LAT,
+                500.0,
+                off_nadir_deg=angle,
+                image_width=SIZE,
+                image_height=SIZE,
+                gsd=10.0,
+                heights=(0.0, 1000.0),
+            )
+            self.rpcs[name] = export_rpc(camera).rpc
+            (folder / name).mkdir(parents=True)
+            dataset = gdal.GetDriverByName("GTiff").Create(str(self.image(name)), SIZE, SIZE, 1, gdal.GDT_Byte)
+            dataset.SetMetadata(rpc_metadata(self.rpcs[name]), "RPC")
+            dataset = None
+        random = np.random.default_rng(5)
+        plan = np.column_stack([random.uniform(-0.013, 0.013, 30) + LON, random.uniform(-0.011, 0.011, 30) + LAT])
+        self.ground = np.column_stack([plan, random.uniform(200, 800, 30)])
+        self.seen = {
+            name: rpc.ground_to_image(self.ground) + BIAS[name] + random.normal(0, 0.1, (30, 2))
+            for name, rpc in self.rpcs.items()
+        }
+
+    def image(self, name: str) -> Path:
+        return self.folder / name / "BAND.tif"
+
+    @property
+    def images(self) -> list[str]:
+        return [str(self.image(name)) for name in self.rpcs]
+
+    def write(
+        self, control: int = 8, check: int = 12, *, header: str = "", dh: float = 0.0, origin: float = 0.0
+    ) -> Path:
+        """Write the long table: control and check have ground in their first line only, the others tie."""
+        lines = [
+            header or "#CRS: EPSG:4326\n#vertical: ellipsoid",
+            "id,image,col,row,x,y,h,role,sigma_image,sigma_xy,sigma_h",
+        ]
+        for name, seen in self.seen.items():
+            for k, (col, row) in enumerate(seen.tolist()):
+                x, y, h = self.ground[k].tolist()
+                role = "control" if k < control else "check"
+                known = f"{x},{y},{h + dh},{role},0.2,0.1,0.1" if k < control + check and name == "aft" else ",,,,0.2,,"
+                lines.append(f"p{k},{name}/BAND.tif,{col + origin},{row + origin},{known}")
+        path = self.folder / "rays.csv"
+        path.write_text("\n".join(lines) + "\n")
+        return path
+
+
+@pytest.fixture
+def stereo(tmp_path: Path) -> Stereo:
+    return Stereo(tmp_path / "stereo")
+
+
+def run(*args: str | Path, code: int = 0) -> str:
+    """Run a command; return what it prints, or with --json its document alone."""
+    done = CliRunner().invoke(cli, [str(arg) for arg in args])
+    assert done.exit_code == code, done.output + str(done.exception)
+    return done.stdout if "--json" in args else done.output
+
+
+# -- ortho adjust ----------------------------------------------------------------------------------------------------
+
+
+def test_adjust_writes_models_points_rpcs_and_one_report(stereo: Stereo, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    document = json.loads(run("adjust", *stereo.images, "--points", stereo.write(), "-o", out, "--json"))
+    files = {name: Path(path) for name, path in document["files"].items()}
+    assert sorted(path.name for path in out.iterdir()) == sorted(path.name for path in files.values())
+    # Two images of one stem do not overwrite each other.
+    assert {"aft_BAND_model.json", "fore_BAND_model.json", "aft_BAND_RPC.TXT", "fore_BAND_RPC.TXT"} <= {
+        path.name for path in files.values()
+    }
+    adjustment = document["report"]["adjustment"]
+    for name, bias in BIAS.items():
+        found = adjustment["images"][f"{name}_BAND"]["parameters"]
+        assert found["col_shift"]["value"] == pytest.approx(bias[0], abs=0.15)
+        assert found["row_shift"]["value"] == pytest.approx(bias[1], abs=0.15)
+        model = load_model(files[f"{name}_BAND model"])
+        exported = read_rpc(files[f"{name}_BAND rpc"])
+        np.testing.assert_allclose(
+            exported.ground_to_image(stereo.ground), model.ground_to_image(stereo.ground), atol=1e-5
+        )
+        residual = stereo.seen[name] - model.ground_to_image(stereo.ground)
+        assert np.sqrt((residual**2).mean()) < 0.2
+    # 10 m pixels measured to 0.1: a metre or two.
+    assert adjustment["object_rms"]["check"]["n"] == 12
+    assert adjustment["object_rms"]["check"]["plan"] < 2.5
+    assert "8 control points" in adjustment["gauge"]
+
+
+def test_written_points_are_read_as_ground_again(stereo: Stereo, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    points = stereo.write()
+    run("adjust", *stereo.images, "--points", points, "-o", out)
+    again = read_block_points(points_without_ground(points), gcps=out / "block_points.csv")
+    assert (again.sigma_ground > 0).all()
+    apart = (again.ground - stereo.ground) * (92_000.0, 111_000.0, 1.0)
+    assert (np.abs(apart) < 4.5 * again.sigma_ground).all()
+    geo = json.loads((out / "block_points.geojson").read_text())
+    first = geo["features"][0]
+    assert first["properties"]["kind"] == "control"
+    assert first["properties"]["rays"] == 2
+    assert 0 < first["properties"]["sigma_h"] < 10
+    np.testing.assert_allclose(first["geometry"]["coordinates"], stereo.ground[0], rtol=0, atol=2.0)
+    wide = read_block_points(points_without_ground(points), gcps=out / "block_points.geojson")
+    np.testing.assert_allclose(wide.ground, again.ground, atol=1e-9)
+
+
+def points_without_ground(path: Path) -> Path:
+    """Write the same rays without any ground."""
+    lines = [line.split(",")[:4] for line in path.read_text().splitlines() if not line.startswith("#")]
+    bare = path.with_name("bare.csv")
+    bare.write_text("\n".join(",".join(line) for line in lines) + "\n")
+    return bare
+
+
+def test_the_report_is_one_page_in_both_lights(stereo: Stereo, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run("adjust", *stereo.images, "--points", stereo.write(), "-o", out)
+    page = (out / "block_report.html").read_text()
+    for text in ("prefers-color-scheme: dark", "aft_BAND", "fore_BAND", "12 check points", "Standard error", "<svg"):
+        assert text in page
+    assert "http://" not in page.replace("http://www.w3.org/2000/svg", "")
+    assert "https://" not in page
+    report = json.loads((out / "block_report.json").read_text())
+    assert report["document"] == "ortho-pipeline block report"
+    assert {entry["role"] for entry in report["provenance"]["inputs"]} >= {"image", "points"}
+    assert any("ASPRS" in text for text in report["warnings"])
+
+
+def test_ties_alone_hold_the_datum_and_say_so(stereo: Stereo, tmp_path: Path) -> None:
+    points = points_without_ground(stereo.write())
+    text = run("adjust", *stereo.images, "--points", points, "-o", tmp_path / "out")
+    assert "No control points: the orientation is held" in text
+    assert "how well the images agree, not how right they are" in text
+
+
+@pytest.mark.parametrize("crs", ["geocentric", "utm"])
+def test_a_family_is_fitted_from_the_points(stereo: Stereo, tmp_path: Path, crs: str) -> None:
+    document = json.loads(
+        run("adjust", *stereo.images, "--points", stereo.write(15, 15), "-o", tmp_path / "out", "--json",
+            "--model", "affine3d", "--model-crs", crs)
+    )  # fmt: skip
+    image = document["report"]["images"]["aft_BAND"]
+    assert image["model"] == "affine3d"
+    assert "15 control points" in image["model_source"]
+    # Not quite an affine projection, but nearly, over 4 km.
+    assert document["report"]["adjustment"]["object_rms"]["check"]["plan"] < 4.0
+
+
+def test_correction_none_only_intersects(stereo: Stereo, tmp_path: Path) -> None:
+    given = ("adjust", *stereo.images, "--points", stereo.write(0, 20), "-o", tmp_path / "out", "--json")
+    document = json.loads(run(*given, "--correction", "none"))
+    adjustment = document["report"]["adjustment"]
+    assert adjustment["images"]["aft_BAND"]["parameters"] == {}
+    assert adjustment["object_rms"]["check"]["plan"] > 15
+    assert load_model(document["files"]["aft_BAND model"]).kind == "rpc"
+
+
+def test_check_option_and_gross_errors(stereo: Stereo, tmp_path: Path) -> None:
+    stereo.seen["fore"][3] += (12.0, 9.0)
+    points = stereo.write(20, 0)
+    document = json.loads(
+        run("adjust", *stereo.images, "--points", points, "-o", tmp_path / "out", "--check", "every:2", "--json")
+    )
+    adjustment = document["report"]["adjustment"]
+    assert [entry["id"] for entry in adjustment["points"] if entry["role"] == "check"][:3] == ["p1", "p3", "p5"]
+    assert [one["point"] for one in adjustment["rejected"]] == ["p3"]
+    assert any("p3" in text and "gross error" in text for text in document["report"]["warnings"])
+
+
+def test_geoid_heights_are_brought_to_the_ellipsoid(stereo: Stereo, tmp_path: Path) -> None:
+    points = stereo.write(header="#CRS: EPSG:4326", dh=-UNDULATION)
+    given = ("adjust", *stereo.images, "--points", points, "-o", tmp_path / "out", "--json")
+    assert "--points-vertical" in json.loads(run(*given, code=2))["error"]["field"]
+    document = json.loads(run(*given, "--points-vertical", "egm96"))
+    # 28 m of height are 6 to 8 m in the image of either side: a wrong datum would be seen as a bias.
+    assert document["report"]["adjustment"]["images"]["aft_BAND"]["parameters"]["col_shift"]["value"] == pytest.approx(
+        BIAS["aft"][0], abs=0.15
+    )
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (("--model", "pushbroom"), "has no model 'pushbroom'"),
+        (("--model", "affine3d", "--correction", "shift"), "fitted as a whole"),
+        (("--model-crs", "utm"), "ground CRS of a fitted model"),
+        (("--correction", "model"), "no parameters of its own"),
+        (("--check", "every:0"), "does not choose check points"),
+    ],
+)
+def test_options_that_do_not_go_together(stereo: Stereo, tmp_path: Path, args: tuple[str, ...], message: str) -> None:
+    assert message in run("adjust", *stereo.images, "--points", stereo.write(), "-o", tmp_path / "out", *args, code=2)
+    assert not (tmp_path / "out").exists()
+
+
+def test_outputs_beside_the_images_are_refused(stereo: Stereo) -> None:
+    text = run("adjust", *stereo.images, "--points", stereo.write(), "-o", stereo.folder / "aft", code=2)
+    assert "would attach to the source image" in text
+
+
+# -- ortho intersect -------------------------------------------------------------------------------------------------
+
+
+def test_intersect_with_saved_models(stereo: Stereo, tmp_path: Path) -> None:
+    points, out = stereo.write(), tmp_path / "out"
+    run("adjust", *stereo.images, "--points", points, "-o", out)
+    table = tmp_path / "found.geojson"
+    saved = [arg for name in BIAS for arg in ("--models", str(out / f"{name}_BAND_model.json"))]
+    document = json.loads(run("intersect", *stereo.images, "--points", points, *saved, "-o", table, "--json"))
+    found = np.array([row["ground"] for row in document["points"]])
+    np.testing.assert_allclose(found[:, 2], stereo.ground[:, 2], atol=15.0)
+    apart = np.array([row["residual"] for row in document["points"][:20]])
+    assert np.sqrt((apart[:, :2] ** 2).mean()) < 2.5
+    assert document["points"][25]["residual"] is None
+    assert len(json.loads(table.read_text())["features"]) == 30
+    # Without them the images' own models, with their bias.
+    raw = json.loads(run("intersect", *stereo.images, "--points", points, "--json"))
+    assert np.abs(np.array([row["residual"] for row in raw["points"][:20]])[:, :2]).max() > 20
+    assert "sigma0" in run("intersect", *stereo.images, "--points", points)
+    assert "2 images" in run("intersect", *stereo.images, "--points", points, *saved[:2], code=2)
+
+
+# -- images and their points -----------------------------------------------------------------------------------------
+
+
+def test_labels_are_unique(tmp_path: Path) -> None:
+    paths = [tmp_path / "a" / "x.tif", tmp_path / "b" / "x.tif", tmp_path / "b" / "y.tif", tmp_path / "b" / "Y.jp2"]
+    labels = labels_of(paths)
+    assert labels[:2] == ["a_x", "b_x"]
+    assert len({label.lower() for label in labels}) == 4
+    with pytest.raises(InputError, match="given twice"):
+        labels_of([paths[0], paths[1], paths[0]])
+
+
+def test_names_in_point_files_find_their_images(stereo: Stereo) -> None:
+    points = read_block_points(stereo.write())
+    table, strangers = points_of_images(points, stereo.images, ["a", "f"])
+    assert table.images == ("a", "f")
+    assert not strangers
+    one, strangers = points_of_images(points, stereo.images[:1], ["a"])
+    assert strangers == ["fore/BAND.tif"]
+    assert one.rays == 30
+    text = stereo.write().read_text().replace("aft/BAND.tif", "BAND").replace("fore/BAND.tif", "other")
+    (stereo.folder / "rays.csv").write_text(text)
+    with pytest.raises(InputError, match="could mean"):
+        points_of_images(read_block_points(stereo.folder / "rays.csv"), stereo.images, ["a", "f"])
+
+
+# -- point files -----------------------------------------------------------------------------------------------------
+
+HEADER = "#CRS: EPSG:4326\n#vertical: ellipsoid\nid,image,col,row,x,y,h,role\n"
+
+
+def read(tmp_path: Path, text: str, name: str = "rays.csv", **options: str | Path) -> BlockPoints:
+    path = tmp_path / name
+    path.write_text(text)
+    return read_block_points(path, **options)  # type: ignore[arg-type]
+
+
+def test_long_and_wide_forms_are_the_same(stereo: Stereo, tmp_path: Path) -> None:
+    long = read_block_points(stereo.write())
+    features = []
+    for k in range(30):
+        known = k < 20
+        features.append({
+            "type": "Feature",
+            "geometry": {"type": "Point", "coordinates": stereo.ground[k].tolist()} if known else None,
+            "properties": {
+                "id": f"p{k}", "sigma_image": 0.2,
+                "ji": {f"{name}/BAND.tif": (stereo.seen[name][k] - 0.5).tolist() for name in BIAS},
+                **({"role": "control" if k < 8 else "check", "sigma_xy": 0.1, "sigma_h": 0.1} if known else {}),
+            },
+        })  # fmt: skip
+    text = json.dumps({"type": "FeatureCollection", "features": features})
+    wide = read(tmp_path, text, "rays.geojson")
+    assert wide.ids == long.ids
+    assert (wide.roles == long.roles).all()
+    np.testing.assert_allclose(wide.ground, long.ground, atol=1e-12)
+    order = np.lexsort((long.image, long.point))
+    other = np.lexsort((np.array([long.images.index(wide.images[i]) for i in wide.image]), wide.point))
+    np.testing.assert_allclose(wide.measured[other], long.measured[order], atol=1e-9)
+    np.testing.assert_array_equal(wide.sigma_ground, long.sigma_ground)
+
+
+def test_odm_lists_hold_blocks_too(tmp_path: Path) -> None:
+    text = "EPSG:32634\n500000 4000000 10 5.5 6.5 a.tif one\n500000 4000000 10 7.5 8.5 b.tif one\n"
+    text += "500100 4000000 11 15.5 6.5 a.tif\n500100 4000000 11 17.5 8.5 b.tif\n"
+    points = read(tmp_path, text, "gcp_list.txt", vertical="ellipsoid")
+    assert points.ids == ("one", "point 1")
+    assert points.rays == 4
+    assert points.control.all()
+    with pytest.raises(DatumError):
+        read(tmp_path, text, "gcp_list.txt")
+
+
+def test_pixel_centres_and_ground_of_its_own(tmp_path: Path) -> None:
+    (tmp_path / "ground.csv").write_text("id,x,y,h,role\na,24.4,-33.6,100,check\nz,24.5,-33.6,100,control\n")
+    text = "id,image,col,row\na,l.tif,10,20\na,r.tif,30,40\nb,l.tif,11,21\n"
+    given = {"gcps": tmp_path / "ground.csv", "crs": "EPSG:4326", "vertical": "ellipsoid"}
+    points = read(tmp_path, text, pixel_origin="center", **given)
+    np.testing.assert_array_equal(points.measured, [[10.5, 20.5], [30.5, 40.5], [11.5, 21.5]])
+    assert points.roles.tolist() == ["check", "tie"]
+    with pytest.raises(CrsError, match="CRS of these points is not known"):
+        read(tmp_path, text, gcps=tmp_path / "ground.csv")
+    (tmp_path / "ground.csv").write_text("id,x,y,h\nq,24.4,-33.6,100\n")
+    with pytest.raises(InputError, match="none of these points was measured"):
+        read(tmp_path, text, **given)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ("a,l,1,2,24,-33,5,\na,r,1,2,24,-33,6,\n", "the h of the point 'a'"),
+        ("a,l,1,2,24,-33,5,control\na,r,1,2,,,,check\n", "the role of the point 'a'"),
+        ("a,l,1,2,,,,\na,l,3,4,,,,\n", "measured twice in the image 'l'"),
+        ("a,l,1,2,,,,\nb,l,1,2,,,,\n", "the same pixel of the same image"),
+        ("a,l,1,2,24,-33,5,\nb,l,3,4,24,-33,5,\n", "have the same ground"),
+        ("a,l,1,2,24,,5,\n", "ground is x and y, or none"),
+        ("a,l,1,2,,,,control\n", "control points without ground"),
+        ("a,l,1,nan,,,,\n", "is not a number"),
+        ("a,,1,2,,,,\n", "a point without an image"),
+        (",l,1,2,,,,\n", "a point without an id"),
+        ("a,l,1,2,240000,-33,5,\n", None),
+        ("", "holds no points"),
+    ],
+)
+def test_bad_lines_are_named(tmp_path: Path, lines: str, message: str | None) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        read(tmp_path, HEADER + lines)
+    assert caught.value.file
+
+
+def test_a_file_of_one_image_is_no_block(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no column image"):
+        read(tmp_path, "id,col,row,x,y,h\na,1,2,24,-33,5\n")
+    feature = {
+        "type": "Feature", "geometry": {"type": "Point", "coordinates": [24, -33, 5]}, "properties": {"ji": [1, 2]},
+    }  # fmt: skip
+    with pytest.raises(InputError, match="in which image"):
+        read(tmp_path, json.dumps({"type": "FeatureCollection", "features": [feature]}), "a.geojson")
