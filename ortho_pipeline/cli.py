@@ -12,6 +12,8 @@ from typing import Any
 
 import click
 
+from ortho_pipeline.cli_batch import run
+from ortho_pipeline.cli_blocks import adjust, intersect
 from ortho_pipeline.cli_options import (
     folder_option,
     image_argument,
@@ -30,6 +32,7 @@ from ortho_pipeline.cli_text import (
     print_result,
     print_warnings,
     progress,
+    view_text,
 )
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
@@ -80,12 +83,15 @@ def main() -> None:
 def cli() -> None:
     """Orthorectify satellite scenes, and say honestly how good the result is.
 
-    Exit codes: 0 done, 1 failed, 2 you can correct it (the message says how), 130 interrupted.
+    Exit codes: 0 done, 1 failed, 2 you can correct it (the message says how), 3 partly done (ortho run), 130 interrupted.
     """
 
 
 cli.add_command(simulate)
 cli.add_command(reproduce)
+cli.add_command(run)
+cli.add_command(adjust)
+cli.add_command(intersect)
 
 # -- commands --------------------------------------------------------------------------------------------------------
 
@@ -138,9 +144,10 @@ def info(image: str, scene: SceneOptions, as_json: bool) -> None:
         "Read from": document["model_source"],
         "Heights": "{:.0f} to {:.0f} m (ellipsoidal)".format(*document["height_range"]),
         "Pixel": f"{document['gsd_m']:.3g} m at {document['reference_height']:.0f} m",
+        "View": view_text(document["view"]),
         "UTM": document["utm"],
-        "Corners": "  ".join("outside" if lon is None else f"{lon:.5f},{lat:.5f}" for lon, lat in
-                             document["corners_lon_lat"]),
+        "Corners": "lon,lat " + "  ".join("outside" if lon is None else f"{lon:.5f},{lat:.5f}" for lon, lat in
+                                          document["corners_lon_lat"]),
         **{name: str(value) for name, value in document["facts"].items()},
     }  # fmt: skip
     for name, value in lines.items():
@@ -285,6 +292,20 @@ def report(report_file: str, folder: str, kind: str, as_json: bool) -> None:
     from ortho_pipeline import pipeline
 
     print_result(pipeline.write_plots(report_file, folder, kind), as_json)
+
+
+@cli.command()
+@image_argument
+@click.option("--edge", metavar="X1,Y1,X2,Y2", help="Columns and rows of its ends  [default: edges are looked for]")
+@click.option("--band", type=click.IntRange(min=1), default=1, show_default=True)
+@click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="For JSON and a plot.")
+@click.option("--allow-network", is_flag=True, help="Open URLs and /vsi paths too.")
+@json_option
+def edge(image: str, edge: str | None, band: int, folder: str | None, allow_network: bool, as_json: bool) -> None:
+    """Measure the effective resolution of IMAGE from straight edges (edge spread, line spread, width in pixels)."""
+    from ortho_pipeline import pipeline
+
+    print_result(pipeline.edge(image, folder, edge=edge, band=band, allow_network=allow_network), as_json)
 
 
 @cli.command()

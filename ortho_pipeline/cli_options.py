@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import BlockOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 
 
 def json_option(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -44,14 +44,11 @@ def _grouped(
 
 _FILE = click.Path(dir_okay=False)
 
-scene_options = _grouped(
-    "scene",
-    SceneOptions,
+_SENSOR_OPTIONS = (
     click.option("--sensor", "scene_sensor", metavar="NAME", help="Sensor of the image (see 'ortho sensors')."),
     click.option(
         "--rpc", "scene_rpc", metavar="tag|sidecar|FILE", help="Which RPC, where there are several, or an RPC file."
     ),
-    click.option("--model", "scene_model", type=_FILE, help="A saved *_model.json in place of the image's model."),
     click.option(
         "--sensor-option",
         "scene_sensor_options",
@@ -62,6 +59,15 @@ scene_options = _grouped(
     ),
     click.option("--allow-network", "scene_allow_network", is_flag=True, help="Open URLs and /vsi paths too."),
 )
+scene_options = _grouped(
+    "scene",
+    SceneOptions,
+    *_SENSOR_OPTIONS[:2],
+    click.option("--model", "scene_model", type=_FILE, help="A saved *_model.json in place of the image's model."),
+    *_SENSOR_OPTIONS[2:],
+)
+#: The same for the images of a block, where a saved model cannot take the place of all.
+sensor_options = _grouped("scene", SceneOptions, *_SENSOR_OPTIONS)
 
 point_options = _grouped(
     "points",
@@ -114,6 +120,42 @@ point_options = _grouped(
         help="Ground of fitted models: geocentric, geographic, utm or EPSG:n  [default: that of the points]",
     ),
     click.option("--prune", "points_prune", is_flag=True, help="Remove parameters that the points do not justify."),
+)
+
+block_options = _grouped(
+    "points",
+    BlockOptions,
+    click.option(
+        "--points",
+        "points_points",
+        metavar="FILE",
+        required=True,
+        help="Rays: CSV (id,image,col,row[,x,y,h,role,...]), GeoJSON with 'ji' by image, or ODM gcp_list.txt.",
+    ),
+    click.option("--gcps", "points_gcps", metavar="FILE", help="Ground of the points: CSV (id,x,y,h,...) or GeoJSON."),
+    click.option("--points-crs", "points_crs", metavar="CRS", help="CRS of the ground, where its file has none."),
+    click.option(
+        "--points-vertical",
+        "points_vertical",
+        metavar="DATUM",
+        help="Height datum of the ground: ellipsoid, egm96, egm2008, EPSG:n or a grid file.",
+    ),
+    click.option(
+        "--pixel-origin",
+        "points_pixel_origin",
+        type=click.Choice(["corner", "center"]),
+        default="corner",
+        show_default=True,
+        help="What (0, 0) is in CSV files: the outer corner of the first pixel or its centre.",
+    ),
+    click.option("--check", "points_check", metavar="every:N|ids:A,B", help="Points that check and do not control."),
+    click.option(
+        "--model",
+        "points_model",
+        metavar="NAME",
+        help="One of the images' models, such as rpc or pushbroom, or a model fitted to points (see 'ortho models')  "
+        "[default: the images' best]",
+    ),
 )
 
 surface_options = _grouped(
@@ -220,6 +262,10 @@ output_options = _grouped(
         show_default=True,
         metavar="PX",
         help="Bound on the warper's geometric error, in source pixels.",
+    ),
+    click.option("--stac", "output_stac", is_flag=True, help="Write a STAC item of the ortho too."),
+    click.option(
+        "--acquired", "output_acquired", metavar="TIME", help="Of acquisition (RFC 3339), where the metadata have none."
     ),
 )
 

@@ -79,6 +79,46 @@ class PointOptions:
 
 
 @dataclass(frozen=True)
+class BlockOptions:
+    """Which points of a block there are, and what is adjusted to them.
+
+    Parameters
+    ----------
+    points : path
+        Rays: which point was measured where in which image.
+    gcps : path, optional
+        Ground of the points, where that file does not have it.
+    crs, vertical : str, optional
+        For files that do not say.
+    pixel_origin : {'corner', 'center'}
+        Where CSV files count pixels from.
+    check : str, optional
+        ``every:N`` or ``ids:a,b``: which control points only check.
+    model : str, optional
+        A name among the models of each scene, or a family (`ortho models`) that is fitted to the control points of
+        each image; the scene's best model by default.
+    model_crs : str, optional
+        Ground CRS of that family: geocentric, geographic, utm or EPSG:n.
+    correction : {'none', 'shift', 'shift-drift', 'affine', 'model'}, optional
+        What is adjusted: a correction in image space, or the model's own parameters. Default: the model's own where it
+        has any, else a shift.
+    hold : float, optional
+        Sigma (px) with which the orientation is held at its start values.
+    """
+
+    points: str | os.PathLike[str]
+    gcps: str | os.PathLike[str] | None = None
+    crs: str | None = None
+    vertical: str | None = None
+    pixel_origin: str = "corner"
+    check: str | None = None
+    model: str | None = None
+    model_crs: str | None = None
+    correction: str | None = None
+    hold: float | None = None
+
+
+@dataclass(frozen=True)
 class SurfaceOptions:
     """Where heights come from: a DEM, or one ellipsoidal height in metres.
 
@@ -99,7 +139,10 @@ class SurfaceOptions:
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """What the ortho looks like and how it is computed; `memory` in bytes, `tolerance` in source pixels."""
+    """What the ortho looks like and how it is computed; `memory` in bytes, `tolerance` in source pixels.
+
+    `stac` asks for a STAC item, `acquired` is the time of acquisition for it where the metadata have none.
+    """
 
     crs: str | None = None
     resolution: float | None = None
@@ -112,3 +155,5 @@ class OutputOptions:
     memory: int = 512_000_000
     threads: int | None = None
     tolerance: float = 0.01
+    stac: bool = False
+    acquired: str | None = None

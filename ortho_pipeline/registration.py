@@ -200,7 +200,7 @@ def measure(fixed: Array, moving: Array, guess: Any, *, patch: int, spacing: int
 
 def _register_band(fixed: Array, moving: Array, name: str, transform: str, patch: int, spacing: int) -> Registration:
     coarse, _ = _shift(fixed, moving, np.outer(np.hanning(fixed.shape[0]), np.hanning(fixed.shape[1])))
-    fixed, moving = _details(fixed), _details(moving)
+    fixed, moving = details(fixed), details(moving)
     reference, there = measure(fixed, moving, lambda image: image + coarse, patch=2 * patch, spacing=2 * spacing)
     first, _ = _fit_robust("similarity", reference, there, name)
     for _ in range(2):
@@ -209,7 +209,7 @@ def _register_band(fixed: Array, moving: Array, name: str, transform: str, patch
     return Registration(name, first, reference, there, there - first(reference), used)
 
 
-def _details(band: Array) -> Array:
+def details(band: Array) -> Array:
     """Return what is smaller than a dozen pixels: broad differences of brightness pull the peak aside."""
     from scipy.ndimage import gaussian_filter
 

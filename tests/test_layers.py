@@ -14,24 +14,26 @@ PACKAGE = ROOT / "ortho_pipeline"
 #: A module imports only from lines above its own.
 LAYERS = """
 errors options
-files crs geometry
+files crs geometry notebook
 point_files datum
 points
 models least_squares statistics
-problem
-ridge
+problem block_points ground_frame
+ridge block_solver intersection
 blunders
-registration estimation hookspecs swaps model_file kernels ray_kernel landscape rpc_files
-model_choice selection ground_error drawing report_text covariance
-compare report_plots adjustment
+block_blunders registration estimation hookspecs swaps model_file kernels ray_kernel landscape rpc_files
+model_choice selection ground_error drawing report_text contract
+comparison report_plots adjustment covariance
 raster
-rpc dem preview edge
-plugins testing rays gdal_engine
-footprint lattice simulate inputs
+rpc dem preview edge outline
+plugins rays gdal_engine resolution
+footprint lattice simulate inputs testing
 gcp_export scene_fit warp mosaic
-report experiments stac
-pipeline
-studies blocks batch
+report experiments stac block_images
+pipeline block_report
+studies batch_config batch_manifest executors
+batch_plan
+blocks batch
 cli_options cli_text
 cli_studies cli_blocks cli_batch
 cli

@@ -1,0 +1,177 @@
+"""How long many small scenes take: a plain loop, `ortho run` in one process, in two, and on two dask workers.
+
+    python benchmarks/batch.py [--scenes 200] [--repeat 3] [--json FILE]
+
+The scenes are windows of sample_data/scene.tif with the RPC moved along, so that each is a scene of its own. Every way
+starts with an empty output folder; the time is that of the whole call, the start of the processes included. A run that
+is killed half-way and started again has to end with the same bytes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+import json
+import os
+import resource
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from osgeo import gdal
+
+from ortho_pipeline import batch, pipeline
+from ortho_pipeline.options import OutputOptions, SurfaceOptions
+from ortho_pipeline.rpc import rpc_metadata, rpc_of_dataset
+
+SAMPLE = Path(__file__).resolve().parent.parent / "sample_data"
+SIDE = 400
+FILE = """
+defaults:
+  surface: {dem: dem.tif}
+scenes:
+  - images: raw/*.tif
+"""
+
+
+def make_scenes(folder: Path, count: int) -> None:
+    """Write the scenes, the DEM and the pipeline file."""
+    (folder / "raw").mkdir(parents=True)
+    shutil.copy(SAMPLE / "dem.tif", folder)
+    (folder / "p.yaml").write_text(FILE)
+    source = gdal.Open(str(SAMPLE / "scene.tif"))
+    model, _ = rpc_of_dataset(source)
+    pixels, room = source.ReadAsArray(), source.RasterXSize - SIDE
+    for number in range(count):
+        left, top = 37 * number % room, 53 * number % room
+        moved = dataclasses.replace(model, col_off=model.col_off - left, row_off=model.row_off - top)
+        path = folder / "raw" / f"s{number:04}.tif"
+        dataset = gdal.GetDriverByName("GTiff").Create(str(path), SIDE, SIDE, 1, gdal.GDT_UInt16)
+        dataset.SetMetadata(rpc_metadata(moved), "RPC")
+        dataset.WriteArray(pixels[top : top + SIDE, left : left + SIDE])
+        dataset = None
+
+
+def loop(folder: Path) -> None:
+    """Rectify all scenes one after the other, with nothing around it."""
+    for image in sorted((folder / "raw").glob("*.tif")):
+        pipeline.rectify(
+            image, folder / "out" / image.stem, surface=SurfaceOptions(dem=folder / "dem.tif"), output=OutputOptions()
+        )
+
+
+def run(folder: Path, **options: Any) -> None:
+    """Make all scenes with `batch.run`."""
+    result = batch.run(folder / "p.yaml", **options)
+    assert not result.failed, result.to_json()["counts"]
+
+
+def timed(folder: Path, work: Callable[[Path], None]) -> dict[str, float]:
+    """Return wall and CPU seconds of a call that begins with an empty output folder."""
+    shutil.rmtree(folder / "out", ignore_errors=True)
+    wall, cpu = time.perf_counter(), cpu_seconds()
+    work(folder)
+    return {"wall": time.perf_counter() - wall, "cpu": cpu_seconds() - cpu}
+
+
+def cpu_seconds() -> float:
+    """Return the CPU seconds of this process and of those of its children that have ended."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(one.ru_utime + one.ru_stime for one in used)
+
+
+def digest(folder: Path) -> str:
+    """Return the checksum of all outputs of all scenes."""
+    total = hashlib.sha256()
+    for path in sorted((folder / "out").glob("s*/*")):
+        total.update(path.name.encode() + path.read_bytes())
+    return total.hexdigest()
+
+
+def killed_and_resumed(folder: Path, scenes: int) -> dict[str, Any]:
+    """Kill a run of two processes when half is done, start it again, and compare the bytes with one that was not."""
+    run(folder, executor="processes", workers=2)
+    whole = digest(folder)
+    shutil.rmtree(folder / "out")
+    command = [sys.executable, "-m", "ortho_pipeline", "run", str(folder / "p.yaml"), "--workers", "2"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    while len(list((folder / "out").glob(".run/s*.json"))) < scenes // 2:
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    result = batch.run(folder / "p.yaml", executor="processes", workers=2)
+    return {"kept": result.count("unchanged"), "made": result.count("done"), "same_bytes": digest(folder) == whole}
+
+
+def measure(folder: Path, few: Path, scenes: int, repeat: int) -> dict[str, Any]:
+    """Measure all ways in turn, `repeat` times, after one with `few` scenes each."""
+    from distributed import LocalCluster
+
+    ways: dict[str, Callable[[Path], None]] = {
+        "loop": loop,
+        "sequential": lambda where: run(where, executor="sequential"),
+        "processes": lambda where: run(where, executor="processes", workers=2),
+    }
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
+        ways["dask"] = lambda where: run(where, executor="dask", scheduler=cluster.scheduler_address)
+        for warm in ways.values():
+            # Compiled kernels are loaded, and the workers of dask, which stay, have their imports.
+            timed(few, warm)
+        runs: dict[str, list[dict[str, float]]] = {name: [] for name in ways}
+        for _ in range(repeat):
+            for name, work in ways.items():
+                runs[name].append(timed(folder, work))
+    begin = time.perf_counter()
+    run(folder, executor="sequential")
+    again = time.perf_counter() - begin
+    wall = {name: statistics.median(one["wall"] for one in each) for name, each in runs.items()}
+    pairs = list(zip(runs["sequential"], runs["processes"], runs["dask"], runs["loop"], strict=True))
+    return {
+        "scenes": scenes,
+        "side": SIDE,
+        "processors": len(os.sched_getaffinity(0)),
+        "seconds": wall,
+        "runs": runs,
+        "processes_speedup": statistics.median(s["wall"] / p["wall"] for s, p, _, _ in pairs),
+        "dask_beside_processes": statistics.median(d["wall"] / p["wall"] for _, p, d, _ in pairs),
+        "overhead_ms_per_scene": 1000 * statistics.median(s["cpu"] - b["cpu"] for s, _, _, b in pairs) / scenes,
+        "overhead_wall_ms_per_scene": 1000 * statistics.median(s["wall"] - b["wall"] for s, _, _, b in pairs) / scenes,
+        "unchanged_ms_per_scene": 1000 * again / scenes,
+    }
+
+
+def main() -> None:
+    """Measure, print, and write the numbers."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=int, default=200)
+    parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder, few = Path(name) / "all", Path(name) / "few"
+        make_scenes(folder, given.scenes)
+        make_scenes(few, 4)
+        found = measure(folder, few, given.scenes, given.repeat)
+        found["killed_and_resumed"] = killed_and_resumed(folder, given.scenes)
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=1) + "\n")
+    print(f"{given.scenes} scenes of {SIDE} x {SIDE} px, {found['processors']} processors, median of {given.repeat}")
+    for way, seconds in found["seconds"].items():
+        print(f"  {way:<11} {seconds:7.2f} s   {1000 * seconds / given.scenes:6.1f} ms a scene")
+    print(f"processes beside sequential: {found['processes_speedup']:.2f} times as fast")
+    print(f"dask beside processes:       {found['dask_beside_processes']:.2f} of the time")
+    print(f"overhead beside the loop:    {found['overhead_ms_per_scene']:.1f} ms CPU a scene, "
+          f"{found['overhead_wall_ms_per_scene']:.1f} ms wall")  # fmt: skip
+    print(f"a scene that is there:       {found['unchanged_ms_per_scene']:.2f} ms")
+    print(f"killed and resumed:          {found['killed_and_resumed']}")
+
+
+if __name__ == "__main__":
+    main()

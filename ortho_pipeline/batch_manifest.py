@@ -1,0 +1,208 @@
+"""What a run knows of each scene: a record per scene, and locks.
+
+A record says from which content (checksums of inputs, configuration, versions) which outputs were made. It says "done"
+only after all of them are written, and no longer once work begins again, whatever kills the process in between.
+Checksums are taken again only of files whose size or time of change differ from those recorded.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+import socket
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ortho_pipeline import files
+from ortho_pipeline.errors import InputError
+
+SCHEMA_VERSION = 1
+DOCUMENT = "ortho-pipeline scene record"
+
+
+@dataclass(frozen=True)
+class FileState:
+    """A file at the time of its checksum; `role` says what it is to the scene."""
+
+    role: str
+    path: str
+    bytes: int
+    mtime_ns: int
+    sha256: str
+
+    @classmethod
+    def of(
+        cls, role: str, path: Path, digest: Callable[[Path], str] = files.sha256, name: str | None = None
+    ) -> FileState:
+        """Return the state of a file, which is recorded under `name` (its path without one)."""
+        stat = path.stat()
+        return cls(role, name or str(path), stat.st_size, stat.st_mtime_ns, digest(path))
+
+    def untouched(self, folder: Path | None = None) -> bool:
+        """Tell whether size and time of change are those recorded; `folder` is that of a relative path."""
+        try:
+            stat = os.stat(folder / self.path if folder else self.path)
+        except OSError:
+            return False
+        return (stat.st_size, stat.st_mtime_ns) == (self.bytes, self.mtime_ns)
+
+    def same(self, folder: Path) -> bool:
+        """Tell whether the file in `folder` has the content recorded."""
+        path = folder / self.path
+        return self.untouched(folder) or (path.is_file() and files.sha256(path) == self.sha256)
+
+
+@dataclass(frozen=True)
+class Record:
+    """What was made of a scene, from what.
+
+    Parameters
+    ----------
+    key : str
+        SHA-256 of content of the inputs, configuration and versions.
+    inputs, outputs : tuple of FileState
+        Outputs by their names within the folder of the scene.
+    siblings : str
+        Digest of the names in the folders of the inputs: a new side-car changes it.
+    status : {'started', 'done', 'failed'}
+    facts : mapping
+        JSON values for the summary.
+    error : mapping, optional
+        Kind, message, file, field and remedy.
+    run : str
+        The run that made it.
+    """
+
+    name: str
+    key: str
+    status: str
+    inputs: tuple[FileState, ...] = ()
+    outputs: tuple[FileState, ...] = ()
+    siblings: str = ""
+    seconds: float = 0.0
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    error: Mapping[str, Any] | None = None
+    run: str = ""
+
+    def write(self, path: Path) -> None:
+        """Write the record, whole or not at all."""
+        document = {
+            "document": DOCUMENT, "schema_version": SCHEMA_VERSION, **vars(self),
+            "inputs": [vars(one) for one in self.inputs], "outputs": [vars(one) for one in self.outputs],
+        }  # fmt: skip
+        files.write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+    @classmethod
+    def read(cls, path: Path) -> Record | None:
+        """Return the record, or None where there is none of this version that can be understood."""
+        try:
+            document = json.loads(path.read_text(encoding="utf-8"))
+            if (document.pop("document"), document.pop("schema_version")) != (DOCUMENT, SCHEMA_VERSION):
+                return None
+            inputs, outputs = (tuple(FileState(**one) for one in document.pop(name)) for name in ("inputs", "outputs"))
+            record = cls(**document, inputs=inputs, outputs=outputs)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return None
+        # What is outside of the scene's folder is not ours to judge, or to remove.
+        return record if all(Path(one.path).name == one.path for one in record.outputs) else None
+
+    def intact(self, folder: Path, verify: bool = False) -> bool:
+        """Tell whether all outputs are as they were written; with `verify` by content whatever their dates say."""
+        if verify:
+            return all((folder / one.path).is_file() and files.sha256(folder / one.path) == one.sha256
+                       for one in self.outputs)  # fmt: skip
+        return all(one.same(folder) for one in self.outputs)
+
+
+def key_of(inputs: Sequence[FileState], configuration: Mapping[str, Any], versions: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of all that the outputs depend on."""
+    content = {
+        "inputs": sorted((one.role, one.path, one.sha256) for one in inputs),
+        "configuration": configuration,
+        "versions": versions,
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+def siblings(paths: Sequence[str | os.PathLike[str]], cache: dict[Path, list[str]] | None = None) -> str:
+    """Return a digest of the names in the folders of some files; `cache` holds listings of this run."""
+    listed: dict[Path, list[str]] = {} if cache is None else cache
+    digest = hashlib.sha256()
+    for folder in sorted({Path(path).parent for path in paths}):
+        if folder not in listed:
+            listed[folder] = sorted(entry.name for entry in os.scandir(folder)) if folder.is_dir() else []
+        digest.update("\0".join([str(folder), *listed[folder], ""]).encode(errors="surrogateescape"))
+    return digest.hexdigest()
+
+
+class Digests:
+    """SHA-256 of files, taken once for each state (size, time of change) of a file."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[str, int, int], str] = {}
+
+    def learn(self, states: Sequence[FileState]) -> None:
+        """Take over what a record knows."""
+        self._known.update({(one.path, one.bytes, one.mtime_ns): one.sha256 for one in states})
+
+    def __call__(self, path: str | os.PathLike[str]) -> str:
+        stat = os.stat(path)
+        state = os.fspath(path), stat.st_size, stat.st_mtime_ns
+        if state not in self._known:
+            self._known[state] = files.sha256(path)
+        return self._known[state]
+
+
+# -- locks -----------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def locked(path: Path, *, shared: bool = False, wait: bool = False, owner: str = "") -> Iterator[None]:
+    """Hold a lock, which the system releases however the process ends.
+
+    Parameters
+    ----------
+    shared : bool
+        Others may hold it too, if they share it.
+    wait : bool
+        Wait for it; otherwise a lock that is held is an error.
+    owner : str
+        What the error of others names, with the process and the machine.
+
+    Raises
+    ------
+    InputError
+        If the lock is held, or the folder cannot be written or locked.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise InputError(
+            f"cannot write here ({error.strerror})", file=path.parent, remedy="choose a folder that you may write to"
+        ) from error
+    try:
+        try:
+            fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError as error:
+            holder = os.pread(descriptor, 500, 0).decode(errors="replace").strip() or "another run"
+            raise InputError(
+                f"{holder} works in this output folder", file=path.parent.parent, field="output",
+                remedy="wait for its end, or choose another output folder",
+            ) from error  # fmt: skip
+        except OSError as error:
+            raise InputError(
+                f"this file system has no locks ({error.strerror})", file=path, field="output",
+                remedy="choose an output folder on another one",
+            ) from error  # fmt: skip
+        if not wait:
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"{owner} (process {os.getpid()} on {socket.gethostname()})".strip().encode(), 0)
+        yield
+    finally:
+        os.close(descriptor)

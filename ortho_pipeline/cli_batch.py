@@ -1,0 +1,151 @@
+"""The command `ortho run`: many scenes by a pipeline file."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ortho_pipeline.cli_options import json_option
+from ortho_pipeline.cli_text import print_json, progress
+
+if TYPE_CHECKING:
+    from ortho_pipeline.batch import BatchResult, Outcome
+
+FAILED, PARTLY_DONE = 1, 3
+#: More scenes than this are only counted, except for those that failed.
+_SHOWN = 60
+
+
+class _Shard(click.ParamType):
+    name = "K/N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        """Return (k, n) of 'k/n'."""
+        if isinstance(value, tuple):
+            return value
+        match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", value)
+        if not match or not 1 <= int(match[1]) <= int(match[2]):
+            self.fail(f"{value!r} is no part such as 1/4", param, ctx)
+        return int(match[1]), int(match[2])
+
+
+@click.command()
+@click.argument("pipeline_file", metavar="PIPELINE.yaml", type=click.Path(), required=False)
+@click.option(
+    "--executor",
+    type=click.Choice(["sequential", "processes", "dask"]),
+    help="Who does the work  [default: processes; dask with --scheduler]",
+)
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes  [default: all processors]")
+@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Of each scene  [default: shared out]")
+@click.option(
+    "--memory", type=click.IntRange(min=16), default=512, show_default=True, metavar="MB", help="Of each scene."
+)
+@click.option("--scheduler", metavar="URL", help="Of dask, such as tcp://host:8786.")
+@click.option("--only", multiple=True, metavar="NAME", help="Only this scene; may be repeated.")
+@click.option("--shard", type=_Shard(), metavar="K/N", help="Only the K-th of N parts, for arrays of jobs.")
+@click.option("--verify", is_flag=True, help="Judge all files by their content, whatever their dates say.")
+@click.option("--list", "as_list", is_flag=True, help="List the scenes and their state, and do nothing.")
+@click.option("--schema", "as_schema", is_flag=True, help="Print the JSON Schema of the file, and do nothing.")
+@json_option
+def run(
+    pipeline_file: str | None,
+    memory: int,
+    as_list: bool,
+    as_schema: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Make the orthos of all scenes that PIPELINE.yaml names.
+
+    A scene is made once, and again only when its files, its settings or the software have changed, or outputs are
+    missing. What fails does not stop the rest; a run that was interrupted goes on where it stood. Exit code 3: some
+    scenes failed.
+    """
+    if as_schema:
+        from ortho_pipeline import batch_config
+
+        return print_json(batch_config.schema())
+    if pipeline_file is None:
+        raise click.UsageError("Missing argument 'PIPELINE.yaml'.")
+    from ortho_pipeline import batch
+
+    if as_list:
+        listed = batch.list_scenes(pipeline_file)
+        if as_json:
+            return print_json({"schema_version": batch.SCHEMA_VERSION, "scenes": listed})
+        for scene in listed:
+            click.echo(f"{scene['name']}\t{scene['state']}\t{scene['image']}")
+        return None
+    try:
+        with progress("Orthorectifying scenes") as advance:
+            result = batch.run(pipeline_file, memory=memory * 1_000_000, progress=advance, **options)
+    except KeyboardInterrupt:
+        click.echo("What is done is kept: run it again to go on.", err=True)
+        raise
+    if as_json:
+        print_json(result.to_json())
+    else:
+        _print_summary(result)
+    if result.failed:
+        click.get_current_context().exit(FAILED if result.count("failed") == len(result.scenes) else PARTLY_DONE)
+    return None
+
+
+def _print_summary(result: BatchResult) -> None:
+    """Print a table of the scenes and what went wrong; of many scenes only those that failed."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False, soft_wrap=True)
+    scenes = result.scenes if len(result.scenes) <= _SHOWN else [one for one in result.scenes if one.status == "failed"]
+    table = Table(box=None, pad_edge=False)
+    for title in ("scene", "state", "model", "check px", "left out px", "control px", "seconds"):
+        table.add_column(title, justify="left" if title in ("scene", "state", "model") else "right", no_wrap=True)
+    for scene in scenes:
+        table.add_row(*_row(scene))
+    if scenes:
+        console.print(table)
+    for scene in scenes:
+        if scene.error:
+            console.print(f"\n{scene.name}: {_error_text(scene.error)}", markup=False)
+    counts = ", ".join(f"{result.count(status)} {status}" for status in ("done", "unchanged", "failed"))
+    console.print(f"\n{len(result.scenes)} scenes: {counts}  ({result.seconds:.1f} s)")
+    if result.mosaic:
+        console.print(_mosaic_text(result.mosaic), markup=False)
+    for name, path in result.files.items():
+        console.print(f"  {name:<10} {path}", markup=False)
+
+
+def _row(scene: Outcome) -> list[str]:
+    from rich.markup import escape
+
+    rmse = scene.facts.get("rmse_px", {})
+    numbers = ["-" if rmse.get(which) is None else f"{rmse[which]:.3f}" for which in ("check", "loo", "control")]
+    return [escape(scene.name), scene.status, str(scene.facts.get("model", "-")), *numbers, f"{scene.seconds:.1f}"]
+
+
+def _mosaic_text(mosaic: Mapping[str, Any]) -> str:
+    """Return what there is to say of a mosaic and its seams."""
+    if mosaic.get("error"):
+        return f"mosaic: {_error_text(mosaic['error'])}"
+    lines = [f"mosaic: {mosaic['size'][0]} x {mosaic['size'][1]} px of {len(mosaic['on_top_first'])} scenes"]
+    if mosaic["seams"]:
+        text = f"seams: {mosaic['seams_measured']} of {len(mosaic['seams'])} measured"
+        if mosaic["worst_seam"]:
+            worst = mosaic["worst_seam"]
+            text += f", median {mosaic['median_seam_px']:.2f} px, worst {worst['px']:.2f} px"
+            text += f" ({worst['first']} and {worst['second']})"
+        lines.append(text)
+    if mosaic["missing"]:
+        lines.append(f"not in the mosaic: {', '.join(mosaic['missing'])}")
+    return "\n".join(lines)
+
+
+def _error_text(error: Mapping[str, Any]) -> str:
+    where = ": ".join(part for part in (error["file"], error["field"]) if part)
+    text = f"{where}: {error['message']}" if where else error["message"]
+    return f"{text}\n  Remedy: {error['remedy']}" if error["remedy"] else text

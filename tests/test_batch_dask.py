@@ -1,0 +1,112 @@
+"""`ortho run` on a real dask cluster of two worker processes: the same bytes, also when a worker is killed."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+import signal
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from osgeo import gdal
+
+from ortho_pipeline import batch
+from ortho_pipeline.cli import cli
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.rpc import rpc_metadata
+
+distributed = pytest.importorskip("distributed")
+
+FILE = """
+defaults:
+  surface: {dem: dem.tif, vertical: ellipsoid}
+  output: {resolution: 5}
+scenes:
+  - images: raw/*.tif
+"""
+SCENES = 12
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """Start a scheduler and two worker processes, which a nanny starts again when they die."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
+    ) as made:
+        yield made
+
+
+@pytest.fixture
+def folder(tiny: Any, tmp_path: Path) -> Path:
+    """Make a pipeline file and small scenes."""
+    made = tmp_path / "block"
+    (made / "raw").mkdir(parents=True)
+    (made / "dem.tif").write_bytes(tiny.dem.read_bytes())
+    (made / "p.yaml").write_text(FILE)
+    pixels = gdal.Open(str(tiny.image)).ReadAsArray()
+    for number in range(SCENES):
+        at = 15 * number
+        model = dataclasses.replace(tiny.model, col_off=tiny.model.col_off - at, row_off=tiny.model.row_off - at)
+        path = made / "raw" / f"s{number}.tif"
+        dataset = gdal.GetDriverByName("GTiff").Create(str(path), 96, 80, 1, gdal.GDT_UInt16)
+        dataset.SetMetadata(rpc_metadata(model), "RPC")
+        dataset.WriteArray(pixels[at : at + 80, at : at + 96])
+        dataset = None
+    return made
+
+
+def digests(folder: Path) -> dict[str, str]:
+    files = sorted(path for path in (folder / "out").glob("s*/*") if path.is_file())
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def test_a_killed_worker_loses_nothing_and_nothing_is_done_twice(folder, cluster):
+    address = cluster.scheduler_address
+    with ThreadPoolExecutor(1) as pool, distributed.Client(address, set_as_default=False) as client:
+        running = pool.submit(batch.run, folder / "p.yaml", executor="dask", scheduler=address)
+        deadline = time.monotonic() + 60
+        while len(list((folder / "out").glob(".run/s*.json"))) < 2:
+            assert not running.done()
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+        victim, pid = next(iter(client.run(os.getpid).items()))
+        os.kill(pid, signal.SIGKILL)
+        made = {path: path.stat().st_mtime_ns for path in (folder / "out").glob(".run/s*.json")}
+        result = running.result(60)
+        assert victim not in client.scheduler_info()["workers"]
+    assert len(made) < SCENES
+    assert [scene.status for scene in result.scenes] == ["done"] * SCENES
+    assert {path: path.stat().st_mtime_ns for path in made} == made
+    events = [json.loads(line) for line in (folder / "out" / "run.jsonl").read_text().splitlines()]
+    assert sorted(event["name"] for event in events if event["event"] == "scene") == sorted(
+        f"s{number}" for number in range(SCENES)
+    )
+    assert not list((folder / "out").rglob("*.part*"))
+    dask = digests(folder)
+    assert len(dask) == SCENES * 6
+    shutil.rmtree(folder / "out")
+    batch.run(folder / "p.yaml", executor="sequential")
+    assert digests(folder) == dask
+
+
+def test_on_the_command_line(folder, cluster):
+    (folder / "raw" / "s3.tif").write_bytes(b"no image")
+    run = ["run", str(folder / "p.yaml"), "--scheduler", cluster.scheduler_address]
+    first = CliRunner().invoke(cli, run)
+    assert (first.exit_code, f"{SCENES - 1} done, 0 unchanged, 1 failed" in first.stdout) == (3, True), first.output
+    (folder / "raw" / "s3.tif").unlink()
+    again = CliRunner().invoke(cli, run)
+    assert (again.exit_code, f"{SCENES - 1} unchanged, 0 failed" in again.stdout) == (0, True), again.output
+
+
+def test_no_scheduler(folder):
+    with pytest.raises(InputError, match="no dask scheduler answers"):
+        batch.run(folder / "p.yaml", executor="dask", scheduler="tcp://127.0.0.1:1")

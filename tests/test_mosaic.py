@@ -1,0 +1,232 @@
+"""Mosaics: pixels taken over unchanged, the right one on top, seams measured against shifts that are known."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+import pytest
+from click.testing import CliRunner
+from osgeo import gdal
+from scipy.ndimage import gaussian_filter, shift
+
+from ortho_pipeline import batch, mosaic
+from ortho_pipeline.cli import cli
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.mosaic import Ortho, lay_out, measure_seam, overlaps, write_cog, write_vrt
+from ortho_pipeline.raster import Grid, Profile, RasterWriter, open_dataset
+from ortho_pipeline.rpc import rpc_metadata
+
+UTM = pyproj.CRS("EPSG:32635")
+SIDE = 700
+
+
+@pytest.fixture(scope="module")
+def landscape() -> np.ndarray:
+    """Return a textured image that orthos are cut from."""
+    random = np.random.default_rng(1)
+    texture = sum(gaussian_filter(random.normal(size=(SIDE, SIDE)), s) * s for s in (1.5, 3, 8))
+    return 6000 + 600 * texture / texture.std()
+
+
+def cut(
+    folder: Path, name: str, pixels: np.ndarray, column: int, row: int, width: int, height: int, **options: Any
+) -> Ortho:
+    """Write a window of an image as an ortho; a slanted corner of it has no values."""
+    values = pixels[row : row + height, column : column + width]
+    valid = np.add.outer(np.arange(height), np.arange(width)) > options.get("corner", 60)
+    kind, nodata = options.get("validity", "mask"), options.get("nodata")
+    dtype = np.dtype(options.get("dtype", "uint16"))
+    profile = Profile(1, dtype, kind, nodata)
+    step = options.get("step", 2.0)
+    grid = Grid(options.get("crs", UTM), 500000 + column * 2.0 + options.get("off", 0.0), 4e6 - row * 2.0, step, step,
+                width, height)  # fmt: skip
+    path = folder / name / f"{name}_ortho.tif"
+    with RasterWriter(path, grid, profile, driver=options.get("driver", "COG")) as writer:
+        filled = np.where(valid, values, 0 if nodata is None else nodata).astype(dtype)
+        writer.write(0, 0, filled[None], valid)
+    return Ortho(name, path, options.get("lean"))
+
+
+def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    dataset = open_dataset(path)
+    band = dataset.GetRasterBand(1)
+    return band.ReadAsArray(), band.GetMaskBand().ReadAsArray() > 0
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"validity": "nodata", "nodata": 7.0}, {"dtype": "float32", "validity": "nodata", "nodata": math.nan}],
+)
+def test_vrt_and_cog_are_the_same_pixels(tmp_path, landscape, options):
+    a = cut(tmp_path, "a", landscape, 40, 30, 300, 260, lean=0.4, **options)
+    b = cut(tmp_path, "b [x]", landscape + 3000, 200, 130, 300, 260, lean=0.1, **options)
+    c = cut(tmp_path, "c", landscape + 6000, 250, 20, 200, 200, lean=None, **options)
+    expected = np.zeros((360, 460))
+    for order, on_top in (("best-view", "ba?"), ("first-on-top", "abc")):
+        layout = lay_out([a, b, c], order)
+        assert "".join(layer.ortho.name[0] for layer in layout.layers).startswith(on_top[:2])
+        assert (layout.grid.width, layout.grid.height) == (460, 370)
+        assert layout.grid.extent == (500080, 4e6 - 780, 501000, 4e6 - 40)
+        write_vrt(layout, tmp_path / "m.vrt")
+        write_cog(layout, tmp_path / "m.tif")
+        expected, known = np.zeros((370, 460)), np.zeros((370, 460), dtype=bool)
+        for layer in reversed(layout.layers):
+            values, valid = read(layer.ortho.path)
+            place = slice(layer.top, layer.top + values.shape[0]), slice(layer.left, layer.left + values.shape[1])
+            expected[place] = np.where(valid, values, expected[place])
+            known[place] |= valid
+        for path in (tmp_path / "m.vrt", tmp_path / "m.tif"):
+            values, valid = read(path)
+            np.testing.assert_array_equal(valid, known)
+            np.testing.assert_array_equal(values[known], expected[known])
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
+    names = [element.text for element in ET.parse(tmp_path / "m.vrt").getroot().iter("SourceFilename")]
+    assert set(names) == {"a/a_ortho.tif", "b [x]/b [x]_ortho.tif", "c/c_ortho.tif"}
+
+
+def test_a_mosaic_larger_than_its_windows(tmp_path, landscape, monkeypatch):
+    orthos = [cut(tmp_path, f"s{i}", landscape + 100 * i, 90 * i, 70 * i, 250, 230) for i in range(4)]
+    layout = lay_out(orthos, "first-on-top")
+    write_cog(layout, tmp_path / "one.tif")
+    monkeypatch.setattr(mosaic, "_WINDOW", 97)
+    write_cog(layout, tmp_path / "many.tif")
+    for one, many in zip(read(tmp_path / "one.tif"), read(tmp_path / "many.tif"), strict=True):
+        np.testing.assert_array_equal(one, many)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"off": 0.5}, "off by 0.250 px"),
+        ({"step": 2.5}, "2.5 x 2.5"),
+        ({"crs": pyproj.CRS("EPSG:32636")}, "zone 36N"),
+        ({"dtype": "uint8"}, "1 bands of uint8"),
+        ({"validity": "nodata", "nodata": 0.0}, "valid by nodata"),
+    ],
+)
+def test_what_does_not_fit_is_refused(tmp_path, landscape, options, message):
+    a = cut(tmp_path, "a", landscape / 50, 0, 0, 100, 100)
+    b = cut(tmp_path, "b", landscape / 50, 50, 50, 100, 100, **options)
+    with pytest.raises(InputError, match=message) as caught:
+        lay_out([a, b])
+    assert caught.value.file == str(b.path)
+    with pytest.raises(InputError, match="needs an ortho"):
+        lay_out([])
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(0.0, 0.0), (0.4, -0.25), (3.3, 1.6), (-9.0, 14.5)])
+def test_a_seam_is_the_shift_of_the_content(tmp_path, landscape, columns, rows):
+    moved = shift(landscape, (rows, columns), order=3, mode="reflect")
+    a = cut(tmp_path, "a", landscape, 0, 0, 450, 450)
+    b = cut(tmp_path, "b", moved, 100, 150, 450, 450)
+    (pair,) = overlaps(lay_out([a, b], "first-on-top"))
+    # The slanted corners are missing from an overlap of 350 x 300.
+    assert pair.pixels == pytest.approx(350 * 300 - 60 * 60 / 2, rel=0.02)
+    seam = measure_seam(pair)
+    assert seam["patches"] >= 5
+    # The correlation finds hundredths of a pixel; shifts of half a pixel are pulled back by a few of them.
+    assert seam["median_px"] == pytest.approx([columns, rows], abs=0.05)
+    assert seam["rmse_px"] == pytest.approx(math.hypot(columns, rows), abs=0.08)
+
+
+def test_seams_without_detail_or_room(tmp_path, landscape):
+    flat = np.full_like(landscape, 500.0)
+    a = cut(tmp_path, "a", landscape, 0, 0, 300, 300)
+    b = cut(tmp_path, "b", flat, 150, 0, 300, 300)
+    c = cut(tmp_path, "c", landscape, 290, 0, 300, 300, corner=-1)
+    d = cut(tmp_path, "d", landscape, 0, 400, 100, 100)
+    layout = lay_out([a, b, c, d], "first-on-top")
+    found = [measure_seam(pair) for pair in overlaps(layout)]
+    assert [(seam["first"], seam["second"]) for seam in found] == [("a", "b"), ("a", "c"), ("b", "c")]
+    assert all(seam["patches"] == 0 and seam["median_px"] is None for seam in found)
+    summary = mosaic.summary(layout, found)
+    assert (summary["seams_measured"], summary["worst_seam"], summary["median_seam_px"]) == (0, None, None)
+    json.dumps(summary, allow_nan=False)
+
+
+# -- within a run ----------------------------------------------------------------------------------------------------
+
+FILE = """
+defaults:
+  surface: {dem: dem.tif, vertical: ellipsoid}
+  output: {crs: "EPSG:32734", resolution: 5}
+scenes:
+  - images: raw/*.tif
+mosaic: {format: FORMAT, order: first-on-top}
+"""
+
+
+@pytest.fixture
+def block(tiny: Any, tmp_path: Path, landscape: np.ndarray) -> Path:
+    """Make three overlapping scenes of one picture, the third with an RPC that is 2 columns and -1 row wrong."""
+    folder = tmp_path / "block"
+    (folder / "raw").mkdir(parents=True)
+    (folder / "dem.tif").write_bytes(tiny.dem.read_bytes())
+    for number, (column, row, wrong) in enumerate([(0, 0, (0, 0)), (150, 60, (0, 0)), (100, 20, (2, -1))]):
+        model = dataclasses.replace(
+            tiny.model, col_off=tiny.model.col_off - column + wrong[0], row_off=tiny.model.row_off - row + wrong[1]
+        )
+        path = folder / "raw" / f"s{number}.tif"
+        dataset = gdal.GetDriverByName("GTiff").Create(str(path), 240, 220, 1, gdal.GDT_UInt16)
+        dataset.SetMetadata(rpc_metadata(model), "RPC")
+        dataset.WriteArray(landscape[row : row + 220, column : column + 240].astype(np.uint16))
+        dataset = None
+    return folder
+
+
+def test_a_run_ends_in_a_mosaic(block):
+    (block / "p.yaml").write_text(FILE.replace("FORMAT", "VRT"))
+    done = CliRunner().invoke(cli, ["run", str(block / "p.yaml"), "--executor", "sequential"])
+    assert done.exit_code == 0, done.output
+    assert "seams: 3 of 3 measured" in done.stdout
+    document = json.loads((block / "out" / "mosaic.json").read_text())
+    seams = {(seam["first"], seam["second"]): seam for seam in document["seams"]}
+    grid = open_dataset(block / "out" / "s0" / "s0_ortho.tif").GetGeoTransform()
+    assert document["resolution"] == [grid[1], -grid[5]]
+    # 4.8 m pixels in 5 m ones: an RPC that says too large a column shows the ground too far west.
+    assert np.hypot(*seams["s0", "s1"]["median_px"]) < 0.1
+    for pair in (("s0", "s2"), ("s1", "s2")):
+        assert seams[pair]["median_px"] == pytest.approx([-2 * 4.8 / 5, 1 * 4.8 / 5], abs=0.15)
+    assert document["worst_seam"]["px"] > 2
+    values, valid = read(block / "out" / "mosaic.vrt")
+    assert valid.mean() > 0.5
+    before = (block / "out" / "mosaic.vrt").stat().st_mtime_ns
+    again = batch.run(block / "p.yaml", executor="sequential")
+    assert again.mosaic["status"] == "unchanged"
+    assert (block / "out" / "mosaic.vrt").stat().st_mtime_ns == before
+    (block / "out" / "mosaic.vrt").unlink()
+    assert batch.run(block / "p.yaml", executor="sequential").mosaic["status"] == "done"
+    (block / "p.yaml").write_text(FILE.replace("FORMAT", "COG"))
+    other = batch.run(block / "p.yaml", executor="sequential")
+    assert other.mosaic["status"] == "done"
+    assert not (block / "out" / "mosaic.vrt").exists()
+    for one, two in zip((values, valid), read(block / "out" / "mosaic.tif"), strict=True):
+        np.testing.assert_array_equal(np.where(valid, one, 0), np.where(valid, two, 0))
+
+
+def test_a_mosaic_says_what_is_missing_and_parts_make_none(block):
+    (block / "p.yaml").write_text(FILE.replace("FORMAT", "VRT"))
+    assert batch.run(block / "p.yaml", executor="sequential", only=["s0"]).mosaic is None
+    (block / "raw" / "s1.tif").write_bytes(b"no image")
+    done = CliRunner().invoke(cli, ["run", str(block / "p.yaml"), "--executor", "sequential"])
+    assert done.exit_code == 3
+    assert "not in the mosaic: s1" in done.stdout
+    (block / "p.yaml").write_text(
+        FILE.replace("FORMAT", "VRT").replace("scenes:", "scenes:\n  - image: raw/s2.tif\n    output: {resolution: 4}")
+    )
+    wrong = CliRunner().invoke(cli, ["run", str(block / "p.yaml"), "--executor", "sequential"])
+    assert wrong.exit_code == 3
+    assert "is not on the grid of" in wrong.stdout
+    for field in ("crs", "resolution"):
+        text = FILE.replace('crs: "EPSG:32734", ', "") if field == "crs" else FILE.replace(", resolution: 5", "")
+        (block / "p.yaml").write_text(text.replace("FORMAT", "VRT"))
+        with pytest.raises(InputError, match="share a grid") as caught:
+            batch.run(block / "p.yaml", executor="sequential")
+        assert caught.value.field == f"defaults.output.{field}"
