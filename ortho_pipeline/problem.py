@@ -43,7 +43,9 @@ class Prior:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.mean) and self.sigma > 0):
-            raise InputError("a prior has a finite mean and a positive sigma", field="prior")
+            raise InputError(
+                f"a prior has a finite mean and a positive sigma, not {self.mean} and {self.sigma}", field="prior"
+            )
 
 
 def priors_at(model: SensorModel, sigmas: Mapping[str, float]) -> dict[str, Prior]:
@@ -168,8 +170,8 @@ class Problem:
             known = np.vstack([data, rows[true]])
             effective = float(np.einsum("ij,ij->", known @ solved.cofactors, known))
         freedom = len(observed) - effective
-        # Fictitious observations make the count a fraction; below half an observation it is none.
-        sigma0 = math.sqrt(float(observed @ observed) / freedom) if freedom > 0.5 else None
+        # Fictitious observations make the count a fraction; less than a whole one to spare tells nothing of weights.
+        sigma0 = math.sqrt(float(observed @ observed) / freedom) if freedom > 1 - 1e-6 else None
         return Solution(model, jacobian, residuals, sigma, solved.cofactors, freedom, effective, sigma0, condition)
 
     def _enough(self, points: int) -> None:

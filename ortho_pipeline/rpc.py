@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 import os
 import re
 from collections.abc import Iterator
@@ -418,6 +419,8 @@ def fit_rpc(
     terms = rpc_terms(*((ground - centre) / half).T).T
     names = ("col_off", "row_off", "lon_off", "lat_off", "h_off", "col_scale", "row_scale", "lon_scale", "lat_scale")
     numbers = dict(zip((*names, "h_scale"), map(float, (*middle, *centre, *scale, *half)), strict=True))
+    # A box across the antimeridian may be given beyond 180 degrees; readers of RPCs want the offset within.
+    numbers["lon_off"] = math.remainder(numbers["lon_off"], 360.0)
     (col_num, col_den), (row_num, row_den) = (_fit_ratio(terms, (image - middle)[:, k] / scale[k]) for k in (0, 1))
     rpc = RPC(**numbers, col_num=col_num, col_den=col_den, row_num=row_num, row_den=row_den)
     nx, ny, nh = grid

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
+import pickle
 import time
 from dataclasses import replace
 
@@ -210,6 +213,43 @@ def test_a_million_points_per_second_on_one_core() -> None:
     assert len(ground) / min(taken) > 1e6
 
 
+def test_rounded_rotations_are_made_rotations() -> None:
+    """Six printed digits: the inverse of what is printed would be another than its transpose, by 0.05 px."""
+    model = exact(scanner())
+    rounded = replace(model, mounting=np.round(model.mounting, 6), orbital=np.round(model.orbital, 6))
+    image = sample(scanner(), 100)[0]
+    assert np.abs(rounded.ground_to_image(rounded.image_to_ground(image, 300.0)) - image).max() < 1e-7
+    again = model_from_dict(json.loads(json.dumps(rounded.to_dict())))
+    assert again.to_dict() == rounded.to_dict()
+
+
+def test_copies_in_other_processes_project_alike() -> None:
+    model = exact(scanner())
+    ground = sample(scanner(), 100)[1]
+    image = model.ground_to_image(ground)
+    assert (pickle.loads(pickle.dumps(model)).ground_to_image(ground) == image).all()
+
+
+def test_few_parameters_of_many_cost_little() -> None:
+    """Partials by the six free parameters of a table with hundreds, which once cost as much as by all of them."""
+    model = exact(scanner())
+    ground = np.tile(sample(scanner(), 1000)[1], (5, 1))
+
+    def taken(one: Pushbroom) -> float:
+        times = []
+        for _ in range(3):
+            begin = time.process_time()
+            one.param_partials(ground)
+            times.append(time.process_time() - begin)
+        return min(times)
+
+    whole = model.freed(*model.groups)
+    few = model.param_partials(ground)
+    at = [whole.param_names.index(name) for name in model.param_names]
+    assert np.allclose(few, whole.param_partials(ground)[:, :, at], rtol=1e-12, atol=0)
+    assert taken(model) < 0.4 * taken(whole)
+
+
 # -- conventions -----------------------------------------------------------------------------------------------------
 
 
@@ -374,10 +414,13 @@ def test_tables_hold_the_coefficients_that_they_observe() -> None:
 # -- adjustment ------------------------------------------------------------------------------------------------------
 
 
-def test_hundred_of_hundred_scenes_converge_from_metadata_alone() -> None:
-    """Nine points of 0.5 px; forward, backward and nadir views by turns."""
+def test_all_scenes_converge_from_metadata_alone() -> None:
+    """Nine points of 0.5 px; forward, backward and nadir views by turns.
+
+    25 scenes, and as many as ORTHO_SCENES says: `ORTHO_SCENES=100 pytest tests/test_pushbroom.py -k all_scenes`.
+    """
     starts, errors = [], []
-    for seed in range(100):
+    for seed in range(int(os.environ.get("ORTHO_SCENES", "25"))):
         camera = scanner(seed, pitch_deg=(-26.0, 5.0, 0.0)[seed % 3])
         start = metadata_start(camera, seed)
         check, place = sample(camera, 100, 1000 + seed)
@@ -439,6 +482,16 @@ def test_honest_covariance_with_soft_constraints() -> None:
     assert 0.9 < np.sqrt(np.mean(np.square(weights))) < 1.1
 
 
+def test_less_than_one_observation_to_spare_tells_nothing_of_weights() -> None:
+    """Five points and the soft constraints: what is to spare is a fraction, and no sigma is scaled by it."""
+    for seed, enough in ((18, False), (19, True)):
+        points = points_of(*sample(scanner(seed), 5, seed, noise=0.5))
+        found = fit(metadata_start(scanner(seed), seed), points, robust=False)
+        assert 0.5 < found.degrees_of_freedom < 1.5
+        assert found.redundancy == int(enough)
+        assert (found.sigma0 is not None) == enough
+
+
 def test_points_that_do_not_determine_it_are_refused() -> None:
     camera = scanner(9)
     # In the middle row the derivatives by a drift are nothing but rounding.
@@ -447,6 +500,21 @@ def test_points_that_do_not_determine_it_are_refused() -> None:
         ground = camera.image_to_ground(image, 100.0)
         with pytest.raises(DegeneratePoints):
             fit(exact(camera), points_of(image, ground), robust=False)
+
+
+def test_an_rpc_beside_the_antimeridian_has_an_offset_that_others_read() -> None:
+    """The satellite on the other side: longitudes are given about its own, beyond 180 degrees."""
+    camera = LineScanner.over(
+        179.7, -20.0, 300.0, image_width=1000, image_height=1000, gsd=30.0, off_nadir_deg=25.0, heading_deg=192.0,
+        altitude=618e3, heights=HEIGHTS,
+    )  # fmt: skip
+    model = exact(camera)
+    (west, south, _), (east, north, _) = (model.domain[0] + sign * model.domain[1] for sign in (-1, 1))
+    assert west < -180
+    rpc = fit_rpc(model, (west, south, east, north), HEIGHTS).rpc
+    assert rpc.lon_off == pytest.approx(179.7, abs=0.1)
+    ground = model.domain[0] + np.random.default_rng(0).uniform(-0.9, 0.9, (50, 3)) * model.domain[1]
+    assert np.abs(rpc.ground_to_image(ground) - model.ground_to_image(ground)).max() < 0.01
 
 
 def test_an_rpc_of_a_pushbroom() -> None:
@@ -525,6 +593,31 @@ def test_impossible_tables(table: str, what: str) -> None:
     assert caught.value.field == table
 
 
+@pytest.mark.parametrize("spoil", [2.0, np.array([-1.0, 1.0, 1.0])])
+@pytest.mark.parametrize("mounting", [None, np.eye(3)])
+def test_tables_of_what_is_no_rotation(spoil: object, mounting: Array | None) -> None:
+    """Scaled or mirrored axes: their angles alone would look like an attitude."""
+    camera = scanner(12)
+    times, positions, turns = tables_of(camera, np.linspace(-0.6, 1.6, 20) * camera.height)
+    with pytest.raises(InputError) as caught:
+        pushbroom_of_tables(
+            LineCamera(12_000, 12_000, 6000.0, 0.0, 277_857.0),
+            line_period=camera.line_period,
+            first_time=0.0,
+            orbit=(times, positions),
+            attitude=(times, turns * spoil),
+            mounting=mounting,
+        )
+    assert caught.value.field == "attitude"
+
+
+@pytest.mark.parametrize("degree", [1, 2, 4, 5])
+def test_tables_by_splines_of_other_degrees(degree: int) -> None:
+    image, ground = sample(scanner(13), 50)
+    model = exact(scanner(13), degree=degree)
+    assert np.abs(model.ground_to_image(ground) - image).max() < (2.0 if degree == 1 else 1e-3)
+
+
 def test_sparse_tables_and_other_clocks() -> None:
     """A table every ten seconds, in seconds of the day, is as good as a dense one."""
     camera = scanner(13)
@@ -557,6 +650,13 @@ def test_sparse_tables_and_other_clocks() -> None:
         {"shape": {"radius": 7e6}},
         {"path_observations": [{"times": [0.0], "values": [[0.0, 0.0]], "sigma": [[1.0, 1.0]]}]},
         {"attitude_observations": [{"times": [0.0], "values": [[0.0] * 3], "sigma": [[0.0] * 3]}]},
+        {"attitude_observations": [{"times": [0.0], "values": [[0.0] * 3], "sigma": [[1.0] * 3], "fictitious": "no"}]},
+        {"path_observations": {}},
+        {"shape": {"plane": 1.0, "samples": 10**9}},
+        {"shape": {"plane": 1.0, "samples": math.nan}},
+        {"camera": {"width": 2.5, "height": 5, "principal_column": 0.0, "principal_line": 0.0, "focal_length": 1.0}},
+        {"camera": {"width": 1e300, "height": 5, "principal_column": 0.0, "principal_line": 0.0, "focal_length": 1.0}},
+        {"kind": []},
     ],
 )
 def test_files_that_are_no_pushbroom(change: dict[str, object]) -> None:

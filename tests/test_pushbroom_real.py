@@ -270,6 +270,13 @@ def test_two_of_them_and_damaged_ones_are_said(made: Path) -> None:
         ("<COEFFICIENTS>-0.0001 7e-07", "<COEFFICIENTS>-0.0001 0", "across"),
         ("-0.70710678", "0.0", "attitude"),
         ("Sensor_Model_Characteristics", "Other", "Sensor_Model_Characteristics"),
+        # A part of the line, or of the pass: how columns and rows then count is not documented.
+        (
+            "<Sensor_Viewing_Model>",
+            "<Sensor_Viewing_Model><Position_In_Retina><FIRST_COL>5001</FIRST_COL></Position_In_Retina>",
+            "Position_In_Retina",
+        ),
+        ("</START>", "</START><END>2021-01-01T00:00:00.1</END>", "UTC_Sensor_Model_Range"),
         ("<PHR_Dimap_Document>", "<!DOCTYPE x [<!ENTITY a 'b'>]><PHR_Dimap_Document>", None),
     ],
 )

@@ -30,11 +30,11 @@ def model_from_dict(data: dict[str, Any]) -> SensorModel:
         If its kind is unknown (the plugin that has it is not installed) or its fields do not fit.
     """
     kind = data.get("kind")
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise InputError(
             f"no installed sensor model is of kind {kind!r}",
             field="kind",
-            remedy=f"known kinds are {', '.join(sorted(KINDS))}; install the plugin that brings it",
+            remedy=f"known kinds are {', '.join(sorted(KINDS))}; install the plugin that offers it in ortho_models",
         )
     try:
         return KINDS[kind].from_dict(data)

@@ -29,6 +29,10 @@ from ortho_pipeline.models.base import Array
 PRINCIPAL = ("principal_column", "principal_line", "focal_length")
 
 
+#: Columns or rows: more than any line scanner takes in one pass.
+MOST_PIXELS = 10_000_000
+
+
 @dataclass(frozen=True, eq=False)
 class LineCamera:
     """Interior orientation of a line scanner, in pixels.
@@ -52,7 +56,7 @@ class LineCamera:
     dy: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        if min(self.width, self.height) < 1:
+        if not all(1 <= size <= MOST_PIXELS and size == int(size) for size in (self.width, self.height)):
             raise InputError(f"{self.width} x {self.height} is no size of an image", field="width, height")
         for name in ("dx", "dy"):
             value = np.array(getattr(self, name), dtype=np.float64).ravel()

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from ortho_pipeline.crs import parse_crs
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import Array, SensorModel, as_ground
 
@@ -55,6 +56,10 @@ class Pieces(SensorModel):
     @property
     def domain(self) -> tuple[Array, Array]:
         boxes = [model.domain for model in self.models]
+        if parse_crs(self.crs).is_geographic:
+            # Beside the antimeridian a piece may count its longitudes from the other side.
+            turn = np.array([360.0, 0.0, 0.0])
+            boxes = [(at - turn * np.round((at - boxes[0][0])[0] / 360.0), half) for at, half in boxes]
         low = np.min([centre - half for centre, half in boxes], axis=0)
         high = np.max([centre + half for centre, half in boxes], axis=0)
         return (low + high) / 2, (high - low) / 2
@@ -64,16 +69,29 @@ class Pieces(SensorModel):
         return np.concatenate([model.corners for model in self.models])
 
     def ground_to_image(self, ground: ArrayLike) -> Array:
+        return self._seen(as_ground(ground))[0]
+
+    def ground_partials(self, ground: ArrayLike) -> Array:
         ground = as_ground(ground)
+        # Of the piece that each point belongs to: differences across a seam are no slope.
+        owner = self._seen(ground)[1]
+        partials = np.full((len(ground), 2, 3), np.nan)
+        for k, model in enumerate(self.models):
+            partials[owner == k] = model.ground_partials(ground[owner == k])
+        return partials
+
+    def _seen(self, ground: Array) -> tuple[Array, NDArray[np.intp]]:
+        """Return image points ``(N, 2)`` and the number of the piece ``(N,)``, -1 where none sees the point."""
         image = np.full((len(ground), 2), np.nan)
+        owner = np.full(len(ground), -1)
         nearest = np.full(len(ground), np.inf)
-        for model, offset, size in zip(self.models, self.offsets, self.sizes, strict=True):
+        for k, (model, offset, size) in enumerate(zip(self.models, self.offsets, self.sizes, strict=True)):
             seen = model.ground_to_image(ground)
             outside = np.maximum(-seen, seen - size).max(axis=1, initial=0.0)
             better = outside < nearest  # NaN is no number, and not less than any
             image[better] = seen[better] + offset
-            nearest[better] = outside[better]
-        return image
+            nearest[better], owner[better] = outside[better], k
+        return image, owner
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:

@@ -117,8 +117,14 @@ class Pushbroom(SensorModel):
             object.__setattr__(self, name, value)
         for name in ("orbital", "mounting"):
             axes = getattr(self, name)
-            if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-6 or np.linalg.det(axes) < 0:
+            if not are_rotations(axes[None]):
                 raise InputError("this matrix is no rotation", field=name)
+            # A matrix with printed digits is none exactly, and its inverse would be another than its transpose.
+            if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-12:
+                left, _, right = np.linalg.svd(axes)
+                axes = left @ right
+                axes.setflags(write=False)
+                object.__setattr__(self, name, axes)
         if not (math.isfinite(self.line_period) and self.line_period > 0):
             raise InputError("the line period is positive", field="line_period")
         low, high = (float(value) for value in self.heights)
@@ -268,8 +274,8 @@ class Pushbroom(SensorModel):
         value = self._path(times, derivative) @ self.orbital.T + (0.0 if derivative else self.origin)
         basis = self._basis(self.path, times, derivative)
         slopes = np.zeros((len(times), 3, len(self._names)))
-        for columns, weights in self._members("path", basis):
-            slopes[:, :, columns] = self.orbital * weights[:, None, None]
+        for first, weights in self._members("path", basis):
+            slopes[:, :, first : first + 3] = self.orbital * weights[:, None, None]
         return value, slopes
 
     def _basis(self, spline: Spline, times: Array, derivative: int = 0) -> Array:
@@ -277,11 +283,11 @@ class Pushbroom(SensorModel):
         line = [np.ones_like(times), times - self._middle] if not derivative else [0 * times, np.ones_like(times)]
         return np.column_stack([spline.basis(times, derivative), *line])
 
-    def _members(self, group: str, basis: Array) -> list[tuple[slice, Array]]:
-        """Return, for each three parameters that move along the three axes, their place and their weights ``(N,)``."""
+    def _members(self, group: str, basis: Array) -> list[tuple[int, Array]]:
+        """Return, for each three parameters that move along the three axes, the first one and weights ``(N,)``."""
         firsts = [self._starts[group] + 3 * k for k in range(basis.shape[1] - 2)]
         firsts += [self._starts[f"{group}_offset"], self._starts[f"{group}_drift"]]
-        return [(slice(first, first + 3), basis[:, k]) for k, first in enumerate(firsts)]
+        return [(first, basis[:, k]) for k, first in enumerate(firsts)]
 
     # -- the map -----------------------------------------------------------------------------------------------------
 
@@ -381,17 +387,24 @@ class Pushbroom(SensorModel):
         """Return d(image)/d(params) as ``(N, 2, P)``, in closed form."""
         ground = as_ground(ground)
         state = _State(self, ground)
-        by_vector = np.zeros((len(ground), 3, len(self._names)))
+        place = {column: at for at, column in enumerate(self._columns)}
+        by_vector = np.zeros((len(ground), 3, len(place)))
         groups = (
             ("path", self.path, -(self.mounting.T @ np.swapaxes(state.turn, 1, 2))),
             ("attitude", self.attitude, self.mounting.T @ state.by_angles),
         )
         for group, spline, slopes in groups:
-            for columns, weights in self._members(group, self._basis(spline, state.times)):
-                by_vector[:, :, columns] = slopes * weights[:, None, None]
-        inner = np.zeros((len(ground), 2, len(self._names)))
-        inner[:, :, self._starts["camera"] :] = self.camera.partials(state.column)
-        return state.image_by(by_vector[:, :, self._columns], inner[:, :, self._columns])
+            for first, weights in self._members(group, self._basis(spline, state.times)):
+                for axis in range(3):
+                    if (at := place.get(first + axis)) is not None:
+                        by_vector[:, :, at] = slopes[:, :, axis] * weights[:, None]
+        inner = np.zeros((len(ground), 2, len(place)))
+        start = self._starts["camera"]
+        camera = [(column - start, at) for column, at in place.items() if column >= start]
+        if camera:
+            theirs, ours = (list(side) for side in zip(*camera, strict=True))
+            inner[:, :, ours] = self.camera.partials(state.column)[:, :, theirs]
+        return state.image_by(by_vector, inner)
 
     # -- files -------------------------------------------------------------------------------------------------------
 
@@ -413,7 +426,9 @@ class Pushbroom(SensorModel):
                 raise InputError(f"a pushbroom has its {name}", field=name)
             parts[name] = make(**data[name])
         for name in ("path_observations", "attitude_observations"):
-            parts[name] = tuple(Observations(**table) for table in data.get(name, ()))
+            if not isinstance(data.get(name), list | tuple):
+                raise InputError("a list of tables belongs here, which may be empty", field=name)
+            parts[name] = tuple(Observations(**table) for table in data[name])
         return super().from_dict({**data, **parts})
 
 
@@ -452,6 +467,12 @@ class _State:
     def image_by(self, vector: Array, look: Array | float = 0.0) -> Array:
         """Return d(image) ``(N, 2, P)`` of changes of the vector ``(N, 3, P)`` and of u, v themselves ``(N, 2, P)``."""
         return self.solved @ (self.by_vector @ vector - look)
+
+
+def are_rotations(turns: Array) -> bool:
+    """Tell whether all matrices ``(N, 3, 3)`` are rotations, rounded to six digits or better."""
+    miss = np.swapaxes(turns, 1, 2) @ turns - np.eye(3)
+    return bool(np.abs(miss).max(initial=0.0) <= 3e-6 and (np.linalg.det(turns) > 0).all())
 
 
 def rotations(angles: Array) -> Array:

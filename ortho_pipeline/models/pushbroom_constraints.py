@@ -25,6 +25,8 @@ from ortho_pipeline.models.splines import Spline
 
 #: Position (or velocity: derivative 1) in ECEF ``(N, 3)`` at times ``(N,)``, and its partials ``(N, 3, P)``.
 Path = Callable[[Array, int], tuple[Array, Array]]
+#: Times at which the shape of an orbit is asked for: one scene needs two.
+MOST_SAMPLES = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +60,8 @@ class Observations:
             raise InputError("an observation is not finite", field="observations")
         if not (sigma > 0).all() or self.derivative not in (0, 1):
             raise InputError("sigmas are positive, and values or rates are observed", field="observations")
+        if not isinstance(self.fictitious, bool):
+            raise InputError(f"fictitious is true or false, not {self.fictitious!r}", field="fictitious")
         for name, value in (("times", times), ("values", values), ("sigma", sigma)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
@@ -102,8 +106,10 @@ class OrbitShape:
 
     def __post_init__(self) -> None:
         given = [value for value in (self.plane, self.circular, self.radius, self.radius_sigma) if value is not None]
-        if not all(np.isfinite(value) and value > 0 for value in given) or self.samples < 1:
+        if not all(np.isfinite(value) and value > 0 for value in given):
             raise InputError("soft constraints have positive sigmas", field="shape")
+        if not (isinstance(self.samples, int) and 1 <= self.samples <= MOST_SAMPLES):
+            raise InputError(f"1 to {MOST_SAMPLES} times are asked for, not {self.samples!r}", field="samples")
         if (self.radius is None) != (self.radius_sigma is None):
             raise InputError("a radius comes with its sigma", field="radius_sigma")
 

@@ -36,7 +36,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.geometry import geocentric, orbital_from_ecef
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom import Pushbroom, angles_of, rotations
+from ortho_pipeline.models.pushbroom import Pushbroom, angles_of, are_rotations, rotations
 from ortho_pipeline.models.pushbroom_constraints import Observations, OrbitShape
 from ortho_pipeline.models.splines import Spline
 
@@ -99,13 +99,17 @@ def pushbroom_of_tables(
     last = camera.height * line_period
     times, positions = _table(orbit, (3,), first_time, last, degree, "orbit")
     turn_times, turns = _table(attitude, (3, 3), first_time, last, degree, "attitude")
+    if not are_rotations(turns):
+        raise InputError("a matrix of this table is no rotation", field="attitude")
     # Half an image beyond both ends, as far as the tables go: points outside of the image are legal.
     low, high = max(-last / 2, times[0], turn_times[0]), min(1.5 * last, times[-1], turn_times[-1])
     origin, velocity = _lagrange(times, positions, np.array([last / 2]))
     orbital = _orbital_axes(origin[0], velocity[0])
     path_breaks = np.linspace(low, high, 1 + (segments[0] or max(2, math.ceil((high - low) / _PATH_PIECE))))
     sites = np.linspace(low, high, 4 * (len(path_breaks) + degree))
-    path = Spline.fitted(sites, (_lagrange(times, positions, sites)[0] - origin) @ orbital, degree, path_breaks, 2)
+    path = Spline.fitted(
+        sites, (_lagrange(times, positions, sites)[0] - origin) @ orbital, degree, path_breaks, min(degree, 2)
+    )
     body = orbital.T @ turns
     mounted = None if mounting is None else np.asarray(mounting, dtype=np.float64)
     if mounted is None:

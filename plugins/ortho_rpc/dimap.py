@@ -27,7 +27,7 @@ from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.models.line_camera import LineCamera
+from ortho_pipeline.models.line_camera import MOST_PIXELS, LineCamera
 from ortho_pipeline.models.pushbroom import Pushbroom
 from ortho_pipeline.models.pushbroom_start import pushbroom_of_tables, rotations_of_quaternions
 
@@ -39,7 +39,7 @@ _MODEL = "Geometric_Data/Sensor_Model_Characteristics"
 _HEIGHTS = (-100.0, 3000.0)
 #: How often the attitude polynomial is sampled, and by how many cubic polynomials it is followed: to 1e-12 rad.
 _SAMPLES, _PIECES = 96, 24
-_MOST_PIXELS, _MOST_TERMS, _MOST_POINTS = 10_000_000, 10, 100_000
+_MOST_TERMS, _MOST_POINTS = 10, 100_000
 # camera axes (along the line, forward, to the ground) in those of the vendor (psi_Y, -psi_X, 1)
 _VENDOR_FROM_CAMERA = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -70,6 +70,7 @@ def read_dimap_pushbroom(path: str | PathLike[str]) -> Pushbroom:
     if not 0 < period < 1:
         raise InputError(f"{period} s is no time for a row", file=path, field="SENSOR_LINE_PERIOD")
     first = file.time(f"{_MODEL}/UTC_Sensor_Model_Range/START") - 0.5 * period
+    _refuse_parts(file, rows * period, first)
     psi_x, psi_y = (file.polynomial(f"{_MODEL}/Sensor_Viewing_Model/Viewing_Directions/{n}_Model") for n in _PSI)
     # The vendor counts columns from 0 at the first centre.
     across, along = (Polynomial(psi)(Polynomial([-0.5, 1.0])).coef for psi in (psi_x, psi_y))
@@ -92,6 +93,24 @@ def read_dimap_pushbroom(path: str | PathLike[str]) -> Pushbroom:
 
 
 _PSI = ("PsiX", "PsiY")
+
+
+def _refuse_parts(file: _File, duration: float, first: float) -> None:
+    """Refuse metadata whose times and columns are not those of the whole image: no grid tells how to count them."""
+    if file.root.find(f"{_MODEL}/Sensor_Viewing_Model/Position_In_Retina") is not None:
+        column = file.number(f"{_MODEL}/Sensor_Viewing_Model/Position_In_Retina/FIRST_COL")
+        if column != 1:
+            raise InputError(
+                f"the image begins in column {column:g} of the line: from where its look angles count is not known",
+                file=file.path, field="Position_In_Retina", remedy="use the RPC",
+            )  # fmt: skip
+    if file.root.find(f"{_MODEL}/UTC_Sensor_Model_Range/END") is not None:
+        taken = file.time(f"{_MODEL}/UTC_Sensor_Model_Range/END") - first
+        if abs(taken - duration) > 0.01 * duration:
+            raise InputError(
+                f"the rows take {duration:.6g} s, from START to END there are {taken:.6g} s", file=file.path,
+                field="UTC_Sensor_Model_Range", remedy="use the RPC",
+            )  # fmt: skip
 
 
 def _quaternions(file: _File, seconds: Array) -> Array:
@@ -182,7 +201,7 @@ class _File:
     def integer(self, field: str) -> int:
         """Return the number of rows or columns in a field."""
         value = self.number(field)
-        if value != int(value) or not 0 < value <= _MOST_PIXELS:
+        if value != int(value) or not 0 < value <= MOST_PIXELS:
             raise InputError(f"{value} is no size of an image", file=self.path, field=field)
         return int(value)
 
