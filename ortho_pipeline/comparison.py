@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -160,6 +160,7 @@ def compare(
     size: tuple[int, int] | None = None,
     crs: str | None = None,
     heights: tuple[float, float] | None = None,
+    unsuited: Mapping[str, str] | None = None,
 ) -> Comparison:
     """Fit every model to the same control points and hold them against the same check points.
 
@@ -177,6 +178,8 @@ def compare(
         Ground CRS of the classical models: geocentric, geographic, utm or EPSG:n; that of the points by default.
     heights : (lo, hi), optional
         Heights (m) for which the models are meant.
+    unsuited : mapping of str to str, optional
+        Families that do not suit the scene, with a warning for each.
     """
     known = available_models(own)
     job = _Job(own, dict(priors or {}), size, crs, heights)
@@ -188,6 +191,8 @@ def compare(
         found = first[name]
         if blunders or not isinstance(found, Fit) or found.rejected:
             found = job.attempt(name, kept, robust=False)
+        if isinstance(found, Fit) and unsuited and name in unsuited:
+            found = replace(found, warnings=(*found.warnings, unsuited[name]))
         parameters, minimum, dimensions = known[name]
         rows.append(
             Row(name, parameters, minimum, dimensions, fit=found) if isinstance(found, Fit)

@@ -195,7 +195,7 @@ def _lonlat(model: SensorModel, image: Array, surface: Surface | None) -> Array:
 def write_gcps(dataset: gdal.Dataset, gcps: Gcps, path: str | PathLike[str]) -> None:
     """Write the image with control points in WGS 84: a ``.vrt`` that refers to it, or a GeoTIFF copy.
 
-    An RPC of the image is left out, so that no program can take it instead.
+    An RPC and a geotransform of the image are left out, so that no program can take them instead.
 
     Raises
     ------
@@ -205,12 +205,9 @@ def write_gcps(dataset: gdal.Dataset, gcps: Gcps, path: str | PathLike[str]) -> 
         If the file does not give the same points again.
     """
     path = Path(path)
-    view = gdal.GetDriverByName("VRT").CreateCopy("", dataset)
-    view.SetMetadata({}, "RPC")
-    view.SetGCPs(
-        [gdal.GCP(x, y, h, column, row, "", str(k + 1)) for k, (column, row, x, y, h) in enumerate(gcps.tolist())],
-        _wgs84().ExportToWkt(),
-    )
+    points = [gdal.GCP(x, y, h, column, row, "", str(k + 1)) for k, (column, row, x, y, h) in enumerate(gcps.tolist())]
+    view = _without_georeferencing(dataset)
+    view.SetGCPs(points, _wgs84().ExportToWkt())
     with files.whole_or_nothing(path) as temporary:
         with gdal_errors(path):
             if path.suffix.lower() == ".vrt":
@@ -224,8 +221,18 @@ def write_gcps(dataset: gdal.Dataset, gcps: Gcps, path: str | PathLike[str]) -> 
             written = gdal.OpenEx(os.fspath(temporary), gdal.OF_RASTER, allowed_drivers=["VRT", "GTiff"])
             again = np.array([[p.GCPPixel, p.GCPLine, p.GCPX, p.GCPY, p.GCPZ] for p in written.GetGCPs()])
         # A VRT keeps four decimals of pixels and twelve of degrees.
-        if again.shape != gcps.shape or np.abs(again - gcps).max() > 1e-4 or written.GetMetadata("RPC"):
+        other = written.GetMetadata("RPC") or written.GetGeoTransform(can_return_null=True)
+        if again.shape != gcps.shape or np.abs(again - gcps).max() > 1e-4 or other:
             raise ModelError("the control points that were written are others when they are read again", file=path)
+
+
+def _without_georeferencing(dataset: gdal.Dataset) -> gdal.Dataset:
+    """Return a view of an image without RPC, points and geotransform, which programs would prefer to ours."""
+    # A geotransform cannot be taken away again; points keep Translate from copying it.
+    view = gdal.Translate("", dataset, format="VRT", GCPs=[gdal.GCP()])
+    view.SetGCPs([], "")
+    view.SetMetadata({}, "RPC")
+    return view
 
 
 def _wgs84() -> osr.SpatialReference:
@@ -277,9 +284,7 @@ def write_geolocation(
         for k in (0, 1):
             raster.GetRasterBand(k + 1).WriteArray(np.ascontiguousarray(lonlat[:, :, k]))
         del raster
-    view = gdal.GetDriverByName("VRT").CreateCopy("", dataset)
-    view.SetGCPs([], "")
-    view.SetMetadata({}, "RPC")
+    view = _without_georeferencing(dataset)
     view.SetMetadata(
         {"X_DATASET": str(arrays), "X_BAND": "1", "Y_DATASET": str(arrays), "Y_BAND": "2", "PIXEL_OFFSET": "0",
          "LINE_OFFSET": "0", "PIXEL_STEP": str(step), "LINE_STEP": str(step), "SRS": _wgs84().ExportToWkt(),

@@ -81,7 +81,9 @@ def fit_family(
         ridge = "gcv" if chosen.regularised else None
     start = start_model(family, points, crs=crs, size=size, heights=heights)
     try:
-        return fit(start, points, priors=priors, robust=robust, ridge=ridge, name=family)
+        found = fit(start, points, priors=priors, robust=robust, ridge=ridge, name=family)
+        # The start is of no vendor's making: that it is off says nothing.
+        return replace(found, raw_residuals=np.full_like(found.raw_residuals, np.nan))
     except (DegeneratePoints, NotConverged) as error:
         simpler = _simpler(family, points, crs, size, heights)
         if simpler is None:

@@ -45,9 +45,14 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _FORMATS = "CSV/TSV (id,col,row,x,y,h,...), GeoJSON with 'ji', QGIS .points, ODM gcp_list.txt, ENVI .pts"
 
 
+#: Where another image lies in this one: column and row of its first corner, and the width of one of its pixels.
+Piece = tuple[float, float, float]
+OWN_IMAGE: Piece = (0.0, 0.0, 1.0)
+
+
 @dataclass
 class Row:
-    """One point as its file has it; None is what the file does not give."""
+    """One point as its file has it; None is what the file does not give. `piece` is where its image lies."""
 
     where: str
     id: str | None
@@ -58,6 +63,7 @@ class Row:
     sigma_xy: float | None = None
     sigma_h: float | None = None
     image_name: str | None = None
+    piece: Piece = OWN_IMAGE
 
 
 @dataclass
@@ -85,7 +91,7 @@ class Line(NamedTuple):
 def read_table(
     path: str | os.PathLike[str],
     image_name: str | None = None,
-    pieces: Mapping[str, tuple[float, float]] | None = None,
+    pieces: Mapping[str, Piece] | None = None,
 ) -> Table:
     """Read a point file; its format is known by its content, then by its suffix.
 
@@ -93,8 +99,9 @@ def read_table(
     ----------
     image_name : str, optional
         Keep the points of this image, where a file holds points of several.
-    pieces : mapping of str to (float, float), optional
-        Further images whose points are kept, with the column and row of their first corner in this image.
+    pieces : mapping of str to (float, float, float), optional
+        Further images whose points are kept: column and row of their first corner in this image, and the width of one
+        of their pixels.
 
     Raises
     ------
@@ -152,18 +159,16 @@ def _reader(
     raise InputError("the format of this point file is not known", file=path, remedy=f"give one of: {_FORMATS}")
 
 
-def _of_image(
-    path: str | os.PathLike[str], table: Table, image_name: str | None, pieces: Mapping[str, tuple[float, float]]
-) -> Table:
+def _of_image(path: str | os.PathLike[str], table: Table, image_name: str | None, pieces: Mapping[str, Piece]) -> Table:
     named = {row.image_name for row in table.rows if row.image_name}
     if image_name is None or not named:
         return table
     kept: list[Row] = []
-    for name, offset in {image_name: (0.0, 0.0), **pieces}.items():
+    for name, piece in {image_name: OWN_IMAGE, **pieces}.items():
         wanted, ids = Path(name).stem.lower(), {row.id for row in kept} - {None}
         # A point that was measured in several of the images counts once: where it was measured first, this image ahead.
         kept += [
-            replace(row, image=(row.image[0] + offset[0], row.image[1] + offset[1]))
+            replace(row, piece=piece)
             for row in table.rows
             if row.image_name and Path(row.image_name).stem.lower() == wanted and row.id not in ids
         ]

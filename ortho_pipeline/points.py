@@ -32,7 +32,7 @@ from ortho_pipeline.crs import (
 )
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.files import write_text
-from ortho_pipeline.point_files import CSV_COLUMNS, ROLES, Row, Table, read_table
+from ortho_pipeline.point_files import CSV_COLUMNS, ROLES, Piece, Row, Table, read_table
 
 Array = NDArray[np.float64]
 
@@ -162,7 +162,7 @@ def read_points(
     vertical: str | Vertical | None = None,
     pixel_origin: str = "corner",
     image_name: str | None = None,
-    pieces: Mapping[str, tuple[float, float]] | None = None,
+    pieces: Mapping[str, Piece] | None = None,
 ) -> Points:
     """Read points of any known format (see `ortho_pipeline.point_files`).
 
@@ -174,8 +174,9 @@ def read_points(
         Where (0, 0) is in the first pixel, for CSV and ODM files; the others have a convention of their own.
     image_name : str, optional
         Keep the points of this image, where a file holds points of several.
-    pieces : mapping of str to (float, float), optional
-        Further images whose points are kept, with the column and row of their first corner in this image.
+    pieces : mapping of str to (float, float, float), optional
+        Further images whose points are kept: column and row of their first corner in this image, and the width of one
+        of their pixels.
 
     Raises
     ------
@@ -189,6 +190,8 @@ def read_points(
     image = np.array([row.image for row in table.rows])
     if pixel_origin == "center" and table.centre_origin_allowed:
         image += 0.5
+    pieces_of = np.array([row.piece for row in table.rows])
+    image = image * pieces_of[:, 2:] + pieces_of[:, :2]
     ground, plane = ground_of(path, table, crs, vertical)
     _refuse_duplicates(path, [row.where for row in table.rows], image, ground, [row.role for row in table.rows])
     return Points(
@@ -196,7 +199,7 @@ def read_points(
         image=image,
         ground=ground,
         roles=np.array([row.role for row in table.rows], dtype="<U7"),
-        sigma_image=np.array([_or(row.sigma_image, DEFAULT_SIGMA_IMAGE) for row in table.rows]),
+        sigma_image=np.array([_or(row.sigma_image, DEFAULT_SIGMA_IMAGE) * row.piece[2] for row in table.rows]),
         sigma_ground=np.array([[_or(row.sigma_xy, 0.0)] * 2 + [_or(row.sigma_h, 0.0)] for row in table.rows]),
         crs=plane,
         source=os.fspath(path),

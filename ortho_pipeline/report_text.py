@@ -27,6 +27,11 @@ def headline(report: Mapping[str, Any]) -> dict[str, Any]:
         notes = ["The model is used as it was delivered. Vendors' models are commonly off by 5 to 25 m."]
         return {"figure": "Not tested", "metres": None, "what": "there were no ground control points", "notes": notes}
     notes = []
+    if lost := len(adjustment["rejected"]):
+        notes.append(
+            f"{count(lost, 'control point')} left out and not counted: good points that are left out are a sign of a "
+            "model that does not suit the scene."
+        )
     if control and parameters:
         fitted = f"{px(control['total'])} RMSE at {count(control['n'], 'control point')}"
         notes.append(

@@ -267,6 +267,18 @@ def test_every_format_from_the_command_line(tiny, tmp_path):
     assert document["exact"] is True
 
 
+@pytest.mark.parametrize("name", ["gcp", "gcp-tag", "geolocation"])
+def test_what_stands_for_the_model_is_not_beside_a_geotransform(tiny, tmp_path, name):
+    # A product on a plane looks like a map: gdalwarp would take its geotransform, and so would a GeoTIFF.
+    gdal.Open(str(tiny.image), gdal.GA_Update).SetGeoTransform((500000.0, 1.0, 0.0, 6000000.0, 0.0, -1.0))
+    surface = SurfaceOptions(height=500.0)
+    path = pipeline.export(tiny.image, tmp_path / "out", formats=[name], surface=surface).files[name]
+    dataset = gdal.Open(str(path))
+    assert dataset.GetGeoTransform(can_return_null=True) is None
+    assert bool(dataset.GetGCPs()) == (name != "geolocation")
+    np.testing.assert_array_equal(dataset.ReadAsArray(), gdal.Open(str(tiny.image)).ReadAsArray())
+
+
 def test_an_unknown_format_is_refused(tiny, tmp_path):
     with pytest.raises(InputError, match="no format is called shp") as caught:
         pipeline.export(tiny.image, tmp_path / "out", formats=["rpb", "shp"])

@@ -25,7 +25,7 @@ from ortho_pipeline.model_file import load_model
 from ortho_pipeline.models import ImageCorrection, MapPlane, Pieces
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.plugins import Host
-from ortho_pipeline.rpc import export_rpc, read_rpc, write_rpc_txt
+from ortho_pipeline.rpc import export_rpc, read_rpc, write_rpb, write_rpc_txt
 from ortho_pipeline.testing import check_sensor, check_sensor_model
 
 UTM = "EPSG:32639"
@@ -468,9 +468,15 @@ def test_nitf_and_other_cases_of_letters(tmp_path):
 def test_what_contradicts_is_said(tmp_path):
     folder = tmp_path / "order"
     image = write_order(folder, rpc=True, text=metadata_text(component_text("0000000", (535003.0, 3957000.0))))
-    found = " ".join(open_order(image).warnings)
-    assert "georeferencing of the image is 3.00 px off" in found
-    assert "RPC and metadata differ by 3.0 px" in found
+    with pytest.raises(InputError, match=r"RPC and metadata differ by 3\.0 px") as caught:
+        open_order(image)
+    assert caught.value.file.endswith("po_39001_pan_0000000_rpc.txt")
+    assert "geometry=geo" in caught.value.remedy
+    for choice in ({"rpc": "sidecar"}, {"geometry": "rpc"}, {"geometry": "geo"}):
+        found = " ".join(open_order(image, **choice).warnings)
+        assert "georeferencing of the image is 3.00 px off" in found
+        assert "RPC and metadata differ by 3.0 px" in found
+    image.with_name(f"{image.stem}_rpc.txt").unlink()
     (folder / "po_39001_metadata.txt").write_text(metadata_text().replace("Product Line: Geo", "Product Line: Pro"))
     assert any("corrected twice" in text for text in open_order(image).warnings)
     (folder / "po_39001_metadata.txt").write_text(metadata_text().replace("Zone Number: 39", "Zone Number: 38"))
@@ -505,6 +511,43 @@ def test_wrong_options_and_crops_are_refused(tmp_path):
     assert open_order(write_order(tmp_path / "order"), heights="1000,2500").model.height_range == (1000.0, 2500.0)
 
 
+def test_side_cars_of_another_image_are_refused_whatever_reads_them(tmp_path):
+    # GDAL attaches any .RPB, and takes it before the vendor's own text.
+    image = write_order(tmp_path / "order", rpc=True)
+    far = plane(corner=(CORNER[0], CORNER[1] - 400000.0))
+    write_rpb(export_rpc(far).rpc, image.with_suffix(".RPB"))
+    with pytest.raises(InputError, match="differ by") as caught:
+        open_order(image)
+    assert caught.value.file.endswith(".RPB")
+    assert next(iter(open_order(image, geometry="geo").models)) == "geo"
+
+
+@pytest.mark.parametrize("part", [2, 4])
+def test_a_crop_to_a_part_is_not_taken_for_coarser_pixels(tmp_path, part):
+    image = write_order(tmp_path / "order")
+    red = image.with_name("po_39001_red_0000000.tif")
+    columns, rows = SIZE[0] // part, SIZE[1] // part
+    refused = f"the image has {columns} x {rows} pixels"
+    image.unlink()  # GDAL would delete the metadata with an image that it overwrites
+    for path in (image, red):
+        write_image(path, ramps()[:1, :rows, :columns])
+        with pytest.raises(InputError, match=refused):
+            open_order(path)
+        path.unlink()
+        # Resampled, and it says so.
+        write_image(path, ramps()[:1, ::part, ::part], pixel=float(part))
+        assert open_order(path).model.pixel == (float(part), float(part))
+        path.unlink()
+        # Where nothing says so, only colours are coarser, by 4.
+        gdal.GetDriverByName("GTiff").Create(str(path), columns, rows, 1).FlushCache()
+        if path == red and part == 4:
+            assert open_order(path).model.pixel == (4.0, 4.0)
+        else:
+            with pytest.raises(InputError, match=refused):
+                open_order(path)
+        path.unlink()
+
+
 def test_the_header_of_an_image_comes_before_the_metadata(tmp_path):
     image = write_order(tmp_path / "order")
     header = image.with_name("po_39001_pan_0000000_hdr.txt")
@@ -535,7 +578,7 @@ def test_colour_images_share_the_outer_corner_of_the_panchromatic_one(tmp_path):
     assert scene.model.pixel == (4.0, 4.0)
     assert scene.model.corner == CORNER
     assert not scene.warnings
-    assert {piece.path.name[9:12] for piece in scene.pieces} == {"blu", "grn", "nir"}
+    assert {piece.path.name[9:12] for piece in scene.pieces} == {"blu", "grn", "nir", "pan"}
 
 
 def test_bands_are_stacked_and_each_is_as_by_itself(tmp_path):
@@ -644,6 +687,45 @@ def test_a_point_of_several_bands_counts_once(tmp_path):
     assert sorted(fitted.points.ids) == ["g0", "g1", "g2"]
     # The image that is adjusted comes first.
     np.testing.assert_array_equal(fitted.points.image[fitted.points.ids.index("g1")], [80.2, 15.2])
+
+
+@pytest.mark.parametrize("origin", ["corner", "center"])
+def test_points_in_the_panchromatic_image_adjust_the_colour_bands(tmp_path, origin):
+    # Nobody measures in 4 m pixels what can be seen in those of 1 m.
+    bands, rng = write_bands(tmp_path / "order"), np.random.default_rng(3)
+    at = rng.uniform(20, 280, (8, 2))
+    ground = plane().image_to_ground(at, rng.uniform(*HEIGHTS, 8))
+    at += (6.0, -4.0) - np.array(0.5 if origin == "center" else 0.0)
+    rows = [f"g{k},{','.join(map(str, (*at[k], *ground[k])))},po_39001_pan_0000000.tif,0.5" for k in range(8)]
+    path = tmp_path / "gcps.csv"
+    path.write_text(f"#CRS: {UTM}\n#vertical: ellipsoid\nid,col,row,x,y,h,image,sigma_image\n" + "\n".join(rows) + "\n")
+    options = PointOptions(gcps=path, correction="shift", pixel_origin=origin)
+    found = pipeline.fit(bands["red"], options).fit
+    np.testing.assert_allclose(found.model.params, [1.5, -1.0], atol=1e-6)
+    np.testing.assert_allclose(found.points.sigma_image, 0.125)
+    # Coarser by as much, and the same in metres, the other way round.
+    path.write_text(path.read_text().replace("pan_0000000", "red_0000000"))
+    found = pipeline.fit(tmp_path / "order" / "po_39001_pan_0000000.tif", options).fit
+    np.testing.assert_allclose(found.points.sigma_image, 2.0)
+
+
+def test_sharpened_colours_have_pixels_of_their_own(tmp_path):
+    bands = write_bands(tmp_path / "order")
+    sharp = write_image(tmp_path / "order" / "po_39001_rgb_0000000.tif", ramps())
+    assert {piece.path.name[9:12]: piece.scale for piece in open_order(sharp).pieces} == {
+        "pan": 1.0, "blu": 4.0, "grn": 4.0, "red": 4.0, "nir": 4.0,
+    }  # fmt: skip
+    assert {piece.path.name[9:12]: piece.scale for piece in open_order(bands["red"]).pieces} == {
+        "pan": 0.25, "rgb": 0.25, "blu": 1.0, "grn": 1.0, "nir": 1.0,
+    }  # fmt: skip
+
+
+def test_a_neighbour_that_is_broken_is_no_obstacle(tmp_path):
+    bands = write_bands(tmp_path / "order")
+    (tmp_path / "order" / "po_39001_pan_0000000.tif").write_bytes(b"cut off")
+    scene = open_order(bands["red"])
+    assert {piece.path.name[9:12] for piece in scene.pieces} == {"blu", "grn", "nir"}
+    assert "points in po_39001_pan_0000000.tif are not taken over" in scene.warnings[0]
 
 
 # -- what GDAL makes of it -------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import ClassVar, Self
 
 import numpy as np
@@ -292,6 +292,7 @@ class Believed(SensorModel):
         return self.scanner.project(ground)
 
 
+@lru_cache(maxsize=16)
 def aim(view: str, *, size: int = SIZE) -> Scanner:
     """Return the camera of a view ('fore' or 'aft'), aimed at the middle of the scene; its columns do not drift there.
 
@@ -328,6 +329,7 @@ def _level(height: float) -> Callable[[Array, Array], Array]:
     return lambda lon, lat: np.full(len(lon), height)
 
 
+@lru_cache(maxsize=16)
 def biased(camera: Scanner, bias: Bias) -> Scanner:
     """Return the camera as the vendor believes it to be: attitude and its rates off, so that `bias` comes out.
 
@@ -420,7 +422,8 @@ class StereoPair:
                 (jitter * PITCH / FOCAL_LENGTH / np.sqrt(2.0), float(frequency), float(phase))
                 for frequency, phase in zip((1.7, 2.9), random.uniform(0, 2 * np.pi, 2), strict=True)
             )
-            cameras[view] = replace(camera, attitude=replace(camera.attitude, jitter=swings if jitter else ()))
+            # Without jitter it is the same camera every time, and what the vendor believes has been found before.
+            cameras[view] = replace(camera, attitude=replace(camera.attitude, jitter=swings)) if jitter else camera
         ground = cameras["fore"].meet(_spread(round(CELLS * points), random) * size, hills)
         lowest = np.sort(np.argsort(ground[:, 2])[:points])
         return cls(cameras, ground[lowest], hills)

@@ -90,6 +90,14 @@ def open_scene(
         models["geo"] = _plane(dataset, position, source, _heights(heights, position, vendor and vendor[0]))
     first = _first(geometry, models, lacking, delivery.file, component)
     models = {first: models[first], **models}
+    pieces, broken = _pieces(image, delivery, component, position, first == "rpc") if image else ((), [])
+    contradiction = _disagreement(models)
+    if contradiction and vendor is not None and rpc is None and geometry is None:
+        raise InputError(
+            contradiction[0], file=vendor[1], field="rpc",
+            remedy="choose one: the RPC with --rpc tag, --rpc sidecar or --rpc FILE, or the metadata with "
+            "--sensor-option geometry=geo",
+        )  # fmt: skip
     return Scene(
         sensor="ikonos",
         path=path,
@@ -98,10 +106,10 @@ def open_scene(
         models=models,
         model_source=vendor[1] if vendor and first == "rpc" else delivery.file,
         facts=_facts(image, delivery, component, source, position, models, lacking),
-        warnings=(*_level_warnings(delivery), *delivery.notes, *position.warnings, *_disagreement(models)),
+        warnings=(*_level_warnings(delivery), *delivery.notes, *position.warnings, *broken, *contradiction),
         priors=_priors(models[first]),
         rasters=bands_of(image, bands) if image else (),
-        pieces=_pieces(image, delivery, component, position, with_models=first == "rpc") if image else (),
+        pieces=pieces,
         sources=position.sources,
     )
 
@@ -174,24 +182,32 @@ def _priors(model: SensorModel) -> dict[str, Prior]:
 
 
 def _pieces(
-    image: ImageFile, delivery: Delivery, component: Component, position: Position, *, with_models: bool
-) -> tuple[Piece, ...]:
-    """Return the other files of the acquisition whose pixels are those of this image, moved by whole pixels."""
-    found = []
-    for other in image.others():
+    image: ImageFile, delivery: Delivery, component: Component, position: Position, with_models: bool
+) -> tuple[tuple[Piece, ...], list[str]]:
+    """Return the other files of the acquisition, of the same plane and maybe other pixels, and what is wrong."""
+    found: list[Piece] = []
+    warnings: list[str] = []
+    others = list(image.others())
+    # Only images with pixels of this size bring models: a component without one cannot be predicted.
+    alike = {other.component for other in others if other.grid == image.grid} | {image.component}
+    for other in others:
         known = [one for one in delivery.components if one.component == other.component]
-        if len(known) != 1 or known[0].product_image != component.product_image:
+        if len(known) != 1 or known[0].product_image != component.product_image or other.component not in alike:
             continue
-        if other.component == component.component:
+        if other.component == image.component and other.grid == image.grid:
             found.append(Piece(other.path))
             continue
-        opened = open_dataset(other.path)
-        offset = position.offset_of(position_of(opened, delivery, known[0]))
-        if offset is None:
+        try:
+            opened = open_dataset(other.path)
+            place = position.place_of(position_of(opened, delivery, known[0]))
+            vendor = _rpc(opened, None) if with_models and other.grid == image.grid else None
+        except InputError as error:
+            warnings.append(f"points in {other.path.name} are not taken over: {error.message}")
             continue
-        vendor = _rpc(opened, None) if with_models else None
-        found.append(Piece(other.path, offset, (opened.RasterXSize, opened.RasterYSize), vendor[0] if vendor else None))
-    return tuple(found)
+        if place is not None:
+            size = opened.RasterXSize, opened.RasterYSize
+            found.append(Piece(other.path, place[:2], size, vendor[0] if vendor else None, place[2]))
+    return tuple(found), warnings
 
 
 # -- what to say -----------------------------------------------------------------------------------------------------

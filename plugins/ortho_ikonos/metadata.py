@@ -186,10 +186,13 @@ class Delivery:
         found = [one for one in self.components if name is None or one.component == name]
         if len(found) != 1:
             known = ", ".join(one.component for one in self.components[:10])
+            problem = "no component" if not found else "more than one component"
             raise InputError(
-                f"{'no' if not found else 'more than one'} component is called {name} (there are {known or 'none'})",
+                f"{problem} is called {name} (there are {known or 'none'})" if name is not None
+                else f"the name of the image does not say which component it is (there are {known or 'none'})",
                 file=self.file, field=f"{COMPONENTS}: Component ID",
-                remedy="give the metadata file that belongs to this image",
+                remedy="give the metadata file that belongs to this image" if name is not None
+                else "name the image po_<order>_<band>_<component of 7 digits>.tif",
             )  # fmt: skip
         return found[0]
 

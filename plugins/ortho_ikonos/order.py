@@ -20,6 +20,8 @@ _NAME = re.compile(
 )
 #: Bands that have a file of their own, in the vendor's order of a file of several.
 SEPARATE = ("blu", "grn", "red", "nir")
+#: How many panchromatic pixels one of colours is wide.
+COARSER = 4
 #: Georeferencing and metadata that differ by more than this (pixels) are not the same.
 _SAME = 0.05
 
@@ -45,17 +47,15 @@ class ImageFile:
         return beside(self.path, f"{self.order}_metadata.txt")
 
     @property
-    def panchromatic(self) -> bool:
-        """Whether it has the pixels of the panchromatic camera: alone, or sharpened bands with them."""
-        return self.band == "pan"
+    def grid(self) -> str:
+        """What images with the same pixels have in common: separate colours; files of several may be sharpened."""
+        return "colour" if self.band in SEPARATE else self.band
 
     def others(self) -> Iterator[ImageFile]:
-        """Yield the other images of the order whose pixels are as large, by name."""
+        """Yield the other images of the order, by name."""
         for path in sorted(self.path.parent.iterdir()):
             other = ImageFile.of(path)
-            if other is None or other.path.name == self.path.name or other.order.lower() != self.order.lower():
-                continue
-            if other.panchromatic == self.panchromatic:
+            if other is not None and path.name != self.path.name and other.order.lower() == self.order.lower():
                 yield other
 
 
@@ -84,7 +84,8 @@ def bands_of(image: ImageFile, wanted: str) -> tuple[Path, ...]:
     if wanted == "one":
         return ()
     there = {image.band: image.path}
-    there |= {other.band: other.path for other in image.others() if other.component == image.component}
+    same = [other for other in image.others() if other.component == image.component]
+    there |= {other.band: other.path for other in same if other.grid == image.grid}
     names = [name.strip().lower() for name in wanted.split(",")]
     if wanted == "all":
         names = [name for name in SEPARATE if name in there]
@@ -116,15 +117,16 @@ class Position:
     warnings: tuple[str, ...] = ()
     sources: tuple[Path, ...] = ()
 
-    def offset_of(self, other: Position) -> tuple[float, float] | None:
-        """Return the position of the first corner of another image in the pixels of this; None where unknown."""
+    def place_of(self, other: Position) -> tuple[float, float, float] | None:
+        """Return column and row of the first corner of another image in this, and its pixels' width; None: unknown."""
         if self.corner is None or self.pixel is None or other.corner is None or other.pixel is None:
             return None
-        if not all(math.isclose(a, b, rel_tol=1e-9) for a, b in zip(self.pixel, other.pixel, strict=True)):
+        wide, tall = (theirs / own for theirs, own in zip(other.pixel, self.pixel, strict=True))
+        if not math.isclose(wide, tall, rel_tol=1e-9):
             return None
         column = (other.corner[0] - self.corner[0]) / self.pixel[0]
         row = (self.corner[1] - other.corner[1]) / self.pixel[1]
-        return round(column, 6), round(row, 6)
+        return round(column, 6), round(row, 6), round(wide, 9)
 
 
 def position_of(dataset: gdal.Dataset, delivery: Delivery, component: Component) -> Position:
@@ -142,10 +144,10 @@ def position_of(dataset: gdal.Dataset, delivery: Delivery, component: Component)
         stated, sources = read_header(header).completed_by(stated), (*sources, header)
     if len(delivery.components) == 1:
         stated = stated.completed_by(delivery.product)
-    factor = _factor(stated, size, path)
+    crs, own = delivery.crs, _georeferencing(dataset)
+    factor = _factor(stated, size, path, own and own[2])
     stated = stated.completed_by(delivery.product)
     corner, pixel = _corner(stated), stated.pixel and (factor * stated.pixel[0], factor * stated.pixel[1])
-    crs, own = delivery.crs, _georeferencing(dataset)
     warnings = []
     if own is not None:
         own_crs, own_corner, own_pixel = own
@@ -163,15 +165,25 @@ def position_of(dataset: gdal.Dataset, delivery: Delivery, component: Component)
     return Position(crs, corner, pixel, stated.reference_height, tuple(warnings), sources)
 
 
-def _factor(stated: Placement, size: tuple[int, int], path: Path) -> int:
+def _factor(stated: Placement, size: tuple[int, int], path: Path, own_pixel: tuple[float, float] | None) -> int:
     """Return how many stated pixels are one pixel of the image: 4 for colours beside panchromatic metadata.
 
-    Colour and panchromatic images of one acquisition share their outer corner.
+    Colour and panchromatic images of one acquisition share their outer corner. A crop to a half, or to a quarter, has
+    such a size as well: its own pixels tell, and where it has none, only colours can be coarser.
     """
     if stated.size is None or stated.size == size:
         return 1
     factor = round(stated.size[0] / size[0])
-    if factor < 2 or any(abs(whole - factor * part) >= factor for whole, part in zip(stated.size, size, strict=True)):
+    fits = factor > 1 and all(
+        abs(whole - factor * part) < factor for whole, part in zip(stated.size, size, strict=True)
+    )
+    if own_pixel is not None and stated.pixel is not None:
+        fits &= all(math.isclose(own, factor * one, rel_tol=1e-3)
+                    for own, one in zip(own_pixel, stated.pixel, strict=True))  # fmt: skip
+    else:
+        image = ImageFile.of(path)
+        fits &= factor == COARSER and not (image is not None and image.grid == "pan")
+    if not fits:
         raise InputError(
             f"the image has {size[0]} x {size[1]} pixels, the metadata are of {stated.size[0]} x {stated.size[1]}",
             file=path, field="Columns, Rows", remedy="give the whole image as delivered, and its own metadata",

@@ -21,9 +21,10 @@ _KINDS = {"p": "panchromatic", "m": "multispectral"}
 BANDS = ("blue", "green", "red", "nir")
 #: Families that can be fitted to points in place of the RPC, best first.
 FAMILIES = ("affine14", "affine12", "affine3d", "dlt")
-UNSUITED = (
-    "an original scene, not projected to a plane: of the families that --fit-model offers only affine14 comes near "
-    "the RPC; affine12, affine3d and dlt leave several metres"
+UNSUITED = dict.fromkeys(
+    FAMILIES[1:],
+    "this is an original scene, not projected to a plane: affine12, affine3d and dlt leave several metres; of the "
+    "families only affine14 comes near the RPC",
 )
 #: Ground speed (m/s) below a circular orbit at 470 km, and the most panchromatic lines per second (staggered).
 GROUND_SPEED, LINES_PER_SECOND = 7100.0, {"panchromatic": 5000.0, "multispectral": 1250.0}
@@ -86,7 +87,8 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None, label: str | No
         models={"rpc": model},
         model_source=source,
         facts=_facts(product, model, name, dataset.RasterCount),
-        warnings=(*warnings, *_contradictions(product), UNSUITED),
+        warnings=(*warnings, *_contradictions(product)),
+        unsuited=UNSUITED,
     )
 
 

@@ -92,8 +92,9 @@ def rpc_text_of(image: str | PathLike[str]) -> Path | None:
 
 def _beside(image: Path, end: str) -> Path | None:
     wanted = f"{image.stem}{end}".lower()
-    exact = image.with_name(f"{image.stem}{end}")
     try:
+        # A dataset in memory has no name.
+        exact = image.with_name(f"{image.stem}{end}")
         if exact.is_file():
             return exact
         # Archives that went through other systems come in capitals.
