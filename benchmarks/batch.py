@@ -1,10 +1,11 @@
 """How long many small scenes take: a plain loop, `ortho run` in one process, in two, and on two dask workers.
 
-    python benchmarks/batch.py [--scenes 200] [--repeat 3] [--json FILE]
+    python benchmarks/batch.py [--scenes 200] [--repeat 3] [--quiet SECONDS] [--json FILE]
 
 The scenes are windows of sample_data/scene.tif with the RPC moved along, so that each is a scene of its own. Every way
 starts with an empty output folder; the time is that of the whole call, the start of the processes included. A run that
-is killed half-way and started again has to end with the same bytes.
+is killed half-way and started again has to end with the same bytes. With --quiet each run waits up to that long for
+processors that nobody else uses; what others used meanwhile is in the JSON, as a share of the machine.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import dataclasses
 import hashlib
 import json
 import os
-import resource
 import shutil
 import statistics
 import subprocess
@@ -33,6 +33,7 @@ from ortho_pipeline.rpc import rpc_metadata, rpc_of_dataset
 
 SAMPLE = Path(__file__).resolve().parent.parent / "sample_data"
 SIDE = 400
+PROCESSORS, TICKS = len(os.sched_getaffinity(0)), os.sysconf("SC_CLK_TCK")
 FILE = """
 defaults:
   surface: {dem: dem.tif}
@@ -74,17 +75,44 @@ def run(folder: Path, **options: Any) -> None:
 
 
 def timed(folder: Path, work: Callable[[Path], None]) -> dict[str, float]:
-    """Return wall and CPU seconds of a call that begins with an empty output folder."""
+    """Return wall and CPU seconds of a call that begins with an empty output folder, and the share of others."""
     shutil.rmtree(folder / "out", ignore_errors=True)
-    wall, cpu = time.perf_counter(), cpu_seconds()
+    wall, cpu, busy = time.perf_counter(), cpu_seconds(), busy_seconds()
     work(folder)
-    return {"wall": time.perf_counter() - wall, "cpu": cpu_seconds() - cpu}
+    wall, cpu, busy = time.perf_counter() - wall, cpu_seconds() - cpu, busy_seconds() - busy
+    return {"wall": wall, "cpu": cpu, "others": max(0.0, busy - cpu) / (wall * PROCESSORS)}
 
 
 def cpu_seconds() -> float:
-    """Return the CPU seconds of this process and of those of its children that have ended."""
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(one.ru_utime + one.ru_stime for one in used)
+    """Return the CPU seconds of this process and of all below it, those that have ended included."""
+    used, parents = {}, {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        parents[int(path.parent.name)] = int(fields[1])
+        used[int(path.parent.name)] = sum(map(int, fields[11:15]))
+    mine = {os.getpid()}
+    while more := {pid for pid, parent in parents.items() if parent in mine} - mine:
+        mine |= more
+    return sum(used[pid] for pid in mine) / TICKS
+
+
+def busy_seconds() -> float:
+    """Return the CPU seconds of the machine."""
+    user, nice, system, _, _, irq, softirq, steal = map(int, Path("/proc/stat").read_text().split()[1:9])
+    return (user + nice + system + irq + softirq + steal) / TICKS
+
+
+def wait_for_quiet(limit: float) -> None:
+    """Wait until the processors have been idle for two seconds, at most `limit` seconds."""
+    end = time.monotonic() + limit
+    while time.monotonic() < end:
+        before = busy_seconds()
+        time.sleep(2)
+        if busy_seconds() - before < 0.1 * 2 * PROCESSORS:
+            return
 
 
 def digest(folder: Path) -> str:
@@ -110,7 +138,7 @@ def killed_and_resumed(folder: Path, scenes: int) -> dict[str, Any]:
     return {"kept": result.count("unchanged"), "made": result.count("done"), "same_bytes": digest(folder) == whole}
 
 
-def measure(folder: Path, few: Path, scenes: int, repeat: int) -> dict[str, Any]:
+def measure(folder: Path, few: Path, scenes: int, repeat: int, quiet: float) -> dict[str, Any]:
     """Measure all ways in turn, `repeat` times, after one with `few` scenes each."""
     from distributed import LocalCluster
 
@@ -127,7 +155,9 @@ def measure(folder: Path, few: Path, scenes: int, repeat: int) -> dict[str, Any]
         runs: dict[str, list[dict[str, float]]] = {name: [] for name in ways}
         for _ in range(repeat):
             for name, work in ways.items():
+                wait_for_quiet(quiet)
                 runs[name].append(timed(folder, work))
+                print(name, {key: round(value, 2) for key, value in runs[name][-1].items()}, flush=True)
     begin = time.perf_counter()
     run(folder, executor="sequential")
     again = time.perf_counter() - begin
@@ -136,7 +166,7 @@ def measure(folder: Path, few: Path, scenes: int, repeat: int) -> dict[str, Any]
     return {
         "scenes": scenes,
         "side": SIDE,
-        "processors": len(os.sched_getaffinity(0)),
+        "processors": PROCESSORS,
         "seconds": wall,
         "runs": runs,
         "processes_speedup": statistics.median(s["wall"] / p["wall"] for s, p, _, _ in pairs),
@@ -152,13 +182,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=200)
     parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--quiet", type=float, default=0.0)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder, few = Path(name) / "all", Path(name) / "few"
         make_scenes(folder, given.scenes)
         make_scenes(few, 4)
-        found = measure(folder, few, given.scenes, given.repeat)
+        found = measure(folder, few, given.scenes, given.repeat, given.quiet)
         found["killed_and_resumed"] = killed_and_resumed(folder, given.scenes)
     if given.json:
         given.json.write_text(json.dumps(found, indent=1) + "\n")

@@ -26,6 +26,7 @@ from ortho_pipeline.estimation import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING
 from ortho_pipeline.ground_frame import GEODETIC
 from ortho_pipeline.intersection import frame_of, meet, models_of, predict, sigmas_of
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.notebook import block_html
 from ortho_pipeline.point_files import ROLES
 from ortho_pipeline.problem import CONDITION_LIMIT, Prior
 from ortho_pipeline.report_text import count
@@ -45,8 +46,8 @@ class BlockFit:
     at the known ground (NaN for ties), `raw_residuals` the same with the models as they were. `object_residuals`
     ``(N, 3)`` are known minus adjusted ground in metres east, north, up. `ground` is lon, lat, h (EPSG:4979), NaN where
     the rays do not determine it; `ground_covariance` ``(N, 3, 3)`` m², east, north, up. `parameters` are (image, name)
-    in the order of `covariance` ``(P, P)``. Covariances are scaled by sigma0² where there is redundancy, else `sigma0`
-    is None.
+    in the order of `covariance` ``(P, P)``. Where there is redundancy (else `sigma0` is None), sigmas are scaled by
+    sigma0, but for those that hold the datum or are fictitious.
     """
 
     models: dict[str, SensorModel]
@@ -70,6 +71,18 @@ class BlockFit:
     warnings: tuple[str, ...] = ()
     condition: float = 1.0
     iterations: int = 0
+
+    def __repr__(self) -> str:
+        found = self.object_rms()
+        checks = (
+            f"; RMSE {found['plan']:.2f} m, height {found['h']:.2f} m at {found['n']} check points" if found else ""
+        )
+        sigma0 = "unknown" if self.sigma0 is None else f"{self.sigma0:.3g}"
+        size = f"{count(len(self.models), 'image')}, {count(len(self.points), 'point')}"
+        return f"<block of {size}: sigma0 {sigma0}{checks}>"
+
+    def _repr_html_(self) -> str:
+        return block_html(self.to_json())
 
     @property
     def values(self) -> Array:
@@ -468,7 +481,7 @@ def _result(
         start=dict(zip(points.images, start, strict=True)),
         points=points,
         ground=ground,
-        ground_covariance=problem.ground_cofactors(solved) * factor,
+        ground_covariance=problem.ground_covariance(solved, factor),
         residuals=points.measured - predict(problem.frame, state.models, points, local),
         back_projected=_at(problem, state.models, known),
         raw_residuals=_at(problem, start, known),
@@ -480,7 +493,7 @@ def _result(
             for image, model in zip(points.images, state.models, strict=True)
             for name in model.param_names
         ),
-        covariance=solved.cofactors * factor,
+        covariance=problem.covariance(solved, factor),
         redundancy=math.floor(freedom + 1e-6),
         degrees_of_freedom=freedom,
         sigma0=sigma0,

@@ -28,7 +28,9 @@ from ortho_pipeline.problem import CONDITION_LIMIT
 _SCALE_FLOOR = 1e-3
 #: Directions in which a part has less than this share of redundancy cannot be tested in it.
 _TESTABLE = 0.01
-_ROBUST_ROUNDS, _TEST_ROUNDS = 12, 8
+_ROBUST_ROUNDS, _TEST_ROUNDS = 6, 8
+#: Robust weights that change less than this on average decide no more about who is a suspect.
+_SETTLED = 0.02
 _HUBER, _REDESCENDING, _SUSPECT = 2.0, 3.0, 4.0
 #: Median and 95th percentile of chi squared of 1, 2 and 3 degrees of freedom.
 _MEDIANS = np.array([np.nan, 0.4549, 1.3863, 2.3660])
@@ -67,11 +69,20 @@ class Tests:
 
     def scale(self) -> float:
         """Return the robust standard error of unit weight."""
-        ratio = np.concatenate([
-            (self.rays / _MEDIANS[self.ray_rank])[self.ray_rank > 0],
-            (self.ground / _MEDIANS[self.ground_rank])[self.ground_rank > 0],
-        ])  # fmt: skip
-        return max(math.sqrt(float(np.median(ratio))) if len(ratio) else 1.0, _SCALE_FLOOR)
+        ground = (self.ground / _MEDIANS[self.ground_rank])[self.ground_rank > 0]
+        return _root_median(np.concatenate([self._of_rays(), ground]))
+
+    def scale_of_rays(self) -> float:
+        """Return that of the rays alone."""
+        return _root_median(self._of_rays())
+
+    def _of_rays(self) -> Array:
+        ratio: Array = (self.rays / _MEDIANS[self.ray_rank])[self.ray_rank > 0]
+        return ratio
+
+
+def _root_median(ratio: Array) -> float:
+    return max(math.sqrt(float(np.median(ratio))) if len(ratio) else 1.0, _SCALE_FLOOR)
 
 
 def tests_of(problem: BlockProblem, solved: Solved) -> Tests:
@@ -138,21 +149,23 @@ def find_blunders(problem: BlockProblem, solved: Solved, selection: Selection) -
         If more than 30 % of the control points, or of the others, would have to go.
     """
     tests = tests_of(problem, solved)
-    if not _suspects(problem, tests).any() and not _significant(problem, solved, tests).any():
+    significant = _significant(problem, solved, tests)
+    if not significant.any() and not _suspects(problem, tests).any():
         return Found(selection)
-    robust = _robust(problem, solved, selection)
+    problem, robust = _robust(problem, solved, selection, tests)
     suspects = _suspects(problem, tests_of(problem, robust))
+    trusted = _trusted(problem, robust, selection, suspects)
+    if trusted is None:
+        # Weights of few points fall at random, and may leave too few: then only what all others contradict is doubted.
+        suspects = significant
+        trusted = _trusted(problem, solved, selection, suspects)
     kept, rejected = selection, dict[int, Rejected]()
     for _ in range(_TEST_ROUNDS):
-        of_others = ~suspects[problem.points.point]
-        others = Selection.of(selection.rays & of_others, selection.ground & ~suspects)
-        if selection.ground.any() and not (problem.active(others) & others.ground).any():
-            # Without any control the rest has no datum to judge them by.
-            _refuse_many(problem, selection, np.flatnonzero(suspects).tolist())
-        trusted = problem.solve(robust.state, others)
-        if not trusted.condition <= CONDITION_LIMIT:
-            names = [problem.points.ids[i] for i in np.flatnonzero(suspects)]
-            return Found(kept, tuple(rejected.values()), tuple(names))
+        if trusted is None:
+            doubted = np.flatnonzero(suspects).tolist()
+            if suspects[problem.active(selection) & selection.ground].all():
+                _refuse_many(problem, selection, doubted)
+            return Found(kept, tuple(rejected.values()), tuple(problem.points.ids[i] for i in doubted))
         kept, rejected = _judged(problem, trusted, selection, suspects)
         _refuse_many(problem, selection, list(rejected))
         solved = problem.solve(trusted.state, kept)
@@ -160,26 +173,49 @@ def find_blunders(problem: BlockProblem, solved: Solved, selection: Selection) -
         if (more == suspects).all():
             break
         suspects = more
+        trusted = _trusted(problem, trusted, selection, suspects)
     return Found(kept, tuple(rejected[number] for number in sorted(rejected)))
 
 
-def _robust(problem: BlockProblem, solved: Solved, selection: Selection) -> Solved:
-    """Return a solution that gross errors have little part in."""
+def _trusted(problem: BlockProblem, start: Solved, selection: Selection, suspects: Mask) -> Solved | None:
+    """Return the solution without the suspects; None if that leaves no control to judge them by, or is undetermined."""
+    of_others = ~suspects[problem.points.point]
+    others = Selection.of(selection.rays & of_others, selection.ground & ~suspects)
+    if selection.ground.any() and not (problem.active(others) & others.ground).any():
+        return None
+    trusted = problem.solve(start.state, others)
+    return trusted if trusted.condition <= CONDITION_LIMIT else None
+
+
+def _robust(problem: BlockProblem, solved: Solved, selection: Selection, tests: Tests) -> tuple[BlockProblem, Solved]:
+    """Return a solution that gross errors have little part in, and the problem with the sigmas that rays have in it.
+
+    Sigmas of measurements are often guessed. Were good ground judged by how much better than that the images agree with
+    each other, it would look wrong.
+    """
     state = solved.state
-    for turn in range(_ROBUST_ROUNDS):
-        tests = tests_of(problem, solved)
-        scale = tests.scale()
-        weigh = _huber if turn < _ROBUST_ROUNDS // 2 else _geman_mcclure
-        weights = replace(
-            selection,
-            ray_weights=weigh(np.sqrt(tests.rays) / scale),
-            ground_weights=weigh(np.sqrt(tests.ground) / scale),
-        )
-        found, ahead = problem.once(state, weights)
-        if not (math.isfinite(found.condition) and np.isfinite(found.linear.ray_misfit).all()):
-            break
-        solved, state = found, ahead
-    return replace(solved, linear=replace(solved.linear, state=state))
+    for weigh in (_huber, _geman_mcclure):
+        before = np.zeros(problem.points.rays)
+        for _ in range(_ROBUST_ROUNDS):
+            scale = tests.scale()
+            weights = replace(
+                selection,
+                ray_weights=weigh(np.sqrt(tests.rays) / scale),
+                ground_weights=weigh(np.sqrt(tests.ground) / scale),
+            )
+            found, ahead = problem.once(state, weights)
+            if not (math.isfinite(found.condition) and np.isfinite(found.linear.ray_misfit).all()):
+                return problem, replace(solved, linear=replace(solved.linear, state=state))
+            solved, state = found, ahead
+            tests = tests_of(problem, solved)
+            if np.abs(weights.ray_weights - before).mean() < _SETTLED:
+                break
+            before = weights.ray_weights
+        if weigh is _huber:
+            points = problem.points
+            sigma_image = points.sigma_image * tests.scale_of_rays()
+            problem = replace(problem, points=replace(points, sigma_image=sigma_image))
+    return problem, replace(solved, linear=replace(solved.linear, state=state))
 
 
 def _huber(size: Array) -> Array:
@@ -232,22 +268,16 @@ def _judged(
     linear = problem.linearise(trusted.state, problem.layout(alone), alone)
     bar = _Bar.of(problem, trusted, int(problem.active(selection).sum()))
     for rows in problem.eliminate(linear):
-        for group in rows.chunk.groups:
-            columns, real = problem.group_columns(rows.chunk, group)
-            design = rows.design(group)[:, :, real]
-            spread = np.eye(design.shape[1]) + design @ trusted.cofactors[np.ix_(columns, columns)] @ design.swapaxes(
-                1, 2
-            )
-            for k in range(group.start, group.stop):
-                suspect = _Suspect(problem, rows, k, spread[k - group.start])
-                if bar.passes(*suspect.contradiction(None)):
-                    continue
-                culprits = [part for part in suspect.parts if bar.passes(*suspect.contradiction(part))]
-                number = int(rows.chunk.points[k])
-                rejected[number] = suspect.rejected(culprits)
-                bad = culprits if len(culprits) == 1 else list(suspect.parts)
-                rays[[rows.chunk.rays[k, part] for part in bad if part != _GROUND]] = False
-                ground[number] &= _GROUND not in bad
+        suspect = _Suspects(problem, rows, trusted.cofactors)
+        agree = bar.passes(*suspect.contradictions(None))
+        agree_without = {part: bar.passes(*suspect.contradictions(part)) for part in suspect.parts}
+        for k in np.flatnonzero(~agree).tolist():
+            culprits = [part for part in suspect.parts if agree_without[part][k]]
+            number = int(rows.chunk.points[k])
+            rejected[number] = suspect.rejected(k, culprits)
+            bad = culprits if len(culprits) == 1 else list(suspect.parts)
+            rays[[rows.chunk.rays[k, part] for part in bad if part != _GROUND]] = False
+            ground[number] &= _GROUND not in bad
     return Selection.of(rays, ground), rejected
 
 
@@ -264,49 +294,56 @@ class _Bar:
         sigma0, freedom = problem.unit_weight(trusted)
         return cls(max(1.0 if sigma0 is None else sigma0, _SCALE_FLOOR), max(freedom, 1.0), BLUNDER_RISK / count)
 
-    def passes(self, square: float, spare: int) -> bool:
+    def passes(self, squares: Array, spare: int) -> Mask:
         from scipy.special import fdtri
 
-        return spare > 0 and square <= spare * self.scale**2 * fdtri(spare, self.freedom, 1 - self.risk)
+        limit = spare * self.scale**2 * fdtri(spare, self.freedom, 1 - self.risk) if spare > 0 else -1.0
+        return np.asarray(squares <= limit)
 
 
 #: The part of a suspect that is its known ground; the others are its rays, counted from 0.
 _GROUND = -1
 
 
-class _Suspect:
-    """The rows of one point; its parts are its rays, and its ground if that is known."""
+class _Suspects:
+    """The rows of points of a chunk; their parts are their rays, and their ground if that is known."""
 
-    def __init__(self, problem: BlockProblem, rows: Eliminated, k: int, spread: Array) -> None:
-        self.problem, self.rows, self.k, self.spread = problem, rows, k, spread
-        self.design, self.misfit = rows.q[k] @ rows.r[k], rows.misfit[k]
+    def __init__(self, problem: BlockProblem, rows: Eliminated, cofactors: Array) -> None:
+        self.problem, self.rows = problem, rows
+        self.design, self.misfit = rows.q @ rows.r, rows.misfit
         self.parts = {c: np.arange(2 * c, 2 * c + 2) for c in range(rows.chunk.rays.shape[1])}
         if rows.chunk.ground:
-            self.parts[_GROUND] = np.arange(len(self.misfit) - 3, len(self.misfit))
+            self.parts[_GROUND] = np.arange(self.misfit.shape[1] - 3, self.misfit.shape[1])
+        self.spread = np.tile(np.eye(self.misfit.shape[1]), (len(self.misfit), 1, 1))
+        for group in rows.chunk.groups:
+            columns, real = problem.group_columns(rows.chunk, group)
+            by_params = rows.design(group)[:, :, real]
+            self.spread[group] += by_params @ cofactors[columns[:, None], columns] @ by_params.swapaxes(1, 2)
 
-    def contradiction(self, without: int | None) -> tuple[float, int]:
-        """Return the square by which all parts but one miss each other and the block, and its degrees of freedom."""
+    def contradictions(self, without: int | None) -> tuple[Array, int]:
+        """Return the squares ``(n,)`` by which all parts but one miss each other and the block, and their freedom."""
         keep = self._all_but(without)
         spare = len(keep) - 3
         if spare < 1:
-            return math.inf, 0
-        half = np.linalg.cholesky(self.spread[np.ix_(keep, keep)])
-        q, _ = np.linalg.qr(np.linalg.solve(half, self.design[keep]))
-        misfit = np.linalg.solve(half, self.misfit[keep])
-        return float(((misfit - q @ (q.T @ misfit)) ** 2).sum()), spare
+            return np.full(len(self.misfit), math.inf), 0
+        half = np.linalg.cholesky(self.spread[:, keep[:, None], keep])
+        q, _ = np.linalg.qr(np.linalg.solve(half, self.design[:, keep]))
+        misfit = np.linalg.solve(half, self.misfit[:, keep, None])
+        left = misfit - q @ (q.swapaxes(1, 2) @ misfit)
+        return (left**2).sum(axis=(1, 2)), spare
 
     def _all_but(self, without: int | None) -> np.ndarray:
         return np.concatenate([part for name, part in self.parts.items() if name != without])
 
-    def rejected(self, culprits: list[int]) -> Rejected:
-        """Return what is said of the point when it is these parts, each by itself, that could be wrong."""
+    def rejected(self, k: int, culprits: list[int]) -> Rejected:
+        """Return what is said of a point when it is these parts, each by itself, that could be wrong."""
         points, chunk = self.problem.points, self.rows.chunk
-        name = points.ids[chunk.points[self.k]]
+        name = points.ids[chunk.points[k]]
         known = _GROUND in self.parts
         if len(culprits) != 1:
             who = "its ground and its measurements contradict each other" if known else "its rays miss each other"
-            size = float(np.abs(self._apart(None)[: 2 * chunk.rays.shape[1]]).max())
-            sigma = float(points.sigma_image[chunk.rays[self.k]].max())
+            size = float(np.abs(self._apart(k, None)[: 2 * chunk.rays.shape[1]]).max())
+            sigma = float(points.sigma_image[chunk.rays[k]].max())
             return Rejected(
                 name,
                 "point",
@@ -314,21 +351,21 @@ class _Suspect:
                 f"gross error: {who} by {size * sigma:.1f} px, and it cannot be decided which is wrong",
             )
         culprit = culprits[0]
-        apart = self._apart(culprit)[self.parts[culprit]]
+        apart = self._apart(k, culprit)[self.parts[culprit]]
         if culprit == _GROUND:
-            sigmas = self.problem.ground_sigmas[chunk.points[self.k]]
+            sigmas = self.problem.ground_sigmas[chunk.points[k]]
             metres = float(np.linalg.norm((apart * sigmas)[np.isfinite(sigmas)]))
             return Rejected(name, "ground", None, f"gross error: {metres:.1f} m from where its rays meet")
-        ray = chunk.rays[self.k, culprit]
+        ray = chunk.rays[k, culprit]
         size = float(np.hypot(*apart) * points.sigma_image[ray])
         image = points.images[points.image[ray]]
         return Rejected(name, "ray", image, f"gross error: {size:.1f} px from where the other rays and points put it")
 
-    def _apart(self, without: int | None) -> Array:
-        """Return the misfits of all rows at the place that all parts but one give."""
+    def _apart(self, k: int, without: int | None) -> Array:
+        """Return the misfits of all rows of a point at the place that all parts but one give."""
         keep = self._all_but(without)
-        place = np.linalg.lstsq(self.design[keep], self.misfit[keep], rcond=None)[0]
-        apart: Array = self.misfit - self.design @ place
+        place = np.linalg.lstsq(self.design[k, keep], self.misfit[k, keep], rcond=None)[0]
+        apart: Array = self.misfit[k] - self.design[k] @ place
         return apart
 
 

@@ -115,6 +115,10 @@ class BlockPoints:
                 file=self.source or None, field="id", remedy="remove one of the two measurements",
             )  # fmt: skip
 
+    def __repr__(self) -> str:
+        roles = ", ".join(f"{(self.roles == role).sum()} {role}" for role in ROLES if (self.roles == role).any())
+        return f"<{len(self)} points: {roles or 'none'}; {self.rays} rays in {len(self.images)} images; {self.source}>"
+
     def __len__(self) -> int:
         return len(self.ids)
 

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 DOCUMENT, SCHEMA_VERSION = "ortho-pipeline block report", 1
 #: Images whose residuals are drawn, rays that are drawn of each, points that are listed on the page.
 _DRAWN_IMAGES, _DRAWN_RAYS, _LISTED = 6, 400, 400
-_SIDE, _MARGIN = 452.0, 19.0
+#: A frame's side, the longest arrow in it, and the margin in which arrows of points at its edge end.
+_SIDE, _ARROW, _MARGIN = 420.0, 44.0, 48.0
 
 
 def build_document(
@@ -71,10 +72,23 @@ def headline(document: Mapping[str, Any]) -> dict[str, Any]:
             )
         what = f"RMSE in plan and height at {count(check['n'], 'check point')} whose ground took no part"
         return {"figure": metres(check["plan"]), "height": metres(check["h"]), "what": what, "notes": notes}
-    if control:
-        what = f"RMSE in plan and height at {count(control['n'], 'control point')}: the fit, not a test"
+    # The ground of control is held by its sigma: how well it fits is to be seen in the images.
+    seen = {
+        role: merged([image["rms"]["back_projected"][role] for image in adjustment["images"].values()])
+        for role in ("check", "control")
+    }
+    if check := seen["check"]:
+        what = f"RMSE of {count(check['n'], 'measurement')} of check points, whose ground took no part, in the images"
+        return {"figure": px(check["total"]), "height": None, "what": what, "notes": notes}
+    if control and seen["control"]:
         notes.append("No check points were kept apart.")
-        return {"figure": metres(control["plan"]), "height": metres(control["h"]), "what": what, "notes": notes}
+        if not adjustment["redundancy"]:
+            what = "nothing is left over to test the fit with"
+            return {"figure": "Not tested", "height": None, "what": what, "notes": notes}
+        what = (
+            f"RMSE of {count(seen['control']['n'], 'measurement')} of control points in the images: the fit, not a test"
+        )
+        return {"figure": px(seen["control"]["total"]), "height": None, "what": what, "notes": notes}
     sizes = [math.hypot(*ray["residual"]) for ray in adjustment["rays"] if ray["used"] and None not in ray["residual"]]
     figure = px(float(np.median(sizes))) if sizes else "Not tested"
     what = f"median residual of {count(len(sizes), 'ray')}: how well the images agree, not how right they are"
@@ -105,7 +119,7 @@ def summary_text(document: Mapping[str, Any]) -> str:
     return "\n".join([*lines, *(f"Warning: {text}" for text in document["warnings"])])
 
 
-def merged(parts: Sequence[Mapping[str, Any] | None]) -> dict[str, float | int] | None:
+def merged(parts: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:
     """Return the root mean squares of several groups together."""
     groups = [part for part in parts if part]
     number = sum(part["n"] for part in groups)
@@ -203,7 +217,7 @@ def _vectors(
     drawing = Drawing(max(wide, 300.0) + 2 * _MARGIN, tall + 2 * _MARGIN + 30, title, "block")
     drawing.rect("frame", _MARGIN, _MARGIN, wide, tall)
     longest = max((math.hypot(*vector) for _, vector, kind, _ in shown if kind != "out"), default=0.0)
-    arrow = 0.13 * _SIDE / longest if longest > 0 else 0.0
+    arrow = _ARROW / longest if longest > 0 else 0.0
     for place, vector, kind, name in shown:
         x, y = (_MARGIN + value * scale for value in place)
         with drawing.titled(f"{name}\n{vector[0]:+.3f}, {vector[1]:+.3f} {unit}"):

@@ -292,8 +292,7 @@ class BlockProblem:
         for model, used in zip(state.models, layout.rays_of_image, strict=True):
             rows, scale = points.point[used], root[used][:, None, None]
             by_point[used] = places.ground_partials(model, rows) * scale
-            count = len(model.params)
-            if count:
+            if count := len(model.params):
                 by_params[used, :, :count] = model.param_partials(places.in_crs(model.crs)[rows]) * scale
         ground_by_point, rows = np.zeros((len(points), 3, 3)), layout.grounded
         scale = np.sqrt(weights.ground_weights[rows])[:, None] / self.ground_sigmas[rows]
@@ -406,16 +405,22 @@ class BlockProblem:
         product = np.zeros(rows.turned.swapaxes(1, 2).shape)
         for group in rows.chunk.groups:
             columns, real = self.group_columns(rows.chunk, group)
-            part = cofactors[np.ix_(columns, columns)] @ rows.turned[group][:, :, real].swapaxes(1, 2)
+            part = cofactors[columns[:, None], columns] @ rows.turned[group][:, :, real].swapaxes(1, 2)
             product[group.start : group.stop, real] = part
         return product, rows.turned @ product
 
-    def ground_cofactors(self, solved: Solved) -> Array:
-        """Return the cofactors of the points ``(N, 3, 3)`` in their own horizons, NaN for those that take no part."""
+    def covariance(self, solved: Solved, factor: float) -> Array:
+        """Return the covariance of the parameters ``(P, P)``: scaled, but for what holds the datum or is fictitious."""
+        stated = solved.linear.pseudo_rows[~solved.linear.pseudo_true] @ solved.cofactors
+        return np.asarray(factor * solved.cofactors + (1.0 - factor) * stated.T @ stated)
+
+    def ground_covariance(self, solved: Solved, factor: float) -> Array:
+        """Return that of the points ``(N, 3, 3)`` in their own horizons, NaN for those that take no part."""
         found = np.full((len(self.points), 3, 3), np.nan)
+        covariance = self.covariance(solved, factor)
         for rows in solved.eliminated:
             root = np.linalg.inv(rows.r)
-            inner = np.eye(3) + self.taken(rows, solved.cofactors)[1]
+            inner = factor * np.eye(3) + self.taken(rows, covariance)[1]
             found[rows.chunk.points] = root @ inner @ root.swapaxes(1, 2)
         axes = self.frame.horizons(self.frame.geodetic(solved.state.local))
         return axes @ found @ axes.swapaxes(1, 2)
@@ -480,7 +485,7 @@ class BlockProblem:
             damping = max(10 * damping, 1e-3)
             if damping > 1e8:
                 break
-        raise NotConverged("the adjustment did not converge", remedy="give better start values or fewer parameters")
+        raise NotConverged("the adjustment did not converge", remedy="give more control, better starts or fewer parameters")
 
     def _promised(self, linear: Linear, step: Array, shift: Array) -> float:
         return math.sqrt(sum(float((part**2).sum()) for part in self.changes(linear, step, shift)))
@@ -555,7 +560,7 @@ class NormalSystem:
 
     def add(self, columns: Index, design: Array, right: Array, *, sign: float = 1.0) -> None:
         """Add (or subtract) the products of rows ``(n, p)`` of some columns."""
-        self.matrix[np.ix_(columns, columns)] += sign * (design.T @ design)
+        self.matrix[columns[:, None], columns] += sign * (design.T @ design)
         self.right[columns] += sign * (design.T @ right)
 
     @property

@@ -253,10 +253,14 @@ def _warnings(fit: BlockFit, starts: Mapping[str, Start]) -> list[str]:
         found.append(f"{int(outside.sum())} measurements outside of their images (used all the same): {names}")
     if fit.parameters and fit.redundancy == 0:
         found.append("no redundancy: residuals are zero by construction and say nothing")
-    checks = int(points.check.sum())
+    checks = max((int(rms["n"]) for rms in _check_rms(fit) if rms), default=0)
     if points.control.any() and checks < _ENOUGH_CHECKS:
         found.append(f"{checks} check points: fewer than the 30 that ASPRS 2023 asks for before accuracy is claimed")
     return list(dict.fromkeys(found))
+
+
+def _check_rms(fit: BlockFit) -> list[Mapping[str, Any] | None]:
+    return [fit.object_rms(), *(fit.image_rms(image, "check") for image in fit.points.images)]
 
 
 def _write(

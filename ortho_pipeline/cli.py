@@ -83,7 +83,7 @@ def main() -> None:
 def cli() -> None:
     """Orthorectify satellite scenes, and say honestly how good the result is.
 
-    Exit codes: 0 done, 1 failed, 2 you can correct it (the message says how), 3 partly done (ortho run), 130 interrupted.
+    Exit codes: 0 done, 1 failed, 2 you can correct it (the message says how), 3 partly done (run), 130 interrupted.
     """
 
 

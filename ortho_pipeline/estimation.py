@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.blunders import REJECTED_LIMIT, find_blunders
-from ortho_pipeline.errors import DegeneratePoints
+from ortho_pipeline.errors import DegeneratePoints, InputError
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.notebook import fit_html
 from ortho_pipeline.points import Points
@@ -40,10 +40,10 @@ class Fit:
     """Result of an adjustment.
 
     Residuals are measured minus predicted, ``(N, 2)`` column and row in pixels, for all points whatever their role;
-    `raw_residuals` are those of the model before the adjustment. `loo_residuals` are NaN for points that did not take
-    part. `sigma0` is None without redundancy. Heights that a model of the plane does not need, and that the points do
-    not have, are its reference height in `points`. With a regularisation of the strength `ridge`, the points determine
-    `effective_parameters`, and `condition` is that of the design without it.
+    `raw_residuals` are those of the model before the adjustment, NaN where it is of the points alone. `loo_residuals`
+    are NaN for points that did not take part. `sigma0` is None without redundancy. Heights that a model of the plane
+    does not need, and that the points do not have, are its reference height in `points`. With a regularisation of the
+    strength `ridge`, the points determine `effective_parameters`, and `condition` is that of the design without it.
     """
 
     model: SensorModel
@@ -111,7 +111,7 @@ class Fit:
     def raw_bias(self) -> dict[str, float | int] | None:
         """Mean and scatter (px) of measured minus predicted of the model as delivered, over the used points."""
         raw = self.raw_residuals[self.used]
-        if not len(raw):
+        if not np.isfinite(raw).any():
             return None
         mean, spread = raw.mean(axis=0), raw.std(axis=0)
         return {"col": mean[0], "row": mean[1], "std_col": spread[0], "std_row": spread[1], "n": len(raw)}
@@ -212,11 +212,20 @@ def fit(
     ------
     TooFewPoints, DegeneratePoints
         If the control points do not determine the parameters, or too many of them contradict the others.
+    InputError
+        If no point at all has an image.
     """
     points = _placed(points, model)
     raw = points.image - model.ground_to_image(points.ground)
     known_bad = {points.ids.index(name): reason for name, reason in (exclude or {}).items() if name in points.ids}
     projected = np.asarray(np.isfinite(raw).all(axis=1))
+    if len(points) and not projected.any():
+        raise InputError(
+            f"none of the {len(points)} points has an image by the model {model.kind!r}: no height, or outside of "
+            "where the model is defined",
+            file=points.source or None,
+            remedy="check the CRS and the heights of the points, and that they and the model belong to this scene",
+        )
     usable = points.control & projected
     warnings = _unusable(points, usable, projected)
     usable[list(known_bad)] = False
@@ -317,6 +326,13 @@ def _uncertain_edge(solution: Solution, source: str, strength: float | None) -> 
     partials = solution.model.param_partials(solution.model.corners)
     spread = np.sqrt(((partials @ solution.cofactors) * partials).sum(axis=2))
     factor = float(np.nanmax(spread, initial=0.0) / np.median(solution.sigma))
+    if np.isnan(spread).all() and strength is None:
+        raise DegeneratePoints(
+            "how certain the model is cannot be said: no corner of the ground that it is meant for has an image",
+            file=source,
+            field="domain",
+            remedy="check the metadata of the scene; of a plugin, that domain is (centre, half-size) in units of crs",
+        )
     if np.isnan(spread).all():
         factor = math.inf
     if factor > EXTRAPOLATION_LIMIT and strength is None:

@@ -228,5 +228,9 @@ def _continuous(ground: Array, crs: pyproj.CRS) -> Array:
 def _centre(model: SensorModel, width: int, height: int) -> Array:
     centre = model.image_to_ground(np.array([[width / 2, height / 2]]), model.reference_height)
     if not np.isfinite(centre).all():
-        raise ModelError("the middle of the image does not meet the ground: the model does not belong to this image")
+        raise ModelError(
+            "the middle of the image does not meet the ground: the model does not belong to this image",
+            remedy="give the metadata of this very image, and points that were measured in it; "
+            "if they are, its plugin reads them wrongly (docs/plugins.md)",
+        )
     return centre

@@ -19,7 +19,8 @@ into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole
         return Scene("tinysat", dataset.GetDescription(), dataset.RasterXSize, dataset.RasterYSize, {"rpc": rpc},
                      source, facts={"band": int(band)})
 
-Test it with `ortho_pipeline.testing.check_sensor`.
+The host tries every scene at a few points before it works with it (`ortho_pipeline.contract`). Test more with
+`ortho_pipeline.testing.check_sensor`.
 """
 
 from __future__ import annotations
@@ -54,12 +55,15 @@ class Piece:
         Its columns and rows, where it has a model of its own.
     model : SensorModel, optional
         In its own pixels, where the first model of the scene does not reach as far.
+    scale : float
+        Width of one of its pixels in those of the scene; another than 1 where colours are coarser than panchromatic.
     """
 
     path: str | PathLike[str]
     offset: tuple[float, float] = (0.0, 0.0)
     size: tuple[int, int] | None = None
     model: SensorModel | None = None
+    scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ class Scene:
     path : path
         The image file.
     width, height : int
-        Size of the image in pixels.
+        Size of the image in pixels, which is that of the dataset.
     models : mapping of str to SensorModel
         Best first; image coordinates are (column, row) from the outer corner of the first pixel.
     model_source : str
@@ -83,13 +87,15 @@ class Scene:
     warnings : tuple of str
         What the user ought to know before trusting the result.
     priors : mapping of str to Prior
-        How well the vendor knows parameters of the first model, for ``--correction model``.
+        How well the vendor knows parameters of the model that ``--correction model`` adjusts (`adjustable`).
     rasters : tuple of path
         Files of one size whose bands the ortho stacks, in this order; without them the image alone.
     pieces : tuple of Piece
         Other bands and components of the same acquisition, which share one adjustment with this image.
     sources : tuple of path
         Files that were read besides the image and `model_source`, for the record.
+    unsuited : mapping of str to str
+        Model families (`ortho models`) that do not suit this product, each with what to say where it is fitted.
     """
 
     sensor: str
@@ -104,15 +110,23 @@ class Scene:
     rasters: tuple[str | PathLike[str], ...] = ()
     pieces: tuple[Piece, ...] = ()
     sources: tuple[str | PathLike[str], ...] = ()
+    unsuited: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", Path(self.path))
+        if isinstance(self.model_source, PathLike):
+            object.__setattr__(self, "model_source", str(self.model_source))
         object.__setattr__(self, "rasters", tuple(map(Path, self.rasters)))
 
     @property
     def model(self) -> SensorModel:
         """The first, best model."""
         return next(iter(self.models.values()))
+
+    @property
+    def adjustable(self) -> str | None:
+        """Name of the first model that has parameters of its own, such as a pushbroom beside an RPC; None if none."""
+        return next((name for name, model in self.models.items() if model.param_names), None)
 
 
 @dataclass(frozen=True)
@@ -126,12 +140,13 @@ class Sensor:
     description : str
         One line for `ortho sensors`.
     recognises : callable(dataset) -> bool
-        True if the open `gdal.Dataset` is such a product. No exception for what is not.
+        True if the open `gdal.Dataset` is such a product. No exception for what is not, datasets without a file
+        included.
     open_scene : callable(dataset, **options) -> Scene
         Translates the vendor's metadata. Raises `ortho_pipeline.errors.InputError` for a damaged product.
     options : mapping of str to str
-        The keyword options of `open_scene`, with a line of help for each. Any other option is refused
-        before `open_scene` is called.
+        The keyword options of `open_scene`, each with a default there and a line of help here. Values arrive as
+        text; any other option is refused before `open_scene` is called.
     fallback : bool
         A fallback sensor serves any product of a general kind: it is asked only when no other sensor
         recognises the dataset, and it is taken when it alone declares the options that the user gave.

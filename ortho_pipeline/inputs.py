@@ -152,7 +152,7 @@ def read_control(scene: Scene, options: PointOptions, allow_network: bool = Fals
             vertical=None if options.vertical is None else Vertical.parse(options.vertical),
             pixel_origin=options.pixel_origin,
             image_name=Path(scene.path).name,
-            pieces={Path(piece.path).name: piece.offset for piece in scene.pieces},
+            pieces={Path(piece.path).name: (*piece.offset, piece.scale) for piece in scene.pieces},
         )
     if options.select is not None and options.check is not None:
         raise InputError(

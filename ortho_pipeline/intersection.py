@@ -52,6 +52,11 @@ class Intersection:
     angles_deg: Array
     sigma0: float | None
 
+    def __repr__(self) -> str:
+        met = int(np.isfinite(self.ground).all(axis=1).sum())
+        sigma0 = "unknown" if self.sigma0 is None else f"{self.sigma0:.3g}"
+        return f"<{met} of {len(self.points)} points intersected from {self.points.rays} rays: sigma0 {sigma0}>"
+
     @property
     def sigmas(self) -> Array:
         """Standard deviations east, north, up in metres ``(N, 3)``."""

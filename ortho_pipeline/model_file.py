@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, PluginError
 from ortho_pipeline.files import write_text
 from ortho_pipeline.models import model_from_dict
 from ortho_pipeline.models.base import SensorModel
@@ -45,7 +45,22 @@ class SavedModel:
 
 
 def write_model_file(saved: SavedModel, path: str | os.PathLike[str]) -> None:
-    """Write a model file, whole or not at all; numbers are kept to the last bit."""
+    """Write a model file, whole or not at all; numbers are kept to the last bit.
+
+    Raises
+    ------
+    PluginError
+        If the file could not be read again: its model is of a kind that nobody registered.
+    """
+    model = saved.model.to_dict()
+    try:
+        model_from_dict(model)
+    except InputError as error:
+        raise PluginError(
+            f"this model could not be read again: {error.message}",
+            file=path,
+            remedy="its plugin must offer the class in the hook ortho_models; a script: register it in models.KINDS",
+        ) from error
     document = {
         "document": DOCUMENT,
         "schema_version": SCHEMA_VERSION,
@@ -53,7 +68,7 @@ def write_model_file(saved: SavedModel, path: str | os.PathLike[str]) -> None:
         "sensor": saved.sensor,
         "model_source": saved.model_source,
         "size": None if saved.size is None else list(saved.size),
-        "model": saved.model.to_dict(),
+        "model": model,
         "provenance": dict(saved.provenance),
     }
     write_text(path, json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n")

@@ -9,6 +9,8 @@ from typing import Any
 
 #: In a notebook, pages of reports are this high (CSS pixels).
 _PAGE_HEIGHT = 640
+#: Images and gross errors of a block that are listed.
+_LISTED = 20
 
 
 def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -41,6 +43,31 @@ def fit_html(document: Mapping[str, Any]) -> str:
     said = [f"left out: point {one['id']} ({one['reason']})" for one in document["rejected"]] + document["warnings"]
     if said:
         parts.append("<ul>" + "".join(f"<li>{escape(text)}</li>" for text in said) + "</ul>")
+    return "".join(parts)
+
+
+def block_html(document: Mapping[str, Any]) -> str:
+    """Return the document of a block (`BlockFit.to_json`) as HTML: RMSE on the ground and in the images, warnings."""
+    ground = [
+        (f"{role} points", str(found["n"]), *(f"{found[axis]:.3f}" for axis in "xyh"))
+        for role, found in document["object_rms"].items()
+        if found
+    ]
+    parts = [table("Known minus adjusted ground: RMSE, metres", ("", "points", "east", "north", "height"), ground)]
+    images = [
+        (f"{name}, {role} points", str(found["n"]), *(f"{found[axis]:.3f}" for axis in ("col", "row", "total")))
+        for name, image in list(document["images"].items())[:_LISTED]
+        for role, found in image["rms"]["residuals" if not ground else "back_projected"].items()
+        if found
+    ]
+    what = "Known ground in the images" if ground else "Rays at the adjusted ground"
+    parts.append(table(f"{what}: RMSE, pixels", ("", "points", "column", "row", "both"), images))
+    rejected = document["rejected"]
+    said = [document["gauge"], *document["warnings"]]
+    said += [f"left out: point {one['point']} ({one['reason']})" for one in rejected[:_LISTED]]
+    if len(rejected) > _LISTED:
+        said.append(f"and {len(rejected) - _LISTED} more gross errors")
+    parts.append("<ul>" + "".join(f"<li>{escape(text)}</li>" for text in said) + "</ul>")
     return "".join(parts)
 
 

@@ -218,7 +218,7 @@ def compare(
     given = heights_where_wanted(given, heights, *names)
     compared = comparing.compare(
         given, names, own=own, priors=opened.priors, size=(opened.width, opened.height), crs=points.model_crs,
-        heights=heights_around(given, heights),
+        heights=heights_around(given, heights), unsuited=opened.unsuited,
     )  # fmt: skip
     result = CompareResult(opened, compared)
     best = compared.best
@@ -413,8 +413,11 @@ def edge(
 
 
 def doctor() -> dict[str, Any]:
-    """Return versions of GDAL, PROJ and the compiled parts, geoid grids, and plugins with their distributions."""
-    host = plugins.Host.discover()
+    """Return versions of GDAL, PROJ and the compiled parts, geoid grids, and plugins with their distributions.
+
+    A plugin that breaks the contract, at which other commands stop, is among the broken ones here.
+    """
+    host = plugins.Host(installed=True, lenient=True)
     packages = ("ortho-pipeline", "numpy", "scipy", "numba", "pyproj", "click", "pluggy")
     allowed = [name for name in raster.DRIVERS if raster.gdal.GetDriverByName(name) is not None]
     return {

@@ -6,9 +6,11 @@ path, only reserved names. See `ortho_pipeline.hookspecs` for the other side.
 
 from __future__ import annotations
 
+import contextlib
+import difflib
 import functools
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from os import PathLike
@@ -18,6 +20,7 @@ from typing import Any
 import pluggy
 
 from ortho_pipeline import hookspecs
+from ortho_pipeline.contract import described, scene_faults, sensor_faults
 from ortho_pipeline.errors import InputError, OrthoError, PluginError
 from ortho_pipeline.hookspecs import PROJECT_NAME, Scene, Sensor
 from ortho_pipeline.models import KINDS, SensorModel
@@ -25,6 +28,12 @@ from ortho_pipeline.raster import open_dataset
 
 BUNDLED = "ortho-pipeline"
 HOOKS = ("ortho_sensors", "ortho_models")
+#: What each hook returns, what it is collected in, and what authors are told who return something else.
+_RETURNS: dict[str, tuple[type, type, str]] = {
+    "ortho_sensors": (Iterable, list, "yield the Sensor, or return [Sensor(...)]"),
+    "ortho_models": (Mapping, dict, "return {kind: class}"),
+}
+_TEST_IT = "its author: run ortho_pipeline.testing.check_sensor on this file"
 log = logging.getLogger(__name__)
 
 
@@ -47,7 +56,7 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Broken:
-    """A plugin that could not be imported, and why."""
+    """A plugin that could not be imported, or that breaks the contract, and why."""
 
     plugin: str
     distribution: str
@@ -71,6 +80,8 @@ class Host:
         Plugins to register besides the installed ones, for scripts and tests.
     installed : bool
         Whether to look for the entry points of installed distributions.
+    lenient : bool
+        Leave out a plugin that breaks the contract and list it in `broken`, instead of raising.
 
     Attributes
     ----------
@@ -78,7 +89,7 @@ class Host:
     models : mapping of str to type
         Model families that plugins registered.
     broken : tuple of Broken
-        Installed plugins that could not be imported.
+        Plugins that could not be imported.
 
     Raises
     ------
@@ -87,19 +98,19 @@ class Host:
         the wrong arguments, or a hook returns what it must not.
     """
 
-    def __init__(self, plugins: Iterable[ModuleType] = (), *, installed: bool = False) -> None:
+    def __init__(self, plugins: Iterable[ModuleType] = (), *, installed: bool = False, lenient: bool = False) -> None:
         self._manager = pluggy.PluginManager(PROJECT_NAME)
         self._manager.add_hookspecs(hookspecs)
         self._origin: dict[str, Provenance] = {}
         self._owner: dict[str, str] = {}
         self._reserved: set[str] = set()
+        self._lenient = lenient
         self.broken: tuple[Broken, ...] = ()
         if installed:
             self._register_installed()
         for plugin in plugins:
             name = plugin.__name__
             self._register(plugin, Provenance(name, name, "(registered by a script)", ""))
-        self._refuse_unknown_hooks()
         self.sensors: Mapping[str, Sensor] = MappingProxyType(self._collect_sensors())
         self.models: Mapping[str, type[SensorModel]] = MappingProxyType(self._collect_models())
 
@@ -182,15 +193,20 @@ class Host:
                 )
         try:
             scene = chosen.open_scene(dataset, **options)
-        except OrthoError:
+            size = dataset.RasterXSize, dataset.RasterYSize
+            fault = next(scene_faults(chosen, scene, size, {*KINDS, *self.models}), None)
+        except OrthoError as error:
+            if error.file is None:
+                error.file = str(path)
             raise
         except Exception as error:
-            raise PluginError(f"{self._name(chosen)} failed to open it ({_text(error)})", file=path) from error
-        self._check_scene(chosen, scene)
+            text = described(error, chosen.open_scene)
+            raise PluginError(f"{self._name(chosen)} failed to open it ({text})", file=path) from error
+        if fault:
+            raise PluginError(f"{self._name(chosen)}: {fault}", file=path, remedy=_TEST_IT)
         return scene
 
     def _register_installed(self) -> None:
-        broken = []
         for entry in sorted(metadata.entry_points(group=PROJECT_NAME), key=lambda entry: entry.name):
             distribution, version = (entry.dist.name, entry.dist.version) if entry.dist else ("(unknown)", "")
             if _normalised(distribution) == BUNDLED:
@@ -199,74 +215,109 @@ class Host:
                 plugin = entry.load()
             except Exception as error:
                 # A plugin is somebody else's code: whatever its import does wrong, the others go on.
-                broken.append(Broken(entry.name, distribution, version, _text(error)))
-                log.warning("%s", broken[-1])
+                self._leave_out(Broken(entry.name, distribution, version, described(error, entry.module)))
                 continue
             self._register(plugin, Provenance(entry.name, entry.value, distribution, version))
-        self.broken = tuple(broken)
+
+    def _leave_out(self, broken: Broken) -> None:
+        self.broken += (broken,)
+        log.warning("%s", broken)
+
+    @contextlib.contextmanager
+    def _judged(self, origin: Provenance) -> Iterator[None]:
+        """Let an error of a plugin pass, or note it and go on."""
+        try:
+            yield
+        except PluginError as error:
+            if not self._lenient:
+                raise
+            self._leave_out(Broken(origin.plugin, origin.distribution, origin.version, error.message))
 
     def _register(self, plugin: Any, origin: Provenance) -> None:
         name = f"{origin.plugin} ({origin})" if origin.version else origin.plugin
+        with self._judged(origin):
+            self._refuse_misspelt(plugin, name)
+            try:
+                registered = self._manager.register(plugin, name)
+            except (pluggy.PluginValidationError, ValueError) as error:
+                raise PluginError(f"plugin {name}: {error}", file=origin.module) from error
+            if registered is not None:
+                self._origin[registered] = origin
+
+    def _refuse_misspelt(self, plugin: Any, name: str) -> None:
         for hook in HOOKS:
             if callable(getattr(plugin, hook, None)) and self._manager.parse_hookimpl_opts(plugin, hook) is None:
-                raise PluginError(f"plugin {name}: {hook} is not marked with @hookimpl", file=origin.module)
-        try:
-            registered = self._manager.register(plugin, name)
-        except (pluggy.PluginValidationError, ValueError) as error:
-            raise PluginError(f"plugin {name}: {error}", file=origin.module) from error
-        if registered is not None:
-            self._origin[registered] = origin
+                raise PluginError(
+                    f"plugin {name}: {hook} is not marked with @hookimpl", remedy="write @hookimpl above it"
+                )
+        for hook in dir(plugin):
+            if hook not in HOOKS and self._manager.parse_hookimpl_opts(plugin, hook) is not None:
+                meant = difflib.get_close_matches(hook, HOOKS, 1) or HOOKS
+                raise PluginError(
+                    f"plugin {name}: there is no hook {hook!r}", remedy=f"did you mean {' or '.join(meant)}?"
+                )
 
-    def _refuse_unknown_hooks(self) -> None:
-        try:
-            self._manager.check_pending()
-        except pluggy.PluginValidationError as error:
-            raise PluginError(f"misspelt hook: {error}", remedy=f"the hooks are {', '.join(HOOKS)}") from error
-
-    def _returned(self, hook: str) -> Iterable[tuple[str, Any]]:
+    def _returned(self, hook: str) -> Iterator[tuple[str, Any]]:
         # Each implementation is called by itself, so that an error can name its plugin.
+        wanted, collect, advice = _RETURNS[hook]
         for implementation in getattr(self._manager.hook, hook).get_hookimpls():
             plugin = implementation.plugin_name
-            try:
-                result = implementation.function()
-                yield plugin, dict(result) if hook == "ortho_models" else list(result)
-            except Exception as error:
-                raise PluginError(f"plugin {plugin}: {hook} failed ({_text(error)})") from error
+            with self._judged(self._origin[plugin]):
+                try:
+                    offered = implementation.function()
+                    returned = collect(offered) if isinstance(offered, wanted) else None
+                except Exception as error:
+                    text = described(error, implementation.function)
+                    raise PluginError(f"plugin {plugin}: {hook} failed ({text})") from error
+                if returned is None:
+                    what = type(offered).__name__
+                    raise PluginError(f"plugin {plugin}: {hook} returned {what}", remedy=f"its author: {advice}")
+                yield plugin, returned
 
     def _collect_sensors(self) -> dict[str, Sensor]:
         sensors: dict[str, Sensor] = {}
         for plugin, offered in self._returned("ortho_sensors"):
-            for sensor in offered:
-                _check_sensor_type(plugin, sensor)
-                if sensor.name in sensors and self._owner[sensor.name] == plugin:
-                    raise PluginError(f"plugin {plugin} offers two sensors {sensor.name!r}")
-                self._claim(plugin, sensor.name)
-                sensors[sensor.name] = sensor
+            with self._judged(self._origin[plugin]):
+                for sensor in offered:
+                    fault = next(sensor_faults(sensor), None)
+                    if fault:
+                        raise PluginError(f"plugin {plugin}: {fault}")
+                    if sensor.name in sensors and self._owner[sensor.name] == plugin:
+                        raise PluginError(f"plugin {plugin} offers two sensors {sensor.name!r}")
+                    self._claim(plugin, sensor.name, "sensor")
+                    sensors[sensor.name] = sensor
         return dict(sorted(sensors.items()))
 
     def _collect_models(self) -> dict[str, type[SensorModel]]:
         families: dict[str, type[SensorModel]] = {}
         for plugin, offered in self._returned("ortho_models"):
-            for name, family in offered.items():
-                if not (isinstance(name, str) and isinstance(family, type) and issubclass(family, SensorModel)):
-                    raise PluginError(f"plugin {plugin}: ortho_models must map names to SensorModel classes")
-                if KINDS.get(name, family) is not family:
-                    raise PluginError(f"plugin {plugin} offers the model family {name!r}, but that name is taken")
-                self._claim(plugin, name)
-                families[name] = family
+            with self._judged(self._origin[plugin]):
+                for name, family in offered.items():
+                    if not (isinstance(name, str) and isinstance(family, type) and issubclass(family, SensorModel)):
+                        raise PluginError(f"plugin {plugin}: ortho_models must map names to SensorModel classes")
+                    taken = KINDS.get(name, family)
+                    if taken is not family:
+                        raise PluginError(
+                            f"plugin {plugin} offers the model family {name!r}, but that name is taken by "
+                            f"{taken.__module__}.{taken.__qualname__}",
+                            remedy=f"give {family.__qualname__} another kind; or uninstall that plugin",
+                        )
+                    self._claim(plugin, name, "model family")
+                    families[name] = family
         return families
 
-    def _claim(self, plugin: str, name: str) -> None:
+    def _claim(self, plugin: str, name: str, what: str) -> None:
         bundled = {key for key, origin in self._origin.items() if _normalised(origin.distribution) == BUNDLED}
         if plugin not in bundled and (name in self._reserved or self._owner.get(name) in bundled):
             raise PluginError(
-                f"plugin {plugin} offers {name!r}, but that name belongs to {BUNDLED}",
-                remedy="uninstall that plugin, or ask its author for another name",
+                f"plugin {plugin} offers the {what} {name!r}, but that name belongs to {BUNDLED}",
+                remedy=f"its author: rename the {what}; its users: uninstall that plugin",
             )
         # A sensor and a model family of one plugin may share a name.
         if self._owner.get(name, plugin) != plugin:
             raise PluginError(
-                f"two plugins offer {name!r}: {self._owner[name]} and {plugin}", remedy="uninstall one of the two"
+                f"two plugins offer the {what} {name!r}: {self._owner[name]} and {plugin}",
+                remedy=f"an author: rename the {what}; a user: uninstall one of the two",
             )
         self._owner[name] = plugin
 
@@ -275,26 +326,13 @@ class Host:
             return bool(sensor.recognises(dataset))
         except Exception as error:
             raise PluginError(
-                f"{self._name(sensor)} failed while looking at the dataset ({_text(error)})",
+                f"{self._name(sensor)} failed while looking at the dataset ({described(error, sensor.recognises)})",
                 file=dataset.GetDescription(),
                 remedy="choose the sensor yourself with --sensor NAME, or uninstall that plugin",
             ) from error
 
     def _name(self, sensor: Sensor) -> str:
         return f"sensor {sensor.name!r} of plugin {self._owner[sensor.name]}"
-
-    def _check_scene(self, sensor: Sensor, scene: object) -> None:
-        wrong = None
-        if not isinstance(scene, Scene):
-            wrong = f"open_scene returned {type(scene).__name__} instead of a Scene"
-        elif scene.sensor != sensor.name:
-            wrong = f"the scene says that it is of sensor {scene.sensor!r}"
-        elif not scene.models or not all(isinstance(model, SensorModel) for model in scene.models.values()):
-            wrong = "the scene has no models, or one that is no SensorModel"
-        elif not (scene.width > 0 and scene.height > 0):
-            wrong = f"the size of the scene is {scene.width} x {scene.height}"
-        if wrong:
-            raise PluginError(f"{self._name(sensor)}: {wrong}")
 
 
 def open_scene(
@@ -337,26 +375,6 @@ def _discovered() -> Host:
 
 def _normalised(distribution: str) -> str:
     return distribution.lower().replace("_", "-").replace(".", "-")
-
-
-def _text(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"
-
-
-def _check_sensor_type(plugin: str, sensor: object) -> None:
-    wrong = None
-    if not isinstance(sensor, Sensor):
-        wrong = f"ortho_sensors returned {type(sensor).__name__} instead of Sensor"
-    elif not isinstance(sensor.name, str) or not sensor.name or sensor.name != sensor.name.strip():
-        wrong = f"{sensor.name!r} is no name of a sensor"
-    elif not callable(sensor.recognises) or not callable(sensor.open_scene):
-        wrong = f"sensor {sensor.name!r}: recognises and open_scene must be callable"
-    elif not isinstance(sensor.options, Mapping) or not all(
-        isinstance(text, str) for pair in sensor.options.items() for text in pair
-    ):
-        wrong = f"sensor {sensor.name!r}: options must map names to help texts"
-    if wrong:
-        raise PluginError(f"plugin {plugin}: {wrong}")
 
 
 def _unknown_sensor(name: str, sensors: Iterable[str]) -> InputError:

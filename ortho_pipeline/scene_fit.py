@@ -21,6 +21,8 @@ from ortho_pipeline.options import PointOptions, SceneOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.swaps import refuse_swapped
 
+#: A delivered model that is so many image sizes off belongs to another place, or reads its metadata wrongly.
+_ELSEWHERE = 3.0
 #: How far (in parts of their own extent) beyond the points the DEM is asked for its range of heights.
 _MARGIN = 0.25
 
@@ -58,7 +60,8 @@ class Adjusted:
     def warnings(self, surface: Surface | None) -> tuple[str, ...]:
         """Return what people ought to know before they trust the numbers."""
         scene, adjusted, points = self.scene, self.fit, self.fit.points
-        found = [*scene.warnings, *adjusted.warnings]
+        found = [*scene.warnings, *(scene.unsuited[name] for name in scene.models if name in scene.unsuited)]
+        found += adjusted.warnings
         if surface is not None:
             found += surface.provenance.get("warnings", [])
         found += [f"point {name} was left out: {reason}" for name, reason in adjusted.rejected]
@@ -66,6 +69,7 @@ class Adjusted:
         if not inside.all():
             outside = ", ".join(np.array(points.ids)[~inside])
             found.append(f"points outside of the image (used all the same): {outside}")
+        found += self._elsewhere()
         if adjusted.used.any() and len(adjusted.param_names) and adjusted.redundancy == 0:
             found.append("no redundancy: the RMSE of the control points is zero by construction and says nothing")
         checks = int(points.check.sum())
@@ -77,6 +81,19 @@ class Adjusted:
             names = ", ".join(f"{one.name} (t {one.t:.1f})" for one in self.removed)
             found.append(f"parameters that the points do not justify were removed: {names}")
         return tuple(dict.fromkeys(found))
+
+    def _elsewhere(self) -> list[str]:
+        """Return a warning if the points say that the model, as delivered, shows quite another place."""
+        bias = self.fit.raw_bias
+        if bias is None or self.fit.model_name in {family.name for family in families()}:
+            return []
+        sizes = max(abs(bias["col"]) / self.scene.width, abs(bias["row"]) / self.scene.height)
+        if not sizes > _ELSEWHERE:
+            return []
+        return [
+            f"the model as delivered is {sizes:.3g} image sizes away from the points: points or metadata of another "
+            "scene, longitude and latitude exchanged, or an angle of another sign or unit"
+        ]
 
 
 def open_adjustable(image: Any, scene: SceneOptions, points: PointOptions) -> Scene:
@@ -148,10 +165,21 @@ def _corrected(
             remedy="adjust the scene's own model with all points (leave out --model)",
         )
     if correction == OWN:
+        scene = _by_own_parameters(scene)
         return Adjusted(scene, fit_own(scene.model, points, scene.priors))
     start = ImageCorrection.identity(shared_model(scene), correction, (scene.width / 2, scene.height / 2))
     name = scene.model.kind if correction == "none" else f"{scene.model.kind}+{correction}"
     return Adjusted(scene, fit(start, points, robust=correction != "none", name=name))
+
+
+def _by_own_parameters(scene: Scene) -> Scene:
+    """Return the scene with the first of its models that has parameters in front, such as a pushbroom beside an RPC."""
+    chosen = scene.adjustable
+    if chosen is None or scene.models[chosen] is scene.model:
+        return scene
+    rest = {name: model for name, model in scene.models.items() if name != chosen}
+    source = f"metadata of {Path(scene.path).name}"
+    return dataclasses.replace(scene, models={chosen: scene.models[chosen], **rest}, model_source=source)
 
 
 def shared_model(scene: Scene) -> SensorModel:

@@ -13,12 +13,16 @@ from __future__ import annotations
 
 import json
 import pickle
+import tempfile
+from collections.abc import Iterator
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ortho_pipeline.contract import described, model_faults, scene_faults, sensor_faults
 from ortho_pipeline.hookspecs import Scene, Sensor
 from ortho_pipeline.models import KINDS, SensorModel, model_from_dict
 from ortho_pipeline.models.base import as_ground
@@ -27,20 +31,25 @@ from ortho_pipeline.models.base import as_ground
 CLOSURE = 1e-5
 #: Partial derivatives have to agree with differences of the model to this part of their largest.
 PARTIALS = 1e-4
+#: A domain reaches no farther from its image than so many image sizes: a crop of a scene may have the domain of it all.
+WIDEST = 20.0
+#: Images smaller than this (pixels) are tests, and their domains wider than they.
+_SMALL = 1000
 
 
 def check_sensor_model(model: SensorModel, ground: ArrayLike) -> None:
     """Check that a sensor model keeps the contract.
 
-    Shapes; N points as N single points; rows of NaN stay NaN and harm no other row; ground to image to ground closes;
-    `ground_partials` and `param_partials` predict a nudge; `with_params` and `to_dict` give the same model again; it
-    can be pickled.
+    Shapes; N points as N single points; rows of NaN stay NaN and harm no other row; points far away raise nothing;
+    ground to image to ground closes; `ground_partials` and `param_partials` predict a nudge; `with_params` and
+    `to_dict` give the same model again; it can be pickled.
 
     Parameters
     ----------
     model : SensorModel
     ground : (N, 3)
-        Points in the model's CRS that it is meant for, at different heights; at least 3.
+        Points in `model.crs` (EPSG:4979: lon, lat, ellipsoidal height) that it is meant for, at different heights; at
+        least 3.
 
     Raises
     ------
@@ -48,7 +57,9 @@ def check_sensor_model(model: SensorModel, ground: ArrayLike) -> None:
     """
     points = as_ground(ground)
     assert len(points) >= 3, "give at least 3 ground points"
+    _assert_none(model_faults(model))
     image = _check_mapping(model, points)
+    _check_far(model)
     _check_closure(model, points, image)
     _check_ground_partials(model, points)
     _check_params(model, points, image)
@@ -57,6 +68,9 @@ def check_sensor_model(model: SensorModel, ground: ArrayLike) -> None:
 
 def check_sensor(sensor: Sensor, path: str | PathLike[str], **options: Any) -> Scene:
     """Check that a sensor recognises and opens `path`, and that every model of the scene keeps the contract.
+
+    It must recognise neither a raster in memory nor a TIFF with nothing beside it; the domain of its models must lie
+    near the image, and the middle of the image meet the ground.
 
     Parameters
     ----------
@@ -78,7 +92,7 @@ def check_sensor(sensor: Sensor, path: str | PathLike[str], **options: Any) -> S
     # Here, because models and estimation are tested without GDAL.
     from ortho_pipeline.raster import open_dataset
 
-    assert sensor.name, "a sensor has a name"
+    _assert_none(sensor_faults(sensor))
     assert sensor.name == sensor.name.lower().strip(), f"{sensor.name!r}: names are in lower case, without blanks"
     assert sensor.description.strip(), "a sensor has a description"
     assert all(text.strip() for text in sensor.options.values()), "every option has a line of help"
@@ -88,26 +102,60 @@ def check_sensor(sensor: Sensor, path: str | PathLike[str], **options: Any) -> S
     recognised = sensor.recognises(dataset)
     assert isinstance(recognised, bool), f"recognises returns True or False, not {recognised!r}"
     assert recognised or options, f"the sensor does not recognise {path}"
+    _check_foreign(sensor)
     scene = sensor.open_scene(dataset, **options)
     _check_scene(sensor, scene, dataset)
     return scene
 
 
 def _check_scene(sensor: Sensor, scene: Scene, dataset: Any) -> None:
-    assert isinstance(scene, Scene), f"open_scene returns a Scene, not {type(scene).__name__}"
-    assert scene.sensor == sensor.name, f"the scene says it is of sensor {scene.sensor!r}, not {sensor.name!r}"
-    size = (dataset.RasterXSize, dataset.RasterYSize)
-    assert (scene.width, scene.height) == size, f"the size is {(scene.width, scene.height)}, the file's is {size}"
-    assert scene.models, "a scene has at least one model"
-    assert scene.model_source, "a scene names the file or tag that its model comes from"
-    assert isinstance(scene.warnings, tuple), "warnings are a tuple of texts"
+    size = dataset.RasterXSize, dataset.RasterYSize
+    _assert_none(scene_faults(sensor, scene, size))
     try:
         json.dumps(dict(scene.facts), allow_nan=False)
     except (TypeError, ValueError) as error:
         raise AssertionError(f"facts must be plain JSON values: {error}") from error
-    for name, model in scene.models.items():
-        assert isinstance(model, SensorModel), f"model {name!r} is a {type(model).__name__}, no SensorModel"
+    for model in scene.models.values():
+        _check_near(model, size)
         check_sensor_model(model, _points_in(model))
+
+
+def _assert_none(faults: Iterator[str]) -> None:
+    fault = next(faults, None)
+    assert fault is None, fault
+
+
+def _check_foreign(sensor: Sensor) -> None:
+    """Check that a sensor leaves datasets alone that nobody can take for its own."""
+    from ortho_pipeline.raster import gdal
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = str(Path(folder, "foreign.tif"))
+        made = {"MEM": "a raster in memory (without a file name)", "GTiff": "a TIFF with nothing beside it"}
+        for driver, what in made.items():
+            dataset = gdal.GetDriverByName(driver).Create("" if driver == "MEM" else path, 4, 4)
+            try:
+                recognised = sensor.recognises(dataset)
+            except Exception as error:
+                text = described(error, sensor.recognises)
+                raise AssertionError(f"recognises of {what} failed ({text}): False, not an exception") from error
+            assert not recognised, f"recognises returns {recognised!r} for {what}, which is not of this sensor"
+            dataset = None
+
+
+def _check_near(model: SensorModel, size: tuple[int, int]) -> None:
+    """Check that domain and image are of one place: a box in other units is the commonest mistake."""
+    asked = "domain must be (centre, half-size), not (low, high), in the units of crs and x (longitude) first"
+    image = model.ground_to_image(_points_in(model))
+    middle = np.array(size) / 2
+    apart = np.abs((image - middle) / np.maximum(size, _SMALL)).max(axis=1)
+    assert np.isfinite(apart).any(), f"no point of the domain has an image: {asked}"
+    assert np.nanmin(apart) <= WIDEST, f"the domain lies {np.nanmin(apart):.0f} image sizes off the image: {asked}"
+    assert np.nanmax(apart) <= WIDEST, f"the domain reaches {np.nanmax(apart):.0f} image sizes off the image: {asked}"
+    ground = model.image_to_ground(middle[None], model.reference_height)
+    assert np.isfinite(ground).all(), (
+        f"the middle of the image meets no ground within the domain at the height {model.reference_height:g} m: {asked}"
+    )
 
 
 def _points_in(model: SensorModel) -> NDArray[np.float64]:
@@ -143,6 +191,28 @@ def _check_mapping(model: SensorModel, ground: NDArray[np.float64]) -> NDArray[n
     return image
 
 
+def _check_far(model: SensorModel) -> None:
+    """Check that points far from the scene have an image or NaN, and that points far from the image do no harm."""
+    centre, half = model.domain
+    far = centre + 1000 * half * np.concatenate([np.eye(3), -np.eye(3)])
+    for name, method, points in (
+        ("ground_to_image", model.ground_to_image, far),
+        (
+            "image_to_ground",
+            lambda image: model.image_to_ground(image, model.reference_height),
+            1e7 * np.array([[1.0, 1.0], [-1.0, -1.0]]),
+        ),
+    ):
+        try:
+            with np.errstate(all="ignore"):
+                found = method(points)
+        except Exception as error:
+            raise AssertionError(
+                f"{name} of points far away failed ({described(error, type(model))}): must be NaN where there is none"
+            ) from error
+        assert not np.isinf(found).any(), f"{name} of points far away returned inf: must be NaN where there is none"
+
+
 def _check_closure(model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64]) -> None:
     back = model.image_to_ground(image, ground[:, 2])
     assert back.shape == ground.shape, f"image_to_ground returns {ground.shape}, not {back.shape}"
@@ -168,7 +238,8 @@ def _check_ground_partials(model: SensorModel, ground: NDArray[np.float64]) -> N
         nudge = np.zeros(3)
         nudge[axis] = step
         moved = (model.ground_to_image(ground + nudge) - model.ground_to_image(ground - nudge)) / 2
-        _assert_predicts(partials[:, :, axis] * step, moved, f"ground_partials along axis {axis}")
+        what = f"ground_partials (over 1e-4 of the domain) along axis {axis}"
+        _assert_predicts(partials[:, :, axis] * step, moved, what, model.ground_to_image(ground))
 
 
 def _check_params(model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64]) -> None:
@@ -189,14 +260,26 @@ def _check_params(model: SensorModel, ground: NDArray[np.float64], image: NDArra
         step[k] = 0.01 / reach
         ahead, behind = model.with_params(params + step), model.with_params(params - step)
         moved = (ahead.ground_to_image(ground) - behind.ground_to_image(ground)) / 2
-        _assert_predicts(partials[:, :, k] * step[k], moved, f"param_partials of {name!r}")
+        _assert_predicts(partials[:, :, k] * step[k], moved, f"param_partials of {name!r}", image)
+    _check_order(model, params, partials)
     assert np.array_equal(model.params, params), "with_params changes the model itself"
 
 
-def _assert_predicts(predicted: NDArray[np.float64], moved: NDArray[np.float64], what: str) -> None:
+def _check_order(model: SensorModel, params: NDArray[np.float64], partials: NDArray[np.float64]) -> None:
+    """Check that `with_params` takes values in the order of `params`, by values that all differ."""
+    steps = 0.01 * np.arange(1, len(params) + 1) / np.abs(partials).max(axis=(0, 1), initial=0.0)
+    found = model.with_params(params + steps).params
+    assert (np.abs(found - params - steps) <= 1e-6 * steps + 1e-15 * np.abs(params)).all(), (
+        "with_params(values).params are other values: they come in the order of param_names"
+    )
+
+
+def _assert_predicts(
+    predicted: NDArray[np.float64], moved: NDArray[np.float64], what: str, image: NDArray[np.float64]
+) -> None:
     miss = np.abs(predicted - moved).max()
     # Differences of image coordinates of some 1e5 px carry rounding of 1e-9 px.
-    allowed = PARTIALS * np.abs(moved).max() + 1e-8
+    allowed = PARTIALS * np.abs(moved).max() + 1e-8 * max(1.0, np.abs(image).max() / 1e5)
     assert miss <= allowed, f"{what} misses a nudge by {miss:g} px (allowed {allowed:g})"
 
 

@@ -183,6 +183,30 @@ def test_a_family_is_fitted_from_the_points(stereo: Stereo, tmp_path: Path, crs:
     assert document["report"]["adjustment"]["object_rms"]["check"]["plan"] < 4.0
 
 
+def test_one_image_is_tested_in_the_image(stereo: Stereo, tmp_path: Path) -> None:
+    args = ("--points", stereo.write(), "-o", tmp_path, "--json")
+    report = json.loads(run("adjust", stereo.images[0], *args))["report"]
+    # One ray determines no ground, but known ground has a place in the image.
+    assert report["adjustment"]["object_rms"]["check"] is None
+    assert report["headline"]["figure"].endswith(" px")
+    assert "12 measurements of check points" in report["headline"]["what"]
+    assert any("12 check points: fewer than" in text for text in report["warnings"])
+
+
+def test_nothing_is_claimed_of_a_fit_to_control_alone(stereo: Stereo, tmp_path: Path) -> None:
+    images = stereo.images
+    report = json.loads(
+        run("adjust", *images, "--points", stereo.write(8, 0), "-o", tmp_path, "--json")
+    )["report"]  # fmt: skip
+    assert "control points in the images: the fit, not a test" in report["headline"]["what"]
+    assert report["headline"]["figure"].endswith(" px")
+    lines = stereo.write(3, 0).read_text().splitlines()
+    few = tmp_path / "few.csv"
+    few.write_text("\n".join(lines[:3] + [line for line in lines if line.startswith(("p0,", "p1,", "p2,"))]) + "\n")
+    alone = run("adjust", images[0], "--points", few, "--correction", "affine", "-o", tmp_path)
+    assert "Not tested: nothing is left over to test the fit with" in alone
+
+
 def test_correction_none_only_intersects(stereo: Stereo, tmp_path: Path) -> None:
     given = ("adjust", *stereo.images, "--points", stereo.write(0, 20), "-o", tmp_path / "out", "--json")
     document = json.loads(run(*given, "--correction", "none"))

@@ -148,6 +148,16 @@ def test_an_encrypted_rpc_leaves_the_pushbroom(product, tmp_path):
     assert Path(made["files"]["ortho"]).is_file()
 
 
+def test_a_pushbroom_beside_an_rpc_is_the_model_with_parameters_of_its_own(product):
+    said = json.loads(run("fit", product["fore"], "--gcps", product["points"], "--correction", "model", "--json"))
+    assert said["model"] == "pushbroom+model"
+    assert said["model_source"] == "metadata of BANDF.tif"
+    assert said["rmse"]["check"]["total"] < 1.0
+    # The RPC is still what the image is worked with otherwise.
+    said = json.loads(run("fit", product["fore"], "--gcps", product["points"], "--json"))
+    assert said["model"] == "rpc+shift"
+
+
 def test_simulate_writes_a_pair_that_the_other_commands_take(tmp_path):
     said = json.loads(run("simulate", "cartosat", "-o", tmp_path / "s", "--seed", 2, "--size", 96, "--json"))
     files = {name: Path(path) for name, path in said["files"].items()}

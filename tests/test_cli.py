@@ -80,6 +80,8 @@ def test_info_says_where_the_model_was_read(tiny):
     assert document["gsd_m"] == pytest.approx(4.8, abs=0.05)
     assert document["utm"] == "EPSG:32734"
     assert document["model_source"] in run("info", tiny.image).output
+    lon, lat = document["corners_lon_lat"][0]
+    assert f"Corners    lon,lat {lon:.5f},{lat:.5f}" in run("info", tiny.image).output
 
 
 def test_fit_prints_the_documented_json(tiny):

@@ -280,3 +280,12 @@ def test_document(rpc):
     assert set(found["points"][0]) == {"id", "role", "used", "image", "predicted", "residual", "loo_residual"}
     assert set(found["rmse"]["loo"]) == {"col", "row", "total", "n"}
     assert found["rmse"]["check"] is None
+
+
+def test_points_none_of_which_has_an_image_are_an_error(rpc):
+    """Two warnings and nothing else looked like a fit."""
+    points = make_points(rpc)
+    away = points.with_ground(points.ground + np.array([40.0, 0.0, 0.0]))
+    for kind in ("none", "shift"):
+        with pytest.raises(InputError, match=r"simulated: none of the 12 points has an image(.|\n)*check the CRS"):
+            fit(start(rpc, kind), away)

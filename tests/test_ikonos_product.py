@@ -179,3 +179,20 @@ def test_the_ortho_is_as_good_as_the_adjustment_says(product, scene, tmp_path):
     off = np.sqrt(((true[:, :2] + found - check.ground[:, :2]) ** 2).sum(axis=1).mean())
     for kind in ("check", "loo"):
         assert report[kind]["total"] / 1.5 < off < 1.3 * report[kind]["total"]
+
+
+def test_one_point_adjusts_the_metadata_model_beside_an_rpc(product, tmp_path):
+    points = tmp_path / "one.csv"
+    lines = (product / "gcps.csv").read_text().splitlines()
+    header = next(k for k, line in enumerate(lines) if line.startswith("id,"))
+    role = lines[header].split(",").index("role")
+    rows = [line.split(",") for line in lines[header + 1 :]]
+    for k, row in enumerate(rows):
+        row[role] = "control" if k == 0 else "check"
+    points.write_text("\n".join([*lines[: header + 1], *map(",".join, rows)]) + "\n")
+    image = product / "po_39001_pan_0000000.tif"
+    said = json.loads(run("fit", image, "--gcps", points, "--correction", "model", "--json"))
+    # The RPC has no parameters; those of geo are held by what the metadata are worth. One point leaves a few metres
+    # (the simulated pixel has some of them), without it there are 10 to 25.
+    assert said["model"] == "geo+model"
+    assert said["rmse"]["check"]["total"] * PIXEL < 5

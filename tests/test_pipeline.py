@@ -13,8 +13,9 @@ from osgeo import gdal
 
 import ortho_pipeline
 from ortho_pipeline import pipeline, plugins
-from ortho_pipeline.errors import CoverageError, DatumError, DegeneratePoints, InputError
+from ortho_pipeline.errors import CoverageError, DatumError, DegeneratePoints, InputError, PluginError
 from ortho_pipeline.model_file import read_model_file
+from ortho_pipeline.models import KINDS
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.rpc import read_rpc, rpc_metadata, write_rpc_txt
 
@@ -469,3 +470,21 @@ def test_model_files_may_name_model_families_of_plugins(tiny, tmp_path, monkeypa
     ortho_pipeline.save_model(tiny.model, path)
     pipeline.open_scene(tiny.image, SceneOptions(model=path))
     assert called
+
+
+def test_a_model_of_another_place_is_a_warning(tiny):
+    """A shift fits exactly, and nothing else said that the delivered model is four images away."""
+    rows = [(name, col + 4 * tiny.width, *others) for name, col, *others in tiny.points(12)]
+    moved = tiny.write(tiny.folder / "moved.csv", rows)
+    (warning,) = [text for text in pipeline.fit(tiny.image, points_of(tiny, moved)).warnings if "image sizes" in text]
+    assert warning.startswith("the model as delivered is 4.01 image sizes away from the points: ")
+    assert not [text for text in pipeline.fit(tiny.image, points_of(tiny)).warnings if "image sizes" in text]
+    family = pipeline.fit(tiny.image, points_of(tiny, moved, fit_model="affine3d")).warnings
+    assert not [text for text in family if "image sizes" in text]
+
+
+def test_a_model_that_could_not_be_read_again_is_not_written(tiny, tmp_path, monkeypatch):
+    monkeypatch.delitem(KINDS, "rpc")
+    with pytest.raises(PluginError, match=r"m_model\.json: .*could not be read again.*'rpc'(.|\n)*ortho_models"):
+        ortho_pipeline.save_model(tiny.model, tmp_path / "m_model.json")
+    assert not list(tmp_path.glob("*.json"))

@@ -9,6 +9,7 @@ import ortho_rpc
 import pytest
 from osgeo import gdal
 
+from ortho_pipeline import pipeline
 from ortho_pipeline.errors import InputError, PluginError
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models import RPC, SensorModel
@@ -112,8 +113,23 @@ def test_plugin_that_fails_to_import_is_left_out_with_a_warning(install, caplog,
 
 def test_bundled_name_cannot_be_shadowed(install):
     install("third-party", "third_party_plugin", PLUGIN.format(name="rpc"))
-    with pytest.raises(PluginError, match="belongs to ortho-pipeline"):
+    with pytest.raises(PluginError, match=r"the sensor 'rpc', but that name belongs to ortho-pipeline\n.*rename"):
         Host(installed=True)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [PLUGIN.format(name="rpc"), PLUGIN.format(name=" a "), PLUGIN.format(name="a").replace("_sensors", "_sensor")],
+)
+def test_the_doctor_lists_what_stops_other_commands(install, source):
+    install("third-party", "third_party_plugin", source)
+    with pytest.raises(PluginError):
+        Host(installed=True)
+    document = pipeline.doctor()
+    (broken,) = document["broken"]
+    assert (broken["plugin"], broken["distribution"], broken["version"]) == ("third_party_plugin", "third-party", "1.2")
+    assert "third_party_plugin (third-party 1.2)" in broken["error"]
+    assert "rpc" in document["sensors"]
 
 
 def test_name_of_a_broken_bundled_plugin_stays_reserved(install):
@@ -124,15 +140,32 @@ def test_name_of_a_broken_bundled_plugin_stays_reserved(install):
 
 
 def test_two_sensors_of_one_name_are_an_error():
-    with pytest.raises(PluginError, match="two plugins offer 'alpha': one and two"):
+    with pytest.raises(PluginError, match="two plugins offer the sensor 'alpha': one and two"):
         Host([make_plugin(make_sensor(), name="one"), make_plugin(make_sensor(), name="two")])
     with pytest.raises(PluginError, match="plugin offers two sensors 'alpha'"):
         Host([make_plugin(make_sensor(), make_sensor())])
 
 
 def test_misspelt_hook_is_an_error():
-    with pytest.raises(PluginError, match="ortho_sensor'"):
+    with pytest.raises(
+        PluginError, match=r"plugin plugin: .*no hook 'ortho_sensor'(.|\n)*did you mean ortho_sensors\?"
+    ):
         Host([make_plugin(make_sensor(), hook="ortho_sensor")])
+
+
+@pytest.mark.parametrize(
+    ("hook", "returned", "message"),
+    [
+        ("ortho_sensors", make_sensor(), r"ortho_sensors returned Sensor\n.*yield the Sensor, or return \[Sensor"),
+        ("ortho_sensors", None, "ortho_sensors returned NoneType"),
+        ("ortho_models", [RPC], r"ortho_models returned list\n.*return \{kind: class\}"),
+    ],
+)
+def test_hook_that_returns_something_else_is_told_what_to_return(hook, returned, message):
+    module = types.ModuleType("other")
+    setattr(module, hook, hookimpl(lambda: returned))
+    with pytest.raises(PluginError, match=message):
+        Host([module])
 
 
 def test_hook_without_marker_or_with_other_arguments_is_an_error():
@@ -173,7 +206,9 @@ def test_hook_that_raises_names_its_plugin():
         raise RuntimeError("no luck")
 
     module.ortho_sensors = ortho_sensors
-    with pytest.raises(PluginError, match=r"raising: ortho_sensors failed \(RuntimeError: no luck\)"):
+    with pytest.raises(
+        PluginError, match=r"raising: ortho_sensors failed \(RuntimeError: no luck at test_plugins\.py:\d+\)"
+    ):
         Host([module])
 
 
@@ -185,7 +220,7 @@ def test_model_families_are_collected():
     with pytest.raises(PluginError, match="SensorModel"):
         Host([module])
     module.ortho_models = hookimpl(lambda: {"rpc": SensorModel})
-    with pytest.raises(PluginError, match="'rpc', but that name is taken"):
+    with pytest.raises(PluginError, match=r"'rpc', but that name is taken by ortho_pipeline.*RPC\n.*another kind"):
         Host([module])
 
 
@@ -228,9 +263,10 @@ def test_recogniser_and_opener_that_raise_name_their_plugin(tmp_path):
     image = make_image(tmp_path / "a.tif")
     with pytest.raises(PluginError, match=r"'alpha' of plugin plugin failed while looking(.|\n)*oops"):
         Host([make_plugin(make_sensor(recognises=fail))]).open_scene(image)
-    with pytest.raises(PluginError, match=r"'alpha' of plugin plugin failed to open(.|\n)*oops"):
+    with pytest.raises(PluginError, match=r"'alpha' of plugin plugin failed to open.*oops at test_plugins\.py:\d+"):
         Host([make_plugin(make_sensor(open_scene=fail))]).open_scene(image)
-    with pytest.raises(InputError, match="the band is missing"):
+    # What the user can correct is said of the file, where the plugin names none.
+    with pytest.raises(InputError, match=r"a\.tif: the band is missing"):
         Host([make_plugin(make_sensor(open_scene=bad_product))]).open_scene(image)
 
 

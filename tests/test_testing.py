@@ -90,6 +90,16 @@ def wrong_nan(model, ground):
     return np.nan_to_num(Plane.ground_to_image(model, ground))
 
 
+def wrong_far_away(model, ground):
+    return np.where(
+        np.abs(ground).max(axis=1, initial=0.0, keepdims=True) > 9, np.inf, Plane.ground_to_image(model, ground)
+    )
+
+
+def fails_far_away(model, ground):
+    return Plane.ground_to_image(model, ground) if not (np.abs(ground) > 9).any() else 1 / 0
+
+
 def wrong_partials(model, ground):
     return 1.01 * SensorModel.ground_partials(model, ground)
 
@@ -113,12 +123,14 @@ def wrong_to_dict(model):
 @pytest.mark.parametrize(
     ("method", "wrong", "message"),
     [
-        ("ground_to_image", wrong_shape, "returns"),
+        ("ground_to_image", wrong_shape, "returned shape"),
         ("ground_to_image", wrong_mean, "one at a time"),
         ("ground_to_image", wrong_nan, "row of NaN"),
         ("ground_partials", wrong_partials, "misses a nudge"),
         ("param_partials", wrong_param_partials, "misses a nudge"),
         ("image_to_ground", wrong_inverse, "closes only"),
+        ("ground_to_image", wrong_far_away, "far away returned inf"),
+        ("ground_to_image", fails_far_away, r"far away failed \(ZeroDivisionError.*must be NaN"),
         ("with_params", wrong_with_params, "with_params"),
         ("to_dict", wrong_to_dict, "to_dict gives another model"),
     ],
@@ -128,6 +140,34 @@ def test_broken_models_are_found(monkeypatch, method, wrong, message):
     monkeypatch.setitem(KINDS, "test-broken", broken)
     with pytest.raises(AssertionError, match=message):
         check_sensor_model(broken(), GROUND)
+
+
+@dataclass(frozen=True, eq=False)
+class Stretched(Plane):
+    """A plane with another scale in y, whose parameters come in the wrong order."""
+
+    kind: ClassVar[str] = "test-stretched"
+    other: float = 100.0
+
+    @property
+    def param_names(self):
+        return ("scale", "other")
+
+    @property
+    def params(self):
+        return np.array([self.scale, self.other])
+
+    def with_params(self, params):
+        return self._replace(scale=float(params[1]), other=float(params[0]))
+
+    def ground_to_image(self, ground):
+        return Plane.ground_to_image(self, ground) * [1.0, self.other]
+
+
+def test_parameters_in_another_order_are_found_where_their_values_are_equal(monkeypatch):
+    monkeypatch.setitem(KINDS, "test-stretched", Stretched)
+    with pytest.raises(AssertionError, match="order of param_names"):
+        check_sensor_model(Stretched(), GROUND)
 
 
 @pytest.fixture
@@ -152,12 +192,16 @@ def test_check_sensor_passes_the_bundled_one(image):
         check_sensor(sensor, image, band=1)
 
 
+def is_large(dataset):
+    return dataset.RasterXSize == 2000
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"sensor": "other"}, "says it is of sensor"),
         ({"width": 10}, "the size is"),
-        ({"models": {}}, "at least one model"),
+        ({"models": {}}, "at least one"),
         ({"model_source": ""}, "file or tag"),
         ({"facts": {"gsd": np.float32(1)}}, "plain JSON"),
         ({"facts": {"gsd": float("nan")}}, "plain JSON"),
@@ -168,9 +212,57 @@ def test_check_sensor_finds_wrong_scenes(image, changes, message):
         "sensor": "test", "path": image, "width": 2000, "height": 1600, "models": {"rpc": make_rpc()},
         "model_source": "tag",
     }  # fmt: skip
-    sensor = Sensor("test", "a test", lambda dataset: True, lambda dataset: Scene(**(fields | changes)))
+    sensor = Sensor("test", "a test", is_large, lambda dataset: Scene(**(fields | changes)))
     with pytest.raises(AssertionError, match=message):
         check_sensor(sensor, image)
+    eager = Sensor("test", "a test", lambda dataset: True, lambda dataset: Scene(**fields))
+    with pytest.raises(AssertionError, match="True for a raster in memory"):
+        check_sensor(eager, image)
+    named = Sensor("test", "a test", lambda dataset: bool(dataset.GetDescription()), lambda dataset: Scene(**fields))
+    with pytest.raises(AssertionError, match="True for a TIFF with nothing beside it"):
+        check_sensor(named, image)
+    failing = Sensor("test", "a test", lambda dataset: is_large(dataset) or 1 / 0 > 0, lambda dataset: Scene(**fields))
+    with pytest.raises(AssertionError, match=r"failed \(ZeroDivisionError.*at test_testing.py:\d+\): False, not an"):
+        check_sensor(failing, image)
     unrecognised = Sensor("test", "a test", lambda dataset: False, lambda dataset: Scene(**fields))
     with pytest.raises(AssertionError, match="does not recognise"):
         check_sensor(unrecognised, image)
+
+
+@dataclass(frozen=True, eq=False)
+class Place(Plane):
+    """A plane of 10,000 px per degree, whose middle (1000, 800) is at 12.5, 41.9."""
+
+    kind: ClassVar[str] = "test-place"
+    centre: tuple[float, ...] = (12.5, 41.9, 150.0)
+    half: tuple[float, ...] = (0.1, 0.08, 150.0)
+    scale: float = 1e4
+
+    @property
+    def domain(self):
+        return np.array(self.centre), np.array(self.half)
+
+    def ground_to_image(self, ground):
+        image = Plane.ground_to_image(self, as_ground(ground) * [1, 1, 1e-5] - [12.5, 41.9, 0])
+        return image + np.array([1000.0, 800.0])
+
+
+@pytest.mark.parametrize(
+    ("centre", "half", "message"),
+    [
+        # Low and high, in place of centre and half-size.
+        ((12.4, 41.82, 0.0), (12.6, 41.98, 300.0), "the domain lies .* image sizes off"),
+        ((12.5, 41.9, 150.0), (10.0, 8.0, 150.0), "the domain reaches .* image sizes off"),
+        ((41.9, 12.5, 150.0), (0.08, 0.1, 150.0), "the domain lies .* image sizes off"),
+        ((12.9, 41.9, 150.0), (0.1, 0.08, 150.0), "the middle of the image meets no ground"),
+    ],
+)
+def test_a_domain_elsewhere_is_named(image, monkeypatch, centre, half, message):
+    monkeypatch.setitem(KINDS, Place.kind, Place)
+
+    def sensor(model):
+        return Sensor("test", "a test", is_large, lambda dataset: Scene("test", image, 2000, 1600, {"a": model}, "tag"))
+
+    check_sensor(sensor(Place()), image)
+    with pytest.raises(AssertionError, match=rf"{message}.*\(centre, half-size\), not \(low, high\)"):
+        check_sensor(sensor(Place(centre=centre, half=half)), image)

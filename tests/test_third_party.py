@@ -6,15 +6,18 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import sysconfig
 from pathlib import Path
 
+import numpy as np
 import pytest
 from osgeo import gdal
 
 from ortho_pipeline import hookspecs
+from ortho_pipeline.testing import check_sensor_model
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLE = ROOT / "examples" / "ortho_tinysat"
@@ -80,13 +83,50 @@ def test_the_command_line_has_the_sensor(fresh, tinysat):
     assert (ortho.ReadAsArray() == 100).sum() == pytest.approx(120 * 90, rel=0.02)
 
 
+def test_the_points_of_the_tutorial_adjust_it(fresh, tinysat):
+    (points,) = blocks_of("points.csv")
+    tinysat.with_name("points.csv").write_text(points, encoding="utf-8")
+    (command,) = re.findall(r"^ortho (fit scene\.tif .*)$", TUTORIAL, re.MULTILINE)
+    document = json.loads(run(fresh / "ortho", *command.split(), "--json", cwd=tinysat.parent))
+    assert document["parameters"]["roll"]["value"] == pytest.approx(1e-4, abs=1e-5)
+    assert document["parameters"]["delay"]["value"] == pytest.approx(0.004, abs=4e-4)
+    assert document["rmse"]["control"]["total"] < 1
+    assert document["rmse"]["check"]["total"] < 1
+
+
+def test_the_test_of_the_tutorial_runs_as_it_is_printed(fresh, tinysat, tmp_path):
+    (text,) = blocks_of("test_tinysat.py")
+    folder = tmp_path / "tests"
+    shutil.copytree(tinysat.parent, folder / "data", ignore=shutil.ignore_patterns("tests"))
+    (folder / "test_tinysat.py").write_text(text, encoding="utf-8")
+    run(fresh / "python", "-m", "pytest", "-q", "-p", "no:cacheprovider", folder, cwd=tmp_path)
+
+
 # -- the tutorial ----------------------------------------------------------------------------------------------------
 
 
+def blocks_of(name: str) -> list[str]:
+    """Return the parts of a file that the tutorial prints."""
+    return re.findall(rf"<!-- {re.escape(name)} -->\n```\w*\n(.*?)```", TUTORIAL, re.DOTALL)
+
+
+def test_the_camera_of_the_tutorial_looks_where_it_says():
+    found = {}
+    exec(blocks_of("frame")[0], found)
+    model = found["model"]
+    centre, half = model.domain
+    check_sensor_model(model, centre + np.array([[0, 0, 0], [0.5, 0.3, 0.9], [-0.5, -0.4, -0.9]]) * half)
+    # Flying east with the right wing down it looks to the left: north, by height times tan 2 degrees.
+    lon, lat, _ = model.image_to_ground([[2000, 1500]], 0.0)[0]
+    assert lon == pytest.approx(12.5, abs=1e-9)
+    assert (lat - 41.9) * 111_070 == pytest.approx(2500 * np.tan(np.radians(2)), rel=1e-3)
+    # Forwards is up in the image.
+    assert model.image_to_ground([[2000, 0]], 0.0)[0, 0] > lon
+
+
 def test_the_tutorial_is_the_example():
-    blocks = re.findall(r"<!-- (\S+) -->\n```\w+\n(.*?)```", TUTORIAL, re.DOTALL)
     for name in ("pyproject.toml", "ortho_tinysat.py"):
-        parts = [text.strip("\n") for file, text in blocks if file == name]
+        parts = [text.strip("\n") for text in blocks_of(name)]
         assert "\n\n\n".join(parts) + "\n" == (EXAMPLE / name).read_text(encoding="utf-8"), name
 
 

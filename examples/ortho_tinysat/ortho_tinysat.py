@@ -20,6 +20,8 @@ class StraightScanner(SensorModel):
     """A line scanner that flies straight on: one row every `line_period`, one column every `pixel_angle`."""
 
     kind: ClassVar[str] = "tinysat"
+    crs: ClassVar[str] = "EPSG:4979"  # of the ground: longitude, latitude (degrees), ellipsoidal height (m) on WGS84
+    param_names: ClassVar[tuple[str, ...]] = ("roll", "delay")
 
     position: tuple[float, float, float]  # ECEF metres, when the middle row is taken
     velocity: tuple[float, float, float]  # ECEF metres per second
@@ -30,9 +32,10 @@ class StraightScanner(SensorModel):
     roll: float = 0.0  # radians, positive to the right of the flight
     delay: float = 0.0  # seconds by which the clock is late
 
-    @property
-    def crs(self) -> str:
-        return "EPSG:4979"  # longitude, latitude, ellipsoidal height on WGS84
+    def __post_init__(self) -> None:
+        for name, shape in (("position", (3,)), ("velocity", (3,)), ("box", (3, 2))):
+            if np.shape(getattr(self, name)) != shape or not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"{name} must have the shape {shape} and finite numbers")
 
     @property
     def domain(self) -> tuple[np.ndarray, np.ndarray]:
@@ -52,16 +55,11 @@ class StraightScanner(SensorModel):
         return np.stack([columns / 2 + angle / self.pixel_angle, rows / 2 + time / self.line_period], axis=1)
 
     @property
-    def param_names(self) -> tuple[str, ...]:
-        return ("roll", "delay")
-
-    @property
     def params(self) -> np.ndarray:
         return np.array([self.roll, self.delay])
 
     def with_params(self, params) -> "StraightScanner":
-        roll, delay = (float(value) for value in params)
-        return replace(self, roll=roll, delay=delay)
+        return replace(self, roll=float(params[0]), delay=float(params[1]))
 
 
 @hookimpl
@@ -71,7 +69,7 @@ def ortho_models() -> Mapping[str, type[SensorModel]]:
 
 @hookimpl
 def ortho_sensors() -> Iterable[Sensor]:
-    yield Sensor("tinysat", "TinySat-1 level 1A scenes", recognises, open_scene, {"roll": "mounting angle, degrees"})
+    yield Sensor("tinysat", "TinySat-1 level 1A scenes", recognises, open_scene, {"mounting": "roll angle, degrees"})
 
 
 def recognises(dataset: Any) -> bool:
@@ -79,17 +77,20 @@ def recognises(dataset: Any) -> bool:
 
 
 def flight_file(dataset: Any) -> Path:
-    return Path(dataset.GetDescription()).with_suffix(".tinysat.json")
+    return Path(dataset.GetDescription().removesuffix(".tif") + ".tinysat.json")
 
 
-def open_scene(dataset: Any, *, roll: str = "0") -> Scene:
+def open_scene(dataset: Any, *, mounting: str = "0") -> Scene:
     path, size = flight_file(dataset), (dataset.RasterXSize, dataset.RasterYSize)
     try:
+        roll = float(np.radians(float(mounting)))
+    except ValueError as error:
+        raise InputError(f"{mounting!r} is no angle", field="mounting", remedy="degrees, such as 0.1") from error
+    try:
         flight = json.loads(path.read_text())
-        model = StraightScanner(size=size, roll=np.radians(float(roll)), **flight["camera"])
+        model = StraightScanner(size=size, roll=roll, **flight["camera"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"not a TinySat-1 flight: {error}", file=path, remedy="ask for the delivery again") from error
-    known = {"roll": Prior(model.roll, np.radians(0.05)), "delay": Prior(0.0, 0.1)}
+    known = {"roll": Prior(roll, np.radians(0.05)), "delay": Prior(0.0, 0.1)}
     facts = {"acquired": flight.get("acquired", "unknown")}
-    return Scene("tinysat", path.with_name(Path(dataset.GetDescription()).name), *size, {"tinysat": model},
-                 str(path), facts=facts, priors=known)  # fmt: skip
+    return Scene("tinysat", dataset.GetDescription(), *size, {"tinysat": model}, str(path), facts=facts, priors=known)

@@ -34,9 +34,9 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 def recognises(dataset: gdal.Dataset) -> bool:
     """Tell whether an imaging survey lies beside the image."""
-    path = survey_of(dataset.GetDescription())
     try:
-        with open(path, "rb") as file:
+        # A dataset in memory has no name: ValueError.
+        with open(survey_of(dataset.GetDescription()), "rb") as file:
             return file.read(len(MARK)) == MARK.encode()
     except (OSError, ValueError):
         return False

@@ -8,7 +8,7 @@ band or component of the same acquisition count for this image as well.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -107,7 +107,7 @@ def open_scene(
         model_source=vendor[1] if vendor and first == "rpc" else delivery.file,
         facts=_facts(image, delivery, component, source, position, models, lacking),
         warnings=(*_level_warnings(delivery), *delivery.notes, *position.warnings, *broken, *contradiction),
-        priors=_priors(models[first]),
+        priors=_priors(models),
         rasters=bands_of(image, bands) if image else (),
         pieces=pieces,
         sources=position.sources,
@@ -177,8 +177,8 @@ def _first(
     return first
 
 
-def _priors(model: SensorModel) -> dict[str, Prior]:
-    return priors_at(model, SIGMAS) if isinstance(model, MapPlane) else {}
+def _priors(models: Mapping[str, SensorModel]) -> dict[str, Prior]:
+    return priors_at(models["geo"], SIGMAS) if "geo" in models else {}
 
 
 def _pieces(

@@ -47,12 +47,21 @@ def test_the_contract(sensor, scene):
     assert middle == pytest.approx([60, 45], abs=1e-6)
 
 
-def test_roll_is_an_option(sensor, scene):
-    rolled = check_sensor(sensor, scene, roll="0.01").model
+def test_the_mounting_is_an_option(sensor, scene):
+    rolled = check_sensor(sensor, scene, mounting="0.01").model
     assert rolled.params[0] == pytest.approx(np.radians(0.01))
+    with pytest.raises(InputError, match=r"^mounting: 'x' is no angle"):
+        sensor.open_scene(gdal.Open(str(scene)), mounting="x")
 
 
-def test_a_damaged_flight(sensor, scene):
-    scene.with_suffix(".tinysat.json").write_text("{}")
+@pytest.mark.parametrize(
+    "damage", [{"position": [1.0, 2.0]}, {"velocity": [1.0, 2.0, float("nan")]}, {"position": None}]
+)
+def test_a_damaged_flight(sensor, scene, damage):
+    flight = scene.with_suffix(".tinysat.json")
+    flight.write_text(json.dumps({"camera": CAMERA | damage}))
+    with pytest.raises(InputError, match=r"scene\.tinysat\.json"):
+        sensor.open_scene(gdal.Open(str(scene)))
+    flight.write_text("{}")
     with pytest.raises(InputError, match=r"scene\.tinysat\.json"):
         sensor.open_scene(gdal.Open(str(scene)))

@@ -1,0 +1,252 @@
+"""What a scene and its models have to be: the cheap part of the contract, which the host asks of every scene it opens.
+
+A fault is a text that says what was returned and what is wanted. The host makes a `PluginError` of the first one, in
+milliseconds and before a warp of hours; `ortho_pipeline.testing` makes it an `AssertionError`, and asks more.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import math
+import traceback
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.crs import parse_crs
+from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.geometry import units_per_metre
+from ortho_pipeline.hookspecs import Piece, Scene, Sensor
+from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.problem import Prior
+
+#: No image has smaller pixels (m), and no scene is narrower: its ground is in other units than its CRS.
+SMALLEST_PIXEL, NARROWEST = 1e-3, 1.0
+#: Parts of the half-size of the domain at which a model is tried, and a row of NaN.
+_TRIED = np.array([[0, 0, 0], [0.5, 0, 0], [0, 0.5, 0], [0, 0, 0.5], [-0.5, -0.5, -0.5], [math.nan] * 3])
+
+
+def described(error: BaseException, culprit: object) -> str:
+    """Return kind, text and place of an error: the last line that it passed of the plugin that `culprit` is from.
+
+    `culprit` is a function or class of the plugin, or the name of its module.
+    """
+    module = culprit if isinstance(culprit, str) else getattr(culprit, "__module__", "")
+    package = module.partition(".")[0]
+    frames = list(traceback.walk_tb(error.__traceback__))
+    own = [one for one in frames if one[0].f_globals.get("__name__", "").partition(".")[0] == package]
+    where = ""
+    if own:
+        frame, line = own[-1]
+        where = f" at {Path(frame.f_code.co_filename).name}:{line}"
+    return f"{type(error).__name__}: {error}{where}"
+
+
+def sensor_faults(sensor: object) -> Iterator[str]:
+    """Yield what is wrong with an offered sensor: types of its fields, and the arguments of its functions."""
+    if not isinstance(sensor, Sensor):
+        yield f"ortho_sensors returned {type(sensor).__name__} instead of Sensor"
+        return
+    if not isinstance(sensor.name, str) or not sensor.name or sensor.name != sensor.name.strip():
+        yield f"{sensor.name!r} is no name of a sensor"
+    said = f"sensor {sensor.name!r}"
+    if not callable(sensor.recognises) or not callable(sensor.open_scene):
+        yield f"{said}: recognises and open_scene must be callable"
+    if not isinstance(sensor.options, Mapping) or not all(
+        isinstance(text, str) for pair in sensor.options.items() for text in pair
+    ):
+        yield f"{said}: options must map names to help texts"
+        return
+    yield from (f"{said}: {fault}" for fault in _option_faults(sensor))
+
+
+def _option_faults(sensor: Sensor) -> Iterator[str]:
+    try:
+        _, *others = inspect.signature(sensor.open_scene).parameters.values()
+    except (TypeError, ValueError):
+        # A callable without a signature, or without arguments; opening it says what is wrong.
+        return
+    if not any(one.kind is one.VAR_KEYWORD for one in others):
+        for name in set(sensor.options) - {one.name for one in others}:
+            yield f"the option {name!r} is declared, but open_scene does not take it"
+    for one in others:
+        if one.kind in (one.VAR_KEYWORD, one.VAR_POSITIONAL):
+            continue
+        if one.name not in sensor.options:
+            yield f"open_scene takes {one.name!r}, which is not among the options of the Sensor"
+        elif one.default is one.empty:
+            yield f"open_scene must have a default for the option {one.name!r}"
+
+
+def scene_faults(
+    sensor: Sensor, scene: object, size: tuple[int, int], kinds: Collection[str] | None = None
+) -> Iterator[str]:
+    """Yield what is wrong with a scene that `sensor` returned for a dataset of `size` (columns, rows).
+
+    `kinds` are the model families that can be read from files; without them that is not asked. Errors of this package
+    that a model raises pass.
+    """
+    if not isinstance(scene, Scene):
+        yield f"open_scene returned {type(scene).__name__} instead of a Scene"
+        return
+    if scene.sensor != sensor.name:
+        yield f"the scene says it is of sensor {scene.sensor!r}, not {sensor.name!r}"
+    if (scene.width, scene.height) != size or not isinstance(scene.width, int) or not isinstance(scene.height, int):
+        yield f"the size is {scene.width} x {scene.height}, the file's is {size[0]} x {size[1]} (int width, height)"
+    if not isinstance(scene.models, Mapping) or not scene.models:
+        yield f"models must map names to models, at least one, not {_shown(scene.models)}"
+        return
+    if not isinstance(scene.model_source, str | Path) or not str(scene.model_source):
+        yield f"model_source must be the file or tag that the model was read from, not {scene.model_source!r}"
+    for name, kind in (("warnings", str), ("pieces", Piece)):
+        items = getattr(scene, name)
+        if not isinstance(items, tuple) or not all(isinstance(one, kind) for one in items):
+            yield f"{name} must be a tuple of {kind.__name__}, not {_shown(items)}"
+    for name in ("facts", "unsuited"):
+        if not isinstance(getattr(scene, name), Mapping):
+            yield f"{name} must be a mapping, not {_shown(getattr(scene, name))}"
+    for name, model in scene.models.items():
+        if not isinstance(model, SensorModel):
+            yield f"model {name!r} is {_shown(model)}, no SensorModel"
+            return
+        yield from (f"model {name!r}: {fault}" for fault in model_faults(model, kinds))
+    adjusted = scene.models[scene.adjustable].param_names if scene.adjustable else ()
+    yield from _prior_faults(scene.priors, adjusted)
+
+
+def model_faults(model: SensorModel, kinds: Collection[str] | None = None) -> Iterator[str]:
+    """Yield what is wrong with a model, from a few points of its domain."""
+    try:
+        yield from _frame_faults(model)
+        yield from _parameter_faults(model)
+        yield from _file_faults(model, kinds)
+    except OrthoError:
+        raise
+    except Exception as error:
+        # The model is somebody else's code.
+        yield f"it failed ({described(error, type(model))})"
+    yield from _mapping_faults(model)
+
+
+def _frame_faults(model: SensorModel) -> Iterator[str]:
+    if not isinstance(model.crs, str):
+        yield f"crs must be a text such as 'EPSG:4979', not {_shown(model.crs)}"
+    domain = model.domain
+    if not _is_pair_of_vectors(domain):
+        yield f"domain must be a property that returns two arrays of 3, centre and half-size, not {_shown(domain)}"
+    centre, half = domain
+    if not np.isfinite(domain).all() or not (half > 0).all():
+        yield f"the domain has the centre {_row(centre)} and the half-size {_row(half)}: must be finite, and positive"
+    crs = parse_crs(model.crs)
+    if crs.is_geographic and (abs(centre[1]) > 90 or abs(centre[0]) > 540 or half[0] > 360 or half[1] > 180):
+        yield f"the domain {_row(centre)} ± {_row(half)} is not in degrees (lon, lat), the units of {model.crs}"
+    metres = half / units_per_metre(crs, centre[None])[0]
+    if min(metres[:2]) < NARROWEST / 2:
+        yield f"the domain {_row(centre)} ± {_row(half)} in {model.crs} is less than a metre wide: other units?"
+    low, high = model.height_range
+    if not (low < high and low <= model.reference_height <= high):
+        yield f"height_range ({low:g}, {high:g}) must rise and hold reference_height {model.reference_height:g}"
+
+
+def _parameter_faults(model: SensorModel) -> Iterator[str]:
+    names, values = model.param_names, model.params
+    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+        yield f"param_names must be a tuple of texts, not {names!r}"
+    fits = isinstance(values, np.ndarray) and values.shape == (len(names),) and values.dtype.kind in "fiu"
+    if not fits or not np.isfinite(values).all():
+        yield f"params must be an array of {len(names)} finite numbers, one for each of param_names, not {values!r}"
+    if len(names) and type(model).with_params is SensorModel.with_params:
+        yield "param_names without with_params: write with_params(params), which returns the model with these values"
+
+
+def _file_faults(model: SensorModel, kinds: Collection[str] | None) -> Iterator[str]:
+    kind, name = getattr(model, "kind", None), type(model).__name__
+    if not isinstance(kind, str) or not kind:
+        yield f"the class {name} needs a name: kind: ClassVar[str] = '...'"
+    if kinds is not None and kind not in kinds:
+        yield (
+            f"its file could not be read again: add the hook ortho_models, which returns {{{kind!r}: {name}}}, to the "
+            "plugin"
+        )
+    try:
+        json.dumps(model.to_dict(), allow_nan=False)
+    except (TypeError, ValueError) as error:
+        yield f"its fields must be JSON values, arrays or tuples ({error}); otherwise write to_dict and from_dict"
+
+
+def _mapping_faults(model: SensorModel) -> Iterator[str]:
+    centre, half = model.domain
+    tried = centre + _TRIED * half
+    images = []
+    for ground in (tried, tried[:1], tried[:0]):
+        what = f"ground_to_image of {len(ground)} point{'s' if len(ground) != 1 else ''}"
+        try:
+            with np.errstate(all="ignore"):
+                images.append(model.ground_to_image(ground.copy()))
+        except OrthoError:
+            raise
+        except Exception as error:
+            yield f"{what} failed ({described(error, type(model))}): it must take (N, 3) at once, N = 0 too"
+            return
+        fault = _array_fault(what, images[-1], len(ground))
+        if fault:
+            yield fault
+            return
+    if not np.isnan(images[0][-1]).all():
+        yield f"ground_to_image returned {_row(images[0][-1])} for a row of NaN, must be NaN"
+    if np.isinf(images[0]).any():
+        yield "ground_to_image returned inf: must be NaN where there is no image"
+    yield from _scale_fault(model, images[0], half / 2)
+
+
+def _array_fault(what: str, image: object, count: int) -> str | None:
+    if not isinstance(image, np.ndarray):
+        return f"{what} returned {_shown(image)}, must be an array of shape ({count}, 2)"
+    if image.shape != (count, 2):
+        return f"{what} returned shape {image.shape}, must be ({count}, 2)"
+    return None if image.dtype == np.float64 else f"{what} returned {image.dtype}, must be float64"
+
+
+def _scale_fault(model: SensorModel, image: Array, step: Array) -> Iterator[str]:
+    metres = step / units_per_metre(parse_crs(model.crs), model.domain[0][None])[0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixel = metres[:2] / np.linalg.norm(image[1:3] - image[0], axis=1)
+    if (pixel < SMALLEST_PIXEL).all():
+        yield (
+            f"a pixel is {min(pixel):.1g} m on the ground: ground_to_image does not take its ground in {model.crs}, or "
+            "domain is not (centre, half-size)"
+        )
+
+
+def _prior_faults(priors: object, names: tuple[str, ...]) -> Iterator[str]:
+    if not isinstance(priors, Mapping):
+        yield f"priors must map names of parameters to Prior(mean, sigma), not {_shown(priors)}"
+        return
+    for name, prior in priors.items():
+        if name not in names:
+            yield f"priors name {name!r}; the parameters of the model that is adjusted are {', '.join(names) or 'none'}"
+        if not isinstance(prior, Prior):
+            yield f"the prior of {name!r} must be Prior(mean, sigma), not {_shown(prior)}"
+
+
+def _is_pair_of_vectors(domain: Any) -> bool:
+    return (
+        isinstance(domain, tuple)
+        and len(domain) == 2
+        and all(isinstance(one, np.ndarray) and one.shape == (3,) and one.dtype.kind in "fiu" for one in domain)
+    )
+
+
+def _shown(value: object) -> str:
+    """Return a value that people gave in few words."""
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    text = repr(value)
+    return text if len(text) < 60 and not callable(value) else f"a {type(value).__name__}"
+
+
+def _row(values: Array) -> str:
+    return "(" + ", ".join(f"{value:g}" for value in values) + ")"

@@ -1,0 +1,224 @@
+"""What the host says of a scene that breaks the contract: at once, in one line, and never a traceback."""
+
+from __future__ import annotations
+
+import itertools
+import time
+import types
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.contract import model_faults, sensor_faults
+from ortho_pipeline.errors import InputError, PluginError
+from ortho_pipeline.estimation import Prior
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.models import KINDS
+from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.plugins import Host
+
+gdal.UseExceptions()
+SIZE = (120, 90)
+
+
+@dataclass(frozen=True, eq=False)
+class Plane(SensorModel):
+    """A model that is right, of 10 m pixels; the tests break it."""
+
+    kind: ClassVar[str] = "test-contract"
+    shift: float = 0.0
+    delay: float = 0.0
+
+    @property
+    def crs(self):
+        return "EPSG:4979"
+
+    @property
+    def domain(self):
+        return np.array([12.5, 41.9, 150.0]), np.array([0.01, 0.01, 150.0])
+
+    @property
+    def param_names(self):
+        return ("shift", "delay")
+
+    @property
+    def params(self):
+        return np.array([self.shift, self.delay])
+
+    def with_params(self, params):
+        return replace(self, shift=float(params[0]), delay=float(params[1]))
+
+    def ground_to_image(self, ground):
+        x, y, h = np.asarray(ground, dtype=float).T
+        return np.stack([60 + 8000 * (x - 12.5) + 1e-3 * h + self.shift, 45 - 11000 * (y - 41.9) + self.delay], axis=1)
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch):
+    monkeypatch.setitem(KINDS, Plane.kind, Plane)
+
+
+@pytest.fixture
+def image(tmp_path):
+    gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), *SIZE)
+    return tmp_path / "a.tif"
+
+
+def host_of(sensor: Sensor) -> Host:
+    plugin = types.ModuleType("plugin")
+    plugin.ortho_sensors = hookimpl(lambda: [sensor])
+    return Host([plugin])
+
+
+def open_with(image: Path, **fields) -> Scene:
+    given = {
+        "sensor": "alpha", "path": image, "width": SIZE[0], "height": SIZE[1], "models": {"plane": Plane()},
+        "model_source": "flight.json",
+    }  # fmt: skip
+    sensor = Sensor("alpha", "a test", lambda dataset: True, lambda dataset: Scene(**(given | fields)))
+    return host_of(sensor).open_scene(image)
+
+
+def test_what_keeps_the_contract_opens_within_milliseconds(image):
+    scene = open_with(image, priors={"shift": Prior(0.0, 1.0)}, model_source=Path("flight.json"))
+    # Reports are JSON.
+    assert scene.model_source == "flight.json"
+    assert list(model_faults(Plane())) == []
+    start = time.perf_counter()
+    for _ in range(20):
+        list(model_faults(Plane()))
+    assert (time.perf_counter() - start) / 20 < 0.02
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"models": [Plane()]}, "models must map names to models"),
+        ({"models": Plane()}, "models must map names to models"),
+        ({"models": {"plane": Plane}}, "no SensorModel"),
+        ({"width": 90, "height": 120}, r"the size is 90 x 120, the file's is 120 x 90"),
+        ({"width": np.int64(120)}, "the size is"),
+        ({"model_source": None}, "model_source must be the file or tag .* not None"),
+        ({"warnings": "beware"}, "warnings must be a tuple of str, not 'beware'"),
+        ({"pieces": ("b.tif",)}, "pieces must be a tuple of Piece"),
+        ({"facts": ["a"]}, "facts must be a mapping"),
+        (
+            {"priors": {"shiftt": Prior(0, 1)}},
+            "priors name 'shiftt'; the parameters of the model that is adjusted are shift, delay",
+        ),
+        ({"priors": {"shift": 0.1}}, r"the prior of 'shift' must be Prior\(mean, sigma\), not 0.1"),
+        ({"priors": [Prior(0, 1)]}, "priors must map names of parameters"),
+    ],
+)
+def test_a_wrong_scene_is_named(image, fields, message):
+    with pytest.raises(PluginError, match=rf"a\.tif: sensor 'alpha' of plugin plugin: .*{message}(.|\n)*check_sensor"):
+        open_with(image, **fields)
+
+
+def fails(self, ground):
+    return np.array([self.lens[0] for _ in ground])
+
+
+def per_point(self, ground):
+    x, y, _ = ground
+    return np.array([x, y])
+
+
+def box(low, high):
+    return property(lambda self: (np.array(low, dtype=float), np.array(high, dtype=float)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"ground_to_image": lambda self, ground: Plane.ground_to_image(self, ground).T},
+         r"ground_to_image of 6 points returned shape \(2, 6\), must be \(6, 2\)"),
+        ({"ground_to_image": lambda self, ground: Plane.ground_to_image(self, ground)[:1]},
+         r"ground_to_image of 6 points returned shape \(1, 2\), must be \(6, 2\)"),
+        ({"ground_to_image": lambda self, ground: Plane.ground_to_image(self, ground).tolist()}, "must be an array"),
+        ({"ground_to_image": lambda self, ground: Plane.ground_to_image(self, ground).astype(int)}, "must be float64"),
+        ({"ground_to_image": per_point}, r"of 6 points failed .* at test_contract\.py:\d+.* \(N, 3\) at once"),
+        ({"ground_to_image": fails}, r"of 6 points failed \(AttributeError: .*'lens' at test_contract\.py:\d+\)"),
+        ({"ground_to_image": lambda self, ground: np.nan_to_num(Plane.ground_to_image(self, ground))},
+         r"returned \(0, 0\) for a row of NaN"),
+        ({"ground_to_image": lambda self, ground: Plane.ground_to_image(self, ground) / 0.0}, "returned inf"),
+        ({"domain": Plane.domain.fget}, "domain must be a property that returns two arrays of 3"),
+        ({"domain": ([12.5, 41.9, 0], [1, 1, 1])}, "domain must be a property that returns two arrays of 3"),
+        ({"domain": property(lambda self: 1 / 0)}, "ZeroDivisionError"),
+        ({"domain": box([12.5, 41.9, 0], [0.01, 0.01, 0])}, "the half-size .* must be finite, and positive"),
+        ({"domain": box([12.5, 41.9, np.nan], [0.01, 0.01, 9])}, "must be finite, and positive"),
+        ({"domain": box([12.5, 41.9, 150], [1000, 1000, 150])}, "not in degrees"),
+        ({"domain": box([500000, 4600000, 150], [1000, 1000, 150])}, "not in degrees"),
+        ({"crs": "EPSG:32633"}, "less than a metre wide"),
+        ({"crs": "EPSG:32633", "domain": box([12.5, 41.9, 150.0], [1.0, 1.0, 150.0])}, "a pixel is .* on the ground"),
+        ({"crs": 4979}, "crs must be a text"),
+        ({"height_range": (5.0, 5.0)}, "height_range"),
+        ({"with_params": SensorModel.with_params}, "param_names without with_params"),
+        ({"params": property(lambda self: np.array([None, 0.0]))}, "params must be an array of 2 finite numbers"),
+        ({"params": property(lambda self: np.zeros(3))}, "params must be an array of 2 finite numbers"),
+        ({"param_names": "shift"}, "param_names must be a tuple"),
+        ({"kind": "test-unregistered"}, r"add the hook ortho_models, which returns \{'test-unregistered': Broken\}"),
+        ({"to_dict": lambda self: {"kind": "test-contract", "lens": object()}}, "its fields must be JSON values"),
+    ],
+)  # fmt: skip
+def test_a_wrong_model_is_named(image, changes, message):
+    broken = type("Broken", (Plane,), {"__module__": __name__, **changes})
+    with np.errstate(all="ignore"), pytest.raises(PluginError, match=message):
+        open_with(image, models={"plane": broken()})
+
+
+@dataclass(frozen=True, eq=False)
+class WithFile(Plane):
+    lens: Path = Path("lens.txt")
+
+
+def test_a_field_that_json_does_not_hold_is_named(image):
+    with pytest.raises(PluginError, match=r"its fields must be JSON values.*Path"):
+        open_with(image, models={"plane": WithFile()})
+
+
+def test_what_a_model_says_itself_passes_with_the_name_of_the_file(image):
+    def blind(self):
+        raise InputError("this camera does not see the Earth", field="attitude")
+
+    with pytest.raises(InputError, match=r"a\.tif: attitude: this camera does not see"):
+        open_with(image, models={"plane": type("Blind", (Plane,), {"domain": property(blind)})()})
+
+
+def opens(dataset, *, band="1", **others):
+    return None
+
+
+def opens_one(dataset, *, band):
+    return None
+
+
+@pytest.mark.parametrize(
+    ("open_scene", "options", "message"),
+    [
+        (lambda dataset: None, {"band": "which"}, "option 'band' is declared, but open_scene does not take it"),
+        (lambda dataset, *, band="1": None, {}, "open_scene takes 'band', which is not among the options"),
+        (opens_one, {"band": "which"}, "must have a default for the option 'band'"),
+        (opens, {"band": "which", "other": "what"}, None),
+        (opens, {}, "open_scene takes 'band'"),
+    ],
+)
+def test_options_and_arguments_belong_together(open_scene, options, message):
+    sensor = Sensor("alpha", "a test", lambda dataset: True, open_scene, options)
+    found = list(sensor_faults(sensor))
+    assert found == [] if message is None else message in found[0]
+    if message:
+        with pytest.raises(PluginError, match=message):
+            host_of(sensor)
+
+
+def test_faults_are_short():
+    """People read them in a terminal."""
+    changes = itertools.chain([{"domain": box([0, 0, 0], [0, 0, 0])}, {"crs": "EPSG:32633"}, {"kind": "test-other"}])
+    for change in changes:
+        (fault, *_) = model_faults(type("Broken", (Plane,), change)(), {Plane.kind})
+        assert len(fault) < 160
