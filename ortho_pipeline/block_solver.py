@@ -485,7 +485,7 @@ class BlockProblem:
             damping = max(10 * damping, 1e-3)
             if damping > 1e8:
                 break
-        raise NotConverged("the adjustment did not converge", remedy="give more control, better starts or fewer parameters")
+        raise NotConverged("the adjustment did not converge", remedy="give more control points or a simpler model")
 
     def _promised(self, linear: Linear, step: Array, shift: Array) -> float:
         return math.sqrt(sum(float((part**2).sum()) for part in self.changes(linear, step, shift)))

@@ -124,6 +124,10 @@ def test_the_pair_is_adjusted_from_the_command_line(product, tmp_path, how):
     truth = truth_of(product["fore"].parent)
     for view, band in BANDS.items():
         saved = read_model_file(Path(done["files"][f"{band} model"]))
+        source = {"rpc": str(product[f"{view}_rpc"]), "pushbroom": f"metadata of {band}.tif"}.get(
+            how[0], "9 control points of"
+        )
+        assert done["report"]["images"][band]["model_source"].startswith(source)
         ground = ground_transform("EPSG:4326", saved.model.crs)(truth["lon_lat_h"])
         miss = saved.model.ground_to_image(ground) - truth[view]
         # Noise of 0.2 to 0.4 px and of 1 m, which is nothing here, in nine points.
