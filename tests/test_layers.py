@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -129,3 +131,20 @@ def code_lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 
 def test_no_drawer_for_everything() -> None:
     assert not [path for path in FILES if path.stem in ("utils", "util", "helpers", "misc", "common")]
+
+
+def test_starting_a_command_loads_nothing_that_few_need() -> None:
+    # Each of these takes as long as all the rest.
+    heavy = (
+        "scipy.interpolate",
+        "scipy.optimize",
+        "scipy.stats",
+        "skimage",
+        "matplotlib",
+        "dask",
+        "pystac",
+        "pydantic",
+    )
+    code = f"import sys, ortho_pipeline.pipeline; print(*[name for name in {heavy!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []

@@ -30,7 +30,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import make_interp_spline
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geometry import geocentric, orbital_from_ecef
@@ -233,6 +232,8 @@ def _attitude_spline(
     near, values = times[first : last + 1], angles[first : last + 1]
     if segments:
         return Spline.fitted(near, values, degree, np.linspace(near[0], near[-1], segments + 1), 1)
+    from scipy.interpolate import make_interp_spline  # takes half of the start-up of a command
+
     through = make_interp_spline(near, values, degree)
     return Spline(degree, np.unique(through.t), through.c, 1)
 

@@ -9,7 +9,6 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import BSpline
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import Array
@@ -140,6 +139,8 @@ class _Unit:
 
     def __init__(self, degree: int, breaks: tuple[float, ...], beyond: int) -> None:
         knots = np.array([breaks[0]] * degree + list(breaks) + [breaks[-1]] * degree)
+        from scipy.interpolate import BSpline  # takes half of the start-up of a command
+
         whole = BSpline(knots, np.eye(len(breaks) - 1 + degree), degree)
         self.inside = [whole, *(whole.derivative(order) for order in range(1, degree + 1))]
         self.sites = np.array([knots[i + 1 : i + 1 + degree].mean() for i in range(len(breaks) - 1 + degree)])
