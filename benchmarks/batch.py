@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -83,6 +84,16 @@ def timed(folder: Path, work: Callable[[Path], None]) -> dict[str, float]:
     return {"wall": wall, "cpu": cpu, "others": max(0.0, busy - cpu) / (wall * PROCESSORS)}
 
 
+def timed_on_dask(folder: Path, few: Path) -> dict[str, float]:
+    """Return what `timed` does on a new cluster of two workers, which have made a few scenes before."""
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
+        work = functools.partial(run, executor="dask", scheduler=cluster.scheduler_address)
+        timed(few, work)
+        return timed(folder, work)
+
+
 def cpu_seconds() -> float:
     """Return the CPU seconds of this process and of all below it, those that have ended included."""
     used, parents = {}, {}
@@ -140,24 +151,19 @@ def killed_and_resumed(folder: Path, scenes: int) -> dict[str, Any]:
 
 def measure(folder: Path, few: Path, scenes: int, repeat: int, quiet: float) -> dict[str, Any]:
     """Measure all ways in turn, `repeat` times, after one with `few` scenes each."""
-    from distributed import LocalCluster
-
     ways: dict[str, Callable[[Path], None]] = {
         "loop": loop,
         "sequential": lambda where: run(where, executor="sequential"),
         "processes": lambda where: run(where, executor="processes", workers=2),
     }
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
-        ways["dask"] = lambda where: run(where, executor="dask", scheduler=cluster.scheduler_address)
-        for warm in ways.values():
-            # Compiled kernels are loaded, and the workers of dask, which stay, have their imports.
-            timed(few, warm)
-        runs: dict[str, list[dict[str, float]]] = {name: [] for name in ways}
-        for _ in range(repeat):
-            for name, work in ways.items():
-                wait_for_quiet(quiet)
-                runs[name].append(timed(folder, work))
-                print(name, {key: round(value, 2) for key, value in runs[name][-1].items()}, flush=True)
+    runs: dict[str, list[dict[str, float]]] = {name: [] for name in (*ways, "dask")}
+    for warm in ways.values():
+        timed(few, warm)
+    for _ in range(repeat):
+        for name, each in runs.items():
+            wait_for_quiet(quiet)
+            each.append(timed_on_dask(folder, few) if name == "dask" else timed(folder, ways[name]))
+            print(name, {key: round(value, 2) for key, value in each[-1].items()}, flush=True)
     begin = time.perf_counter()
     run(folder, executor="sequential")
     again = time.perf_counter() - begin

@@ -91,7 +91,8 @@ class Processes:
             for job, future in _completed(self._pool, ahead, work, jobs):
                 broken = broken or isinstance(future.exception(), BrokenExecutor)
                 yield job, future
-            self._pool.shutdown()
+            # Nothing is under way any more; an interpreter takes its time to end by itself.
+            self.stop()
 
     def stop(self) -> None:
         """End all processes now; whatever they had not finished is not there."""
