@@ -3,7 +3,7 @@
 #   make demo     set up, orthorectify the sample scene, say where the ortho and the report are
 #   make test     set up, run all tests
 #   make check    formatting, lint, types, tests
-#   make bench    speed and memory against gdalwarp, speed of adjustments
+#   make bench    speed and memory against gdalwarp, speed of adjustments and of many scenes
 #   make docs     the documentation as a site in out/site, links checked
 #   make images   draw the pictures of README.md again
 #   make clean    remove .venv, caches and out/
@@ -55,6 +55,8 @@ check: setup
 bench: setup
 	@$(BIN)/python benchmarks/warp.py
 	$(BIN)/python benchmarks/fit.py
+	$(BIN)/python benchmarks/adjust.py
+	$(BIN)/python benchmarks/batch.py
 
 docs: setup
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
