@@ -11,6 +11,7 @@ import math
 import os
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -507,3 +508,35 @@ def write_dem(path: str | os.PathLike[str], heights: Array, corner: tuple[float,
         band.WriteArray(heights.astype(np.float32))
         dataset.FlushCache()
         del band, dataset
+
+
+def write_terrain(
+    path: str | os.PathLike[str],
+    terrain: Callable[[Array, Array], Array],
+    box: ArrayLike,
+    step: float,
+    crs: str,
+    vertical: str,
+) -> None:
+    """Write the DEM of a terrain that is known everywhere: its heights at posts, without error but for rounding.
+
+    Parameters
+    ----------
+    terrain : callable (lon, lat) -> heights
+        Degrees to ellipsoidal metres, all ``(N,)``.
+    box : (2, 2)
+        Least and greatest x, y in `crs`, which the DEM covers; its posts lie on multiples of `step`.
+    crs, vertical : str
+        EPSG codes of the map and of the height datum.
+    """
+    low, high = np.asarray(box, dtype=np.float64)
+    west, south = np.floor(low / step) * step
+    columns, rows = np.ceil((high - (west, south)) / step).astype(int).tolist()
+    north = south + rows * step
+    x, y = np.meshgrid(west + step * (np.arange(columns) + 0.5), north - step * (np.arange(rows) + 0.5))
+    to_map = pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+    lon, lat = to_map.transform(x.ravel(), y.ravel(), direction="INVERSE")
+    heights = terrain(lon, lat) - Vertical.parse(vertical).undulation(lon, lat)
+    # A decimetre is finer than any DEM of such a scene, and packs well.
+    heights = np.round(heights, 1).reshape(rows, columns)
+    write_dem(path, heights, (west, north), step, f"{crs}+{vertical.split(':')[1]}")

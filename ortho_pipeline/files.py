@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and files of strangers, of which no more is read than they may have."""
 
 from __future__ import annotations
 
@@ -56,6 +56,30 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write `text` as UTF-8 to `path`, whole or not at all."""
     with whole_or_nothing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def read_bounded(path: str | os.PathLike[str], limit: int, **told: str) -> bytes:
+    """Return the bytes of a file, of one that is larger the first ``limit + 1``.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read; with field and remedy as `told`.
+    """
+    try:
+        with open(path, "rb") as file:
+            return file.read(limit + 1)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"this file cannot be read ({reason})", file=path, **told) from error
+
+
+def decoded(data: bytes) -> str:
+    """Return text that ought to be UTF-8 but may be Latin-1: what is read of it is ASCII, its names need not be."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
 
 
 def sha256(path: str | os.PathLike[str]) -> str:

@@ -144,23 +144,14 @@ def rpc_of_fields(fields: Mapping[str, str], file: str | PathLike[str] | None = 
 
 
 def _text_of(path: Path) -> str:
-    try:
-        with open(path, "rb") as file:
-            data = file.read(MAX_SIZE + 1)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"this file cannot be read ({reason})", file=path) from error
+    data = files.read_bounded(path, MAX_SIZE)
     if len(data) > MAX_SIZE:
         raise InputError("this file has more than 5 MB, which no RPC file has", file=path)
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise InputError("this file is UTF-16 text", file=path, remedy="save it as UTF-8")
     if b"\0" in data:
         raise InputError("this is a binary file, not RPC text", file=path)
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        # The numbers are ASCII in any case; comments of vendors need not be.
-        return data.decode("latin-1")
+    return files.decoded(data)
 
 
 def _number(text: str | None, file: str | PathLike[str] | None, field: str) -> float:

@@ -221,7 +221,7 @@ class LineScanner(SensorModel):
         frame, _ = self._orbit(time)
         inertial = np.einsum("nij,nj->ni", frame, look @ self._mount)
         origin = -self.radius * frame[:, :, 2]
-        return _spin(origin, -self.earth_rate * time), _spin(inertial, -self.earth_rate * time)
+        return spin(origin, -self.earth_rate * time), spin(inertial, -self.earth_rate * time)
 
     @cached_property
     def _mount(self) -> Array:
@@ -247,7 +247,7 @@ class LineScanner(SensorModel):
     def _in_camera(self, points: Array, time: Array) -> tuple[Array, Array]:
         """Return the vectors from camera to ECEF points in the camera frame at `time`, and their rates per second."""
         frame, frame_rate = self._orbit(time)
-        inertial = _spin(points, self.earth_rate * time)
+        inertial = spin(points, self.earth_rate * time)
         velocity = self.earth_rate * np.stack([-inertial[:, 1], inertial[:, 0], np.zeros_like(time)], axis=1)
         look = np.einsum("nij,ni->nj", frame, inertial)
         look[:, 2] += self.radius
@@ -287,7 +287,7 @@ def _triple(vector: Array) -> tuple[float, float, float]:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
 
-def _spin(vectors: Array, angle: Array) -> Array:
+def spin(vectors: Array, angle: Array) -> Array:
     """Rotate ``(N, 3)`` vectors about the Earth's axis by ``(N,)`` radians."""
     cos, sin = np.cos(angle), np.sin(angle)
     x, y, z = vectors.T

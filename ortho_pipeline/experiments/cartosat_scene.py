@@ -27,7 +27,7 @@ from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.points import Points
 from ortho_pipeline.rpc import fit_rpc
-from ortho_pipeline.simulate import EARTH_A, EARTH_GM, EARTH_RATE, geocentric, geodetic
+from ortho_pipeline.simulate import EARTH_A, EARTH_GM, EARTH_RATE, geocentric, geodetic, spin
 
 Array = NDArray[np.float64]
 
@@ -198,7 +198,7 @@ class Scanner:
         frame = self._frame(self.middle + since)
         directions = np.einsum("nij,nkj,nk->ni", frame, self._camera_from_orbital(since), look)
         turned = -EARTH_RATE * (self.middle + since)
-        return _spin(-self.radius * frame[:, :, 2], turned), _spin(directions, turned)
+        return spin(-self.radius * frame[:, :, 2], turned), spin(directions, turned)
 
     def project(self, ground: ArrayLike) -> Array:
         """Return the image points ``(N, 2)`` of lon, lat (degrees), height ``(N, 3)``: when does the line pass them?
@@ -246,7 +246,7 @@ class Scanner:
     def _look(self, points: Array, since: Array) -> Array:
         """Return the vectors ``(N, 3)`` from camera to ECEF points in its own axes, at seconds from the middle row."""
         time = self.middle + since
-        look = np.einsum("nij,ni->nj", self._frame(time), _spin(points, EARTH_RATE * time))
+        look = np.einsum("nij,ni->nj", self._frame(time), spin(points, EARTH_RATE * time))
         look[:, 2] += self.radius
         return np.einsum("nij,nj->ni", self._camera_from_orbital(since), look)
 
@@ -301,7 +301,7 @@ def aim(view: str, *, size: int = SIZE) -> Scanner:
     target = np.array([[LON, LAT, 100.0]])
     ground = geocentric(target)
     # The Earth turns the scene through the plane of the orbit: half-way between the two images it lies in it.
-    crossing = _spin(ground, np.array([EARTH_RATE * -18.0]))[0]
+    crossing = spin(ground, np.array([EARTH_RATE * -18.0]))[0]
     up = crossing / np.linalg.norm(crossing)
     east = np.cross([0.0, 0.0, 1.0], up)
     east /= np.linalg.norm(east)
@@ -499,13 +499,6 @@ def _spread(count: int, random: np.random.Generator) -> Array:
     places = 2 * cells - 1
     places[:, 1] = np.sign(places[:, 1]) * np.abs(places[:, 1]) ** CROWDING
     return np.array(FIELD_MIDDLE) + places * FIELD_HALF
-
-
-def _spin(vectors: Array, angle: Array) -> Array:
-    """Rotate ``(N, 3)`` vectors about the Earth's axis by ``(N,)`` radians."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    x, y, z = vectors.T
-    return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1)
 
 
 def _triple(vector: ArrayLike) -> tuple[float, float, float]:

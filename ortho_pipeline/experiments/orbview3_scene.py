@@ -28,7 +28,7 @@ from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.points import Points
 from ortho_pipeline.rpc import fit_rpc
-from ortho_pipeline.simulate import EARTH_A, EARTH_GM, EARTH_RATE, geocentric, geodetic
+from ortho_pipeline.simulate import EARTH_A, EARTH_GM, EARTH_RATE, geocentric, geodetic, spin
 
 Array = NDArray[np.float64]
 Surface = Callable[[Array, Array], Array]
@@ -244,7 +244,7 @@ class Scanner:
         origin = self.radius * (np.cos(angle) * self.radial + np.sin(angle) * self.along)
         forward = np.cos(angle) * self.along - np.sin(angle) * self.radial
         wanted = forward if self.flight_line else np.broadcast_to(np.cross(self.along, self.radial), forward.shape)
-        return _spin(origin, -EARTH_RATE * time), _spin(wanted, -EARTH_RATE * time)
+        return spin(origin, -EARTH_RATE * time), spin(wanted, -EARTH_RATE * time)
 
     def target(self, since: Array) -> Array:
         """Return in ECEF the point that the camera is commanded to look at ``(N, 3)``."""
@@ -262,13 +262,6 @@ def _unit(vectors: Array) -> Array:
 def _across(vectors: Array, axis: Array) -> Array:
     """Return the unit vectors of what of `vectors` is normal to the unit vectors `axis`."""
     return _unit(vectors - (vectors * axis).sum(axis=1)[:, None] * axis)
-
-
-def _spin(vectors: Array, angle: Array) -> Array:
-    """Turn ``(N, 3)`` vectors about the Earth's axis by ``(N,)`` radians."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    x, y, z = vectors.T
-    return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1)
 
 
 def _up(ground: Array) -> Array:

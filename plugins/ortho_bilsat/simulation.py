@@ -14,8 +14,7 @@ import pyproj
 
 from ortho_bilsat.stack import write_bands
 from ortho_bilsat.survey import Survey, write_survey
-from ortho_pipeline.crs import Vertical
-from ortho_pipeline.dem import write_dem
+from ortho_pipeline.dem import write_terrain
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.experiments import bilsat_scene as simulated
 from ortho_pipeline.files import write_text
@@ -123,14 +122,7 @@ def _write_heights(scene: simulated.BilsatScene, step: float, path: Path) -> Non
     xy = np.stack(to_map.transform(seen[:, 0], seen[:, 1]), axis=1)
     # What the camera sees at the heights of its survey lies a little beyond what it sees on the hills.
     margin = 2000.0 + step
-    west, south = np.floor((xy.min(axis=0) - margin) / step) * step
-    columns, rows = np.ceil((xy.max(axis=0) + margin - (west, south)) / step).astype(int).tolist()
-    north = south + rows * step
-    x, y = np.meshgrid(west + step * (np.arange(columns) + 0.5), north - step * (np.arange(rows) + 0.5))
-    lon, lat = to_map.transform(x.ravel(), y.ravel(), direction="INVERSE")
-    heights = scene.hills(lon, lat) - Vertical.parse(GEOID).undulation(lon, lat)
-    # A decimetre is finer than any DEM of such a scene, and packs well.
-    write_dem(path, np.round(heights, 1).reshape(rows, columns), (west, north), step, f"{MAP}+{GEOID.split(':')[1]}")
+    write_terrain(path, scene.hills, (xy.min(axis=0) - margin, xy.max(axis=0) + margin), step, MAP, GEOID)
 
 
 def _truth(scene: simulated.BilsatScene, survey: Survey, seed: int, off_nadir_deg: float) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import decoded, read_bounded
 from ortho_pipeline.models.base import Array
 
 MAX_BYTES = 1_000_000
@@ -159,20 +160,11 @@ def read_metadata(path: str | PathLike[str]) -> Metadata:
         If the file cannot be read, is no text, or holds no assignment.
     """
     path = Path(path)
-    try:
-        with open(path, "rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"this file cannot be read ({reason})", file=path) from error
+    data = read_bounded(path, MAX_BYTES)
     if len(data) > MAX_BYTES or b"\0" in data:
         raise InputError("this is no metadata: too large, or no text", file=path)
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")
     fields: dict[str, tuple[str, ...]] = {}
-    for line in text.splitlines():
+    for line in decoded(data).splitlines():
         key, sign, value = (part.strip() for part in line[:2000].partition("="))
         if sign and key:
             fields[key.lower()] = (*fields.get(key.lower(), ()), value.strip("\"'").strip())

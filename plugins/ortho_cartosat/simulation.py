@@ -13,8 +13,7 @@ import numpy as np
 import pyproj
 from osgeo import gdal
 
-from ortho_pipeline.crs import Vertical
-from ortho_pipeline.dem import write_dem
+from ortho_pipeline.dem import write_terrain
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.experiments import cartosat_scene as simulated
 from ortho_pipeline.files import whole_or_nothing, write_text
@@ -142,14 +141,7 @@ def _write_heights(pair: simulated.StereoPair, step: float, path: Path) -> None:
     xy = np.stack(to_map.transform(seen[:, 0], seen[:, 1]), axis=1)
     # What the vendor's models see at the heights of the RPC lies beyond what the cameras see on the hills.
     margin = 1200.0 + step
-    west, south = np.floor((xy.min(axis=0) - margin) / step) * step
-    columns, rows = np.ceil((xy.max(axis=0) + margin - (west, south)) / step).astype(int).tolist()
-    north = south + rows * step
-    x, y = np.meshgrid(west + step * (np.arange(columns) + 0.5), north - step * (np.arange(rows) + 0.5))
-    lon, lat = to_map.transform(x.ravel(), y.ravel(), direction="INVERSE")
-    heights = pair.hills(lon, lat) - Vertical.parse(GEOID).undulation(lon, lat)
-    # A decimetre is finer than any DEM of such a scene, and packs well.
-    write_dem(path, np.round(heights, 1).reshape(rows, columns), (west, north), step, f"{MAP}+{GEOID.split(':')[1]}")
+    write_terrain(path, pair.hills, (xy.min(axis=0) - margin, xy.max(axis=0) + margin), step, MAP, GEOID)
 
 
 def _truth(pair: simulated.StereoPair, seed: int, jitter: float) -> dict[str, Any]:

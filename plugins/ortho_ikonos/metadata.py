@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from os import PathLike
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import decoded, read_bounded
 
 MAX_BYTES = 2_000_000
 MAX_LINE = 10_000
@@ -272,15 +273,7 @@ def read_header(path: str | PathLike[str]) -> Placement:
 
 
 def _text(path: str | PathLike[str]) -> str:
-    try:
-        with open(path, "rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(
-            f"this file cannot be read ({reason})", file=path, field="metadata",
-            remedy="give the option metadata=FILE",
-        ) from error  # fmt: skip
+    data = read_bounded(path, MAX_BYTES, field="metadata", remedy="give the option metadata=FILE")
     problem = None
     if len(data) > MAX_BYTES:
         problem = f"a metadata file has not more than {MAX_BYTES // 1_000_000} MB"
@@ -290,11 +283,7 @@ def _text(path: str | PathLike[str]) -> str:
         problem = "this is a binary file, no metadata text"
     if problem:
         raise InputError(problem, file=path, field="metadata", remedy="give the _metadata.txt of the delivery")
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        # Keys and numbers are ASCII in any case; names of projects need not be.
-        return data.decode("latin-1")
+    return decoded(data)
 
 
 def _lines(path: str, text: str) -> Iterator[tuple[int, str]]:

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from osgeo import gdal, osr
 
-from ortho_pipeline.crs import Vertical
-from ortho_pipeline.dem import write_dem
+from ortho_pipeline.dem import write_terrain
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.experiments import ikonos_scene as simulated
 from ortho_pipeline.experiments.ikonos_scene import GeoScene, VendorModel
@@ -175,16 +174,9 @@ def _write_tiff(path: Path, pixels: Array, grid: GeoScene) -> None:
 def _write_heights(scene: GeoScene, step: float, path: Path) -> None:
     # What is seen at the lowest and the highest ground lies some hundred metres beyond the image.
     margin = 600.0 + step
-    wide, tall = scene.columns * scene.pixel, scene.rows * scene.pixel
-    west, south = np.floor((np.array([scene.west, scene.north - tall]) - margin) / step) * step
-    columns, rows = np.ceil((np.array([scene.west + wide, scene.north]) + margin - (west, south)) / step).astype(int)
-    north = south + rows * step
-    x, y = np.meshgrid(west + step * (np.arange(columns) + 0.5), north - step * (np.arange(rows) + 0.5))
-    lon, lat = simulated.to_map().transform(x.ravel(), y.ravel(), direction="INVERSE")
-    heights = scene.terrain(lon, lat) - Vertical.parse(GEOID).undulation(lon, lat)
-    # A decimetre is finer than any DEM of such a scene, and packs well.
-    crs = f"{simulated.MAP_CRS}+{GEOID.split(':')[1]}"
-    write_dem(path, np.round(heights, 1).reshape(rows, columns), (west, north), step, crs)
+    low = np.array([scene.west, scene.north - scene.rows * scene.pixel]) - margin
+    high = np.array([scene.west + scene.columns * scene.pixel, scene.north]) + margin
+    write_terrain(path, scene.terrain, (low, high), step, simulated.MAP_CRS, GEOID)
 
 
 # -- metadata --------------------------------------------------------------------------------------------------------

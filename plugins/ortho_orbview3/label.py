@@ -18,6 +18,7 @@ from os import PathLike
 from typing import NamedTuple
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import decoded, read_bounded
 
 #: Real labels have 6 kB and three levels of groups.
 MAX_BYTES, MAX_DEPTH = 200_000, 12
@@ -138,21 +139,12 @@ def read_label(path: str | PathLike[str]) -> Group:
 
 
 def _text(path: str | PathLike[str]) -> str:
-    try:
-        with open(path, "rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"this label cannot be read ({reason})", file=path) from error
+    data = read_bounded(path, MAX_BYTES)
     if len(data) > MAX_BYTES:
         raise InputError(f"a label of more than {MAX_BYTES} bytes is not read", file=path)
     if data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"\0" in data:
         raise InputError("a label is plain text, not a binary file or UTF-16", file=path)
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        # Keys and numbers are ASCII in any case; names of companies need not be.
-        return data.decode("latin-1")
+    return decoded(data)
 
 
 class _Token(NamedTuple):

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_orbview3.product import COEFFICIENT_KEYS, CORNERS, ERROR_KEYS, SCALAR_KEYS
-from ortho_pipeline.crs import Vertical
-from ortho_pipeline.dem import write_dem
+from ortho_pipeline.dem import write_terrain
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.experiments import orbview3_scene as simulated
 from ortho_pipeline.files import whole_or_nothing, write_text
@@ -167,18 +166,10 @@ def _write_image(pixels: NDArray[np.uint16], path: Path) -> None:
 
 def _write_heights(cameras: dict[str, simulated.Scanner], coast: simulated.Coast, step: float, path: Path) -> None:
     seen = np.concatenate([camera.outline(h) for camera in cameras.values() for h in simulated.RPC_HEIGHTS])
-    to_map = simulated.to_map()
-    xy = np.stack(to_map.transform(seen[:, 0], seen[:, 1]), axis=1)
+    xy = np.stack(simulated.to_map().transform(seen[:, 0], seen[:, 1]), axis=1)
     margin = 500.0 + step
-    west, south = np.floor((xy.min(axis=0) - margin) / step) * step
-    columns, rows = np.ceil((xy.max(axis=0) + margin - (west, south)) / step).astype(int).tolist()
-    north = south + rows * step
-    x, y = np.meshgrid(west + step * (np.arange(columns) + 0.5), north - step * (np.arange(rows) + 0.5))
-    lon, lat = to_map.transform(x.ravel(), y.ravel(), direction="INVERSE")
-    heights = coast(lon, lat) - Vertical.parse(GEOID).undulation(lon, lat)
-    # A decimetre is finer than any DEM of such a scene, and packs well.
-    crs = f"{simulated.MAP_CRS}+{GEOID.split(':')[1]}"
-    write_dem(path, np.round(heights, 1).reshape(rows, columns), (west, north), step, crs)
+    box = xy.min(axis=0) - margin, xy.max(axis=0) + margin
+    write_terrain(path, coast, box, step, simulated.MAP_CRS, GEOID)
 
 
 def _truth(cameras: dict[str, simulated.Scanner], ground: Array, seed: int, pixel: int) -> dict[str, Any]:

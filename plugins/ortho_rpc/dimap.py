@@ -27,6 +27,7 @@ from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import read_bounded
 from ortho_pipeline.models.line_camera import MOST_PIXELS, LineCamera
 from ortho_pipeline.models.pushbroom import Pushbroom
 from ortho_pipeline.models.pushbroom_start import pushbroom_of_tables, rotations_of_quaternions
@@ -152,12 +153,7 @@ class _File:
 
         self.path = path
         self._midnight: datetime | None = None
-        try:
-            with open(path, "rb") as file:
-                data = file.read(MAX_SIZE + 1)
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(f"this file cannot be read ({reason})", file=path) from error
+        data = read_bounded(path, MAX_SIZE)
         if len(data) > MAX_SIZE:
             raise InputError("this file has more than 5 MB, which no metadata of a scene has", file=path)
         try:
