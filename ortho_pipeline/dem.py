@@ -54,7 +54,7 @@ class Surface:
     constant_height : float or None
         The height of a plane, None for a DEM.
     fill : 'error', 'mask', 'nearest' or float
-        What stands for a void: NaN for the first two; a height with the others.
+        What stands for a void: NaN for the first two; a height with the others. `with_fill` changes it in a copy.
     provenance : dict
         Path, declared and used height datum, warnings; JSON values.
     """
@@ -64,7 +64,7 @@ class Surface:
         self.crs = pyproj.CRS.from_epsg(4326)
         self.shape = (0, 0)
         self.pixel_from_crs = (0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-        self.fill: str | float = "error"
+        self._fill: str | float = "error"
         self.provenance: dict[str, Any] = {"constant_height": constant_height}
         self.vertical = Vertical("ellipsoid")
         self._path, self._allow_network = "", False
@@ -79,6 +79,33 @@ class Surface:
         self._local = threading.local()
         self._lock = threading.Lock()
         self._tiles: OrderedDict[tuple[int, int, bool], Array] = OrderedDict()
+
+    def __copy__(self) -> Surface:
+        # What is cached follows from fill rule and seam: no two surfaces share it, nor the record of what they are.
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        other.provenance = dict(self.provenance)
+        other._forget()
+        return other
+
+    @property
+    def fill(self) -> str | float:
+        """What stands for a void."""
+        return self._fill
+
+    def with_fill(self, fill: str | float) -> Surface:
+        """Return this surface with another rule for voids; this one stays as it is.
+
+        Raises
+        ------
+        InputError
+            If there is no such rule.
+        """
+        other = copy.copy(self)
+        other._fill, other._range = _parse_fill(fill), None
+        if self.constant_height is None:
+            other.provenance["fill"] = other._fill
+        return other
 
     @classmethod
     def constant(cls, height: float) -> Surface:
@@ -118,7 +145,7 @@ class Surface:
         """
         surface = cls()
         surface._path, surface._allow_network = os.fspath(path), allow_network
-        surface.fill = _parse_fill(fill)
+        surface._fill = _parse_fill(fill)
         dataset = surface._dataset()
         crs = surface._place(dataset)
         declared = declared_vertical(crs)
@@ -223,7 +250,6 @@ class Surface:
             return self
         shift = round((lon - (x + a * (columns - 1) / 2)) / a)
         other = copy.copy(self)
-        other._forget()
         other._roll = (self._roll + shift) % columns
         other._set_affine((x + shift * a, a, b, y, c, d))
         return other
@@ -475,9 +501,6 @@ def _parse_fill(fill: str | float) -> str | float:
             remedy="give error, mask, nearest or an ellipsoidal height in metres",
         )
     return height
-
-
-# -- rays ------------------------------------------------------------------------------------------------------------
 
 
 # -- writing ---------------------------------------------------------------------------------------------------------

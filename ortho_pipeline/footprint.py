@@ -6,7 +6,6 @@ height range stand in, so a DEM that covers half the scene cannot cut the ortho 
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -94,8 +93,7 @@ def voids(model: SensorModel, surface: Surface, width: int, height: int) -> Void
         return Voids(0, 0.0)
     import shapely
 
-    surface = copy.copy(facing(model, surface, width, height))
-    surface.fill = "mask"
+    surface = facing(model, surface, width, height).with_fill("mask")
     ground = ground_transform(model.crs, surface.crs)(footprint(model, surface, width, height))
     samples = surface.samples_at(ground[:, :2])
     outline = shapely.Polygon(samples)

@@ -16,6 +16,7 @@ from ortho_pipeline.crs import GroundTransform, Vertical
 from ortho_pipeline.datum import dem_unit
 from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import CrsError, DatumError, InputError
+from ortho_pipeline.footprint import voids
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.rays import intersect
 
@@ -285,6 +286,30 @@ def test_outside_is_nan_and_fill_rules_say_otherwise(tmp_path: Path) -> None:
     assert nearest.window(9, 10, 2, 1)[0] == pytest.approx([heights[10, 9], heights[10, 9]])
     assert nearest.coverage([void, far]) == 0.0
     assert nearest.window(500, 500, 2, 2) == pytest.approx(np.full((2, 2), heights[-1, -1]))
+
+
+@pytest.mark.parametrize("fill", ["nearest", "-3.5", "mask"])
+def test_a_look_with_another_rule_leaves_a_surface_as_it_was(tmp_path: Path, fill: str) -> None:
+    heights = hills()
+    heights[20:24, 30:36] = -9999.0
+    path = write_dem(tmp_path / "dem.tif", heights, nodata=-9999.0)
+    image = np.array([[3000.0, 2000.0], [3250.0, 2150.0], [7000.0, 5000.0]])
+    ground = image * [1.0, -1.0] + UTM_BOX[:2]
+    untouched = Surface.open(path, "ellipsoid", fill=fill).heights(ground)
+    surface = Surface.open(path, "ellipsoid", fill=fill)
+    # Its border must lie on the DEM: only then are tiles read.
+    counted = voids(Oblique(0.0), surface, 6000, 5000)
+    assert counted.count == 24
+    np.testing.assert_array_equal(surface.heights(ground), untouched)
+    other = surface.with_fill("12.0")
+    np.testing.assert_array_equal(other.heights(ground[1:2]), [12.0])
+    np.testing.assert_array_equal(surface.heights(ground), untouched)
+    assert (surface.fill, surface.provenance["fill"]) == (Surface.open(path, "ellipsoid", fill=fill).fill,) * 2
+    assert other.provenance["fill"] == 12.0
+    assert other.height_range[0] == 12.0
+    assert surface.height_range == Surface.open(path, "ellipsoid", fill=fill).height_range
+    with pytest.raises(AttributeError):
+        surface.fill = "mask"  # type: ignore[misc]
 
 
 def test_windows_do_not_depend_on_how_they_are_cut(tmp_path: Path) -> None:
