@@ -262,7 +262,7 @@ def rectify(
     -------
     Result
         `files` has ortho, model, rpc, vrt (unless no RPC stands for the model), residuals and style (with points
-        only), report, html and stac (if asked for).
+        only), report, html, and stac with thumbnail and overview (if asked for).
 
     Raises
     ------
@@ -272,7 +272,7 @@ def rectify(
     """
     stem = Path(image).stem
     files = {
-        kind: Path(folder) / f"{stem}{ending}" for kind, ending in _ENDINGS.items() if kind != "stac" or output.stac
+        kind: Path(folder) / f"{stem}{ending}" for kind, ending in _ENDINGS.items() if kind not in _STAC or output.stac
     }
     inputs.check_paths(files, image, scene, points, surface)
     if not has_surface(surface):
@@ -449,7 +449,11 @@ _ENDINGS = {
     "report": "_report.json",
     "html": "_report.html",
     "stac": "_stac.json",
+    "thumbnail": "_thumbnail.png",
+    "overview": "_overview.png",
 }
+#: Outputs that are only made with a STAC item.
+_STAC = ("stac", "thumbnail", "overview")
 
 
 def _coverage(model: SensorModel, surface: dem.Surface, size: tuple[int, int]) -> tuple[float, list[str]]:

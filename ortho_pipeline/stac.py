@@ -1,7 +1,7 @@
 """A STAC item for an orthoimage: where and when it is, how it was seen, how accurate it is, and a checksum.
 
-Extensions: projection 2.0, raster 1.1, view 1.0, file 2.1, accuracy 1.0. Accuracy comes from check points, or from
-leave-one-out residuals; that of control points is no accuracy, and is left out.
+Extensions: projection 2.0, raster 1.1, view 1.0, file 2.1, accuracy 1.0 beta 1 (its only published version). Accuracy
+comes from check points, or from leave-one-out residuals; that of control points is no accuracy, and is left out.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ import numpy as np
 import shapely
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import sha256, write_text
+from ortho_pipeline.files import sha256, whole_or_nothing, write_text
 from ortho_pipeline.outline import grid_of, to_geojson, valid_outline
+from ortho_pipeline.preview import preview_png
 from ortho_pipeline.raster import RasterSource
 
 if TYPE_CHECKING:
@@ -30,12 +31,16 @@ _URIS = {
     "raster": f"{_EXTENSIONS}/raster/v1.1.0/schema.json",
     "view": f"{_EXTENSIONS}/view/v1.0.0/schema.json",
     "file": f"{_EXTENSIONS}/file/v2.1.0/schema.json",
-    "accuracy": f"{_EXTENSIONS}/accuracy/v1.0.0/schema.json",
+    "accuracy": f"{_EXTENSIONS}/accuracy/v1.0.0-beta.1/schema.json",
 }
 #: Multihash: the code of SHA-256 and its length in bytes.
 _SHA256 = "1220"
+#: Longer side in pixels of the pictures of an item, by their key among the files.
+_PICTURES = {"thumbnail": 256, "overview": 1024}
 #: Files beside the ortho: key, title, media type, roles.
 _ASSETS = (
+    ("thumbnail", "Orthoimage, small", "image/png", ["thumbnail"]),
+    ("overview", "Orthoimage, reduced", "image/png", ["overview", "visual"]),
     ("report", "Accuracy report", "application/json", ["metadata"]),
     ("html", "Accuracy report as a page", "text/html", ["metadata"]),
     ("model", "Adjusted sensor model", "application/json", ["metadata"]),
@@ -78,7 +83,7 @@ def acquisition_time(facts: Mapping[str, Any], given: str | None = None) -> date
 def write_item(
     path: Path, report: Mapping[str, Any], files: Mapping[str, Path], acquired: datetime, name: str
 ) -> None:  # fmt: skip
-    """Write the STAC item of an ortho.
+    """Write the STAC item of an ortho, and its pictures.
 
     Parameters
     ----------
@@ -87,7 +92,8 @@ def write_item(
     report : mapping
         The accuracy report of the ortho.
     files : mapping of str to Path
-        Outputs by what they are; ``ortho`` has to be there, the others become assets where they are.
+        Outputs by what they are; ``ortho`` has to be there, ``thumbnail`` and ``overview`` are made of it (PNG,
+        8 bits, stretched for the eye), the others become assets where they are.
     name : str
         Id of the item.
 
@@ -114,6 +120,10 @@ def write_item(
         name, geometry, box, acquired, properties, stac_extensions=[_URIS[key] for key in _URIS if key in prefixes]
     )
     item.add_asset("ortho", _ortho_asset(files["ortho"], report, path.parent))
+    for key, side in _PICTURES.items():
+        if key in files:
+            with whole_or_nothing(files[key]) as temporary:
+                temporary.write_bytes(preview_png(files["ortho"], side=side))
     for key, title, media, roles in _ASSETS:
         if key in files and files[key].is_file():
             item.add_asset(key, pystac.Asset(_href(files[key], path.parent), title, media_type=media, roles=roles))

@@ -1,4 +1,4 @@
-"""STAC items: valid by pystac's own schemas, true to the ortho, cut at the antimeridian, honest about accuracy."""
+"""STAC items: valid by the published schemas, true to the ortho, cut at the antimeridian, honest about accuracy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import pyproj
 import pystac
@@ -27,78 +26,32 @@ from ortho_pipeline.outline import to_geojson, valid_outline
 from ortho_pipeline.stac import acquisition_time
 
 TIME = "2005-08-03T08:12:31.25Z"
-NUMBER = {"type": "number"}
-ANGLE = {"type": "number", "minimum": 0, "maximum": 360}
-
-
-def extension(uri: str, prefix: str, place: dict[str, Any]) -> dict[str, Any]:
-    """Return the schema of an extension: its own URI is declared, and nothing else has its prefix."""
-    others = {"patternProperties": {f"^(?!{prefix}:)": {}}, "additionalProperties": False}
-    return {
-        "$schema": "http://json-schema.org/draft-07/schema#",
-        "$id": uri,
-        "type": "object",
-        "properties": {
-            "stac_extensions": {"type": "array", "contains": {"const": uri}},
-            "properties": {"type": "object", "properties": place.get("item", {}), **others},
-            "assets": {"additionalProperties": {"type": "object", "properties": place.get("asset", {}), **others}},
-        },
-        "required": ["stac_extensions"],
-    }
-
-
 BASE = "https://stac-extensions.github.io"
-#: What the published extensions say of the fields that are used, in the words of their tables.
+SCHEMAS = Path(__file__).resolve().parent / "data" / "stac"
+#: The extensions as they are published, by their URIs (tests/data/stac/README.md).
 EXTENSIONS = {
-    uri: extension(uri, prefix, place)
-    for uri, prefix, place in (
-        (f"{BASE}/projection/v2.0.0/schema.json", "proj", {"item": {
-            "proj:code": {"type": "string", "pattern": "^[A-Z]+:[0-9]+$"},
-            "proj:wkt2": {"type": "string"},
-            "proj:bbox": {"type": "array", "items": NUMBER, "minItems": 4, "maxItems": 4},
-            "proj:shape": {"type": "array", "items": {"type": "integer"}, "minItems": 2, "maxItems": 2},
-            "proj:transform": {"type": "array", "items": NUMBER, "minItems": 6, "maxItems": 6},
-            "proj:geometry": {"$ref": "https://geojson.org/schema/Geometry.json"},
-        }}),
-        (f"{BASE}/view/v1.0.0/schema.json", "view", {"item": {
-            "view:incidence_angle": {"type": "number", "minimum": 0, "maximum": 90}, "view:azimuth": ANGLE,
-        }}),
-        (f"{BASE}/file/v2.1.0/schema.json", "file", {"asset": {
-            "file:checksum": {"type": "string", "pattern": "^[a-f0-9]+$"},
-            "file:size": {"type": "integer", "minimum": 0},
-        }}),
-        (f"{BASE}/raster/v1.1.0/schema.json", "raster", {"asset": {"raster:bands": {
-            "type": "array", "minItems": 1, "items": {"type": "object", "properties": {
-                "data_type": {"enum": ["int8", "int16", "int32", "uint8", "uint16", "uint32", "float32", "float64"]},
-                "sampling": {"enum": ["area", "point"]}, "spatial_resolution": NUMBER,
-                "nodata": {"oneOf": [NUMBER, {"enum": ["nan", "inf", "-inf"]}]},
-            }, "additionalProperties": False},
-        }}}),
-        (f"{BASE}/accuracy/v1.0.0/schema.json", "accuracy", {"item": {
-            f"accuracy:geometric_{name}": NUMBER for name in ("rmse", "x_bias", "y_bias", "x_stddev", "y_stddev")
-        }}),
-    )
-}  # fmt: skip
+    f"{BASE}/{path.relative_to(SCHEMAS).as_posix()}": json.loads(path.read_text())
+    for path in sorted(SCHEMAS.glob("*/*/schema.json"))
+}
 
 
-@pytest.fixture(scope="module")
-def valid() -> Any:
-    """Return a function that validates a STAC file with pystac, and refuses to fetch anything."""
+class Offline(JsonSchemaSTACValidator):
+    """Validates with pystac's copies of the core schemas and the published ones of extensions; fetches nothing."""
 
-    class Offline(JsonSchemaSTACValidator):
-        def _get_schema(self, schema_uri: str) -> dict[str, Any]:
-            assert schema_uri.rstrip("#") in self.schema_cache, f"{schema_uri} would be fetched"
-            return super()._get_schema(schema_uri.rstrip("#"))
+    def __init__(self) -> None:
+        super().__init__()
+        self.schema_cache.update(EXTENSIONS)
 
-    validator = Offline()
-    validator.schema_cache.update(EXTENSIONS)
+    def _get_schema(self, schema_uri: str) -> dict[str, Any]:
+        assert schema_uri.rstrip("#") in self.schema_cache, f"{schema_uri} would be fetched"
+        return super()._get_schema(schema_uri.rstrip("#"))
 
-    def validate(path: Path) -> dict[str, Any]:
-        document = json.loads(path.read_text())
-        pystac.validation.validate_dict(document, validator=validator)
-        return document
 
-    return validate
+def validate(path: Path) -> dict[str, Any]:
+    """Return a STAC document, validated against every schema that it declares."""
+    document = json.loads(path.read_text())
+    pystac.validation.validate_dict(document, validator=Offline())
+    return document
 
 
 @pytest.fixture(scope="module")
@@ -113,9 +66,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     return folder, result.document["report"]
 
 
-def test_item_is_valid_and_true_to_the_ortho(made, valid):
+def test_item_is_valid_and_true_to_the_ortho(made):
     folder, _ = made
-    item = valid(folder / "scene_stac.json")
+    item = validate(folder / "scene_stac.json")
     properties = item["properties"]
     assert (item["id"], properties["datetime"]) == ("scene", "2005-08-03T08:12:31.250000Z")
     ortho = gdal.Open(str(folder / "scene_ortho.tif"))
@@ -131,7 +84,7 @@ def test_item_is_valid_and_true_to_the_ortho(made, valid):
     # A multihash: 0x12 is SHA-256, 0x20 its 32 bytes.
     assert asset["file:checksum"] == "1220" + hashlib.sha256(content).hexdigest()
     assert asset["raster:bands"] == [{"data_type": "uint16", "sampling": "area", "spatial_resolution": 5.0}]
-    assert {"report", "html", "model"} < set(item["assets"])
+    assert {"report", "html", "model", "thumbnail", "overview"} < set(item["assets"])
     for one in item["assets"].values():
         assert (folder / one["href"]).is_file()
     assert properties["gsd"] == pytest.approx(2.6, abs=0.2)
@@ -292,7 +245,7 @@ def test_several_parts_and_no_valid_pixel(tmp_path):
     assert geometry["type"] == "MultiPolygon"
 
 
-def test_a_run_ends_in_a_catalog(tiny, tmp_path, valid):
+def test_a_run_ends_in_a_catalog(tiny, tmp_path):
     folder = tmp_path / "block"
     for name in ("a", "b"):
         (folder / name).mkdir(parents=True)
@@ -305,25 +258,54 @@ def test_a_run_ends_in_a_catalog(tiny, tmp_path, valid):
     )
     result = batch.run(folder / "p.yaml", executor="sequential")
     assert [scene.status for scene in result.scenes] == ["done", "done"]
-    catalog = valid(folder / "out" / "catalog.json")
+    catalog = validate(folder / "out" / "catalog.json")
     assert [link["href"] for link in catalog["links"] if link["rel"] == "item"] == [
         "./block a/scene_stac.json", "./block b/scene_stac.json"
     ]  # fmt: skip
     opened = pystac.Catalog.from_file(folder / "out" / "catalog.json")
     assert [item.id for item in opened.get_items()] == ["block a", "block b"]
-    item = valid(folder / "out" / "block a" / "scene_stac.json")
-    item["properties"]["view:azimuth"] = 400
-    with pytest.raises(pystac.STACValidationError):
-        pystac.validation.validate_dict(item, validator=_with_extensions())
+    validate(folder / "out" / "block a" / "scene_stac.json")
     assert dataclasses.asdict(result.scenes[0])["files"]["stac"].endswith("scene_stac.json")
 
 
-def _with_extensions() -> JsonSchemaSTACValidator:
-    validator = JsonSchemaSTACValidator()
-    validator.schema_cache.update(EXTENSIONS)
-    return validator
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda item: item["properties"].update({"view:azimuth": 400}),
+        lambda item: item["properties"].update({"accuracy:geometric_rmse": -1}),
+        lambda item: item["properties"].update({"proj:shape": [1.5, 2]}),
+        lambda item: item["assets"]["ortho"].update({"file:checksum": "SHA"}),
+        lambda item: item["assets"]["ortho"]["raster:bands"][0].update({"sampling": "both"}),
+    ],
+)
+def test_the_published_schemas_are_what_is_asked(made, spoil):
+    item = validate(made[0] / "scene_stac.json")
+    # What is declared is all that is used, and the other way round.
+    used = {name.partition(":")[0] for part in (item["properties"], *item["assets"].values()) for name in part}
+    names = {"proj": "projection"}
+    declared = {uri.removeprefix(f"{BASE}/").partition("/")[0] for uri in item["stac_extensions"]}
+    assert {names.get(name, name) for name in used} & {uri.split("/")[3] for uri in EXTENSIONS} == declared
+    spoil(item)
+    with pytest.raises(pystac.STACValidationError):
+        pystac.validation.validate_dict(item, validator=Offline())
 
 
-def test_the_schemas_of_this_test_are_schemas():
-    for schema in EXTENSIONS.values():
-        jsonschema.Draft7Validator.check_schema(schema)
+def test_pictures_of_the_item(made):
+    folder, _ = made
+    item = validate(folder / "scene_stac.json")
+    ortho = gdal.Open(str(folder / "scene_ortho.tif"))
+    size = np.array([ortho.RasterXSize, ortho.RasterYSize])
+    mask = ortho.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0
+    for role, side in (("thumbnail", 256), ("overview", 1024)):
+        asset = item["assets"][role]
+        assert asset["type"] == "image/png"
+        assert role in asset["roles"]
+        picture = gdal.Open(str(folder / asset["href"]))
+        assert picture.GetDriver().ShortName == "PNG"
+        found = np.array([picture.RasterXSize, picture.RasterYSize])
+        assert found.max() == min(side, size.max())
+        assert found / found.max() == pytest.approx(size / size.max(), abs=1 / found.max())
+        alpha = picture.GetRasterBand(picture.RasterCount).ReadAsArray() > 0
+        assert alpha.mean() == pytest.approx(mask.mean(), abs=0.02)
+        values = picture.GetRasterBand(1).ReadAsArray()[alpha]
+        assert np.ptp(values) == 255  # stretched for the eye
