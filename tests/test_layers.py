@@ -21,8 +21,8 @@ point_files datum
 points
 models least_squares statistics
 problem block_points ground_frame
-ridge block_solver intersection
-blunders
+ridge block_system intersection
+blunders block_solver
 block_blunders registration estimation hookspecs swaps model_file kernels ray_kernel landscape rpc_files
 model_choice selection ground_error drawing report_text contract
 comparison report_plots adjustment covariance
