@@ -27,7 +27,7 @@ from ortho_pipeline.ground_frame import GEODETIC
 from ortho_pipeline.intersection import frame_of, meet, models_of, predict, sigmas_of
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.notebook import block_html
-from ortho_pipeline.point_files import ROLES
+from ortho_pipeline.point_table import ROLES
 from ortho_pipeline.problem import CONDITION_LIMIT, Prior
 from ortho_pipeline.report_text import count
 

@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from ortho_pipeline.crs import Vertical, ground_transform, horizontal, same_crs
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.point_files import OF_GROUND, ROLES, Row, Table, read_block_table
+from ortho_pipeline.point_files import read_block_table
+from ortho_pipeline.point_table import OF_GROUND, ROLES, Row, Table
 from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE, Points, ground_of
 
 #: Two statements of one point's ground are the same within this (degrees or metres): files round.

@@ -32,7 +32,8 @@ from ortho_pipeline.crs import (
 )
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.files import write_text
-from ortho_pipeline.point_files import CSV_COLUMNS, ROLES, Piece, Row, Table, read_table
+from ortho_pipeline.point_files import read_table
+from ortho_pipeline.point_table import CSV_COLUMNS, ROLES, Piece, Row, Table
 
 Array = NDArray[np.float64]
 
@@ -164,7 +165,7 @@ def read_points(
     image_name: str | None = None,
     pieces: Mapping[str, Piece] | None = None,
 ) -> Points:
-    """Read points of any known format (see `ortho_pipeline.point_files`).
+    """Read points of any known format (docs/formats.md).
 
     Parameters
     ----------

@@ -17,7 +17,9 @@ PACKAGE = ROOT / "ortho_pipeline"
 LAYERS = """
 errors options
 files crs geometry notebook
-point_files datum
+point_table datum
+point_csv point_geojson point_lists
+point_files
 points
 models least_squares statistics
 problem block_points ground_frame

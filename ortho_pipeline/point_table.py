@@ -1,0 +1,160 @@
+"""The table of points that every reader of a point file fills, and how text and numbers of strangers are read.
+
+Image points are (column, row) from the outer corner of the first pixel, ground points as the file has them, with what
+it says about their CRS. `ortho_pipeline.points` makes ellipsoidal heights of that.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ortho_pipeline.errors import InputError
+
+#: A point file beyond this is not read (bytes), nor a line beyond that (characters).
+MAX_FILE = 32_000_000
+MAX_LINE = 100_000
+ROLES = ("control", "check", "tie")
+CSV_COLUMNS = ("id", "col", "row", "x", "y", "h", "role", "sigma_image", "sigma_xy", "sigma_h")
+#: Column of a CSV of several images: the file that a point was measured in.
+CSV_IMAGE = "image"
+
+
+class Layout(NamedTuple):
+    """Columns that a CSV may have, those that every line fills, and the role of lines that give none."""
+
+    columns: tuple[str, ...]
+    needed: tuple[str, ...]
+    role: str
+
+
+#: Points of one image; rays of a block, whose ground may be known; ground alone.
+OF_IMAGE = Layout((*CSV_COLUMNS, CSV_IMAGE), CSV_COLUMNS[:5], "control")
+OF_BLOCK = Layout(("id", CSV_IMAGE, *CSV_COLUMNS[1:]), ("id", CSV_IMAGE, "col", "row"), "")
+OF_GROUND = Layout(("id", *CSV_COLUMNS[3:7], *CSV_COLUMNS[8:]), ("id", "x", "y"), "")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+
+
+#: Where another image lies in this one: column and row of its first corner, and the width of one of its pixels.
+Piece = tuple[float, float, float]
+OWN_IMAGE: Piece = (0.0, 0.0, 1.0)
+
+
+@dataclass
+class Row:
+    """One point as its file has it; None is what the file does not give. `piece` is where its image lies."""
+
+    where: str
+    id: str | None
+    image: tuple[float, float]
+    ground: tuple[float, float, float]
+    role: str = "control"
+    sigma_image: float | None = None
+    sigma_xy: float | None = None
+    sigma_h: float | None = None
+    image_name: str | None = None
+    piece: Piece = OWN_IMAGE
+
+
+@dataclass
+class Table:
+    """All points of a file, and what it says about their coordinates.
+
+    `vertical` is stated by the file; `assumed_vertical` is what the format means where nothing is stated.
+    """
+
+    format: str
+    rows: list[Row] = field(default_factory=list)
+    crs: str | None = None
+    vertical: str | None = None
+    assumed_vertical: str | None = None
+    centre_origin_allowed: bool = False
+
+
+class Line(NamedTuple):
+    """A line that is not blank, and its number."""
+
+    number: int
+    text: str
+
+
+def load_text(path: str | os.PathLike[str]) -> str:
+    """Return a file as text: UTF-8, a byte-order mark allowed, no NUL, no larger than `MAX_FILE`."""
+    try:
+        if Path(path).stat().st_size > MAX_FILE:
+            raise InputError(f"a point file of more than {MAX_FILE // 1_000_000} MB is not read", file=path)
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", file=path, remedy="check the path") from error
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise InputError("this file is UTF-16", file=path, remedy="save it as UTF-8")
+    if b"\0" in data:
+        line = data[: data.index(b"\0")].count(b"\n") + 1
+        raise InputError("a NUL byte: this is no text file", file=path, field=f"line {line}")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise InputError(
+            "this file is not UTF-8", file=path, field=f"line {line}", remedy="save it as UTF-8"
+        ) from error
+
+
+def number(text: Any, path: str | os.PathLike[str], where: str) -> float:
+    """Return a finite number; `where` (line and column) goes into the error."""
+    if isinstance(text, bool) or not isinstance(text, str | int | float):
+        raise InputError(f"{short(text)} is not a number", file=path, field=where)
+    try:
+        plain = text.strip() if isinstance(text, str) else text
+        if isinstance(plain, str) and (len(plain) > 64 or not _NUMBER.fullmatch(plain)):
+            raise ValueError
+        value = float(plain)
+    except (ValueError, OverflowError):
+        comma = isinstance(text, str) and re.fullmatch(r"\s*[+-]?\d*,\d+\s*", text)
+        remedy = "write numbers with a decimal point" if comma else None
+        raise InputError(f"{short(text)} is not a number", file=path, field=where, remedy=remedy) from None
+    if not math.isfinite(value):
+        raise InputError(f"{short(text)} is not a finite number", file=path, field=where)
+    return value
+
+
+def short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 48 else f"{text[:48]}..."
+
+
+def lines_of(path: str | os.PathLike[str], text: str) -> Iterator[Line]:
+    for count, line in enumerate(text.splitlines(), start=1):
+        if len(line) > MAX_LINE:
+            raise InputError(f"a line of {len(line)} characters", file=path, field=f"line {count}")
+        if line.strip():
+            yield Line(count, line)
+
+
+def role_of(text: Any, path: str | os.PathLike[str], where: str) -> str:
+    role = str(text).strip().lower()
+    if role not in ROLES:
+        raise InputError(
+            f"{short(text)} is not a role", file=path, field=where, remedy=f"use one of {', '.join(ROLES)}"
+        )
+    return role
+
+
+def sigma_of(text: Any, path: str | os.PathLike[str], where: str, *, zero: bool) -> float:
+    value = number(text, path, where)
+    if value < 0 or (value == 0 and not zero):
+        raise InputError(f"{short(text)} is not a standard deviation", file=path, field=where)
+    return value
+
+
+def cells_of(path: str | os.PathLike[str], line: Line, delimiter: str) -> list[str]:
+    try:
+        return [cell.strip() for cell in next(csv.reader([line.text], delimiter=delimiter, strict=True))]
+    except csv.Error as error:
+        raise InputError(f"the line cannot be split ({error})", file=path, field=f"line {line.number}") from error
