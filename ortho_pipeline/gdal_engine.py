@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.raster import Grid, Profile, RasterSource, RasterWriter
+from ortho_pipeline.raster import Grid, RasterSource
+from ortho_pipeline.raster_writer import Profile, RasterWriter
 
 
 def warp_with_gdal(

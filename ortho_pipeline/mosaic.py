@@ -21,7 +21,8 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.outline import grid_of, valid_outline
-from ortho_pipeline.raster import Grid, Profile, RasterSource, RasterWriter, limit_cache
+from ortho_pipeline.raster import Grid, RasterSource, limit_cache
+from ortho_pipeline.raster_writer import Profile, RasterWriter
 from ortho_pipeline.registration import details, measure
 
 #: Part of a pixel by which grids may differ: rounding of coordinates, no more.

@@ -25,7 +25,8 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.gdal_engine import warp_with_gdal
 from ortho_pipeline.lattice import BLOCK, Block, Lattices, Terrain
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.raster import Grid, Profile, RasterSource, RasterWriter, limit_cache
+from ortho_pipeline.raster import Grid, RasterSource, limit_cache
+from ortho_pipeline.raster_writer import Profile, RasterWriter
 
 #: Side of a tile, the piece of work of a thread.
 TILE = 4 * BLOCK

@@ -29,6 +29,7 @@ block_blunders registration estimation hookspecs swaps model_file kernels ray_ke
 model_choice selection ground_error drawing report_text contract
 comparison report_plots adjustment covariance
 raster
+raster_writer
 rpc dem preview edge outline
 plugins rays gdal_engine resolution
 footprint lattice simulate inputs testing
@@ -43,7 +44,7 @@ cli_studies cli_blocks cli_batch
 cli
 """
 LINE = {name: number for number, line in enumerate(LAYERS.split("\n")) for name in line.split()}
-GDAL_MODULES = {"rpc", "raster", "gdal_engine", "dem", "plugins", "gcp_export", "mosaic"}
+GDAL_MODULES = {"rpc", "raster", "raster_writer", "gdal_engine", "dem", "plugins", "gcp_export", "mosaic"}
 NUMBA_MODULES = {"kernels", "ray_kernel", "models"}
 MAX_LINES, MAX_FUNCTION = 600, 50
 

@@ -20,7 +20,8 @@ from ortho_pipeline import batch, mosaic
 from ortho_pipeline.cli import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.mosaic import Ortho, lay_out, measure_seam, overlaps, write_cog, write_vrt
-from ortho_pipeline.raster import Grid, Profile, RasterWriter, open_dataset
+from ortho_pipeline.raster import Grid, open_dataset
+from ortho_pipeline.raster_writer import Profile, RasterWriter
 from ortho_pipeline.rpc import rpc_metadata
 
 UTM = pyproj.CRS("EPSG:32635")

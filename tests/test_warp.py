@@ -764,7 +764,7 @@ def test_an_output_that_may_exceed_4_gb_is_a_bigtiff(scene, tmp_path):
     source = RasterSource(scene.write(texture()))
     small = grid_of(20.0)
     large = Grid(UTM, EAST, NORTH, GSD, GSD, 60_000, 40_000)  # 4.8 GB, none of it over the scene
-    from ortho_pipeline.raster import Profile, RasterWriter
+    from ortho_pipeline.raster_writer import Profile, RasterWriter
 
     for grid, expected in ((small, 42), (large, 43)):
         with RasterWriter(tmp_path / "o.tif", grid, Profile.of(source), driver="GTiff") as writer:

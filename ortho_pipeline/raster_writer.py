@@ -1,0 +1,233 @@
+"""Orthos as files: what one takes over from its source, and the writer that leaves a whole file or none."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import whole_or_nothing
+from ortho_pipeline.raster import Grid, RasterSource, first_line
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What an output raster takes over from its source."""
+
+    count: int
+    dtype: np.dtype[Any]
+    validity: str
+    nodata: float | None = None
+    descriptions: tuple[str, ...] = ()
+    interpretations: tuple[int, ...] = ()
+    color_table: Any = None
+    scales: tuple[tuple[float, float, str], ...] = ()
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, source: RasterSource) -> Profile:
+        """Return the profile of an ortho of `source`.
+
+        Nodata stays nodata (one value for all bands, as GeoTIFF has it), alpha stays alpha; everything else gets a
+        mask, because no pixel value may be given a meaning that it did not have. Under a mask, bands of floating point
+        without a value are NaN; integers cannot say that, so there a pixel is valid only if all of its bands are.
+        """
+        # NaN is not equal to itself, and would make a set of several.
+        bands = source.bands
+        values = {"nan" if value is not None and math.isnan(value) else value for value in source.nodata}
+        if source.validity == "nodata" and len(values) == 1:
+            validity, nodata = "nodata", source.nodata[0]
+        else:
+            validity, nodata = ("alpha" if source.validity == "alpha" else "mask"), None
+        return cls(
+            count=source.count,
+            dtype=source.dtype,
+            validity=validity,
+            nodata=nodata,
+            descriptions=source.descriptions,
+            interpretations=tuple(band.GetColorInterpretation() for band in bands),
+            color_table=bands[0].GetColorTable(),
+            scales=tuple((band.GetScale() or 1.0, band.GetOffset() or 0.0, band.GetUnitType()) for band in bands),
+        )
+
+
+class RasterWriter:
+    """A GeoTIFF or COG that is written in windows and appears at its path when it is complete.
+
+    Use as a context manager: an exception inside leaves nothing behind, and a file that was there before untouched.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        grid: Grid,
+        profile: Profile,
+        *,
+        driver: str = "COG",
+        creation_options: Mapping[str, str] | None = None,
+        threads: int = 1,
+    ) -> None:
+        if driver not in ("COG", "GTiff"):
+            raise InputError(f"orthos are not written as {driver!r}", field="format", remedy="COG or GTiff")
+        self.path, self.grid, self.profile, self.driver = Path(path), grid, profile, driver
+        self.options = _creation_options(driver, dict(creation_options or {}), threads)
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> RasterWriter:
+        self._final = whole_or_nothing(self.path)
+        self._temporary = self._final.__enter__()
+        try:
+            if self.driver == "COG":
+                # The COG driver copies a finished raster: overviews come before the pixels in the file.
+                self._work = self._temporary.with_name(self._temporary.name + ".work.tif")
+                options = {"TILED": "YES", "BIGTIFF": "IF_SAFER", "BLOCKXSIZE": "512", "BLOCKYSIZE": "512"}
+            else:
+                self._work, options = self._temporary, self.options
+            self._dataset = self._create(self._work, options)
+        except BaseException as error:
+            self._final.__exit__(type(error), error, error.__traceback__)
+            raise
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        if kind is None:
+            try:
+                self._finish()
+            except BaseException as problem:
+                self._dataset = None
+                self._final.__exit__(type(problem), problem, problem.__traceback__)
+                raise
+        self._dataset = None
+        self._final.__exit__(kind, error, trace)
+
+    def write(self, left: int, top: int, pixels: NDArray[Any], valid: NDArray[np.bool_] | None) -> None:
+        """Write a window ``(count, h, w)``; `valid` ``(h, w)`` goes to the mask, if the profile has one."""
+        with self._lock, self.disk_errors():
+            self._dataset.WriteArray(pixels, left, top)
+            if self.profile.validity == "mask" and valid is not None:
+                mask = valid.view(np.uint8) * np.uint8(255)
+                self._dataset.GetRasterBand(1).GetMaskBand().WriteArray(mask, left, top)
+
+    def _create(self, path: Path, options: Mapping[str, str]) -> gdal.Dataset:
+        from osgeo import gdal_array
+
+        profile, grid = self.profile, self.grid
+        code = gdal_array.NumericTypeCodeToGDALTypeCode(profile.dtype.type)
+        with self.disk_errors():
+            dataset = gdal.GetDriverByName("GTiff").Create(
+                str(path), grid.width, grid.height, profile.count, code, [f"{k}={v}" for k, v in options.items()]
+            )
+        dataset.SetProjection(grid.crs.to_wkt())
+        dataset.SetGeoTransform(grid.geotransform)
+        dataset.SetMetadataItem("AREA_OR_POINT", "Area")
+        for key, value in profile.metadata.items():
+            dataset.SetMetadataItem(key, value)
+        for i in range(profile.count):
+            _describe(dataset.GetRasterBand(i + 1), profile, i)
+        if profile.validity == "mask":
+            gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", "YES")
+            try:
+                dataset.CreateMaskBand(gdal.GMF_PER_DATASET)
+            finally:
+                gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", None)
+        return dataset
+
+    def _finish(self) -> None:
+        with self.disk_errors():
+            self._dataset.FlushCache()
+            self._dataset = None
+            if self.driver == "COG":
+                source = gdal.Open(str(self._work))
+                options = [f"{k}={v}" for k, v in self.options.items()]
+                gdal.GetDriverByName("COG").CreateCopy(str(self._temporary), source, options=options)
+        check = gdal.Open(str(self._temporary))
+        if (check.RasterXSize, check.RasterYSize) != (self.grid.width, self.grid.height):
+            raise InputError("the output was not written whole", file=self.path, remedy="check the free disk space")
+
+    def copy(self, path: Path) -> int:
+        """Fill the raster from another of its size, whose last band is the mask; return the count of valid pixels."""
+        dataset, count, step = gdal.Open(str(path)), 0, 2048
+        for top in range(0, self.grid.height, step):
+            for left in range(0, self.grid.width, step):
+                size = min(step, self.grid.width - left), min(step, self.grid.height - top)
+                pixels = dataset.ReadAsArray(left, top, *size).reshape(-1, size[1], size[0])
+                if self.profile.validity == "nodata":
+                    nodata = self.profile.nodata
+                    empty = np.isnan(pixels) if nodata is not None and math.isnan(nodata) else pixels == nodata
+                    valid = ~empty.all(axis=0)
+                else:
+                    valid = pixels[-1] > 0
+                self.write(left, top, pixels[: self.profile.count].astype(self.profile.dtype, copy=False), valid)
+                count += int(np.count_nonzero(valid))
+        return count
+
+    def disk_errors(self) -> _DiskErrors:
+        """Return a context in which GDAL's errors become an `InputError` that names the output."""
+        return _DiskErrors(self.path)
+
+
+class _DiskErrors:
+    """Turns GDAL's write errors (a full disk, mostly) into an `InputError`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        if kind is not None and issubclass(kind, RuntimeError):
+            raise InputError(
+                f"the output cannot be written ({first_line(error)})",
+                file=self.path,
+                remedy="check the free disk space and the creation options",
+            ) from error
+
+
+def _describe(band: gdal.Band, profile: Profile, index: int) -> None:
+    if profile.nodata is not None:
+        band.SetNoDataValue(profile.nodata)
+    if profile.descriptions:
+        band.SetDescription(profile.descriptions[index])
+    if profile.interpretations:
+        band.SetColorInterpretation(profile.interpretations[index])
+    if profile.color_table is not None and index == 0:
+        band.SetColorTable(profile.color_table)
+    if profile.scales and profile.scales[index] != (1.0, 0.0, ""):
+        scale, offset, unit = profile.scales[index]
+        band.SetScale(scale)
+        band.SetOffset(offset)
+        band.SetUnitType(unit)
+
+
+def _creation_options(driver: str, given: dict[str, str], threads: int) -> dict[str, str]:
+    """Return lossless defaults under what the user gave; an option that the driver does not know is an error."""
+    given = {key.upper(): value for key, value in given.items()}
+    listed = gdal.GetDriverByName(driver).GetMetadataItem("DMD_CREATIONOPTIONLIST") or ""
+    unknown = [key for key in given if f"name='{key}'" not in listed and f'name="{key}"' not in listed]
+    if unknown:
+        raise InputError(
+            f"the {driver} driver has no creation option {', '.join(unknown)}",
+            field="creation option",
+            remedy=f"see the page of the {driver} driver in GDAL's documentation",
+        )
+    defaults = {"BIGTIFF": "IF_SAFER"}
+    if driver == "GTiff":
+        defaults |= {"TILED": "YES", "BLOCKXSIZE": "512", "BLOCKYSIZE": "512"}
+        if given.get("TILED", "YES").upper() == "NO":
+            defaults = {"BIGTIFF": "IF_SAFER"}
+    else:
+        defaults |= {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "LEVEL": "6", "NUM_THREADS": str(max(1, threads))}
+        if given.get("COMPRESS", "DEFLATE").upper() not in ("DEFLATE", "ZSTD", "LZW"):
+            defaults.pop("PREDICTOR")
+            defaults.pop("LEVEL")
+    return defaults | given
