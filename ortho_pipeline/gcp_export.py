@@ -84,8 +84,11 @@ class Export:
         Its columns and rows.
     surface : Surface, optional
         Where grids of points get their heights from.
-    points : Points
-        Measured points; where there are any, they are the control points of the formats ``gcp``.
+    control : Points
+        The measured points that the model was adjusted to, gross errors not among them; where there are any, they are
+        the control points of the formats ``gcp``.
+    left_out : sequence of (str, str)
+        Measured control points that are not, with the reason.
     force : bool
         Accept an RPC that is off by more than 0.1 px.
     """
@@ -96,12 +99,13 @@ class Export:
         model: SensorModel,
         size: tuple[int, int],
         surface: Surface | None,
-        points: Points,
+        control: Points,
+        left_out: Sequence[tuple[str, str]] = (),
         *,
         force: bool = False,
     ) -> None:
         self.dataset, self.model, self.size = dataset, model, size
-        self.surface, self.points, self.force = surface, points, force
+        self.surface, self.control, self.left_out, self.force = surface, control, tuple(left_out), force
         self.document: dict[str, Any] = {"exact": None, "max_error_px": None, "warnings": []}
 
     @functools.cached_property
@@ -126,11 +130,13 @@ class Export:
         writers[name]()
 
     def _gcps(self) -> Gcps:
-        if self.points.control.any():
-            gcps, source = gcps_of_points(self.points), "the measured control points"
+        left_out: list[dict[str, str]] = []
+        if len(self.control):
+            gcps, source = gcps_of_points(self.control), "the measured control points"
+            left_out = [{"id": name, "reason": reason} for name, reason in self.left_out]
         else:
             gcps, source = gcps_of_model(self.model, self.size, self.surface), f"a grid{self._where()}"
-        self.document["gcps"] = {"n": len(gcps), "source": source}
+        self.document["gcps"] = {"n": len(gcps), "source": source, "left_out": left_out}
         return gcps
 
     def _geolocation(self, path: Path) -> None:
@@ -151,6 +157,7 @@ class Export:
             lines.append("RPC: exact" if self.document["exact"] else f"RPC: refitted, at most {worst:.2g} px off")
         if "gcps" in self.document:
             lines.append("Control points: {n}, {source}".format(**self.document["gcps"]))
+            lines += ["Left out: {id} ({reason})".format(**one) for one in self.document["gcps"]["left_out"]]
         if "geolocation" in self.document:
             found = self.document["geolocation"]
             lines.append(f"Geolocation: {found['heights']}, {found['max_error_px']:.2g} px off between its samples")
@@ -161,8 +168,8 @@ class Export:
 
 
 def gcps_of_points(points: Points) -> Gcps:
-    """Return the measured control points ``(N, 5)``: column, row, longitude, latitude, ellipsoidal height."""
-    control = points.select(points.control).to_crs("EPSG:4979")
+    """Return measured points ``(N, 5)``: column, row, longitude, latitude, ellipsoidal height."""
+    control = points.to_crs("EPSG:4979")
     return np.column_stack([control.image, np.nan_to_num(control.ground, nan=0.0)])
 
 

@@ -349,11 +349,15 @@ def export(
     size = opened.width, opened.height
     if heights is not None:
         heights = footprint.facing(adjusted.model, heights, *size)
-    job = gcp_export.Export(dataset, adjusted.model, size, heights, adjusted.fit.points, force=force)
+    adjustment = adjusted.fit
+    job = gcp_export.Export(
+        dataset, adjusted.model, size, heights, adjustment.points.select(adjustment.used), adjustment.rejected,
+        force=force,
+    )  # fmt: skip
     for name, path in files.items():
         job.write(name, path)
-    document = {**job.document, "model": adjusted.fit.model_name, "model_source": adjusted.scene.model_source}
-    return Result(files, document, job.summary(adjusted.fit.model_name, adjusted.scene.model_source))
+    document = {**job.document, "model": adjustment.model_name, "model_source": adjusted.scene.model_source}
+    return Result(files, document, job.summary(adjustment.model_name, adjusted.scene.model_source))
 
 
 def write_plots(report_file: str | os.PathLike[str], folder: str | os.PathLike[str], kind: str = "svg") -> Result:

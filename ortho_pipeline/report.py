@@ -28,7 +28,7 @@ from ortho_pipeline.estimation import Fit, root_mean_square
 from ortho_pipeline.files import whole_or_nothing, write_text
 from ortho_pipeline.ground_error import along_view, in_metres, rmse_metres, viewing
 from ortho_pipeline.preview import preview_png
-from ortho_pipeline.report_plots import analysed_role, plots
+from ortho_pipeline.report_plots import analysed_role, kind_of, plots
 from ortho_pipeline.report_text import fixed, flat, headline, metres, plain_size, px, share, short, signed, summary_text
 
 if TYPE_CHECKING:
@@ -242,7 +242,12 @@ def residuals_style(report: Mapping[str, Any]) -> str:
     QGIS takes it by itself, as it has the name of the GeoJSON file with the ending ``.qml``.
     """
     template = page_environment().get_template("residuals.qml.j2")
-    lengths = [math.hypot(*point["residual_m"]) for point in report["adjustment"]["points"] if point["residual_m"]]
+    # Points that were left out have no arrow: a gross error would shrink those of all others to dots.
+    lengths = [
+        math.hypot(*point["residual_m"])
+        for point in report["adjustment"]["points"]
+        if point["residual_m"] and kind_of(point) != "out"
+    ]
     ground = report["scene"]["ground_pixel_m"]
     extent = max(report["scene"]["size"]) * (max(ground) if ground else 1.0)
     longest = max(lengths, default=0.0)

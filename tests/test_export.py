@@ -217,6 +217,21 @@ def test_measured_points_are_gcps_that_gdal_fits_to(tiny, tmp_path, name):
     np.testing.assert_array_equal(dataset.ReadAsArray(), gdal.Open(str(tiny.image)).ReadAsArray())
 
 
+@pytest.mark.parametrize("name", ["gcp", "gcp-tag"])
+def test_a_gross_error_is_no_gcp_and_check_points_are_none(tiny, tmp_path, name):
+    rows = [list(row) for row in tiny.points(14)]
+    rows[4][1] += 60.0
+    tiny.write(tiny.gcps, rows)
+    points = points_of(tiny, check="ids:p12,p13")
+    assert [name for name, _ in pipeline.fit(tiny.image, points).fit.rejected] == ["p4"]
+    result = pipeline.export(tiny.image, tmp_path / "out", formats=[name], points=points)
+    found = [(p.GCPPixel, p.GCPLine) for p in gdal.Open(str(result.files[name])).GetGCPs()]
+    np.testing.assert_allclose(found, [row[1:3] for k, row in enumerate(rows) if k not in (4, 12, 13)], atol=1e-4)
+    assert result.document["gcps"]["n"] == 11
+    assert [one["id"] for one in result.document["gcps"]["left_out"]] == ["p4"]
+    assert "Left out: p4 (gross error" in result.summary
+
+
 def test_without_points_a_grid_of_gcps_stands_for_the_model(tiny, tmp_path):
     surface = SurfaceOptions(height=500.0)
     result = pipeline.export(tiny.image, tmp_path / "out", formats=["gcp"], surface=surface)

@@ -416,6 +416,22 @@ def test_style_of_the_residuals_is_qgis_xml():
     assert fields <= set(features[0]["properties"])
 
 
+def test_arrows_of_the_style_are_scaled_by_points_that_have_one():
+    # A gross error of 60 px is drawn as a cross without an arrow: it must not shrink those of the others.
+    measured = points()
+    index = int(np.flatnonzero(measured.control)[2])
+    image = measured.image.copy()
+    image[index] += (60.0, 0.0)
+    wrong = document(adjusted(dataclasses.replace(measured, image=image)))
+    assert [one["id"] for one in wrong["adjustment"]["rejected"]] == [measured.ids[index]]
+
+    def scale(made: dict[str, Any]) -> float:
+        root = ElementTree.fromstring(report.residuals_style(made).split("\n", 1)[1])
+        return {float(prop.get("v") or 0) for prop in root.iter("prop") if prop.get("k") == "scale"}.pop()
+
+    assert scale(wrong) == pytest.approx(scale(document(adjusted(measured))), rel=0.5)
+
+
 @pytest.mark.parametrize(("bands", "colour_type"), [(1, 4), (2, 4), (3, 6), (4, 6)])
 def test_preview_is_a_png_with_transparent_nodata(tmp_path, bands, colour_type):
     png = report.preview_png(_raster(tmp_path / "o.tif", bands), side=100)
