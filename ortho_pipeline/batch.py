@@ -166,7 +166,7 @@ def _still_good(record: Record | None, job: Job, listing: str, verify: bool) -> 
     if not verify:
         _digests.learn(record.inputs)
     known = {one.path: one.role for one in record.inputs if os.path.isfile(one.path)}
-    found = inputs.hash_inputs(job.image, job.scene, job.points, job.surface, digest=_digests)
+    found = inputs.hashed(inputs.files_read(job.image, job.scene, job.points, job.surface), _digests)
     read = _states(job, {**{one["path"]: one["role"] for one in found}, **known})
     if record.key != key_of(read, job.configuration, job.versions) or not record.intact(job.folder, verify):
         return None

@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import socket
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,9 +37,7 @@ class FileState:
     sha256: str
 
     @classmethod
-    def of(
-        cls, role: str, path: Path, digest: Callable[[Path], str] = files.sha256, name: str | None = None
-    ) -> FileState:
+    def of(cls, role: str, path: Path, digest: Callable[..., str] = files.sha256, name: str | None = None) -> FileState:
         """Return the state of a file, which is recorded under `name` (its path without one)."""
         stat = path.stat()
         return cls(role, name or str(path), stat.st_size, stat.st_mtime_ns, digest(path))
@@ -150,11 +149,11 @@ class Digests:
         """Take over what a record knows."""
         self._known.update({(one.path, one.bytes, one.mtime_ns): one.sha256 for one in states})
 
-    def __call__(self, path: str | os.PathLike[str]) -> str:
+    def __call__(self, path: str | os.PathLike[str], stop: threading.Event | None = None) -> str:
         stat = os.stat(path)
         state = os.fspath(path), stat.st_size, stat.st_mtime_ns
         if state not in self._known:
-            self._known[state] = files.sha256(path)
+            self._known[state] = files.sha256(path, stop)
         return self._known[state]
 
 

@@ -217,14 +217,16 @@ def _record(
     command: str | None,
 ) -> dict[str, Any]:
     """Return what is needed to make the same result again."""
-    read: dict[str, dict[str, Any]] = {}
+    read: dict[Path, str] = {}
     for image, start in zip(images, starts.values(), strict=True):
         for given in (options.points, options.gcps):
-            for entry in inputs.hash_inputs(image, scene, PointOptions(gcps=given), rasters=start.scene.rasters):
-                read.setdefault(entry["path"], entry)
+            for path, role in inputs.files_read(
+                image, scene, PointOptions(gcps=given), rasters=start.scene.rasters
+            ).items():
+                read.setdefault(path, role)
     first = next(iter(starts.values())).scene
     whole = inputs.provenance(
-        first, PointOptions(), None, list(read.values()), command, {"block": options, "scene": scene}
+        first, PointOptions(), None, inputs.hashed(read), command, {"block": options, "scene": scene}
     )  # fmt: skip
     return {key: whole[key] for key in ("command", "inputs", "options", "software")}
 

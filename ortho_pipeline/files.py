@@ -7,10 +7,15 @@ import glob
 import hashlib
 import os
 import tempfile
+import threading
 from collections.abc import Iterator
+from concurrent.futures import CancelledError
 from pathlib import Path
 
 from ortho_pipeline.errors import InputError
+
+#: Bytes that are read at once for a checksum.
+_CHUNK = 1 << 20
 
 
 @contextlib.contextmanager
@@ -82,10 +87,21 @@ def decoded(data: bytes) -> str:
         return data.decode("latin-1")
 
 
-def sha256(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 of a file as hexadecimal text."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def sha256(path: str | os.PathLike[str], stop: threading.Event | None = None) -> str:
+    """Return the SHA-256 of a file as hexadecimal text.
+
+    Raises
+    ------
+    CancelledError
+        As soon as `stop` is set.
+    """
+    digest = hashlib.sha256()
+    with open(path, "rb", buffering=0) as file:
+        while chunk := file.read(_CHUNK):
+            if stop is not None and stop.is_set():
+                raise CancelledError
+            digest.update(chunk)
+    return digest.hexdigest()
 
 
 def _sync_folder(folder: Path) -> None:

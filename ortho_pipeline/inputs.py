@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
-from collections.abc import Callable, Iterable, Mapping
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -232,18 +235,17 @@ def check_paths(
 # -- record ----------------------------------------------------------------------------------------------------------
 
 
-def hash_inputs(
+def files_read(
     image: str | os.PathLike[str],
     scene: SceneOptions = SceneOptions(),
     points: PointOptions = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
-    digest: Callable[[Path], str] = sha256,
     rasters: Iterable[str | os.PathLike[str]] = (),
     sources: Iterable[str | os.PathLike[str]] = (),
-) -> list[dict[str, Any]]:
-    """Return path, role, bytes and SHA-256 of every file that is read, side-cars and sources of a VRT included.
+) -> dict[Path, str]:
+    """Return every file that is read and its role, side-cars and sources of a VRT included.
 
-    `digest` may know checksums that were taken before; `rasters` and `sources` are those of the `Scene`.
+    `rasters` and `sources` are those of the `Scene`.
     """
     read: dict[Path, str] = {}
 
@@ -263,10 +265,41 @@ def hash_inputs(
         add("DEM", [surface.dem, *_files_of(surface.dem, scene.allow_network)])
     if surface.vertical is not None:
         add("geoid", [surface.vertical])
+    return read
+
+
+def hashed(
+    read: Mapping[Path, str], digest: Callable[..., str] = sha256, stop: threading.Event | None = None
+) -> list[dict[str, Any]]:
+    """Return path, role, bytes and SHA-256 of the files of `files_read`.
+
+    Parameters
+    ----------
+    digest : callable (path, stop) -> str
+        May know checksums that were taken before.
+    """
     return [
-        {"role": role, "path": str(path), "bytes": path.stat().st_size, "sha256": digest(path)}
+        {"role": role, "path": str(path), "bytes": path.stat().st_size, "sha256": digest(path, stop)}
         for path, role in read.items()
     ]
+
+
+@contextlib.contextmanager
+def hashed_beside(
+    read: Mapping[Path, str], digest: Callable[..., str] = sha256
+) -> Iterator[Future[list[dict[str, Any]]]]:
+    """Take the checksums of files in a thread while the block runs; an error in the block does not wait for them.
+
+    The thread ends with the block, whatever happens, and never calls GDAL: the interpreter cannot exit while a thread
+    is inside of a GDAL function (its binding's destructor takes the lock of the interpreter, and the process aborts).
+    """
+    stop = threading.Event()
+    with ThreadPoolExecutor(1, thread_name_prefix="checksums") as pool:
+        future = pool.submit(hashed, read, digest, stop)
+        try:
+            yield future
+        finally:
+            stop.set()
 
 
 def _files_of(path: str | os.PathLike[str], allow_network: bool) -> list[str]:
@@ -289,7 +322,7 @@ def provenance(
     Parameters
     ----------
     inputs : list
-        From `hash_inputs`.
+        From `hashed`.
     asked : mapping of str to dataclass
         What else the user asked for, by name.
     """

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -230,7 +228,7 @@ def compare(
     if best.model in {family.name for family in families()}:
         opened = replace(opened, models={best.model: best.fit.model}, model_source="control points")
     adjusted = Adjusted(opened, best.fit)
-    hashed = inputs.hash_inputs(image, scene, points, surface)
+    hashed = inputs.hashed(inputs.files_read(image, scene, points, surface))
     record = inputs.provenance(opened, points, heights, hashed, command, {"scene": scene, "surface": surface})
     document = report.build_report(
         scene=opened, fit=best.fit, surface=heights, comparison=result.to_json(), provenance=record,
@@ -251,7 +249,7 @@ def rectify(
     progress: Callable[[float], None] | None = None,
     command: str | None = None,
     name: str | None = None,
-    digest: Callable[[Path], str] = sha256,
+    digest: Callable[..., str] = sha256,
 ) -> Result:
     """Make the orthoimage of a scene, its adjusted model in every format, and the accuracy report.
 
@@ -284,19 +282,19 @@ def rectify(
     opened = open_adjustable(image, scene, points)
     heights = open_surface(surface, scene.allow_network)
     acquired = stac_items.acquisition_time(opened.facts, output.acquired) if output.stac else None
-    hashing = _beside(inputs.hash_inputs, image, scene, points, surface, digest, opened.rasters, opened.sources)
-    adjusted = adjust(opened, points, scene, heights)
-    opened, model, size = adjusted.scene, adjusted.model, (opened.width, opened.height)
-    heights = footprint.facing(model, heights, *size)
-    share, notes = _coverage(model, heights, size)
-    crs = parse_crs(output.crs) if output.crs else None
-    grid = footprint.choose_grid(model, heights, size, crs=crs, resolution=output.resolution, extent=output.extent)
-    exported, complaints = _as_rpc(model)
-    source = raster.RasterSource(*(opened.rasters or (image,)), allow_network=scene.allow_network)
-    warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
-    record = inputs.provenance(
-        opened, points, heights, hashing.result(), command, {"scene": scene, "surface": surface, "output": output}
-    )  # fmt: skip
+    read = inputs.files_read(image, scene, points, surface, opened.rasters, opened.sources)
+    with inputs.hashed_beside(read, digest) as hashing:
+        adjusted = adjust(opened, points, scene, heights)
+        opened, model, size = adjusted.scene, adjusted.model, (opened.width, opened.height)
+        heights = footprint.facing(model, heights, *size)
+        share, notes = _coverage(model, heights, size)
+        crs = parse_crs(output.crs) if output.crs else None
+        grid = footprint.choose_grid(model, heights, size, crs=crs, resolution=output.resolution, extent=output.extent)
+        exported, complaints = _as_rpc(model)
+        source = raster.RasterSource(*(opened.rasters or (image,)), allow_network=scene.allow_network)
+        warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
+        asked = {"scene": scene, "surface": surface, "output": output}
+        record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
     whole = raster.open_dataset(image, allow_network=scene.allow_network)
     _write_models(model, exported, opened, whole, files, {**record, "adjustment": adjusted.fit.to_json()})
     document = report.build_report(
@@ -488,20 +486,6 @@ def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[str]]:
     except InputError as error:
         return None, [f"no RPC files were written: {error.message}"]
     return exported, list(exported.warnings)
-
-
-def _beside(work: Callable[..., Any], *given: Any) -> Future[Any]:
-    """Start `work` beside what follows; an error in the meantime does not wait for its end."""
-    future: Future[Any] = Future()
-
-    def run() -> None:
-        try:
-            future.set_result(work(*given))
-        except BaseException as error:
-            future.set_exception(error)
-
-    threading.Thread(target=run, daemon=True, name="beside").start()
-    return future
 
 
 def _warp(
