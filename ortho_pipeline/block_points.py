@@ -280,7 +280,7 @@ def read_block_points(
                 "none of these points was measured in an image", file=gcps, field="id",
                 remedy=f"the ids have to be those of {os.fspath(path)}",
             )  # fmt: skip
-    shift = 0.5 if pixel_origin == "center" and rays.centre_origin_allowed else 0.0
+    shift = 0.5 if pixel_origin == "center" and rays.origin_allowed else 0.0
     return joined.points(path, rays.rows, shift, pyproj.CRS.from_epsg(4326) if plane is None else plane)
 
 

@@ -9,10 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.point_csv import read_csv
+from ortho_pipeline.point_csv import is_header, read_csv
 from ortho_pipeline.point_geojson import read_geojson
 from ortho_pipeline.point_lists import odm_crs, read_envi, read_odm, read_qgis
-from ortho_pipeline.point_table import OF_BLOCK, OF_IMAGE, OWN_IMAGE, Layout, Piece, Row, Table, load_text
+from ortho_pipeline.point_table import OF_BLOCK, OWN_IMAGE, Layout, Piece, Row, Table, load_text
 
 _FORMATS = "CSV/TSV (id,col,row,x,y,h,...), GeoJSON with 'ji', QGIS .points, ODM gcp_list.txt, ENVI .pts"
 
@@ -53,7 +53,7 @@ def read_block_table(path: str | os.PathLike[str], layout: Layout = OF_BLOCK) ->
         As `read_table`; also for a line that does not say which image it is of.
     """
     text = load_text(path)
-    reader = _reader(path, text, layout)
+    reader = _reader(path, text)
     if reader is read_csv or reader is read_geojson:
         table = reader(path, text, layout)
     elif reader is read_odm and layout is OF_BLOCK:
@@ -68,9 +68,7 @@ def read_block_table(path: str | os.PathLike[str], layout: Layout = OF_BLOCK) ->
     return table
 
 
-def _reader(
-    path: str | os.PathLike[str], text: str, layout: Layout = OF_IMAGE
-) -> Callable[[str | os.PathLike[str], str], Table]:
+def _reader(path: str | os.PathLike[str], text: str) -> Callable[[str | os.PathLike[str], str], Table]:
     suffix = Path(path).suffix.lower()
     start = text.lstrip()[:4096]
     if start.startswith(("{", "[")) or suffix in (".geojson", ".json"):
@@ -79,9 +77,8 @@ def _reader(
         return read_qgis
     if suffix == ".pts" or re.match(r";.*", start):
         return read_envi
-    lines = [line.lower() for line in start.splitlines() if line.strip() and not line.startswith("#")]
-    names = set(re.split(r"[\s,;|]+", lines[0].replace('"', "").strip())) if lines else set()
-    if suffix in (".csv", ".tsv") or set(layout.needed) <= names or {"col", "row"} <= names:
+    lines = [line for line in start.splitlines() if line.strip() and not line.startswith("#")]
+    if suffix in (".csv", ".tsv") or (lines and is_header(lines[0])):
         return read_csv
     if lines and odm_crs(lines[0]) is not None:
         return read_odm

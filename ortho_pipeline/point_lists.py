@@ -66,7 +66,7 @@ def read_odm(path: str | os.PathLike[str], text: str) -> Table:
 
     Columns and rows are taken to count from the corner of the first pixel. A `z` of NaN is a height not given.
     """
-    table = Table("ODM list", centre_origin_allowed=True)
+    table = Table("ODM list", origin_allowed=True)
     for line in lines_of(path, text):
         if line.text.lstrip().startswith("#"):
             continue

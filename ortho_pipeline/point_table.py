@@ -35,7 +35,7 @@ class Layout(NamedTuple):
 
 
 #: Points of one image; rays of a block, whose ground may be known; ground alone.
-OF_IMAGE = Layout((*CSV_COLUMNS, CSV_IMAGE), CSV_COLUMNS[:5], "control")
+OF_IMAGE = Layout((*CSV_COLUMNS, CSV_IMAGE), CSV_COLUMNS[1:5], "control")
 OF_BLOCK = Layout(("id", CSV_IMAGE, *CSV_COLUMNS[1:]), ("id", CSV_IMAGE, "col", "row"), "")
 OF_GROUND = Layout(("id", *CSV_COLUMNS[3:7], *CSV_COLUMNS[8:]), ("id", "x", "y"), "")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -46,7 +46,7 @@ Piece = tuple[float, float, float]
 OWN_IMAGE: Piece = (0.0, 0.0, 1.0)
 
 
-@dataclass
+@dataclass(slots=True)
 class Row:
     """One point as its file has it; None is what the file does not give. `piece` is where its image lies."""
 
@@ -66,7 +66,9 @@ class Row:
 class Table:
     """All points of a file, and what it says about their coordinates.
 
-    `vertical` is stated by the file; `assumed_vertical` is what the format means where nothing is stated.
+    `vertical` is stated by the file; `assumed_vertical` is what the format means where nothing is stated. `of_ground`
+    is ``geographic`` or ``projected`` where the columns are called so. With `origin_allowed` the file does not say what
+    (0, 0) is, and the user may.
     """
 
     format: str
@@ -74,7 +76,8 @@ class Table:
     crs: str | None = None
     vertical: str | None = None
     assumed_vertical: str | None = None
-    centre_origin_allowed: bool = False
+    of_ground: str | None = None
+    origin_allowed: bool = False
 
 
 class Line(NamedTuple):
@@ -154,7 +157,11 @@ def sigma_of(text: Any, path: str | os.PathLike[str], where: str, *, zero: bool)
 
 
 def cells_of(path: str | os.PathLike[str], line: Line, delimiter: str) -> list[str]:
+    """Return the cells of a line without blanks around them; a blank as delimiter stands for any white space."""
+    if delimiter == " " and '"' not in line.text:
+        return line.text.split()
     try:
-        return [cell.strip() for cell in next(csv.reader([line.text], delimiter=delimiter, strict=True))]
+        text = " ".join(line.text.split()) if delimiter == " " else line.text
+        return [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter, strict=True))]
     except csv.Error as error:
         raise InputError(f"the line cannot be split ({error})", file=path, field=f"line {line.number}") from error

@@ -189,7 +189,7 @@ def read_points(
     table = read_table(path, image_name, pieces)
     ids = _ids(path, table.rows)
     image = np.array([row.image for row in table.rows])
-    if pixel_origin == "center" and table.centre_origin_allowed:
+    if pixel_origin == "center" and table.origin_allowed:
         image += 0.5
     pieces_of = np.array([row.piece for row in table.rows])
     image = image * pieces_of[:, 2:] + pieces_of[:, :2]
@@ -226,6 +226,7 @@ def ground_of(
     wheres = [row.where for row in table.rows]
     full = _crs_of(path, table, crs)
     plane = horizontal(full)
+    _check_kind(path, table, plane)
     _check_places(path, plane, wheres, ground)
     datum, unit = _vertical_of(path, table, full, vertical, bool(np.isfinite(ground[:, 2]).any()))
     ground[:, 2] *= unit
@@ -381,6 +382,17 @@ def _ellipsoidal(
     out = ground.copy()
     out[given, 2] += undulation[given]
     return out
+
+
+def _check_kind(path: str | os.PathLike[str], table: Table, crs: pyproj.CRS) -> None:
+    """Refuse degrees in columns that are called Easting and Northing, and metres in those called Lat and Lon."""
+    if table.of_ground is None or crs.is_geographic == (table.of_ground == "geographic"):
+        return
+    named, other = ("longitude", "projected") if table.of_ground == "geographic" else ("easting", "not projected")
+    raise CrsError(
+        f"the columns are called {named} and so on, but {crs.name!r} is {other}", file=path, field="--points-crs",
+        remedy="give the CRS that these columns are in, or rename them x and y",
+    )  # fmt: skip
 
 
 def _check_places(path: str | os.PathLike[str], crs: pyproj.CRS, wheres: Sequence[str], ground: Array) -> None:
