@@ -225,7 +225,8 @@ def _image(folder: Path, width: int, height: int) -> Path:
     one, zero = np.eye(20)[0], np.zeros(20)
     column, row = zero.copy(), zero.copy()
     column[1], row[2] = 1.0, -1.0
-    rpc = RPC(150.0, 200.0, 0.0, 0.0, 500.0, 150.0, 200.0, 0.001, 0.001, 500.0, column, one, row, one)
+    # The middle of the made flight: 0.001 degrees north of where it begins.
+    rpc = RPC(150.0, 200.0, 0.0, 0.0012, 500.0, 150.0, 200.0, 0.001, 0.001, 500.0, column, one, row, one)
     dataset = gdal.GetDriverByName("GTiff").Create(str(path), width, height, 1)
     dataset.SetMetadata(rpc_metadata(rpc), "RPC")
     dataset = None
@@ -268,8 +269,8 @@ def test_two_of_them_and_damaged_ones_are_said(made: Path) -> None:
         ("23:59:59.9990000Z", "25:59:59Z", "START"),
         ("2020-12-31T23:59:59", "1020-12-31T23:59:59", "orbit"),
         ("<COEFFICIENTS>-0.0001 7e-07", "<COEFFICIENTS>-0.0001 0", "across"),
-        ("-0.70710678", "0.0", "attitude"),
-        ("Sensor_Model_Characteristics", "Other", "Sensor_Model_Characteristics"),
+        ("-0.70710678", "0.0", "Sensor_Attitudes"),
+        ("Sensor_Model_Characteristics", "Other", "Geometric_Data"),
         # A part of the line, or of the pass: how columns and rows then count is not documented.
         (
             "<Sensor_Viewing_Model>",

@@ -96,8 +96,9 @@ def pushbroom_of_tables(
         If a table is not ordered in time, too short, or does not cover the image.
     """
     last = camera.height * line_period
-    times, positions = _table(orbit, (3,), first_time, last, degree, "orbit")
-    turn_times, turns = _table(attitude, (3, 3), first_time, last, degree, "attitude")
+    slack = max(line_period, 1e-3 * last)
+    times, positions = _table(orbit, (3,), (first_time, last, slack), degree, "orbit")
+    turn_times, turns = _table(attitude, (3, 3), (first_time, last, slack), degree, "attitude")
     if not are_rotations(turns):
         raise InputError("a matrix of this table is no rotation", field="attitude")
     # Half an image beyond both ends, as far as the tables go: points outside of the image are legal.
@@ -179,17 +180,21 @@ def rotations_of_angles(angles: ArrayLike, positions: ArrayLike, velocities: Arr
 
 
 def _table(
-    table: tuple[ArrayLike, ArrayLike], shape: tuple[int, ...], first: float, last: float, degree: int, name: str
+    table: tuple[ArrayLike, ArrayLike],
+    shape: tuple[int, ...],
+    needed: tuple[float, float, float],
+    degree: int,
+    name: str,
 ) -> tuple[Array, Array]:
-    """Return times after the first row and values of a table, checked."""
+    """Return times after the first row and values of a table, checked; `needed`: first time, duration, slack (s)."""
+    first, last, slack = needed
     times, values = (np.asarray(part, dtype=np.float64) for part in table)
     if times.ndim != 1 or values.shape != (len(times), *shape) or len(times) <= degree:
         raise InputError(f"more than {degree} times with {shape} values each are needed", field=name)
     if not (np.isfinite(times).all() and np.isfinite(values).all() and (np.diff(times) > 0).all()):
         raise InputError("a table has finite values at increasing times", field=name)
     times = times - first
-    # The rim of a row more or less is no reason to refuse a table.
-    slack = 1e-3 * last
+    # The rim of a row more or less is no reason to refuse a table: vendors' tables end at centres of rows.
     if times[0] > slack or times[-1] < last - slack:
         raise InputError(
             f"it is known from {times[0]:.6g} to {times[-1]:.6g} s after the first row, the image takes {last:.6g} s",

@@ -6,23 +6,20 @@ same image lie beside it, the scene has the model ``pushbroom`` as well.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from osgeo import gdal
 
-from ortho_pipeline.errors import InputError
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.rpc import has_rpc, rpc_of_dataset
-from ortho_rpc.dimap import has_dimap_pushbroom, read_dimap_pushbroom
+from ortho_rpc.rigorous import Rigorous, rigorous_beside
 
 # What GDAL's readers of vendor metadata agree on, and what it is called here.
 IMAGERY = {"SATELLITEID": "satellite", "ACQUISITIONDATETIME": "acquired", "CLOUDCOVER": "cloud_cover_percent"}
-_DIMAP = re.compile(r"(DIM|PHRDIMAP)[\w.-]*\.XML", re.IGNORECASE)
 
 
 @hookimpl
@@ -42,39 +39,21 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
     """Open an image with its RPC, or with the one given."""
     model, source = rpc_of_dataset(dataset, rpc)
     width, height = dataset.RasterXSize, dataset.RasterYSize
-    rigorous, remarks = _rigorous(Path(dataset.GetDescription()), width, height)
+    rigorous = rigorous_beside(Path(dataset.GetDescription()), (width, height), model)
+    models: dict[str, SensorModel] = {"rpc": model}
+    if rigorous.model is not None:
+        models["pushbroom"] = rigorous.model
     return Scene(
         sensor="rpc",
         path=dataset.GetDescription(),
         width=width,
         height=height,
-        models={"rpc": model, **rigorous},
+        models=models,
         model_source=source,
-        facts=_facts(dataset, model),
-        warnings=(*_warnings(dataset, model), *remarks),
+        facts=_facts(dataset, model) | _facts_of(rigorous),
+        warnings=(*_warnings(dataset, model), *rigorous.warnings),
+        sources=() if rigorous.path is None else (rigorous.path,),
     )
-
-
-def _rigorous(image: Path, width: int, height: int) -> tuple[dict[str, SensorModel], tuple[str, ...]]:
-    """Return the rigorous model of DIMAP metadata beside an image of the same size, and what is to be said of it."""
-    try:
-        beside = [path for path in image.parent.iterdir() if _DIMAP.match(path.name) and has_dimap_pushbroom(path)]
-    except OSError:
-        return {}, ()
-    found: dict[Path, SensorModel] = {}
-    remarks = []
-    for path in sorted(beside):
-        try:
-            model = read_dimap_pushbroom(path)
-        except InputError as error:
-            remarks.append(f"the rigorous model beside the image is left out: {error}")
-            continue
-        if (model.camera.width, model.camera.height) == (width, height):
-            found[path] = model
-    if len(found) > 1:
-        names = ", ".join(path.name for path in found)
-        return {}, (*remarks, f"several rigorous models of this size lie beside the image, none is taken: {names}")
-    return dict(zip(("pushbroom",), found.values(), strict=False)), tuple(remarks)
 
 
 def _facts(dataset: gdal.Dataset, model: RPC) -> dict[str, Any]:
@@ -89,6 +68,11 @@ def _facts(dataset: gdal.Dataset, model: RPC) -> dict[str, Any]:
             facts[f"rpc_{name}_m"] = value
     facts["rpc_height_range_m"] = list(model.height_range)
     return facts
+
+
+def _facts_of(rigorous: Rigorous) -> dict[str, Any]:
+    facts: dict[str, Any] = {} if rigorous.path is None else {"rigorous_model": rigorous.path.name}
+    return facts | ({"rigorous_models_not_read": dict(rigorous.left)} if rigorous.left else {})
 
 
 def _warnings(dataset: gdal.Dataset, model: RPC) -> tuple[str, ...]:

@@ -1,22 +1,28 @@
-"""The rigorous model in DIMAP metadata of Pleiades: orbit, attitude and look directions instead of an RPC.
+"""The rigorous model in DIMAP metadata: orbit, attitude and look directions instead of an RPC.
 
-What the vendor's numbers mean (checked against the vendor's own location grid, to 0.2 mm):
+Read are version 1 of Pleiades (`Sensor_Model_Characteristics`) and version 2 of Pleiades and SPOT 6 and 7
+(`Refined_Model`). What the vendor's numbers mean:
 
-- the *centre* of row 0 is exposed at START, the next ones every SENSOR_LINE_PERIOD milliseconds;
+- the *centre* of row 1 is exposed at START, the next ones every line period;
 - positions (ECEF) between those of the table follow from Lagrange's polynomial through eight of them; the velocities
   are left alone, they lack the rotation of the Earth;
-- the attitude is a quaternion to ECEF, scalar first, each part a polynomial in (seconds of the day - OFFSET) / SCALE,
-  to be normalised;
-- a column looks along (psi_Y, -psi_X, 1): both angles are polynomials in the column counted from 0 and are used as they
-  are, without a tangent;
+- the attitude is a quaternion to ECEF, scalar first, to be normalised: each part a polynomial in (seconds of the day -
+  OFFSET) / SCALE (Pleiades), or a table of them (SPOT);
+- a column looks along (psi_Y, -psi_X, 1): both are polynomials in the column counted from 0 at the first centre, and
+  are used as they are, without a tangent;
 - no light time, no aberration, no refraction.
+
+Checked: version 1 against the vendor's own location grid (0.2 mm). In version 2 the rays of the corners pass the
+vendor's own vertices within 1.5 mm (Pleiades, where they are the outer corners of the pixels) and 5 mm (SPOT 6, where
+they are centres, all at one height; a microsecond of its times is 7 mm); with tangents they miss them by 0.2 m, and
+by 0.6 m and 28 m of height.
 """
 
 from __future__ import annotations
 
-import math
 import re
-from datetime import datetime
+from collections.abc import Callable
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -27,20 +33,24 @@ from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import read_bounded
-from ortho_pipeline.models.line_camera import MOST_PIXELS, LineCamera
+from ortho_pipeline.models.line_camera import LineCamera
 from ortho_pipeline.models.pushbroom import Pushbroom
 from ortho_pipeline.models.pushbroom_start import pushbroom_of_tables, rotations_of_quaternions
+from ortho_rpc.dimap_file import MAX_SIZE, MOST_TERMS, DimapFile
 
 Array = NDArray[np.float64]
 
-MAX_SIZE = 5_000_000
-_MODEL = "Geometric_Data/Sensor_Model_Characteristics"
-#: Heights (m) of the ground where the metadata say nothing of them.
-_HEIGHTS = (-100.0, 3000.0)
-#: How often the attitude polynomial is sampled, and by how many cubic polynomials it is followed: to 1e-12 rad.
+FIRST, SECOND = "Geometric_Data/Sensor_Model_Characteristics", "Geometric_Data/Refined_Model"
+#: Products of version 2 whose conventions were checked against numbers of the vendor.
+PROFILES = ("PHR_SENSOR", "S6_SENSOR", "S7_SENSOR")
+#: Seconds of the units in which line periods stand; Pleiades names none.
+_UNITS = {None: 1e-3, "ms": 1e-3, "millisecond": 1e-3, "microsecond": 1e-6, "us": 1e-6}
+#: Heights (m) of the ground where nothing is said of them.
+HEIGHTS = (-100.0, 3000.0)
+#: How often an attitude polynomial is sampled, and by how many cubic polynomials it is followed: to 1e-12 rad.
 _SAMPLES, _PIECES = 96, 24
-_MOST_TERMS, _MOST_POINTS = 10, 100_000
+#: Quaternions are normalised, but those of a vendor are nearly so: others are damaged.
+_UNIT_LENGTH = 0.01
 # camera axes (along the line, forward, to the ground) in those of the vendor (psi_Y, -psi_X, 1)
 _VENDOR_FROM_CAMERA = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -50,176 +60,268 @@ def has_dimap_pushbroom(path: str | PathLike[str]) -> bool:
     try:
         with open(path, "rb") as file:
             data = file.read(MAX_SIZE + 1)
-    except OSError:
+    except (OSError, ValueError):
         return False
-    return len(data) <= MAX_SIZE and b"Dimap_Document" in data[:2000] and b"<Sensor_Model_Characteristics" in data
+    models = (b"<Sensor_Model_Characteristics", b"<Refined_Model")
+    return len(data) <= MAX_SIZE and b"Dimap_Document" in data[:2000] and any(name in data for name in models)
 
 
-def read_dimap_pushbroom(path: str | PathLike[str]) -> Pushbroom:
-    """Read the rigorous model of a Pleiades product.
+def read_dimap_pushbroom(
+    source: str | PathLike[str] | DimapFile, *, image: str | None = None, heights: tuple[float, float] | None = None
+) -> Pushbroom:
+    """Read the rigorous model of a Pleiades or SPOT 6/7 product; free are offsets and drifts of the attitude.
 
-    Free are offsets and drifts of the attitude.
+    Parameters
+    ----------
+    source : path or DimapFile
+    image : str, optional
+        Name of a tile that the metadata list: its model then, in its own pixels, instead of that of the whole scene.
+    heights : (float, float), optional
+        Range of ellipsoidal heights (m) of the ground where the metadata themselves give none.
 
     Raises
     ------
     InputError
-        If the file is no such metadata, or something is missing or impossible in it.
+        If the file is no such metadata, something is missing or impossible in it, or its conventions are not known.
     """
-    file = _File(Path(path))
-    rows, columns = file.integer("Raster_Dimensions/NROWS"), file.integer("Raster_Dimensions/NCOLS")
-    period = file.number(f"{_MODEL}/SENSOR_LINE_PERIOD") / 1000
-    if not 0 < period < 1:
-        raise InputError(f"{period} s is no time for a row", file=path, field="SENSOR_LINE_PERIOD")
-    first = file.time(f"{_MODEL}/UTC_Sensor_Model_Range/START") - 0.5 * period
-    _refuse_parts(file, rows * period, first)
-    psi_x, psi_y = (file.polynomial(f"{_MODEL}/Sensor_Viewing_Model/Viewing_Directions/{n}_Model") for n in _PSI)
-    # The vendor counts columns from 0 at the first centre.
-    across, along = (Polynomial(psi)(Polynomial([-0.5, 1.0])).coef for psi in (psi_x, psi_y))
-    times = np.linspace(first - 0.5 * rows * period, first + 1.5 * rows * period, _SAMPLES)
-    turns = rotations_of_quaternions(_quaternions(file, times)) @ _VENDOR_FROM_CAMERA
+    file = source if isinstance(source, DimapFile) else DimapFile(Path(source))
+    if file.has(FIRST):
+        scan = _first_version(file)
+    elif file.has(SECOND):
+        scan = _second_version(file)
+    else:
+        raise file.error("there is no rigorous model in this file", SECOND, "use its RPC instead")
+    left, top, columns, rows = tile_of(file, image) or (0, 0, scan.columns, scan.rows)
+    # Their columns count from 0 at the first centre of the whole.
+    across, along = (Polynomial(psi)(Polynomial([left - 0.5, 1.0])).coef for psi in (scan.psi_x, scan.psi_y))
+    first = scan.start + (top - 0.5) * scan.period
+    times, turns = scan.attitude(first, rows * scan.period)
     try:
         model = pushbroom_of_tables(
             LineCamera.of_polynomials(columns, rows, across, along),
-            line_period=period,
+            line_period=scan.period,
             first_time=0.0,
-            orbit=_orbit(file, first),
+            orbit=(scan.orbit[0] - first, scan.orbit[1]),
             attitude=(times - first, turns),
-            heights=_heights(file),
-            segments=(None, _PIECES),
+            heights=_heights(file) or heights or HEIGHTS,
+            segments=(None, scan.pieces),
         )
         _ = model.domain  # damaged numbers may well make a camera that looks into the sky
     except InputError as error:
-        raise InputError(error.message, file=path, field=error.field, remedy=error.remedy) from error
+        raise InputError(error.message, file=file.path, field=error.field, remedy=error.remedy) from error
     return model
 
 
-_PSI = ("PsiX", "PsiY")
+def images_of(file: DimapFile) -> dict[str, Element]:
+    """Return the images that the metadata are of, by the name of their file in lower case."""
+    listed = {}
+    for entry in file.all("Raster_Data/Data_Access/Data_Files/Data_File"):
+        path = entry.find("DATA_FILE_PATH")
+        if path is not None and (name := (path.get("href") or "").replace("\\", "/").rpartition("/")[2].lower()):
+            listed[name] = entry
+    return listed
 
 
-def _refuse_parts(file: _File, duration: float, first: float) -> None:
-    """Refuse metadata whose times and columns are not those of the whole image: no grid tells how to count them."""
-    if file.root.find(f"{_MODEL}/Sensor_Viewing_Model/Position_In_Retina") is not None:
-        column = file.number(f"{_MODEL}/Sensor_Viewing_Model/Position_In_Retina/FIRST_COL")
-        if column != 1:
-            raise InputError(
-                f"the image begins in column {column:g} of the line: from where its look angles count is not known",
-                file=file.path, field="Position_In_Retina", remedy="use the RPC",
-            )  # fmt: skip
-    if file.root.find(f"{_MODEL}/UTC_Sensor_Model_Range/END") is not None:
-        taken = file.time(f"{_MODEL}/UTC_Sensor_Model_Range/END") - first
-        if abs(taken - duration) > 0.01 * duration:
-            raise InputError(
-                f"the rows take {duration:.6g} s, from START to END there are {taken:.6g} s", file=file.path,
-                field="UTC_Sensor_Model_Range", remedy="use the RPC",
-            )  # fmt: skip
+def tile_of(file: DimapFile, image: str | None) -> tuple[int, int, int, int] | None:
+    """Return first column, first row, columns and rows of an image that is one of several tiles; None if it is not."""
+    listed = images_of(file)
+    entry = listed.get((image or "").lower())
+    tiling = file.root.find("Raster_Data/Raster_Dimensions/Tile_Set/Regular_Tiling")
+    if entry is None or tiling is None or len(listed) < 2:
+        return None
+    field = "Tile_Set/Regular_Tiling"
+    if any((tiling.findtext(f"OVERLAP_{name}") or "0").strip() not in ("0", "0.0") for name in ("ROW", "COL")):
+        raise file.error("the tiles overlap, and how they then count is not known", field)
+    size = tiling.find("NTILES_SIZE")
+    texts = [] if size is None else [size.get("ncols"), size.get("nrows")]
+    texts += [entry.get("tile_C"), entry.get("tile_R")]
+    if len(texts) != 4 or not all(text and re.fullmatch(r"\d{1,8}", text, re.ASCII) for text in texts):
+        raise file.error("size or place of the tiles is missing", field)
+    columns, rows, column, row = (int(text or 0) for text in texts)
+    left, top = columns * (column - 1), rows * (row - 1)
+    width = min(columns, file.integer("Raster_Data/Raster_Dimensions/NCOLS") - left)
+    height = min(rows, file.integer("Raster_Data/Raster_Dimensions/NROWS") - top)
+    if min(left, top) < 0 or min(width, height) < 1:
+        raise file.error(f"tile {row}, {column} lies outside of the scene", field)
+    return left, top, width, height
 
 
-def _quaternions(file: _File, seconds: Array) -> Array:
-    base = f"{_MODEL}/Sensor_Attitudes"
-    offset, scale = file.number(f"{base}/OFFSET"), file.number(f"{base}/SCALE")
+@dataclass(frozen=True)
+class _Scan:
+    """What either version says of a scene; times are seconds of the day.
+
+    Parameters
+    ----------
+    start : float
+        When the centre of the first row is exposed.
+    psi_x, psi_y : (k,)
+        Polynomials, lowest power first, of the column counted from 0 at the first centre.
+    orbit : (N,), (N, 3)
+    attitude : callable(first, duration) -> (N,), (N, 3, 3)
+        Times and rotations around so many seconds from `first` on.
+    pieces : int, optional
+        By how many polynomials the attitude is followed; through all its rows without it.
+    """
+
+    columns: int
+    rows: int
+    period: float
+    start: float
+    psi_x: Array
+    psi_y: Array
+    orbit: tuple[Array, Array]
+    attitude: Callable[[float, float], tuple[Array, Array]]
+    pieces: int | None
+
+
+def _first_version(file: DimapFile) -> _Scan:
+    rows, columns = file.integer("Raster_Dimensions/NROWS"), file.integer("Raster_Dimensions/NCOLS")
+    period = _possible_period(file, file.number(f"{FIRST}/SENSOR_LINE_PERIOD") / 1000, "SENSOR_LINE_PERIOD")
+    start = file.time(f"{FIRST}/UTC_Sensor_Model_Range/START")
+    _refuse_part_of_a_line(file, f"{FIRST}/Sensor_Viewing_Model/Position_In_Retina", columns)
+    _refuse_other_duration(file, f"{FIRST}/UTC_Sensor_Model_Range", start, rows * period)
+    psi_x, psi_y = (
+        file.polynomial(f"{FIRST}/Sensor_Viewing_Model/Viewing_Directions/{name}_Model") for name in ("PsiX", "PsiY")
+    )
+    base = f"{FIRST}/Sensor_Attitudes"
+    attitude = _polynomial_attitude(file, base, f"{base}/Polynomial_Models")
+    orbit = _orbit(file, f"{FIRST}/Sensor_Ephemeris", "UTC_TIME", "LOCATION_VALUES")
+    return _Scan(columns, rows, period, start, psi_x, psi_y, orbit, attitude, _PIECES)
+
+
+def _second_version(file: DimapFile) -> _Scan:
+    profile = file.text("Metadata_Identification/METADATA_PROFILE")
+    if profile not in PROFILES:
+        raise file.error(
+            f"the conventions of {profile[:40]} could not be checked against numbers of the vendor; read are"
+            f" {', '.join(PROFILES)}", "METADATA_PROFILE",
+        )  # fmt: skip
+    size = "Raster_Data/Raster_Dimensions"
+    rows, columns = file.integer(f"{size}/NROWS"), file.integer(f"{size}/NCOLS")
+    stamp = f"{SECOND}/Time/Time_Stamp/LINE_PERIOD"
+    value, element = file.number(stamp), file.root.find(stamp)
+    unit = None if element is None else element.get("unit")
+    if unit not in _UNITS:
+        raise file.error(f"{unit[:20]!r} is an unknown unit", "LINE_PERIOD")
+    period = _possible_period(file, value * _UNITS[unit], "LINE_PERIOD")
+    start = file.time(f"{SECOND}/Time/Time_Range/START")
+    _refuse_other_duration(file, f"{SECOND}/Time/Time_Range", start, rows * period)
+    psi_x, psi_y = _look_angles(file, columns)
+    base = f"{SECOND}/Attitudes"
+    if file.has(f"{base}/Polynomial_Quaternions"):
+        name, pieces = f"{base}/Polynomial_Quaternions", _PIECES
+        attitude = _polynomial_attitude(file, name, name)
+    else:
+        attitude, pieces = _listed_attitude(file, f"{base}/Quaternion_List"), None
+    orbit = _orbit(file, f"{SECOND}/Ephemeris", "TIME", "LOCATION_XYZ")
+    return _Scan(columns, rows, period, start, psi_x, psi_y, orbit, attitude, pieces)
+
+
+def _look_angles(file: DimapFile, columns: int) -> tuple[Array, Array]:
+    """Return the polynomials of both angles, which all bands of the image have to share."""
+    base = f"{SECOND}/Geometric_Calibration/Instrument_Calibration"
+    for name in ("YAW", "PITCH", "ROLL"):
+        field = f"{base}/Instrument_Biases/{name}"
+        if file.has(field) and file.number(field) != 0:
+            raise file.error("a bias of the instrument, of which the sense of turning is not known", field)
+    bands = file.all(f"{base}/Band_Calibration_List/Band_Calibration", 100)
+    places = [f"{base}/Band_Calibration_List/Band_Calibration[{k + 1}]" for k in range(len(bands))] or [base]
+    found = []
+    for place in places:
+        _refuse_part_of_a_line(file, f"{place}/Swath_Range", columns)
+        found.append([_angle(file, f"{place}/Polynomial_Look_Angles", name) for name in ("XLOS", "YLOS")])
+    if any(not np.array_equal(*pair) for other in found for pair in zip(other, found[0], strict=True)):
+        raise file.error("the bands have look angles of their own, an image has one model", "Band_Calibration_List")
+    return found[0][0], found[0][1]
+
+
+def _angle(file: DimapFile, base: str, name: str) -> Array:
+    """Return the coefficients ``name_0``, ``name_1`` ... that there are, of which the first has to be."""
+    terms = [file.number(f"{base}/{name}_0")]
+    while file.has(f"{base}/{name}_{len(terms)}") and len(terms) <= MOST_TERMS:
+        terms.append(file.number(f"{base}/{name}_{len(terms)}"))
+    listed = sum(element.tag.startswith(f"{name}_") for element in file.all(f"{base}/*"))
+    if listed != len(terms):
+        raise file.error("the coefficients are not those of one polynomial", f"{base}/{name}_{len(terms)}")
+    return np.array(terms)
+
+
+def _possible_period(file: DimapFile, period: float, field: str) -> float:
+    if not 0 < period < 1:
+        raise file.error(f"{period} s is no time for a row", field)
+    return period
+
+
+def _refuse_part_of_a_line(file: DimapFile, field: str, columns: int) -> None:
+    """Refuse columns that are not those of the whole image: no numbers of a vendor tell how they count."""
+    if not file.has(field):
+        return
+    first = file.number(f"{field}/FIRST_COL")
+    last = file.number(f"{field}/LAST_COL") if file.has(f"{field}/LAST_COL") else columns
+    if first != 1:
+        raise file.error(
+            f"the image begins in column {first:g} of the line: from where its look angles count is not known", field
+        )
+    if field.endswith("Swath_Range") and last != columns:
+        raise file.error(f"the look angles are of {last:g} columns, the image has {columns}", field)
+
+
+def _refuse_other_duration(file: DimapFile, field: str, start: float, duration: float) -> None:
+    """Refuse a part of a pass: which of its rows the image has is not said."""
+    if not file.has(f"{field}/END"):
+        return
+    taken = file.time(f"{field}/END") - start
+    if abs(taken - duration) > 0.01 * duration:
+        raise file.error(f"the rows take {duration:.6g} s, from START to END there are {taken:.6g} s", field)
+
+
+def _polynomial_attitude(file: DimapFile, scaled: str, parts: str) -> Callable[[float, float], tuple[Array, Array]]:
+    """Return polynomials, sampled as far as half an image beyond both ends."""
+    offset, scale = file.number(f"{scaled}/OFFSET"), file.number(f"{scaled}/SCALE")
     if scale == 0:
-        raise InputError("a scale of zero", file=file.path, field="Sensor_Attitudes/SCALE")
-    parts = [file.polynomial(f"{base}/Polynomial_Models/Q{k}") for k in range(4)]
-    return np.stack([polyval((seconds - offset) / scale, part) for part in parts], axis=1)
+        raise file.error("a scale of zero", f"{scaled}/SCALE")
+    terms = [file.polynomial(f"{parts}/Q{k}") for k in range(4)]
+
+    def sampled(first: float, duration: float) -> tuple[Array, Array]:
+        times = np.linspace(first - 0.5 * duration, first + 1.5 * duration, _SAMPLES)
+        with np.errstate(over="ignore", invalid="ignore"):
+            quaternions = np.stack([polyval((times - offset) / scale, part) for part in terms], axis=1)
+        return times, _turns(file, quaternions, parts)
+
+    return sampled
 
 
-def _orbit(file: _File, first: float) -> tuple[Array, Array]:
-    """Return times after the first row and positions ``(N, 3)``."""
-    points = file.all(f"{_MODEL}/Sensor_Ephemeris/Point_List/Point")
-    if len(points) > _MOST_POINTS:
-        raise InputError(f"{len(points)} positions are no orbit of one scene", file=file.path, field="Sensor_Ephemeris")
-    times = np.array([file.time("UTC_TIME", point) - first for point in points])
-    places = np.array([file.numbers("LOCATION_VALUES", 3, point) for point in points]).reshape(-1, 3)
-    return times, places
+def _listed_attitude(file: DimapFile, field: str) -> Callable[[float, float], tuple[Array, Array]]:
+    rows = file.all(f"{field}/Quaternion")
+    if not rows:
+        raise file.error("there is neither a polynomial nor a list of quaternions", field)
+    times = np.array([file.time("TIME", row) for row in rows])
+    quaternions = np.array([[file.number(f"Q{k}", row) for k in range(4)] for row in rows])
+    turns = _turns(file, quaternions, field)
+    return lambda first, duration: (times, turns)
 
 
-def _heights(file: _File) -> tuple[float, float]:
+def _turns(file: DimapFile, quaternions: Array, field: str) -> Array:
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = np.linalg.norm(quaternions, axis=1)
+    if not (np.abs(length - 1) <= _UNIT_LENGTH).all():
+        raise file.error("the quaternions of the attitude are not of length one", field)
+    return np.asarray(rotations_of_quaternions(quaternions) @ _VENDOR_FROM_CAMERA)
+
+
+def _orbit(file: DimapFile, field: str, time: str, place: str) -> tuple[Array, Array]:
+    """Return times and positions ``(N, 3)``."""
+    points = file.all(f"{field}/Point_List/Point")
+    times = np.array([file.time(time, point) for point in points])
+    return times, np.array([file.numbers(place, 3, point) for point in points]).reshape(-1, 3)
+
+
+def _heights(file: DimapFile) -> tuple[float, float] | None:
     """Return the range of heights for which the RPC of the same file is meant, if it has one."""
     path = "Geoposition/Rational_Sensor_Model/Global_RFM/RFM_Validity/Alt"
-    if file.root.find(path) is None:
-        return _HEIGHTS
+    if not file.has(path):
+        return None
     scale, offset = file.number(f"{path}/A"), file.number(f"{path}/B")
     if not 0 < abs(scale) < 20_000 or abs(offset) > 20_000:
-        return _HEIGHTS
+        return None
     return offset - abs(scale), offset + abs(scale)
-
-
-class _File:
-    """DIMAP metadata, whose fields are asked for by their path."""
-
-    def __init__(self, path: Path) -> None:
-        from defusedxml import ElementTree
-        from defusedxml.common import DefusedXmlException
-
-        self.path = path
-        self._midnight: datetime | None = None
-        data = read_bounded(path, MAX_SIZE)
-        if len(data) > MAX_SIZE:
-            raise InputError("this file has more than 5 MB, which no metadata of a scene has", file=path)
-        try:
-            self.root: Element = ElementTree.fromstring(data, forbid_dtd=True)
-        except (ElementTree.ParseError, DefusedXmlException, ValueError, LookupError) as error:
-            raise InputError(f"this is no well-formed XML ({error})", file=path) from error
-        if self.root.find(_MODEL) is None:
-            raise InputError(
-                "there is no rigorous model in this file", file=path, field=_MODEL, remedy="use its RPC instead"
-            )
-
-    def text(self, field: str, parent: Element | None = None) -> str:
-        """Return the text of a field."""
-        text = (self.root if parent is None else parent).findtext(field)
-        if text is None or not text.strip():
-            raise InputError("this field is missing", file=self.path, field=field)
-        return text.strip()
-
-    def all(self, field: str) -> list[Element]:
-        """Return all elements of a path."""
-        return self.root.findall(field)
-
-    def numbers(self, field: str, count: int | None, parent: Element | None = None) -> list[float]:
-        """Return the finite numbers of a field, `count` of them."""
-        tokens = self.text(field, parent).split(maxsplit=_MOST_TERMS)
-        if len(tokens) > _MOST_TERMS or (count is not None and len(tokens) != count):
-            raise InputError(f"{count or 'a few'} numbers belong here", file=self.path, field=field)
-        values = []
-        for token in tokens:
-            if not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?", token[:60], re.ASCII):
-                raise InputError(f"{token[:60]!r} is no number", file=self.path, field=field)
-            values.append(float(token[:60]))
-        if not all(map(math.isfinite, values)):
-            raise InputError("a number is too large", file=self.path, field=field)
-        return values
-
-    def number(self, field: str) -> float:
-        """Return the finite number of a field."""
-        return self.numbers(field, 1)[0]
-
-    def integer(self, field: str) -> int:
-        """Return the number of rows or columns in a field."""
-        value = self.number(field)
-        if value != int(value) or not 0 < value <= MOST_PIXELS:
-            raise InputError(f"{value} is no size of an image", file=self.path, field=field)
-        return int(value)
-
-    def polynomial(self, field: str) -> Array:
-        """Return the coefficients, lowest power first, of a polynomial with its degree."""
-        terms = self.numbers(f"{field}/COEFFICIENTS", None)
-        if len(terms) != self.number(f"{field}/DEGREE") + 1:
-            raise InputError("degree and coefficients do not match", file=self.path, field=field)
-        return np.array(terms)
-
-    def time(self, field: str, parent: Element | None = None) -> float:
-        """Return a UTC time as seconds after midnight of the day on which the image begins.
-
-        Counted from an epoch far away the seconds would be rounded to a millimetre of orbit.
-        """
-        text = self.text(field, parent)
-        found = re.fullmatch(r"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)(\.\d{1,12})?Z?", text[:60], re.ASCII)
-        try:
-            whole = datetime.fromisoformat(found[1]) if found else None
-        except ValueError:
-            whole = None
-        if found is None or whole is None:
-            raise InputError(f"{text[:60]!r} is no time", file=self.path, field=field)
-        self._midnight = self._midnight or whole.replace(hour=0, minute=0, second=0)
-        return (whole - self._midnight).total_seconds() + float(found[2] or 0.0)

@@ -1,0 +1,100 @@
+"""Which DIMAP metadata beside an image are of it, and what is to be said of a rigorous model that is not read."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.models.pushbroom import Pushbroom
+from ortho_pipeline.models.rational import RPC
+from ortho_rpc.dimap import has_dimap_pushbroom, images_of, read_dimap_pushbroom
+from ortho_rpc.dimap_file import DimapFile
+
+_DIMAP = re.compile(r"(DIM|PHRDIMAP)[\w.-]*\.XML", re.IGNORECASE)
+#: A vendor's RPC follows its rigorous model to a fraction of a pixel, a corrected one to some tens; beyond this (px)
+#: they are of two images.
+DISAGREEMENT = 100.0
+
+
+@dataclass(frozen=True)
+class Rigorous:
+    """The rigorous model beside an image, if there is one to read, and why others were not read.
+
+    Parameters
+    ----------
+    model, path
+        None where none is read.
+    left : dict of str to str
+        Reasons, by the name of the file.
+    """
+
+    model: Pushbroom | None = None
+    path: Path | None = None
+    left: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each model that was not read."""
+        return tuple(f"{name} has a rigorous model that is left out: {reason}" for name, reason in self.left.items())
+
+
+def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:
+    """Return the rigorous model of an image of this size, from DIMAP metadata beside it."""
+    try:
+        beside = sorted(image.parent.iterdir())
+    except (OSError, ValueError):
+        return Rigorous()
+    names = {path.name.lower() for path in beside}
+    left: dict[str, str] = {}
+    # Metadata that name this image go before those that name none; those that name another one are its own.
+    candidates: dict[bool, list[DimapFile]] = {True: [], False: []}
+    for path in (path for path in beside if _DIMAP.match(path.name) and has_dimap_pushbroom(path)):
+        try:
+            file = DimapFile(path)
+            named = set(images_of(file))
+        except InputError as error:
+            left[path.name] = _reason(error)
+            continue
+        if image.name.lower() in named or path.name == image.name:
+            candidates[True].append(file)
+        elif not named & names:
+            candidates[False].append(file)
+    found: dict[Path, Pushbroom] = {}
+    others: dict[str, str] = {}
+    for file in candidates[True] or candidates[False]:
+        try:
+            model = read_dimap_pushbroom(file, image=image.name, heights=rpc.height_range)
+        except InputError as error:
+            left[file.path.name] = _reason(error)
+            continue
+        its = (model.camera.width, model.camera.height)
+        if its == size:
+            found[file.path] = model
+        else:
+            others[file.path.name] = "it is of {} x {} pixels, this image has {} x {}".format(*its, *size)
+    if len(found) > 1:
+        several = ", ".join(path.name for path in found)
+        reason = f"several rigorous models of this size lie beside the image, none is taken: {several}"
+        return Rigorous(left=left | {path.name: reason for path in found})
+    for path, model in found.items():
+        apart = _apart(model, rpc)
+        if apart > DISAGREEMENT:
+            left[path.name] = f"it is {apart:.0f} px off the RPC in the middle of the image: they are of two images"
+            return Rigorous(left=left)
+        return Rigorous(model, path, left)
+    return Rigorous(left=left | others)
+
+
+def _reason(error: InputError) -> str:
+    return "; ".join(filter(None, [f"{error.field}: {error.message}" if error.field else error.message, error.remedy]))
+
+
+def _apart(model: Pushbroom, rpc: RPC) -> float:
+    """Return by how many pixels model and RPC differ in the middle of the image; infinite where one sees nothing."""
+    middle = np.array([[model.camera.width / 2, model.camera.height / 2]])
+    apart = float(np.abs(rpc.ground_to_image(model.image_to_ground(middle, rpc.h_off)) - middle).max())
+    return apart if np.isfinite(apart) else np.inf

@@ -1,0 +1,455 @@
+"""DIMAP 2: the rigorous model against the vendors' own numbers, against its conventions written down again, damaged."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import re
+import shutil
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ortho_rpc.dimap import has_dimap_pushbroom, read_dimap_pushbroom
+from osgeo import gdal
+
+from ortho_pipeline.cli import cli
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geometry import enu_from_ecef, geocentric
+from ortho_pipeline.models import RPC, Pushbroom
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.plugins import open_scene
+from ortho_pipeline.rpc import rpc_metadata
+from ortho_pipeline.testing import check_sensor_model
+
+PLEIADES = "DIM_PHR1A_P_201303310839568_SEN_620285101-001.XML"
+TILES = [f"IMG_PHR1A_P_201303310839568_SEN_620285101-001_R1C{k}.TIF" for k in (1, 2)]
+
+
+@pytest.fixture
+def pleiades(real: Path) -> Path:
+    return real / "sensors" / "pleiades" / PLEIADES
+
+
+@pytest.fixture
+def spot(real: Path) -> Path:
+    return real / "sensors" / "cosicorr3d" / "SPOT6.XML"
+
+
+# -- the conventions, written down again -----------------------------------------------------------------------------
+
+
+class Written:
+    """Rays of a `Refined_Model` straight from its conventions; shares nothing with the engine."""
+
+    def __init__(self, path: Path, tangent: bool = False) -> None:
+        root = ElementTree.parse(path).getroot()
+        model = root.find("Geometric_Data/Refined_Model")
+        assert model is not None
+        self.tangent = tangent
+        self.start = self.seconds(model.findtext("Time/Time_Range/START"))
+        stamp = model.find("Time/Time_Stamp/LINE_PERIOD")
+        self.period = float(stamp.text) * (1e-6 if stamp.get("unit") == "microsecond" else 1e-3)
+        points = model.findall("Ephemeris/Point_List/Point")
+        self.times = np.array([self.seconds(point.findtext("TIME")) for point in points])
+        self.places = np.array([[float(n) for n in point.findtext("LOCATION_XYZ").split()] for point in points])
+        polynomials = model.find("Attitudes/Polynomial_Quaternions")
+        if polynomials is not None:
+            self.offset, self.scale = (float(polynomials.findtext(name)) for name in ("OFFSET", "SCALE"))
+            self.terms = [[float(n) for n in polynomials.findtext(f"Q{k}/COEFFICIENTS").split()] for k in range(4)]
+        self.listed = [
+            (self.seconds(entry.findtext("TIME")), [float(entry.findtext(f"Q{k}")) for k in range(4)])
+            for entry in model.findall("Attitudes/Quaternion_List/Quaternion")
+        ]
+        angles = next(model.iter("Polynomial_Look_Angles"))
+        self.x, self.y = ([float(e.text) for e in angles if e.tag.startswith(name)] for name in ("XLOS", "YLOS"))
+
+    @staticmethod
+    def seconds(text: str) -> float:
+        hours, minutes, seconds = text.rstrip("Z").split("T")[1].split(":")
+        return 3600 * int(hours) + 60 * int(minutes) + float(seconds)
+
+    def ray(self, column: float, row: float) -> tuple[Array, Array]:
+        """Return position and direction (ECEF) of a place of the image, (1, 1) the centre of the first pixel."""
+        time = self.start + (row - 1) * self.period
+        first = int(np.clip(np.searchsorted(self.times, time) - 4, 0, len(self.times) - 8))
+        near = self.times[first : first + 8]
+        weights = [math.prod((time - b) / (a - b) for b in near if b != a) for a in near]
+        place = np.array(weights) @ self.places[first : first + 8]
+        if self.listed:
+            at = np.array([entry[0] for entry in self.listed])
+            w, x, y, z = (np.interp(time, at, [entry[1][k] for entry in self.listed]) for k in range(4))
+        else:
+            w, x, y, z = (np.polyval(part[::-1], (time - self.offset) / self.scale) for part in self.terms)
+        psi_x, psi_y = (sum(c * (column - 1) ** k for k, c in enumerate(terms)) for terms in (self.x, self.y))
+        if self.tangent:
+            psi_x, psi_y = math.tan(psi_x), math.tan(psi_y)
+        v, q = np.array([psi_y, -psi_x, 1.0]), np.array([x, y, z])
+        turned = (w * w - q @ q) * v + 2 * (q @ v) * q + 2 * w * np.cross(q, v)
+        return place, turned / np.linalg.norm(turned)
+
+
+def vertices(path: Path) -> Array:
+    """Return lon, lat, column, row of the corners (and the centre) that the vendor gives."""
+    extent = ElementTree.parse(path).getroot().find("Dataset_Content/Dataset_Extent")
+    assert extent is not None
+    names = ("LON", "LAT", "COL", "ROW")
+    return np.array([[float(v.findtext(n)) for n in names] for v in extent if v.tag in ("Vertex", "Center")])
+
+
+def passing(rays: tuple[Array, Array], lon: float, lat: float) -> tuple[float, float]:
+    """Return by how much (m) a ray misses the vertical at lon, lat, and at which height it is nearest."""
+    (place, direction), spot = rays, np.array([[lon, lat, 0.0]])
+    up = enu_from_ecef(spot)[0, 2]
+    across = np.cross(direction, up)
+    across /= np.linalg.norm(across)
+    solved = np.linalg.solve(np.column_stack([direction, -up, across]), geocentric(spot)[0] - place)
+    return float(solved[2]), float(solved[1])
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", ["pleiades", "spot"])
+def test_rays_are_those_of_the_conventions(name: str, request: pytest.FixtureRequest) -> None:
+    path = request.getfixturevalue(name)
+    model, written = read_dimap_pushbroom(path), Written(path)
+    size = np.array([model.camera.width, model.camera.height])
+    image = np.vstack([np.random.default_rng(0).uniform(0, 1, (200, 2)) * size, np.array([[0.5, 0.5], size - 0.5])])
+    places, directions = model.rays(image)
+    for k, (column, row) in enumerate(image + 0.5):
+        place, direction = written.ray(column, row)
+        # The times of SPOT are rounded to microseconds, 7 mm of orbit, which the smooth path does not follow; its
+        # quaternions are joined by cubics here and by straight lines there.
+        assert np.linalg.norm(places[k] - place) < (1e-6 if name == "pleiades" else 1e-2)
+        apart = np.linalg.norm(np.cross(directions[k], direction)) * 760e3
+        assert apart < (1.3e-5 if name == "pleiades" else 0.05)
+
+
+@pytest.mark.realdata
+def test_pleiades_passes_the_vendors_vertices_without_tangents(pleiades: Path) -> None:
+    """Vertices have no heights, so a ray can only pass beside; they are the outer corners of the corner pixels."""
+    model, tangents = read_dimap_pushbroom(pleiades), Written(pleiades, tangent=True)
+    corners = vertices(pleiades)[:4]
+    for lon, lat, column, row in corners:
+        outer = np.array([column - (column == 1), row - (row == 1)])
+        (place,), (direction,) = model.rays(outer[None])
+        miss, height = passing((place, direction), lon, lat)
+        assert abs(miss) < 1.5e-3
+        assert 0 < height < 800
+        assert abs(passing(tangents.ray(*(outer + 0.5)), lon, lat)[0]) > 0.2
+
+
+@pytest.mark.realdata
+def test_spot_meets_the_vendors_vertices_at_one_height(spot: Path) -> None:
+    """They are centres of pixels at the height of the scene; a microsecond of the file's times is 7 mm of orbit."""
+    model = read_dimap_pushbroom(spot)
+    heights = []
+    for lon, lat, column, row in vertices(spot):
+        (place,), (direction,) = model.rays([[column - 0.5, row - 0.5]])
+        miss, height = passing((place, direction), lon, lat)
+        assert abs(miss) < 7e-3
+        heights.append(height)
+    assert np.ptp(heights) < 0.05
+
+
+@pytest.mark.realdata
+def test_a_tile_is_a_window_of_the_whole(pleiades: Path) -> None:
+    whole = read_dimap_pushbroom(pleiades)
+    image = np.random.default_rng(0).uniform(0, 8000, (20, 2))
+    for name, left, width in ((TILES[0], 0, 32000), (TILES[1].lower(), 32000, 8000)):
+        tile = read_dimap_pushbroom(pleiades, image=name)
+        assert (tile.camera.width, tile.camera.height) == (width, 15872)
+        for ours, theirs in zip(tile.rays(image), whole.rays(image + np.array([left, 0])), strict=True):
+            np.testing.assert_allclose(ours, theirs, atol=1e-9)
+
+
+@pytest.mark.realdata
+def test_it_keeps_the_contract(pleiades: Path) -> None:
+    model = read_dimap_pushbroom(pleiades, heights=(0.0, 1000.0))
+    assert model.heights == (0.0, 1000.0)
+    centre, half = model.domain
+    check_sensor_model(model, centre + np.random.default_rng(0).uniform(-0.8, 0.8, (20, 3)) * half)
+
+
+def _image(path: Path, model: Pushbroom, apart: float = 0.0) -> Path:
+    """Write an image of the model's size, its RPC a plain one that fits the model in the middle."""
+    width, height = model.camera.width, model.camera.height
+    middle, other, below = model.image_to_ground(
+        np.array([[0, 0], [1, 0], [0, 1]]) * 100.0 + np.array([width, height]) / 2, 100.0
+    )
+    slopes = np.linalg.inv(np.column_stack([other - middle, below - middle])[:2] / 100.0)
+    one, zero = np.eye(20)[0], np.zeros(20)
+    column, row = zero.copy(), zero.copy()
+    column[1:3], row[1:3] = slopes[0] * 0.1 / (width / 2), slopes[1] * 0.1 / (height / 2)
+    rpc = RPC(width / 2 + apart, height / 2, middle[0], middle[1], 100.0, width / 2, height / 2, 0.1, 0.1, 500.0,
+              column, one, row, one)  # fmt: skip
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), width, height, 1, options=["SPARSE_OK=TRUE"])
+    dataset.SetMetadata(rpc_metadata(rpc), "RPC")
+    return path
+
+
+def info(path: Path) -> tuple[dict, str]:
+    """Return the document of `ortho info`, and its text with the warnings."""
+    runner = CliRunner()
+    document = runner.invoke(cli, ["info", str(path), "--json"])
+    text = runner.invoke(cli, ["info", str(path)])
+    assert document.exit_code == text.exit_code == 0, document.output
+    return json.loads(document.stdout), text.output
+
+
+@pytest.mark.realdata
+def test_info_of_a_pleiades_tile_names_its_rigorous_model(pleiades: Path, tmp_path: Path) -> None:
+    shutil.copy(pleiades, tmp_path)
+    image = _image(tmp_path / TILES[1], read_dimap_pushbroom(pleiades, image=TILES[1]))
+    document, _ = info(image)
+    assert document["models"] == {"rpc": "rpc", "pushbroom": "pushbroom"}
+    assert document["facts"]["rigorous_model"] == PLEIADES
+    assert not document["warnings"]
+    assert [path.name for path in open_scene(image).sources] == [PLEIADES]
+
+
+@pytest.mark.realdata
+def test_info_says_which_rigorous_model_is_not_read_and_why(real: Path, pleiades: Path, tmp_path: Path) -> None:
+    neo = real / "sensors" / "asp_plot" / "pleiades" / "DIM_PNEO3_202111071029126_PAN_trimmed.XML"
+    shutil.copy(neo, tmp_path)
+    shutil.copy(pleiades, tmp_path)
+    image = _image(tmp_path / "crop.tif", read_dimap_pushbroom(pleiades, image=TILES[1]))
+    document, text = info(image)
+    assert document["models"] == {"rpc": "rpc"}
+    reasons = document["facts"]["rigorous_models_not_read"]
+    assert set(reasons) == {neo.name, PLEIADES}
+    assert "PNEO_SENSOR" in reasons[neo.name]
+    assert "40000 x 15872 pixels, this image has 8000 x 15872" in reasons[PLEIADES]
+    for name in reasons:
+        assert f"{name} has a rigorous model that is left out: " in text
+        assert any(name in warning for warning in document["warnings"])
+
+
+# -- made metadata ---------------------------------------------------------------------------------------------------
+
+
+def made_text(*, listed: bool = False) -> str:
+    """Return metadata of version 2: a flight northwards over the equator at noon, 300 x 400 pixels."""
+    points, quaternions = "", ""
+    for seconds in range(-120, 121, 30):
+        angle = 1.06e-3 * seconds
+        place = f"{7.07e6 * math.cos(angle)!r} 0.0 {7.07e6 * math.sin(angle)!r}"
+        total = 12 * 3600 + seconds
+        moment = f"2020-06-01T{total // 3600:02d}:{total % 3600 // 60:02d}:{total % 60:02d}.000000Z"
+        points += f"<Point><LOCATION_XYZ>{place}</LOCATION_XYZ><TIME>{moment}</TIME></Point>"
+    for k in range(12):
+        quaternions += f"<Quaternion><Q0>{0.70710678 + 1e-6 * (k - 5) * 0.01!r}</Q0><Q1>0.0</Q1><Q2>-0.70710678</Q2>"
+        quaternions += f"<Q3>0.0</Q3><TIME>2020-06-01T12:00:00.{k:02d}0000Z</TIME></Quaternion>"
+    parts = "".join(
+        f"<Q{k}><DEGREE>1</DEGREE><COEFFICIENTS>{terms}</COEFFICIENTS></Q{k}>"
+        for k, terms in enumerate(("0.70710678 1e-6", "0.0 0.0", "-0.70710678 0.0", "0.0 0.0"))
+    )
+    polynomials = f"<Polynomial_Quaternions><OFFSET>43200.05</OFFSET><SCALE>1.0</SCALE>{parts}</Polynomial_Quaternions>"
+    attitude = f"<Quaternion_List>{quaternions}</Quaternion_List>" if listed else polynomials
+    look = "<XLOS_0>-0.0001</XLOS_0><XLOS_1>7e-07</XLOS_1><YLOS_0>8e-05</YLOS_0>"
+    swath = "<Swath_Range><FIRST_COL>1</FIRST_COL><LAST_COL>300</LAST_COL></Swath_Range>"
+    calibration = f"{swath}<Polynomial_Look_Angles>{look}</Polynomial_Look_Angles>"
+    if listed:
+        calibration = (
+            f"<Band_Calibration_List><Band_Calibration>{calibration}</Band_Calibration></Band_Calibration_List>"
+        )
+    return f"""<?xml version="1.0" encoding="UTF-8"?>
+<Dimap_Document>
+  <Metadata_Identification><METADATA_FORMAT version="2.0">DIMAP</METADATA_FORMAT>
+    <METADATA_PROFILE>{"S6_SENSOR" if listed else "PHR_SENSOR"}</METADATA_PROFILE></Metadata_Identification>
+  <Raster_Data><Raster_Dimensions><NROWS>400</NROWS><NCOLS>300</NCOLS></Raster_Dimensions></Raster_Data>
+  <Geometric_Data><Refined_Model>
+    <Time><Time_Range><START>2020-06-01T12:00:00.0000000Z</START><END>2020-06-01T12:00:00.0279300Z</END></Time_Range>
+      <Time_Stamp><LINE_PERIOD>0.07</LINE_PERIOD></Time_Stamp></Time>
+    <Ephemeris><Point_List>{points}</Point_List></Ephemeris>
+    <Attitudes>{attitude}</Attitudes>
+    <Geometric_Calibration><Instrument_Calibration>{calibration}
+      <Instrument_Biases><YAW>0.0</YAW></Instrument_Biases></Instrument_Calibration></Geometric_Calibration>
+  </Refined_Model></Geometric_Data>
+</Dimap_Document>
+"""
+
+
+@pytest.fixture(params=[False, True], ids=["polynomials", "list"])
+def made(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    path = tmp_path / "DIM_SIMULATED.XML"
+    path.write_text(made_text(listed=request.param))
+    return path
+
+
+def test_directions_and_times_of_a_simple_flight(made: Path) -> None:
+    assert has_dimap_pushbroom(made)
+    model = read_dimap_pushbroom(made)
+    # The first centre is exposed at noon over the equator; psi_Y looks forward.
+    column = 0.5 + 0.0001 / 7e-7
+    lon, lat, _ = model.image_to_ground([[column, 0.5]], 0.0)[0]
+    altitude = 7.07e6 - 6378137.0
+    assert lon == pytest.approx(0.0, abs=1e-9)
+    assert lat == pytest.approx(np.degrees(8e-5 * altitude / 6335439.0), rel=2e-2)
+    # Flying north, columns run to the left, the west; later rows lie north by what the satellite goes in the time.
+    west, north = model.image_to_ground([[column + 100, 0.5], [column, 100.5]], 0.0)
+    assert west[0] == pytest.approx(-np.degrees(100 * 7e-7 * altitude / 6378137.0), rel=1e-6)
+    assert north[1] > lat
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        ("<NROWS>400", "<NROWS>400.5", "NROWS"),
+        ("<NROWS>400", "<NROWS>500", "Time_Range"),
+        ("<NCOLS>300</NCOLS>", "", "NCOLS"),
+        ("PHR_SENSOR", "PNEO_SENSOR", "METADATA_PROFILE"),
+        ("<METADATA_PROFILE>PHR_SENSOR</METADATA_PROFILE>", "", "METADATA_PROFILE"),
+        ("<OFFSET>43200.05", "<OFFSET>nan", "OFFSET"),
+        ("<OFFSET>43200.05", "<OFFSET>1e400", "OFFSET"),
+        ("<OFFSET>43200.05", "<OFFSET>-1e9", "Polynomial_Quaternions"),
+        ("<SCALE>1.0", "<SCALE>0", "SCALE"),
+        ("<Q0><DEGREE>1", "<Q0><DEGREE>2", "Q0"),
+        ("0.70710678 1e-6", "0.8 1e-6", "Polynomial_Quaternions"),
+        ("<LINE_PERIOD>", "<LINE_PERIOD unit='hour'>", "LINE_PERIOD"),
+        ("<LINE_PERIOD>0.07", "<LINE_PERIOD unit='microsecond'>0.07", "Time_Range"),
+        ("<LINE_PERIOD>0.07", "<LINE_PERIOD>-0.07", "LINE_PERIOD"),
+        ("T12:00:00.0000000Z", "T25:00:00Z", "START"),
+        ("<FIRST_COL>1<", "<FIRST_COL>5001<", "Swath_Range"),
+        ("<LAST_COL>300<", "<LAST_COL>400<", "Swath_Range"),
+        ("<YAW>0.0", "<YAW>0.1", "YAW"),
+        ("<XLOS_0>-0.0001</XLOS_0>", "", "XLOS_0"),
+        ("<XLOS_1>7e-07</XLOS_1>", "<XLOS_2>7e-07</XLOS_2>", "XLOS_1"),
+        ("<XLOS_1>7e-07", "<XLOS_1>0", "across"),
+        ("Refined_Model", "Other", "Refined_Model"),
+        ("<Dimap_Document>", "<!DOCTYPE x [<!ENTITY a 'b'>]><Dimap_Document>", None),
+    ],
+)
+def test_damaged_metadata(tmp_path: Path, old: str, new: str, field: str | None) -> None:
+    path, text = tmp_path / "DIM_X.XML", made_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        read_dimap_pushbroom(path)
+    assert caught.value.file == str(path)
+    assert field is None or field in str(caught.value.field)
+
+
+def test_shortened_lists_and_bands_of_their_own_are_refused(tmp_path: Path) -> None:
+    path, text = tmp_path / "DIM_X.XML", made_text(listed=True)
+    path.write_text(re.sub(r"<Quaternion>.*?</Quaternion>", "", text))
+    with pytest.raises(InputError, match="neither a polynomial nor a list"):
+        read_dimap_pushbroom(path)
+    early = re.findall(r"<Quaternion>.*?</Quaternion>", text)[:6]
+    path.write_text(text.replace("".join(early), ""))
+    with pytest.raises(InputError) as caught:
+        read_dimap_pushbroom(path)
+    assert caught.value.field == "attitude"
+    band = re.search(r"<Band_Calibration>.*?</Band_Calibration>", text, re.DOTALL)
+    assert band is not None
+    path.write_text(text.replace(band[0], band[0] + band[0]))
+    read_dimap_pushbroom(path)
+    path.write_text(text.replace(band[0], band[0] + band[0].replace("8e-05", "9e-05")))
+    with pytest.raises(InputError, match="look angles of their own"):
+        read_dimap_pushbroom(path)
+
+
+TILED = (
+    '<Raster_Dimensions><NROWS>400</NROWS><NCOLS>300</NCOLS><Tile_Set><Regular_Tiling><NTILES_SIZE nrows="400"'
+    ' ncols="200"/><OVERLAP_ROW>0</OVERLAP_ROW><OVERLAP_COL>0</OVERLAP_COL></Regular_Tiling></Tile_Set>'
+    "</Raster_Dimensions><Data_Access><Data_Files>"
+    '<Data_File tile_R="1" tile_C="1"><DATA_FILE_PATH href="a_R1C1.TIF"/></Data_File>'
+    '<Data_File tile_R="1" tile_C="2"><DATA_FILE_PATH href="a_R1C2.TIF"/></Data_File></Data_Files></Data_Access>'
+)
+UNTILED = "<Raster_Dimensions><NROWS>400</NROWS><NCOLS>300</NCOLS></Raster_Dimensions>"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("<OVERLAP_COL>0", "<OVERLAP_COL>10"),
+        ('tile_C="2"', 'tile_C="9"'),
+        ('tile_C="2"', 'tile_C="0"'),
+        ('tile_C="2"', 'tile_C="٢"'),
+        ('tile_C="2"', 'tile_C="99999999999"'),
+        (' ncols="200"', ""),
+    ],
+)
+def test_damaged_tiles(tmp_path: Path, old: str, new: str) -> None:
+    path, text = tmp_path / "DIM_X.XML", made_text().replace(UNTILED, TILED)
+    path.write_text(text)
+    assert read_dimap_pushbroom(path, image="A_R1C2.tif").camera.width == 100
+    path.write_text(text.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        read_dimap_pushbroom(path, image="a_R1C2.TIF")
+    assert "Tiling" in str(caught.value.field)
+
+
+def test_metadata_that_name_another_image_are_not_taken(tmp_path: Path) -> None:
+    """Both images of a stereo pair have the same size: the names decide."""
+    path = tmp_path / "DIM_A.XML"
+    path.write_text(made_text())
+    model = read_dimap_pushbroom(path)
+    image, other = _image(tmp_path / "b.tif", model), tmp_path / "a.tif"
+    assert list(open_scene(image).models) == ["rpc", "pushbroom"]
+    files = '<Data_Access><Data_Files><Data_File><DATA_FILE_PATH href="A.TIF"/></Data_File></Data_Files></Data_Access>'
+    path.write_text(made_text().replace("</Raster_Data>", f"{files}</Raster_Data>"))
+    _image(other, model)
+    assert list(open_scene(image).models) == ["rpc"]
+    assert list(open_scene(other).models) == ["rpc", "pushbroom"]
+
+
+def test_a_model_far_off_the_rpc_is_of_another_image(tmp_path: Path) -> None:
+    path = tmp_path / "DIM_A.XML"
+    path.write_text(made_text())
+    scene = open_scene(_image(tmp_path / "a.tif", read_dimap_pushbroom(path), apart=150.0))
+    assert list(scene.models) == ["rpc"]
+    assert any("150 px off the RPC" in warning for warning in scene.warnings)
+
+
+def mutated(text: str, generator: random.Random) -> str:
+    """Return text with a few damages, of which many stay well-formed XML."""
+    damaged = list(text)
+    for _ in range(generator.randint(1, 4)):
+        at = generator.randrange(len(damaged))
+        damaged[at] = generator.choice(
+            ["", "9", "-", "0", "e9", "<", "e99", "nan", "\0", "é", "1e400", damaged[at] * 3]
+        )
+    return "".join(damaged)
+
+
+def read_mutations(path: Path, text: str, count: int) -> int:
+    """Return how many of so many mutations are refused with their file; those that are read have to be finite."""
+    generator, refused = random.Random(0), 0
+    for _ in range(count):
+        path.write_text(mutated(text, generator))
+        has_dimap_pushbroom(path)
+        try:
+            model = read_dimap_pushbroom(path)
+        except InputError as error:
+            refused += error.file == str(path)
+            continue
+        assert np.isfinite(model.path.coefficients).all()
+        assert np.isfinite(model.attitude.coefficients).all()
+        assert np.isfinite(model.camera.values).all()
+    return refused
+
+
+def test_mutations_give_a_model_or_a_typed_error(made: Path) -> None:
+    assert 0 < read_mutations(made, made.read_text(), 150) < 150
+
+
+@pytest.mark.realdata
+@pytest.mark.slow
+def test_three_thousand_mutations_of_the_real_file(pleiades: Path, tmp_path: Path) -> None:
+    """Within the geometry, which is a tenth of the file: the rest changes nothing."""
+    text = pleiades.read_text()
+    at = text.index("<Geometric_Data>")
+    end = text.index("<Use_Area>")
+    path, generator, refused = tmp_path / "DIM_X.XML", random.Random(1), 0
+    for _ in range(3000):
+        path.write_text(text[:at] + mutated(text[at:end], generator) + text[end:])
+        try:
+            model = read_dimap_pushbroom(path)
+        except InputError as error:
+            refused += error.file == str(path)
+            continue
+        assert np.isfinite(np.concatenate([model.path.coefficients, model.attitude.coefficients])).all()
+    assert 300 < refused < 2900
