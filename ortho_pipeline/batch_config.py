@@ -54,7 +54,9 @@ class PointSettings(_Strict):
     gcps: str | None = Field(default=None, description="A file of points, or 'own' for those in the image.")
     crs: str | None = Field(default=None, description="CRS of files that do not say.")
     vertical: str | None = Field(default=None, description="Height datum of files that do not say.")
-    pixel_origin: Literal["corner", "center"] = Field(default="corner", description="What (0, 0) is in CSV files.")
+    pixel_origin: Literal["corner", "center", "corner-1", "center-1"] = Field(
+        default="corner", description="What CSV files call the first pixel: its corner or centre (0, 0), or (1, 1)."
+    )
     check: str | None = Field(default=None, description="'every:N' or 'ids:A,B': points that check and do not control.")
     select: str | None = Field(default=None, description="'even:N', 'cluster:N', 'ids:A,B' or 'random:N:SEED'.")
     correction: Literal["none", "shift", "shift-drift", "affine", "model"] | None = Field(

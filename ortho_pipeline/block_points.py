@@ -20,8 +20,9 @@ from ortho_pipeline.crs import Vertical, ground_transform, horizontal, same_crs
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.point_files import read_block_table
-from ortho_pipeline.point_table import OF_GROUND, ROLES, Row, Table
-from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE, Points, ground_of
+from ortho_pipeline.point_ground import ground_of
+from ortho_pipeline.point_table import OF_GROUND, ROLES, Row, Table, origin_shift
+from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE, Points
 
 #: Two statements of one point's ground are the same within this (degrees or metres): files round.
 _SAME_PLACE = 1e-9
@@ -251,17 +252,16 @@ def read_block_points(
         Ground of the points in a file of its own (CSV ``id,x,y,h,...`` or GeoJSON).
     crs, vertical : optional
         What ground and heights are in, where the files do not say it.
-    pixel_origin : 'corner' or 'center'
-        Where (0, 0) is in the first pixel, for CSV and ODM files.
+    pixel_origin : 'corner', 'center', 'corner-1' or 'center-1'
+        As in `read_points`.
 
     Raises
     ------
     InputError, CrsError, DatumError
         Names file and line, and what to do: for statements of one point that contradict each other, too.
     """
-    if pixel_origin not in ("corner", "center"):
-        raise InputError(f"{pixel_origin!r} is not a pixel origin", field="--pixel-origin", remedy="corner or center")
     rays = read_block_table(path)
+    shift = origin_shift(path, rays, pixel_origin)
     _name_by_place(path, rays)
     joined = _Joined()
     where = _placed(path, rays, crs, vertical)
@@ -280,7 +280,6 @@ def read_block_points(
                 "none of these points was measured in an image", file=gcps, field="id",
                 remedy=f"the ids have to be those of {os.fspath(path)}",
             )  # fmt: skip
-    shift = 0.5 if pixel_origin == "center" and rays.origin_allowed else 0.0
     return joined.points(path, rays.rows, shift, pyproj.CRS.from_epsg(4326) if plane is None else plane)
 
 

@@ -8,7 +8,14 @@ from typing import Any
 
 import click
 
-from ortho_pipeline.options import BlockOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import (
+    PIXEL_ORIGINS,
+    BlockOptions,
+    OutputOptions,
+    PointOptions,
+    SceneOptions,
+    SurfaceOptions,
+)
 
 
 def json_option(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -76,7 +83,8 @@ point_options = _grouped(
         "--gcps",
         "points_gcps",
         metavar="FILE|own",
-        help="Points: CSV, GeoJSON, QGIS .points, ODM gcp_list.txt, ENVI .pts; or 'own' for those in the image.",
+        help="Points: CSV, GeoJSON, QGIS .points, ODM gcp_list.txt, ENVI .pts, ASP .gcp, ArcGIS link table; or 'own' "
+        "for those in the image.",
     ),
     click.option("--points-crs", "points_crs", metavar="CRS", help="CRS of the points, where their file has none."),
     click.option(
@@ -88,10 +96,11 @@ point_options = _grouped(
     click.option(
         "--pixel-origin",
         "points_pixel_origin",
-        type=click.Choice(["corner", "center"]),
+        type=click.Choice(list(PIXEL_ORIGINS)),
         default="corner",
         show_default=True,
-        help="What (0, 0) is in CSV files: the outer corner of the first pixel or its centre.",
+        help="What CSV, ODM and link files call the first pixel: its outer corner or its centre (0, 0), or its corner "
+        "or its centre (1, 1).",
     ),
     click.option("--check", "points_check", metavar="every:N|ids:A,B", help="Points that check and do not control."),
     click.option(
@@ -143,10 +152,11 @@ block_options = _grouped(
     click.option(
         "--pixel-origin",
         "points_pixel_origin",
-        type=click.Choice(["corner", "center"]),
+        type=click.Choice(list(PIXEL_ORIGINS)),
         default="corner",
         show_default=True,
-        help="What (0, 0) is in CSV files: the outer corner of the first pixel or its centre.",
+        help="What CSV, ODM and link files call the first pixel: its outer corner or its centre (0, 0), or its corner "
+        "or its centre (1, 1).",
     ),
     click.option("--check", "points_check", metavar="every:N|ids:A,B", help="Points that check and do not control."),
     click.option(

@@ -6,6 +6,14 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+#: What a file of points calls the first pixel -> what is added to reach (0, 0) at its outer corner.
+PIXEL_ORIGINS = {
+    "corner": 0.0,  # (0, 0) is the outer corner of the first pixel: GDAL, QGIS, this package
+    "center": 0.5,  # (0, 0) is its centre: RPC files, OpenCV
+    "corner-1": -1.0,  # (1, 1) is its outer corner: ENVI
+    "center-1": -0.5,  # (1, 1) is its centre: MATLAB, Fortran, DIMAP, much older software
+}
+
 
 @dataclass(frozen=True)
 class SceneOptions:
@@ -49,8 +57,8 @@ class PointOptions:
         A file of points, or ``own`` for those in the image.
     crs, vertical : str, optional
         For files that do not say.
-    pixel_origin : {'corner', 'center'}
-        Where CSV files count pixels from.
+    pixel_origin : one of `PIXEL_ORIGINS`
+        What files that do not say it (CSV, ODM and link files) call the first pixel.
     check : str, optional
         ``every:N`` or ``ids:a,b``: which points only check.
     select : str, optional
@@ -90,8 +98,8 @@ class BlockOptions:
         Ground of the points, where that file does not have it.
     crs, vertical : str, optional
         For files that do not say.
-    pixel_origin : {'corner', 'center'}
-        Where CSV files count pixels from.
+    pixel_origin : one of `PIXEL_ORIGINS`
+        What files that do not say it (CSV, ODM and link files) call the first pixel.
     check : str, optional
         ``every:N`` or ``ids:a,b``: which control points only check.
     model : str, optional

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import PIXEL_ORIGINS
 
 #: A point file beyond this is not read (bytes), nor a line beyond that (characters).
 MAX_FILE = 32_000_000
@@ -78,6 +79,26 @@ class Table:
     assumed_vertical: str | None = None
     of_ground: str | None = None
     origin_allowed: bool = False
+
+
+def origin_shift(path: str | os.PathLike[str], table: Table, origin: str) -> float:
+    """Return what is added to image coordinates of a file whose first pixel is called so.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, and for one where the format itself says it.
+    """
+    if origin not in PIXEL_ORIGINS:
+        raise InputError(
+            f"{origin!r} is not a pixel origin", field="--pixel-origin", remedy=f"one of {', '.join(PIXEL_ORIGINS)}"
+        )
+    if origin != "corner" and not table.origin_allowed:
+        raise InputError(
+            f"the format {table.format} says itself what its first pixel is called", file=path, field="--pixel-origin",
+            remedy="leave the option out",
+        )  # fmt: skip
+    return PIXEL_ORIGINS[origin]
 
 
 class Line(NamedTuple):

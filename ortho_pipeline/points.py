@@ -21,19 +21,16 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.crs import (
-    VERTICAL_FORMS,
-    DeclaredVertical,
     Vertical,
-    declared_vertical,
     ground_transform,
     horizontal,
     parse_crs,
-    same_crs,
 )
-from ortho_pipeline.errors import CrsError, DatumError, InputError
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import write_text
 from ortho_pipeline.point_files import read_table
-from ortho_pipeline.point_table import CSV_COLUMNS, ROLES, Piece, Row, Table
+from ortho_pipeline.point_ground import ground_of
+from ortho_pipeline.point_table import CSV_COLUMNS, ROLES, Piece, Row, Table, origin_shift
 
 Array = NDArray[np.float64]
 
@@ -171,8 +168,9 @@ def read_points(
     ----------
     crs, vertical : optional
         What the coordinates and the heights are in, where the file does not say it.
-    pixel_origin : 'corner' or 'center'
-        Where (0, 0) is in the first pixel, for CSV and ODM files; the others have a convention of their own.
+    pixel_origin : 'corner', 'center', 'corner-1' or 'center-1'
+        What CSV, ODM and link files call the outer corner, or the centre, of the first pixel: (0, 0) or (1, 1). The
+        other formats have a convention of their own.
     image_name : str, optional
         Keep the points of this image, where a file holds points of several.
     pieces : mapping of str to (float, float, float), optional
@@ -184,13 +182,9 @@ def read_points(
     InputError, CrsError, DatumError
         Names file, line and column, and what to do.
     """
-    if pixel_origin not in ("corner", "center"):
-        raise InputError(f"{pixel_origin!r} is not a pixel origin", field="--pixel-origin", remedy="corner or center")
     table = read_table(path, image_name, pieces)
     ids = _ids(path, table.rows)
-    image = np.array([row.image for row in table.rows])
-    if pixel_origin == "center" and table.origin_allowed:
-        image += 0.5
+    image = np.array([row.image for row in table.rows]) + origin_shift(path, table, pixel_origin)
     pieces_of = np.array([row.piece for row in table.rows])
     image = image * pieces_of[:, 2:] + pieces_of[:, :2]
     ground, plane = ground_of(path, table, crs, vertical)
@@ -205,32 +199,6 @@ def read_points(
         crs=plane,
         source=os.fspath(path),
     )
-
-
-def ground_of(
-    path: str | os.PathLike[str], table: Table, crs: str | pyproj.CRS | None, vertical: str | Vertical | None
-) -> tuple[Array, pyproj.CRS]:
-    """Return the ground ``(N, 3)`` of the rows of a table with ellipsoidal heights, and its horizontal CRS.
-
-    Parameters
-    ----------
-    crs, vertical : optional
-        What the coordinates and the heights are in, where the file does not say it.
-
-    Raises
-    ------
-    InputError, CrsError, DatumError
-        If that is not known or contradicts the file, or a place is not on Earth.
-    """
-    ground = np.array([row.ground for row in table.rows], dtype=float).reshape(-1, 3)
-    wheres = [row.where for row in table.rows]
-    full = _crs_of(path, table, crs)
-    plane = horizontal(full)
-    _check_kind(path, table, plane)
-    _check_places(path, plane, wheres, ground)
-    datum, unit = _vertical_of(path, table, full, vertical, bool(np.isfinite(ground[:, 2]).any()))
-    ground[:, 2] *= unit
-    return _ellipsoidal(path, wheres, ground, plane, datum), plane
 
 
 def gcps_of_dataset(
@@ -296,116 +264,6 @@ def _ids(path: str | os.PathLike[str], rows: Sequence[Row]) -> tuple[str, ...]:
             )
         first[row.id] = row.where
     return tuple(str(row.id) for row in rows)
-
-
-def _crs_of(path: str | os.PathLike[str], table: Table, option: str | pyproj.CRS | None) -> pyproj.CRS:
-    try:
-        stated = None if table.crs is None else parse_crs(table.crs)
-    except CrsError as error:
-        raise CrsError(error.message, file=path, field="CRS", remedy=error.remedy) from error
-    given = None if option is None else parse_crs(option)
-    if stated is None and given is None:
-        raise CrsError(
-            "the CRS of these points is not known", file=path, field="--points-crs", remedy="give --points-crs EPSG:n"
-        )
-    if stated is None or given is None:
-        return given if stated is None else stated  # type: ignore[return-value]
-    if not same_crs(horizontal(stated), horizontal(given)):
-        raise CrsError(
-            f"the file says {stated.name!r}, --points-crs says {given.name!r}",
-            file=path,
-            field="--points-crs",
-            remedy="leave the option out",
-        )
-    # The one that also says what heights are in tells more.
-    return stated if declared_vertical(given) is None else given
-
-
-def _vertical_of(
-    path: str | os.PathLike[str], table: Table, crs: pyproj.CRS, option: str | Vertical | None, needed: bool
-) -> tuple[Vertical, float]:
-    """Return the height datum of the points, and metres per unit of their heights."""
-    declared = declared_vertical(crs)
-    if table.assumed_vertical is not None and option is not None:
-        # The CRS is what the format prescribes, not what anybody said of these heights.
-        declared = None
-    given = None if option is None else Vertical.parse(option)
-    stated = None if table.vertical is None else Vertical.parse(table.vertical)
-    unit = declared.metres_per_unit if declared else 1.0
-    certain = stated or _certain(declared)
-    if given is not None and certain is not None and given != certain:
-        raise DatumError(
-            f"the heights of these points are in {certain.label}, --points-vertical says {given.label}",
-            file=path,
-            field="--points-vertical",
-            remedy="leave the option out",
-        )
-    found = given or stated or (declared.vertical if declared else None)
-    if found is None and table.assumed_vertical is not None:
-        found = Vertical.parse(table.assumed_vertical)
-    if found is None and not needed:
-        return Vertical("ellipsoid"), unit
-    if found is None:
-        raise DatumError(
-            "it is not known what the heights of these points are measured above",
-            file=path,
-            field="--points-vertical",
-            remedy=f"say it with --points-vertical ({VERTICAL_FORMS})",
-        )
-    return found, unit
-
-
-def _certain(declared: DeclaredVertical | None) -> Vertical | None:
-    return declared.vertical if declared is not None and declared.certain else None
-
-
-def _ellipsoidal(
-    path: str | os.PathLike[str], wheres: Sequence[str], ground: Array, crs: pyproj.CRS, vertical: Vertical
-) -> Array:
-    given = np.isfinite(ground[:, 2])
-    if vertical.is_ellipsoid or not given.any():
-        return ground
-    plan = np.column_stack([ground[:, :2], np.zeros(len(ground))])
-    lonlat = ground_transform(crs, "EPSG:4979")(plan)
-    try:
-        undulation = vertical.undulation(lonlat[:, 0], lonlat[:, 1])
-    except DatumError as error:
-        raise DatumError(error.message, file=path, field="--points-vertical", remedy=error.remedy) from error
-    outside = given & ~np.isfinite(undulation)
-    if outside.any():
-        raise DatumError(
-            f"the geoid of {vertical.label} does not reach this point",
-            file=path,
-            field=wheres[int(np.flatnonzero(outside)[0])],
-            remedy="check its coordinates and --points-crs",
-        )
-    out = ground.copy()
-    out[given, 2] += undulation[given]
-    return out
-
-
-def _check_kind(path: str | os.PathLike[str], table: Table, crs: pyproj.CRS) -> None:
-    """Refuse degrees in columns that are called Easting and Northing, and metres in those called Lat and Lon."""
-    if table.of_ground is None or crs.is_geographic == (table.of_ground == "geographic"):
-        return
-    named, other = ("longitude", "projected") if table.of_ground == "geographic" else ("easting", "not projected")
-    raise CrsError(
-        f"the columns are called {named} and so on, but {crs.name!r} is {other}", file=path, field="--points-crs",
-        remedy="give the CRS that these columns are in, or rename them x and y",
-    )  # fmt: skip
-
-
-def _check_places(path: str | os.PathLike[str], crs: pyproj.CRS, wheres: Sequence[str], ground: Array) -> None:
-    if crs.is_geographic:
-        unit = math.degrees(crs.axis_info[0].unit_conversion_factor)
-        for where, (x, y, _) in zip(wheres, ground, strict=True):
-            if abs(y * unit) > 90 or abs(x * unit) > 360:
-                raise InputError(
-                    f"longitude {x}, latitude {y} is not on Earth",
-                    file=path,
-                    field=where,
-                    remedy="x is longitude and y latitude; projected coordinates need another --points-crs",
-                )
 
 
 def _refuse_duplicates(

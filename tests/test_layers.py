@@ -18,7 +18,7 @@ LAYERS = """
 errors options
 files crs geometry notebook
 point_table datum
-point_csv point_geojson point_lists
+point_csv point_geojson point_lists point_ground
 point_files
 points
 models least_squares statistics

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 
-from ortho_pipeline.errors import CrsError, InputError
-from ortho_pipeline.points import Points, read_points
+from ortho_pipeline.block_points import read_block_points
+from ortho_pipeline.errors import CrsError, DatumError, InputError
+from ortho_pipeline.points import Points, read_points, write_points
 
 
 def write(path: Path, text: str) -> Path:
@@ -118,3 +121,103 @@ def test_names_of_the_ground_and_its_crs_agree(tmp_path: Path) -> None:
     with pytest.raises(CrsError, match="easting"):
         read(tmp_path, "Name,Pixel,Line,Easting,Northing\na,1,2,24,-33\n", crs="EPSG:4326")
     assert np.isnan(read(tmp_path, "Name,Pixel,Line,X,Y\na,1,2,24,-33\n", crs="EPSG:4326").ground[0, 2])
+
+
+# -- pixel origins
+
+
+@pytest.mark.parametrize(
+    ("origin", "centre_of_first_pixel"),
+    [("corner", 0.5), ("center", 0.0), ("corner-1", 1.5), ("center-1", 1.0)],
+)
+def test_pixel_origins(tmp_path: Path, origin: str, centre_of_first_pixel: float) -> None:
+    at = centre_of_first_pixel
+    points = read(tmp_path, f"id,col,row,x,y\na,{at},{at},500100,6270000\n", pixel_origin=origin)
+    assert points.image.tolist() == [[0.5, 0.5]]
+    rays = f"id,image,col,row\na,one.tif,{at},{at}\na,two.tif,{at},{at}\n"
+    assert read_block_points(write(tmp_path / "b.csv", rays), pixel_origin=origin).measured.tolist() == [[0.5, 0.5]] * 2
+    odm = read(tmp_path, f"EPSG:32735\n500100 6270000 5 {at} {at} one.tif\n", "gcp_list.txt", None, pixel_origin=origin)
+    assert odm.image.tolist() == [[0.5, 0.5]]
+
+
+def test_an_origin_is_not_swallowed(tmp_path: Path) -> None:
+    qgis = "#CRS: EPSG:32735\nmapX,mapY,sourceX,sourceY,enable\n500100,6270000,1,-2,1\n"
+    with pytest.raises(InputError, match="QGIS points says itself"):
+        read(tmp_path, qgis, "a.points", None, pixel_origin="center")
+    with pytest.raises(InputError, match="corner, center, corner-1, center-1"):
+        read(tmp_path, "id,col,row,x,y\na,1,2,3,4\n", pixel_origin="middle")
+
+
+# -- geocentric points
+
+
+def geocentric(lon: float, lat: float, h: float) -> tuple[float, float, float]:
+    """Return X, Y, Z on WGS84 by the textbook's formula."""
+    a, f = 6378137.0, 1 / 298.257223563
+    e2, lon, lat = f * (2 - f), math.radians(lon), math.radians(lat)
+    n = a / math.sqrt(1 - e2 * math.sin(lat) ** 2)
+    x, y = ((n + h) * math.cos(lat) * part for part in (math.cos(lon), math.sin(lon)))
+    return x, y, ((1 - e2) * n + h) * math.sin(lat)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4978", "EPSG:7789", "+proj=geocent +datum=WGS84 +units=m"])
+def test_geocentric_points(tmp_path: Path, crs: str) -> None:
+    truth = np.array([[24.4, -33.65, 123.5], [24.41, -33.66, 500.0]])
+    lines = [
+        f"{k},1{k},20,{','.join(map(repr, geocentric(*row.tolist())))},control,0.5,0.25\n"
+        for k, row in enumerate(truth)
+    ]
+    path = write(tmp_path / "p.csv", "id,col,row,X,Y,Z,role,sigma_xy,sigma_h\n" + "".join(lines))
+    points = read_points(path, crs=crs)
+    # Realisations of the frame differ by centimetres, which PROJ may know of.
+    tolerance = 1e-11 if crs == "EPSG:4978" else 1e-6
+    assert points.ground[:, :2] == pytest.approx(truth[:, :2], abs=tolerance, rel=0)
+    assert points.ground[:, 2] == pytest.approx(truth[:, 2], abs=1e-6 if crs == "EPSG:4978" else 0.05, rel=0)
+    assert points.crs.to_epsg() == 4326
+    assert points.sigma_ground.tolist() == [[0.5, 0.5, 0.25]] * 2
+    # Ellipsoidal by what they are: a geoid is a contradiction.
+    assert read_points(path, crs=crs, vertical="ellipsoid").ground.tolist() == points.ground.tolist()
+    with pytest.raises(DatumError, match="centre of the Earth"):
+        read_points(path, crs=crs, vertical="egm96")
+
+
+def test_geocentric_points_come_back_from_a_file_and_in_a_block(tmp_path: Path) -> None:
+    truth = [24.4, -33.65, 123.5]
+    one = read(tmp_path, f"id,col,row,x,y,h\na,1,2,{','.join(map(repr, truth))}\n", crs="EPSG:4326")
+    write_points(one.to_crs("EPSG:4978"), tmp_path / "ecef.csv")
+    assert read_points(tmp_path / "ecef.csv").ground[0] == pytest.approx(truth, abs=1e-8)
+    x, y, z = geocentric(*truth)
+    rays = f"id,image,col,row,x,y,h\na,one.tif,1,2,{x!r},{y!r},{z!r}\na,two.tif,1,2,,,\nt,one.tif,5,6,,,\n"
+    block = read_block_points(write(tmp_path / "b.csv", rays), crs="EPSG:4978")
+    assert block.ground[0] == pytest.approx(truth, abs=1e-8)
+    assert np.isnan(block.ground[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "h", "said"),
+    [
+        ("24.4", "-33.65", "120", "not on Earth"),
+        ("4841", "2196", "-3514", "not on Earth"),
+        ("4840257", "2195640", "", "Z nan"),
+    ],
+)
+def test_what_is_not_geocentric_is_refused(tmp_path: Path, x: str, y: str, h: str, said: str) -> None:
+    path = write(tmp_path / "p.csv", f"id,col,row,x,y,h\na,1,2,{x},{y},{h}\n")
+    with pytest.raises(InputError, match=f"line 2.*{said}") as caught:
+        read_points(path, crs="EPSG:4978")
+    assert caught.value.remedy
+    named = write(tmp_path / "n.csv", "Name,Pixel,Line,Easting,Northing,Elev\na,1,2,3,4,5\n")
+    with pytest.raises(CrsError, match="easting"):
+        read_points(named, crs="EPSG:4978")
+
+
+def test_a_height_datum_that_is_stated_twice_and_differs(tmp_path: Path) -> None:
+    text = "#CRS: EPSG:32735+5773\n#vertical: {}\nid,col,row,x,y,h\na,1,2,500100,6270000,100\n"
+    with pytest.raises(DatumError, match="state"):
+        read_points(write(tmp_path / "p.csv", text.format("ellipsoid")))
+    assert read_points(write(tmp_path / "p.csv", text.format("egm96"))).ground[0, 2] != 100.0
+    # What is known by a name only gives way to what is stated.
+    flat = pyproj.CRS("EPSG:32735").to_wkt().replace("\n", "")
+    named = 'VERTCRS["EGM96 height",VDATUM["unknown"],CS[vertical,1],AXIS["up",up,LENGTHUNIT["metre",1]]]'
+    by_name = text.format("ellipsoid").replace("EPSG:32735+5773", f'COMPOUNDCRS["both",{flat},{named}]')
+    assert read_points(write(tmp_path / "p.csv", by_name)).ground[0, 2] == 100.0
