@@ -87,11 +87,23 @@ class OutputSettings(_Strict):
     """What an ortho looks like."""
 
     crs: str | None = Field(default=None, description="Default: the UTM zone of the scene.")
-    resolution: _Positive | None = Field(default=None, description="In units of the CRS; default: that of the scene.")
+    resolution: _Positive | Annotated[list[_Positive], Field(min_length=2, max_length=2)] | None = Field(
+        default=None, description="One number or [x, y], in units of the CRS; default: that of the scene."
+    )
     extent: Annotated[list[float], Field(min_length=4, max_length=4)] | None = Field(
         default=None, description="xmin, ymin, xmax, ymax; default: the footprint on whole multiples of the resolution."
     )
+    align: bool = Field(default=False, description="Widen 'extent' to whole multiples of the resolution.")
     resampling: Literal["nearest", "bilinear", "cubic", "lanczos", "average"] = "bilinear"
+    bands: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)] | None = Field(
+        default=None, description="Which bands, from 1; default: all."
+    )
+    dtype: Literal["Byte", "UInt16", "Int16", "UInt32", "Int32", "Float32", "Float64"] | None = Field(
+        default=None, description="Type of the pixels; default: that of the image."
+    )
+    nodata: float | Literal["nan"] | None = Field(
+        default=None, description="Of pixels without an image; default: that of the image, or a mask."
+    )
     dem_interpolation: Literal["bilinear", "cubic"] = "bilinear"
     format: Literal["COG", "GTiff"] = "COG"
     creation_options: dict[str, Scalar] = Field(default={}, description="Options of GDAL's driver.")

@@ -5,15 +5,18 @@ Heavy imports happen inside the commands, so that ``ortho --help`` answers at on
 
 from __future__ import annotations
 
+import importlib
 import logging
 import shlex
 import sys
+import traceback
 from typing import Any
 
 import click
 
 from ortho_pipeline.cli_batch import run
 from ortho_pipeline.cli_blocks import adjust, intersect
+from ortho_pipeline.cli_command import Group
 from ortho_pipeline.cli_options import (
     folder_option,
     image_argument,
@@ -40,7 +43,7 @@ from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, Su
 FAILED, CORRECTABLE, INTERRUPTED = 1, 2, 130
 
 
-class _Commands(click.Group):
+class _Commands(Group):
     """Turns errors into messages on stderr and exit codes, with ``--json`` also into a document on stdout."""
 
     def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> click.Context:
@@ -53,13 +56,38 @@ class _Commands(click.Group):
         try:
             return super().invoke(ctx)
         except OrthoError as error:
-            click.echo(f"Error: {error}", err=True)
-            if ctx.meta.get("json"):
-                print_json({"schema_version": 1, "error": _error_document(error)})
-            ctx.exit(CORRECTABLE if isinstance(error, InputError) else FAILED)
+            return self._fail(ctx, error, CORRECTABLE if isinstance(error, InputError) else FAILED)
         except KeyboardInterrupt:
             click.echo("Interrupted.", err=True)
-            ctx.exit(INTERRUPTED)
+            return ctx.exit(INTERRUPTED)
+        except ImportError as error:
+            missing = _without_gdal(error)
+            if missing is None:
+                raise
+            return self._fail(ctx, missing, CORRECTABLE)
+
+    def _fail(self, ctx: click.Context, error: OrthoError, code: int) -> None:
+        """Print an error, with ``--debug`` after its traceback, and end with an exit code."""
+        if ctx.meta.get("debug"):
+            click.echo("".join(traceback.format_exception(error)), err=True)
+        click.echo(f"Error: {error}", err=True)
+        if ctx.meta.get("json"):
+            print_json({"schema_version": 1, "error": _error_document(error)})
+        ctx.exit(code)
+
+
+def _without_gdal(error: ImportError) -> InputError | None:
+    """Return what to do if an import failed for want of GDAL; None if something else is missing."""
+    try:
+        importlib.import_module("osgeo.gdal_array")
+    except ImportError as problem:
+        missing = InputError(
+            f"GDAL's Python bindings cannot be loaded ({problem})",
+            remedy='pip install "ortho-pipeline[wheel]", or build those of your GDAL library (docs/install.md)',
+        )
+        missing.__cause__ = problem
+        return missing
+    return None
 
 
 def _error_document(error: OrthoError) -> dict[str, str | None]:
@@ -208,9 +236,18 @@ def compare(
     return print_comparison(result, units)
 
 
-@cli.command()
+@cli.command(
+    one="It takes one image; 'ortho run PIPELINE.yaml' makes many, and all outputs go to the folder of '-o DIR'."
+)
 @image_argument
 @folder_option
+@click.option(
+    "--overwrite",
+    "-overwrite",
+    is_flag=True,
+    help="Remove old side-cars that would attach to the ortho, and outputs of an earlier run that this one does not "
+    "make. Outputs of the same name are replaced without it.",
+)
 @point_options
 @scene_options
 @surface_options
@@ -219,6 +256,7 @@ def compare(
 def rectify(
     image: str,
     folder: str,
+    overwrite: bool,
     points: PointOptions,
     scene: SceneOptions,
     surface: SurfaceOptions,
@@ -237,6 +275,7 @@ def rectify(
             surface=surface,
             output=output,
             progress=advance,
+            overwrite=overwrite,
             command=click.get_current_context().meta["command"],
         )
     print_result(result, as_json)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ortho_pipeline.cli_command import Command, Megabytes
 from ortho_pipeline.cli_options import json_option
 from ortho_pipeline.cli_text import print_json, progress
 
@@ -32,7 +33,7 @@ class _Shard(click.ParamType):
         return int(match[1]), int(match[2])
 
 
-@click.command()
+@click.command(cls=Command)
 @click.argument("pipeline_file", metavar="PIPELINE.yaml", type=click.Path(), required=False)
 @click.option(
     "--executor",
@@ -42,7 +43,7 @@ class _Shard(click.ParamType):
 @click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes  [default: all processors]")
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Of each scene  [default: shared out]")
 @click.option(
-    "--memory", type=click.IntRange(min=16), default=512, show_default=True, metavar="MB", help="Of each scene."
+    "--memory", "-wm", type=Megabytes(), default="512", show_default=True, metavar="MB", help="Of each scene."
 )
 @click.option("--scheduler", metavar="URL", help="Of dask, such as tcp://host:8786.")
 @click.option("--only", multiple=True, metavar="NAME", help="Only this scene; may be repeated.")
@@ -82,7 +83,7 @@ def run(
         return None
     try:
         with progress("Orthorectifying scenes") as advance:
-            result = batch.run(pipeline_file, memory=memory * 1_000_000, progress=advance, **options)
+            result = batch.run(pipeline_file, memory=memory, progress=advance, **options)
     except KeyboardInterrupt:
         click.echo("What is done is kept: run it again to go on.", err=True)
         raise

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from ortho_pipeline.cli_command import Command
 from ortho_pipeline.cli_options import block_options, folder_option, json_option, sensor_options
 from ortho_pipeline.cli_text import print_result, print_warnings
 from ortho_pipeline.options import BlockOptions, SceneOptions
@@ -14,7 +15,7 @@ from ortho_pipeline.options import BlockOptions, SceneOptions
 _images = click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
 
 
-@click.command()
+@click.command(cls=Command)
 @_images
 @folder_option
 @block_options
@@ -47,7 +48,7 @@ def adjust(
     print_result(blocks.adjust(images, folder, replace(points, **adjusted), scene, command=command), as_json)
 
 
-@click.command()
+@click.command(cls=Command)
 @_images
 @block_options
 @click.option("--models", multiple=True, type=click.Path(), metavar="FILE", help="A saved *_model.json of each image.")

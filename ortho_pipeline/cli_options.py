@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
 import click
 
+from ortho_pipeline.cli_command import Megabytes, OneOrTwo
 from ortho_pipeline.options import (
     PIXEL_ORIGINS,
+    PIXEL_TYPES,
     BlockOptions,
     OutputOptions,
     PointOptions,
@@ -47,6 +50,20 @@ def _grouped(
 
     prefix = f"{name}_"
     return decorate
+
+
+class _Nodata(click.ParamType):
+    name = "number"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
+        """Return the number, or 'nan', which JSON has not."""
+        try:
+            number = float(value)
+        except ValueError:
+            self.fail(f"{value!r} is not a number (or nan).", param, ctx)
+        if math.isinf(number):
+            self.fail("infinity is not a value for nodata.", param, ctx)
+        return "nan" if math.isnan(number) else number
 
 
 _FILE = click.Path(dir_okay=False)
@@ -197,16 +214,16 @@ surface_options = _grouped(
 
 output_options = _grouped(
     "output",
-    lambda creation_options, memory_mb, **fields: OutputOptions(
-        creation_options=dict(creation_options), memory=memory_mb * 1_000_000, **fields
+    lambda creation_options, bands, **fields: OutputOptions(
+        creation_options=dict(creation_options), bands=bands or None, **fields
     ),
     click.option("--output-crs", "-t_srs", "output_crs", metavar="CRS", help="[default: the UTM zone of the scene]"),
     click.option(
         "--resolution",
         "-tr",
         "output_resolution",
-        type=float,
-        metavar="R",
+        type=OneOrTwo(),
+        metavar="X [Y]",
         help="Pixel size in units of the output CRS  [default: the ground sample distance]",
     ),
     click.option(
@@ -219,12 +236,40 @@ output_options = _grouped(
         help="Taken as it is  [default: the scene's footprint]",
     ),
     click.option(
+        "--align", "-tap", "output_align", is_flag=True, help="Widen --extent to whole multiples of the resolution."
+    ),
+    click.option(
         "--resampling",
         "-r",
         "output_resampling",
         type=click.Choice(["nearest", "bilinear", "cubic", "lanczos", "average"]),
         default="bilinear",
         show_default=True,
+    ),
+    click.option(
+        "--band",
+        "-b",
+        "output_bands",
+        type=click.IntRange(min=1),
+        multiple=True,
+        metavar="N",
+        help="Only this band; may be repeated, in the order of the ortho  [default: all]",
+    ),
+    click.option(
+        "--output-type",
+        "-ot",
+        "output_dtype",
+        type=click.Choice(PIXEL_TYPES, case_sensitive=False),
+        metavar="|".join(PIXEL_TYPES),
+        help="Type of the pixels; values beyond its range are clamped  [default: that of the image]",
+    ),
+    click.option(
+        "--nodata",
+        "-dstnodata",
+        "output_nodata",
+        type=_Nodata(),
+        metavar="VALUE",
+        help="Of pixels without an image  [default: that of the image, or a mask]",
     ),
     click.option(
         "--dem-interpolation",
@@ -256,12 +301,13 @@ output_options = _grouped(
     ),
     click.option(
         "--memory",
-        "output_memory_mb",
-        type=click.IntRange(min=16),
-        default=512,
+        "-wm",
+        "output_memory",
+        type=Megabytes(),
+        default="512",
         show_default=True,
         metavar="MB",
-        help="Bound on windows and caches.",
+        help="Bound on windows and caches; or with a unit, such as 2GB.",
     ),
     click.option("--threads", "output_threads", type=click.IntRange(min=1), help="[default: all processors]"),
     click.option(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import click
 
+from ortho_pipeline.cli_command import Group
 from ortho_pipeline.cli_options import folder_option, json_option
 from ortho_pipeline.cli_text import print_result, progress
 
 
-@click.group()
+@click.group(cls=Group)
 def simulate() -> None:
     """Make scenes of known truth."""
 
@@ -106,7 +107,7 @@ def simulate_orbview3(folder: str, seed: int, pixel: int, as_json: bool) -> None
     print_result(studies.simulate_orbview3(folder, seed=seed, pixel=pixel), as_json)
 
 
-@click.group()
+@click.group(cls=Group)
 def reproduce() -> None:
     """Compute the tables of the papers that this package implements, beside the papers' numbers."""
 

@@ -180,8 +180,9 @@ def choose_grid(
     size: tuple[int, int],
     *,
     crs: pyproj.CRS | None = None,
-    resolution: float | None = None,
+    resolution: float | Sequence[float] | None = None,
     extent: Sequence[float] | None = None,
+    align: bool = False,
 ) -> Grid:
     """Return the output grid of a scene.
 
@@ -191,10 +192,10 @@ def choose_grid(
         Columns and rows of the image.
     crs : pyproj.CRS, optional
         Default: the UTM zone of the scene's centre.
-    resolution : float, optional
-        In units of `crs`. Default: the ground sample distance, to two significant digits.
+    resolution : float or (float, float), optional
+        In units of `crs`, one number or x and y. Default: the ground sample distance, to two significant digits.
     extent : xmin, ymin, xmax, ymax, optional
-        Taken as it is. Default: the footprint, widened to whole multiples of the resolution.
+        Taken as it is, or widened to whole multiples of the resolution with `align`. Default: the footprint, widened.
 
     Raises
     ------
@@ -203,16 +204,18 @@ def choose_grid(
     """
     width, height = size
     crs = crs or output_crs(model, width, height)
-    step = resolution if resolution is not None else two_digits(ground_sample_distance(model, crs, width, height))
+    if resolution is None:
+        resolution = two_digits(ground_sample_distance(model, crs, width, height))
+    step = (resolution, resolution) if isinstance(resolution, int | float) else (resolution[0], resolution[1])
     if extent is not None:
-        return Grid.of_extent(crs, extent, (step, step))
+        return Grid.of_extent(crs, extent, step, align=align)
     ground = _continuous(GroundTransform(model.crs, crs)(footprint(model, surface, width, height)), crs)
     if not np.isfinite(ground).any():
         raise InputError(
             f"the scene does not lie in the domain of {crs.name!r}", field="--output-crs", remedy="choose another CRS"
         )
     low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
-    return Grid.of_extent(crs, (low[0], low[1], high[0], high[1]), (step, step), align=True)
+    return Grid.of_extent(crs, (low[0], low[1], high[0], high[1]), step, align=True)
 
 
 def _continuous(ground: Array, crs: pyproj.CRS) -> Array:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyproj
 from numpy.typing import NDArray
-from osgeo import gdal
+from osgeo import gdal, gdal_array
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster import Grid, RasterSource
@@ -30,6 +30,7 @@ def warp_with_gdal(
     creation_options: Mapping[str, str] | None = None,
     memory: int = 512_000_000,
     threads: int = 1,
+    profile: Profile | None = None,
     progress: Any = None,
 ) -> int:
     """Write the orthoimage of `source` by GDAL's own warper, exactly; return how many pixels are valid.
@@ -45,10 +46,10 @@ def warp_with_gdal(
         raise InputError(
             "GDAL's warper takes one file", file=source.paths[1], field="engine", remedy="use our own engine"
         )
-    view = gdal.GetDriverByName("VRT").CreateCopy("", source.dataset)
+    view = gdal.Translate("", source.dataset, format="VRT", bandList=list(source.band_numbers))
     view.SetGCPs([], "")
     view.SetMetadata(dict(rpc), "RPC")
-    profile = Profile.of(source)
+    profile = profile or Profile.of(source)
     dem = f"/vsimem/ortho_dem_{os.getpid()}_{threading.get_ident()}.tif"
     options = ["METHOD=RPC"]  # GDAL would otherwise prefer GCPs
     writer = RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads)
@@ -101,6 +102,9 @@ def _warp_exactly(
         transformerOptions=transformer_options,
         errorThreshold=0,
         resampleAlg=resampling,
+        # By itself the warper clamps the source to the type of the output before it interpolates.
+        workingType=gdal_array.NumericTypeCodeToGDALTypeCode(source.dtype.type),
+        outputType=gdal_array.NumericTypeCodeToGDALTypeCode(profile.dtype.type),
         dstAlpha=profile.validity == "mask",
         dstNodata=profile.nodata,
         multithread=threads > 1,

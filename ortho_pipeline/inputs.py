@@ -28,6 +28,8 @@ from ortho_pipeline.selection import select_control
 
 #: Side-cars that GDAL would attach to an image of this stem, whatever the image itself says.
 SIDE_CARS = ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", "_metadata.txt", ".IMD")
+#: The same, after the whole name of the image.
+ATTACHED = (".aux.xml", ".ovr", ".msk")
 #: In place of a file of points: the ground control points that the image itself holds.
 OWN_POINTS = "own"
 #: Name of the "sensor" of an image that has no model of its own.
@@ -200,8 +202,14 @@ def check_paths(
     scene: SceneOptions,
     points: PointOptions,
     surface: SurfaceOptions,
+    overwrite: bool = False,
 ) -> None:
     """Refuse to write what is read, and outputs that change the model of the source or of the ortho.
+
+    Parameters
+    ----------
+    overwrite : bool
+        Accept old side-cars of the ortho, which the caller removes (`old_side_cars`).
 
     Raises
     ------
@@ -210,7 +218,8 @@ def check_paths(
     """
     given = (image, *scene.files.values(), points.gcps, surface.dem)
     inputs = {Path(path).resolve() for path in given if path is not None}
-    for path in files.values():
+    removed = old_side_cars(files["ortho"]) if overwrite and "ortho" in files else []
+    for path in (*files.values(), *removed):
         if path.resolve() in inputs:
             raise InputError(
                 "this path would be read and written", file=path, field="-o", remedy="choose another output folder"
@@ -222,14 +231,19 @@ def check_paths(
             "the RPC files written here would attach to the source image and change its model", file=folder,
             field="-o", remedy="choose an output folder of its own",
         )  # fmt: skip
-    if "ortho" in files:
-        for ending in SIDE_CARS:
-            stale = files["ortho"].with_name(files["ortho"].stem + ending)
-            if stale.exists():
+    if "ortho" in files and not overwrite:
+        for stale in old_side_cars(files["ortho"]):
+            if stale.name.endswith(SIDE_CARS):
                 raise InputError(
                     "an old side-car lies here that GDAL would attach to the ortho", file=stale,
-                    remedy="remove it, or choose another output folder",
+                    remedy="remove it (--overwrite does), or choose another output folder",
                 )  # fmt: skip
+
+
+def old_side_cars(ortho: Path) -> list[Path]:
+    """Return the files beside an ortho that GDAL would attach to it: models, statistics, overviews, masks."""
+    names = [ortho.stem + ending for ending in SIDE_CARS] + [ortho.name + ending for ending in ATTACHED]
+    return [path for path in (ortho.with_name(name) for name in names) if path.is_file() or path.is_symlink()]
 
 
 # -- record ----------------------------------------------------------------------------------------------------------

@@ -13,6 +13,8 @@ PIXEL_ORIGINS = {
     "corner-1": -1.0,  # (1, 1) is its outer corner: ENVI
     "center-1": -0.5,  # (1, 1) is its centre: MATLAB, Fortran, DIMAP, much older software
 }
+#: Types of pixels that an ortho may have, by GDAL's names.
+PIXEL_TYPES = ("Byte", "UInt16", "Int16", "UInt32", "Int32", "Float32", "Float64")
 
 
 @dataclass(frozen=True)
@@ -149,13 +151,30 @@ class SurfaceOptions:
 class OutputOptions:
     """What the ortho looks like and how it is computed; `memory` in bytes, `tolerance` in source pixels.
 
-    `stac` asks for a STAC item, `acquired` is the time of acquisition for it where the metadata have none.
+    Parameters
+    ----------
+    resolution : float or (float, float), optional
+        Size of a pixel in x and y, in units of the CRS.
+    align : bool
+        Widen `extent` to whole multiples of the resolution (without an extent that is always so).
+    bands : sequence of int
+        Which bands of the image, from 1, in this order; all without.
+    dtype : str, optional
+        GDAL's name of the type of the pixels (`PIXEL_TYPES`); that of the image without.
+    nodata : float or 'nan', optional
+        Value of pixels without an image; without, that of the image, or a mask.
+    stac : bool
+        Ask for a STAC item; `acquired` is the time of acquisition for it where the metadata have none.
     """
 
     crs: str | None = None
-    resolution: float | None = None
+    resolution: float | Sequence[float] | None = None
     extent: Sequence[float] | None = None
+    align: bool = False
     resampling: str = "bilinear"
+    bands: Sequence[int] | None = None
+    dtype: str | None = None
+    nodata: float | str | None = None
     dem_interpolation: str = "bilinear"
     format: str = "COG"
     creation_options: Mapping[str, str] = field(default_factory=dict)

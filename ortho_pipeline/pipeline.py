@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -30,6 +30,7 @@ from ortho_pipeline.inputs import has_surface, open_scene, open_surface
 from ortho_pipeline.model_file import SavedModel, write_model_file
 from ortho_pipeline.models import SensorModel, families
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.raster_writer import Profile
 from ortho_pipeline.scene_fit import Adjusted, adjust, heights_around, heights_where_wanted, open_adjustable
 from ortho_pipeline.swaps import refuse_swapped
 
@@ -250,11 +251,14 @@ def rectify(
     command: str | None = None,
     name: str | None = None,
     digest: Callable[..., str] = sha256,
+    overwrite: bool = False,
 ) -> Result:
     """Make the orthoimage of a scene, its adjusted model in every format, and the accuracy report.
 
     Nothing is written before all that can be checked is checked. `name` is the id of the STAC item (the
-    image's stem without one), `digest` takes checksums of the inputs, which it may know.
+    image's stem without one), `digest` takes checksums of the inputs, which it may know. Outputs of the same name are
+    replaced; with `overwrite` so are old side-cars of the ortho, and outputs of an earlier run that this one does not
+    make are removed.
 
     Returns
     -------
@@ -272,7 +276,7 @@ def rectify(
     files = {
         kind: Path(folder) / f"{stem}{ending}" for kind, ending in _ENDINGS.items() if kind not in _STAC or output.stac
     }
-    inputs.check_paths(files, image, scene, points, surface)
+    inputs.check_paths(files, image, scene, points, surface, overwrite)
     if not has_surface(surface):
         raise InputError(
             "an orthoimage needs heights",
@@ -289,9 +293,15 @@ def rectify(
         heights = footprint.facing(model, heights, *size)
         share, notes = _coverage(model, heights, size)
         crs = parse_crs(output.crs) if output.crs else None
-        grid = footprint.choose_grid(model, heights, size, crs=crs, resolution=output.resolution, extent=output.extent)
+        grid = footprint.choose_grid(
+            model, heights, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
+        )
         exported, complaints = _as_rpc(model)
-        source = raster.RasterSource(*(opened.rasters or (image,)), allow_network=scene.allow_network)
+        source = raster.RasterSource(
+            *(opened.rasters or (image,)), allow_network=scene.allow_network, bands=output.bands, dtype=output.dtype
+        )
+        if overwrite:
+            _remove(inputs.old_side_cars(files["ortho"]))
         warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
         asked = {"scene": scene, "surface": surface, "output": output}
         record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
@@ -304,6 +314,8 @@ def rectify(
     _write_report(document, adjusted.fit, files)
     if acquired is not None:
         stac_items.write_item(files["stac"], document, files, acquired, name or stem)
+    if overwrite:
+        _remove(Path(folder) / f"{stem}{ending}" for kind, ending in _ENDINGS.items() if kind not in files)
     return Result(files, {"report": document}, report.summary_text(document))
 
 
@@ -458,6 +470,11 @@ _ENDINGS = {
 _STAC = ("stac", "thumbnail", "overview")
 
 
+def _remove(paths: Iterable[Path]) -> None:
+    for path in paths:
+        path.unlink(missing_ok=True)
+
+
 def _coverage(model: SensorModel, surface: dem.Surface, size: tuple[int, int]) -> tuple[float, list[str]]:
     """Return the share of the scene that has heights, and a warning about voids that are too small to stop for.
 
@@ -506,6 +523,7 @@ def _warp(
         "threads": output.threads,
         "driver": output.format,
         "creation_options": dict(output.creation_options),
+        "profile": Profile.of(source, output.dtype, output.nodata),
         "progress": progress,
     }
     if output.engine == "ortho":

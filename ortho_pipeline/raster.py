@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import PIXEL_TYPES
 
 gdal.UseExceptions()
 
@@ -180,7 +181,8 @@ class Grid:
             # A hair of tolerance keeps an extent that is already aligned from growing by a pixel of rounding.
             xmin, ymin = math.floor(xmin / dx + 1e-6) * dx, math.floor(ymin / dy + 1e-6) * dy
             xmax, ymax = math.ceil(xmax / dx - 1e-6) * dx, math.ceil(ymax / dy - 1e-6) * dy
-        width, height = max(1, round((xmax - xmin) / dx)), max(1, round((ymax - ymin) / dy))
+        # As GDAL rounds; Python's round() takes halves to even numbers.
+        width, height = max(1, int((xmax - xmin) / dx + 0.5)), max(1, int((ymax - ymin) / dy + 0.5))
         return cls(crs, xmin, ymax, dx, dy, width, height)
 
     @property
@@ -199,14 +201,16 @@ class Grid:
 
 
 class _RasterFile:
-    """One file of a `RasterSource`, with a GDAL handle for each thread."""
+    """Some or all bands of one file of a `RasterSource`, with a GDAL handle for each thread."""
 
-    def __init__(self, path: str | os.PathLike[str], allow_network: bool) -> None:
+    def __init__(self, path: str | os.PathLike[str], allow_network: bool, numbers: Sequence[int] | None = None) -> None:
         self.path = os.fspath(path)
         self._allow_network = allow_network
         self._local = threading.local()
         dataset = self.dataset
-        self.width, self.height, self.count = dataset.RasterXSize, dataset.RasterYSize, dataset.RasterCount
+        self.width, self.height = dataset.RasterXSize, dataset.RasterYSize
+        self.numbers = tuple(numbers or range(1, dataset.RasterCount + 1))
+        self.count = len(self.numbers)
         bands = self.bands
         if any(gdal.DataTypeIsComplex(band.DataType) for band in bands):
             raise InputError(
@@ -221,7 +225,9 @@ class _RasterFile:
         if any(value is not None for value in self.nodata):
             self.validity = "nodata"
         elif flags & gdal.GMF_ALPHA:
-            self.validity = "alpha"
+            # Without its alpha band the ortho needs a mask.
+            kept = any(band.GetColorInterpretation() == gdal.GCI_AlphaBand for band in bands)
+            self.validity = "alpha" if kept else "mask"
         else:
             self.validity = "mask" if flags & gdal.GMF_PER_DATASET else "all"
 
@@ -235,11 +241,12 @@ class _RasterFile:
     @property
     def bands(self) -> list[gdal.Band]:
         """The GDAL bands of the calling thread."""
-        return [self.dataset.GetRasterBand(i + 1) for i in range(self.dataset.RasterCount)]
+        return [self.dataset.GetRasterBand(number) for number in self.numbers]
 
     def read(self, left: int, top: int, out: NDArray[Any]) -> None:
         """Fill `out` ``(count, height, width)`` with a window that lies inside the raster."""
-        self._io(self.dataset.ReadAsArray, left, top, out.shape[2], out.shape[1], buf_obj=out)
+        given = {"buf_obj": out, "band_list": list(self.numbers)}
+        self._io(self.dataset.ReadAsArray, left, top, out.shape[2], out.shape[1], **given)
 
     def read_valid(self, left: int, top: int, pixels: NDArray[Any]) -> NDArray[np.bool_] | None:
         """Return which of the `pixels` of a window ``(count, h, w)`` are valid; None where all are."""
@@ -280,12 +287,17 @@ class RasterSource:
     ----------
     path, *others : path
         The files, in the order of their bands.
+    bands : sequence of int, optional
+        Which bands, counted from 1 over all files, in the order wanted.
+    dtype : str, optional
+        GDAL's name of the type that an ortho shall have. Pixels of another type are read as floating point that
+        holds both, so that interpolated values are rounded and clamped once, when they are written.
 
     Attributes
     ----------
     width, height, count : int
     dtype : numpy.dtype
-        Common type of all bands.
+        Common type of all bands, as they are read.
     nodata : tuple of float or None, per band
     validity : {'all', 'nodata', 'mask', 'alpha'}
         How the raster says which of its pixels are valid. NaN is never valid.
@@ -293,11 +305,16 @@ class RasterSource:
     Raises
     ------
     InputError
-        If a file cannot be used, or is not as large as the first.
+        If a file cannot be used, is not as large as the first, or has no such band.
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], *others: str | os.PathLike[str], allow_network: bool = False
+        self,
+        path: str | os.PathLike[str],
+        *others: str | os.PathLike[str],
+        allow_network: bool = False,
+        bands: Sequence[int] | None = None,
+        dtype: str | None = None,
     ) -> None:
         self._files = [_RasterFile(name, allow_network) for name in (path, *others)]
         first = self._files[0]
@@ -310,12 +327,31 @@ class RasterSource:
                     file=file.path,
                     remedy="rectify images of different sizes one by one",
                 )
+        if bands is not None:
+            self._files = [_RasterFile(name, allow_network, numbers) for name, numbers in self._chosen(bands)]
         self.count = sum(file.count for file in self._files)
-        self.dtype = np.result_type(*(file.dtype for file in self._files))
+        self.dtype = _read_as(np.result_type(*(file.dtype for file in self._files)), dtype)
         self.nodata = tuple(value for file in self._files for value in file.nodata)
         self.palette = any(file.palette for file in self._files)
         kinds = {file.validity for file in self._files}
         self.validity = kinds.pop() if len(kinds) == 1 else "mask"
+
+    def _chosen(self, bands: Sequence[int]) -> list[tuple[str, list[int]]]:
+        """Return the files, in the order wanted, with the numbers of their bands; a file may come twice."""
+        places = [(file.path, number) for file in self._files for number in file.numbers]
+        chosen: list[tuple[str, list[int]]] = []
+        for band in bands:
+            if not 1 <= band <= len(places):
+                raise InputError(
+                    f"there is no band {band}: the image has {len(places)}", file=self.path, field="--band",
+                    remedy=f"give one from 1 to {len(places)}",
+                )  # fmt: skip
+            path, number = places[band - 1]
+            if chosen and chosen[-1][0] == path:
+                chosen[-1][1].append(number)
+            else:
+                chosen.append((path, [number]))
+        return chosen
 
     @property
     def dataset(self) -> gdal.Dataset:
@@ -328,9 +364,14 @@ class RasterSource:
         return [band for file in self._files for band in file.bands]
 
     @property
+    def band_numbers(self) -> tuple[int, ...]:
+        """Numbers of the bands in the first file."""
+        return self._files[0].numbers
+
+    @property
     def descriptions(self) -> tuple[str, ...]:
         """Names of the bands; of several files, bands without one have the name of their file."""
-        several = len(self._files) > 1
+        several = len(self.paths) > 1
         return tuple(
             band.GetDescription() or (Path(file.path).stem if several else "")
             for file in self._files
@@ -368,13 +409,31 @@ def _numpy_type(gdal_type: int) -> np.dtype[Any]:
 
 def _nodata(band: gdal.Band, dtype: np.dtype[Any]) -> float | None:
     value = band.GetNoDataValue()
-    if value is None or (math.isnan(value) and dtype.kind != "f"):
-        return None
-    if dtype.kind in "iu":
-        # A value that the type cannot hold marks nothing.
-        limits = np.iinfo(dtype)
-        return value if float(value).is_integer() and limits.min <= value <= limits.max else None
-    return value
+    # A value that the type cannot hold marks nothing.
+    return value if value is not None and holds(dtype, value) else None
+
+
+def holds(dtype: np.dtype[Any], value: float) -> bool:
+    """Tell whether a pixel of this type can have a value (of floating point: nearly)."""
+    if dtype.kind == "f":
+        return math.isnan(value) or math.isinf(value) or abs(value) <= np.finfo(dtype).max
+    limits = np.iinfo(dtype)
+    return float(value).is_integer() and bool(limits.min <= value <= limits.max)
+
+
+def pixel_type(name: str) -> np.dtype[Any]:
+    """Return the type of pixels that GDAL calls `name`."""
+    code = gdal.GetDataTypeByName(name)
+    if name.lower() not in {one.lower() for one in PIXEL_TYPES}:
+        raise InputError(f"no pixels are of the type {name!r}", field="--output-type", remedy=", ".join(PIXEL_TYPES))
+    return _numpy_type(code)
+
+
+def _read_as(own: np.dtype[Any], wanted: str | None) -> np.dtype[Any]:
+    """Return the type in which pixels are read that are written as `wanted`."""
+    if wanted is None or pixel_type(wanted) == own:
+        return own
+    return np.promote_types(np.promote_types(own, pixel_type(wanted)), np.float32)
 
 
 def limit_cache(size: int) -> None:

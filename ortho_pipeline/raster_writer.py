@@ -16,7 +16,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import whole_or_nothing
-from ortho_pipeline.raster import Grid, RasterSource, first_line
+from ortho_pipeline.raster import Grid, RasterSource, first_line, holds, pixel_type
 
 
 @dataclass(frozen=True)
@@ -34,30 +34,83 @@ class Profile:
     metadata: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, source: RasterSource) -> Profile:
+    def of(cls, source: RasterSource, dtype: str | None = None, nodata: float | str | None = None) -> Profile:
         """Return the profile of an ortho of `source`.
 
         Nodata stays nodata (one value for all bands, as GeoTIFF has it), alpha stays alpha; everything else gets a
         mask, because no pixel value may be given a meaning that it did not have. Under a mask, bands of floating point
         without a value are NaN; integers cannot say that, so there a pixel is valid only if all of its bands are.
+
+        Parameters
+        ----------
+        dtype : str, optional
+            GDAL's name of the type of the pixels; that of the source without.
+        nodata : float or 'nan', optional
+            Value of pixels without an image, whatever the source has.
+
+        Raises
+        ------
+        InputError
+            If the type cannot hold the nodata value, or the source says by an alpha band what is valid.
         """
+        kind = source.dtype if dtype is None else pixel_type(dtype)
         # NaN is not equal to itself, and would make a set of several.
         bands = source.bands
         values = {"nan" if value is not None and math.isnan(value) else value for value in source.nodata}
-        if source.validity == "nodata" and len(values) == 1:
-            validity, nodata = "nodata", source.nodata[0]
+        validity: str
+        empty: float | None
+        if nodata is not None:
+            validity, empty = "nodata", _given_nodata(float(nodata), kind, source)
+        elif source.validity == "nodata" and len(values) == 1:
+            validity, empty = "nodata", _kept_nodata(source.nodata[0], kind, source)
         else:
-            validity, nodata = ("alpha" if source.validity == "alpha" else "mask"), None
+            validity, empty = ("alpha" if source.validity == "alpha" else "mask"), None
         return cls(
             count=source.count,
-            dtype=source.dtype,
+            dtype=kind,
             validity=validity,
-            nodata=nodata,
+            nodata=empty,
             descriptions=source.descriptions,
             interpretations=tuple(band.GetColorInterpretation() for band in bands),
-            color_table=bands[0].GetColorTable(),
+            color_table=bands[0].GetColorTable() if kind in (np.uint8, np.uint16) else None,
             scales=tuple((band.GetScale() or 1.0, band.GetOffset() or 0.0, band.GetUnitType()) for band in bands),
         )
+
+
+def _given_nodata(value: float, dtype: np.dtype[Any], source: RasterSource) -> float:
+    if source.validity == "alpha":
+        raise InputError(
+            "the image says by its alpha band which pixels are valid", file=source.path, field="--nodata",
+            remedy="leave out --nodata, or choose the other bands (-b 1 -b 2 -b 3)",
+        )  # fmt: skip
+    if not holds(dtype, value):
+        raise InputError(
+            f"pixels of the type {dtype} cannot have the value {value:g}", field="--nodata",
+            remedy="give another value, or another type with --output-type",
+        )  # fmt: skip
+    return value
+
+
+def _kept_nodata(value: float | None, dtype: np.dtype[Any], source: RasterSource) -> float | None:
+    if value is not None and not holds(dtype, value):
+        raise InputError(
+            f"the image's nodata value {value:g} does not fit into {dtype}", file=source.path, field="--output-type",
+            remedy="say with --nodata what pixels without an image shall be",
+        )  # fmt: skip
+    return value
+
+
+def as_written(pixels: NDArray[Any], valid: NDArray[np.bool_], dtype: np.dtype[Any], fill: float) -> NDArray[Any]:
+    """Return pixels ``(count, h, w)`` in the type of the output: rounded and clamped, `fill` where not valid."""
+    if pixels.dtype == dtype:
+        return pixels
+    if dtype.kind in "iu":
+        limits = np.iinfo(dtype)
+        pixels = np.clip(np.floor(np.where(valid, pixels, 0) + 0.5), limits.min, limits.max)
+    with np.errstate(over="ignore"):
+        written = pixels.astype(dtype)
+    written[~valid] = fill
+    return written
 
 
 class RasterWriter:

@@ -26,7 +26,7 @@ from ortho_pipeline.gdal_engine import warp_with_gdal
 from ortho_pipeline.lattice import BLOCK, Block, Lattices, Terrain
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster import Grid, RasterSource, limit_cache
-from ortho_pipeline.raster_writer import Profile, RasterWriter
+from ortho_pipeline.raster_writer import Profile, RasterWriter, as_written
 
 #: Side of a tile, the piece of work of a thread.
 TILE = 4 * BLOCK
@@ -75,12 +75,15 @@ def rectify(
     threads: int | None = None,
     driver: str = "COG",
     creation_options: Mapping[str, str] | None = None,
+    profile: Profile | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> WarpResult:
     """Write the orthoimage of `source` on `grid`.
 
     Parameters
     ----------
+    profile : Profile, optional
+        What the ortho looks like; like its source without.
     tolerance : float
         Bound on the geometric error of the lattice in source pixels.
     memory : int
@@ -99,10 +102,11 @@ def rectify(
     _check(source, resampling, dem_interpolation, tolerance)
     threads = threads or os.cpu_count() or 1
     surface = _seamless(surface, grid)
+    profile = profile or Profile.of(source)
     job = _Job(
-        model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, memory // (4 * threads)
-    )
-    profile = Profile.of(source)
+        model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, memory // (4 * threads),
+        profile,
+    )  # fmt: skip
     limit_cache(memory // 4)
     with RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads) as writer:
         tiles = list(_tiles(grid, TILE))
@@ -133,6 +137,7 @@ def rectify_gdal(
     threads: int | None = None,
     driver: str = "COG",
     creation_options: Mapping[str, str] | None = None,
+    profile: Profile | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> WarpResult:
     """Write the orthoimage by GDAL's own warper with its exact RPC transformer: a cross-check of `rectify`.
@@ -147,7 +152,8 @@ def rectify_gdal(
     surface = _seamless(surface, grid)
     valid = warp_with_gdal(
         source, rpc, _heights_under(surface, grid), grid, path, resampling=resampling, driver=driver,
-        creation_options=creation_options, memory=memory, threads=threads or os.cpu_count() or 1, progress=progress,
+        creation_options=creation_options, memory=memory, threads=threads or os.cpu_count() or 1, profile=profile,
+        progress=progress,
     )  # fmt: skip
     return WarpResult(
         max_error_px=0.0,
@@ -256,6 +262,7 @@ class _Job:
         cubic_dem: bool,
         tolerance: float,
         window_bytes: int,
+        profile: Profile,
     ) -> None:
         self.source, self.surface, self.grid = source, surface, grid
         self.kernel = RESAMPLING[resampling]
@@ -264,9 +271,9 @@ class _Job:
             averages=resampling == "average",
         )  # fmt: skip
         self.cubic_dem, self.window_bytes = cubic_dem, window_bytes
-        self.profile = Profile.of(source)
-        self.low, self.high, self.integer, self.fill = _range(source.dtype, self.profile)
-        self.any_band = self.profile.validity == "nodata" or not self.integer
+        self.profile = profile
+        self.low, self.high, self.integer, self.fill = _range(source.dtype, profile)
+        self.any_band = profile.validity == "nodata" or profile.dtype.kind == "f"
         self._lock = threading.Lock()
         self.valid_pixels = 0
 
@@ -286,8 +293,10 @@ class _Job:
         seen = self.lattices.build(blocks, terrain)
         for group, heights, origin, area in terrain.groups(seen):
             self._warp(group, heights, origin, area, tile, out, valid)
+        _, high, _, fill = _range(self.profile.dtype, self.profile)
+        out = as_written(out, valid, self.profile.dtype, fill)
         if self.profile.validity == "nodata":
-            _keep_off_nodata(out, valid, self.fill, self.high)
+            _keep_off_nodata(out, valid, fill, high)
         # NaN says for itself which band has no value; an integer cannot, so there a pixel needs all of its bands.
         mask = np.asarray((np.any if self.any_band else np.all)(valid, axis=0))
         with self._lock:

@@ -39,6 +39,7 @@ pipeline block_report
 studies batch_config batch_manifest executors
 batch_plan
 blocks batch
+cli_command
 cli_options cli_text
 cli_studies cli_blocks cli_batch
 cli
@@ -109,7 +110,7 @@ def test_the_package_itself_imports_nothing_of_its_own() -> None:
 
 
 def test_the_command_line_defers_heavy_imports() -> None:
-    names = ("errors", "options", "cli_options", "cli_text", "cli_studies", "cli_blocks", "cli_batch")
+    names = ("errors", "options", "cli_command", "cli_options", "cli_text", "cli_studies", "cli_blocks", "cli_batch")
     light = {f"ortho_pipeline.{name}" for name in names}
     for path in PACKAGE.glob("cli*.py"):
         for imported, at_top in imports(parse(path)):

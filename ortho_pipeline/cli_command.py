@@ -1,0 +1,168 @@
+"""Commands as people type them: words that are unknown are errors with a suggestion, not values of other options.
+
+click would read ``-overwrite`` as ``-o verwrite`` and write to a folder of that name. Here a word with one dash is
+an option that exists, or an error; `HINTS` knows what to say of those that other tools have.
+"""
+
+from __future__ import annotations
+
+import difflib
+import logging
+import os
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, NoReturn
+
+import click
+
+_WORD = re.compile(r"-[A-Za-z_]\S")
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+
+#: What is said of gdalwarp's options that have no counterpart under their name.
+HINTS: Mapping[str, str] = {
+    "-s_srs": "the model says where the image lies: leave it out",
+    "-rpc": "the model that the image has is used by itself; '--rpc FILE' chooses another",
+    "-tps": "'--fit-model NAME' fits a model to points ('ortho models' lists them)",
+    "-order": "'--fit-model poly2d2' fits a polynomial of second order ('ortho models' lists all)",
+    "-geoloc": "'ortho sensors' lists how images are placed",
+    "-to": "'--dem FILE' and '--dem-vertical DATUM' take the place of RPC_DEM, '--height M' that of RPC_HEIGHT",
+    "-et": "'--tolerance PX' bounds the geometric error",
+    "-ts": "give the size of a pixel with '-tr X Y' and the extent with '-te'",
+    "-multi": "'--threads N' says how many threads work; all processors do by default",
+    "-wo": "'--threads N' and '--memory MB' bound the work",
+    "-srcnodata": "set it in the image: gdal_translate -a_nodata VALUE",
+    "-dstalpha": "the ortho says by nodata, a mask or the image's own alpha band which pixels are valid",
+    "-cutline": "cut the finished ortho: gdalwarp -cutline",
+    "-crop_to_cutline": "cut the finished ortho: gdalwarp -cutline",
+    "-ovr": "pixels are always read at full resolution; '-r average' is for orthos that are coarser than the image",
+    "-q": "nothing is printed but the result, and progress only to a terminal",
+}
+
+
+class Command(click.Command):
+    """A command that takes options as gdalwarp's users write them, ``-v`` for logs and ``--debug`` for tracebacks.
+
+    Parameters
+    ----------
+    one : str, optional
+        What is said when several files are given to a command that takes one.
+    """
+
+    def __init__(self, *given: Any, one: str | None = None, **named: Any) -> None:
+        super().__init__(*given, **named)
+        self.one = one
+        self.params += [
+            click.Option(
+                ["-v", "--verbose"], count=True, expose_value=False, callback=_verbose, is_eager=True,
+                help="Say on stderr what is done; -vv: GDAL's messages too.",
+            ),
+            click.Option(
+                ["--debug"], is_flag=True, expose_value=False, callback=_debug, is_eager=True,
+                help="Show the traceback of an error.",
+            ),
+        ]  # fmt: skip
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the words of the command line; what is left over is an error that says what was meant."""
+        words = _checked(ctx, args, self.get_params(ctx))
+        # click would say 'unexpected extra argument' and not what to do.
+        ctx.allow_extra_args = True
+        super().parse_args(ctx, words)
+        if ctx.args and not ctx.resilient_parsing:
+            shown = " ".join(ctx.args[:3]) + (" ..." if len(ctx.args) > 3 else "")
+            ctx.fail(f"'{ctx.info_name}' does not take {shown!r} too." + (f" {self.one}" if self.one else ""))
+        return ctx.args
+
+
+class Group(click.Group):
+    """A group whose commands are of that kind."""
+
+    command_class = Command
+
+
+class OneOrTwo(click.ParamType):
+    """One positive number, or two that are separated by a blank (as words) or a comma."""
+
+    name = "number"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return one number, or a pair."""
+        if not isinstance(value, str):
+            return value
+        parts = value.split(",")
+        if len(parts) > 2 or not all(_NUMBER.fullmatch(part) and float(part) > 0 for part in parts):
+            self.fail(f"{value!r} is not one positive number or two.", param, ctx)
+        numbers = tuple(float(part) for part in parts)
+        return numbers[0] if len(numbers) == 1 else numbers
+
+
+class Megabytes(click.ParamType):
+    """An amount of memory: MB, or with a unit (``2GB``); a million and more are bytes, as for gdalwarp."""
+
+    name = "MB"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Return the count of bytes."""
+        match = re.fullmatch(r"(\d{1,15})\s*(MB|GB)?", str(value), re.IGNORECASE)
+        if match is None:
+            self.fail(f"{value!r} is not an amount of memory such as 512 (MB) or 2GB.", param, ctx)
+        number = int(match[1])
+        unit = {"MB": 1_000_000, "GB": 1_000_000_000, "": 1 if number >= 1_000_000 else 1_000_000}
+        size = number * unit[(match[2] or "").upper()]
+        if size < 16_000_000:
+            self.fail(f"{value!r} is less than 16 MB.", param, ctx)
+        return size
+
+
+def _checked(ctx: click.Context, args: Sequence[str], params: Sequence[click.Parameter]) -> list[str]:
+    """Return the words with pairs of numbers joined; a word with one dash that is no option is an error."""
+    known = {name: one for one in params if isinstance(one, click.Option) for name in (*one.opts, *one.secondary_opts)}
+    words: list[str] = []
+    rest = list(args)
+    while rest:
+        word = rest.pop(0)
+        words.append(word)
+        if word == "--":
+            return words + rest
+        option = known.get(word)
+        if option is None:
+            if _WORD.match(word) and not _repeated(word, known):
+                _unknown(ctx, word, known)
+            continue
+        taken = [] if option.is_flag or option.count else [rest.pop(0) for _ in range(min(option.nargs, len(rest)))]
+        if isinstance(option.type, OneOrTwo) and all(map(_NUMBER.fullmatch, (*taken, *(rest[:1] or ["-"])))):
+            taken = [f"{taken[0]},{rest.pop(0)}"]
+        words += taken
+    return words
+
+
+def _repeated(word: str, known: Mapping[str, click.Option]) -> bool:
+    option = known.get(word[:2])
+    return option is not None and option.count and len(set(word[1:])) == 1
+
+
+def _unknown(ctx: click.Context, word: str, known: Mapping[str, click.Option]) -> NoReturn:
+    """Say that there is no such option, and which was probably meant."""
+    name, equals, value = word.partition("=")
+    if name in HINTS and "-t_srs" in known:
+        ctx.fail(f"No such option: {name}; {HINTS[name]}.")
+    if equals and name in known:
+        ctx.fail(f"No such option: {word}; did you mean '{name} {value}'?")
+    bare = {option.lstrip("-").replace("_", "-"): option for option in known}
+    attached = word[:2] in known and not known[word[:2]].is_flag and not known[word[:2]].count
+    close = difflib.get_close_matches(name.lstrip("-").replace("_", "-"), bare, 1, 0.8 if attached else 0.6)
+    meant = bare[close[0]] if close else f"{word[:2]} {word[2:]}" if attached else None
+    said = f"; did you mean '{meant}'?" if meant else "."
+    ctx.fail(f"No such option: {word}{said}")
+
+
+def _verbose(ctx: click.Context, _: click.Parameter, count: int) -> None:
+    if count:
+        logging.getLogger("ortho_pipeline").setLevel(logging.INFO if count == 1 else logging.DEBUG)
+    if count > 1:
+        # GDAL is not loaded yet, and reads this when it is.
+        os.environ.setdefault("CPL_DEBUG", "ON")
+
+
+def _debug(ctx: click.Context, _: click.Parameter, value: bool) -> None:
+    ctx.meta["debug"] = value
