@@ -11,10 +11,13 @@ from pathlib import Path
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.point_csv import is_header, read_csv
 from ortho_pipeline.point_geojson import read_geojson
-from ortho_pipeline.point_lists import odm_crs, read_envi, read_odm, read_qgis
-from ortho_pipeline.point_table import OF_BLOCK, OWN_IMAGE, Layout, Piece, Row, Table, load_text
+from ortho_pipeline.point_lists import LINK_TABLE, odm_crs, read_asp, read_envi, read_links, read_odm, read_qgis
+from ortho_pipeline.point_table import OF_BLOCK, OWN_IMAGE, Layout, Piece, Row, Table, load_text, short
 
-_FORMATS = "CSV/TSV (id,col,row,x,y,h,...), GeoJSON with 'ji', QGIS .points, ODM gcp_list.txt, ENVI .pts"
+_FORMATS = (
+    "CSV/TSV (id,col,row,x,y,h,...), GeoJSON with 'ji', QGIS .points, ODM gcp_list.txt, ENVI .pts, ASP .gcp, "
+    "ArcGIS link table"
+)
 
 
 def read_table(
@@ -45,7 +48,7 @@ def read_table(
 
 
 def read_block_table(path: str | os.PathLike[str], layout: Layout = OF_BLOCK) -> Table:
-    """Read the rays of a block, or with `OF_GROUND` ground alone: CSV, GeoJSON, and rays as ODM list.
+    """Read the rays of a block, or with `OF_GROUND` ground alone: CSV, GeoJSON, and rays as ODM list or ASP file.
 
     Raises
     ------
@@ -56,12 +59,12 @@ def read_block_table(path: str | os.PathLike[str], layout: Layout = OF_BLOCK) ->
     reader = _reader(path, text)
     if reader is read_csv or reader is read_geojson:
         table = reader(path, text, layout)
-    elif reader is read_odm and layout is OF_BLOCK:
-        table = read_odm(path, text)
+    elif (reader is read_odm or reader is read_asp) and layout is OF_BLOCK:
+        table = reader(path, text)
     else:
         raise InputError(
             "points of several images do not stand in this format", file=path,
-            remedy="give CSV (id,image,col,row[,x,y,h,...]), GeoJSON with 'ji' by image, or an ODM gcp_list.txt",
+            remedy="give CSV (id,image,col,row[,x,y,h,...]), GeoJSON with 'ji' by image, ODM gcp_list.txt or ASP .gcp",
         )  # fmt: skip
     if not table.rows:
         raise InputError("this file holds no points", file=path, remedy="add points to it")
@@ -69,24 +72,40 @@ def read_block_table(path: str | os.PathLike[str], layout: Layout = OF_BLOCK) ->
 
 
 def _reader(path: str | os.PathLike[str], text: str) -> Callable[[str | os.PathLike[str], str], Table]:
-    suffix = Path(path).suffix.lower()
-    start = text.lstrip()[:4096]
-    if start.startswith(("{", "[")) or suffix in (".geojson", ".json"):
-        return read_geojson
-    if suffix == ".points" or re.search(r"(?mi)^mapX\s*,", start):
-        return read_qgis
-    if suffix == ".pts" or re.match(r";.*", start):
-        return read_envi
+    suffix, start = Path(path).suffix.lower(), text.lstrip()[:4096]
     lines = [line for line in start.splitlines() if line.strip() and not line.startswith("#")]
-    if suffix in (".csv", ".tsv") or (lines and is_header(lines[0])):
-        return read_csv
-    if lines and odm_crs(lines[0]) is not None:
-        return read_odm
-    raise InputError("the format of this point file is not known", file=path, remedy=f"give one of: {_FORMATS}")
+    first = lines[0].strip() if lines else ""
+    for reader, known in (
+        (read_geojson, start.startswith(("{", "[")) or suffix in (".geojson", ".json")),
+        (read_qgis, suffix == ".points" or re.search(r"(?mi)^mapX\s*,", start)),
+        (read_envi, suffix == ".pts" or start.startswith(";")),
+        (read_asp, suffix == ".gcp" or re.match(r"#\s*WKT\s*:", start)),
+        (read_csv, suffix in (".csv", ".tsv") or is_header(first)),
+        (read_odm, odm_crs(first) is not None),
+        (read_links, LINK_TABLE.match(first)),
+    ):
+        if known:
+            return reader
+    if re.search(r"\d", first) and re.fullmatch(r"[-+.,;\deE\s]+", first):
+        raise InputError(
+            f"numbers without names: it is not said what the columns are; the first line is {short(first)}", file=path,
+            remedy="put a line with their names above them, such as ID P L X Y Z (PCI), or 'link table' (ArcGIS: "
+            "from-x from-y to-x to-y)",
+        )  # fmt: skip
+    raise InputError(
+        f"the format of this point file is not known; its first line is {short(first)}", file=path,
+        remedy=f"give one of: {_FORMATS}",
+    )  # fmt: skip
 
 
 def _of_image(path: str | os.PathLike[str], table: Table, image_name: str | None, pieces: Mapping[str, Piece]) -> Table:
     named = {row.image_name for row in table.rows if row.image_name}
+    if image_name is None and len({Path(name).stem.lower() for name in named}) > 1:
+        some = ", ".join(sorted(map(str, named))[:5])
+        raise InputError(
+            f"there are points of several images ({some})", file=path, field="image",
+            remedy="say which with image_name, or read them as a block (read_block_points)",
+        )  # fmt: skip
     if image_name is None or not named:
         return table
     kept: list[Row] = []

@@ -7,7 +7,7 @@ import os
 import re
 
 from ortho_pipeline.errors import CrsError, InputError
-from ortho_pipeline.point_table import Line, Row, Table, cells_of, lines_of, number, short
+from ortho_pipeline.point_table import Line, Row, Table, cells_of, lines_of, number, short, sigma_of
 
 # -- QGIS ------------------------------------------------------------------------------------------------------------
 
@@ -111,29 +111,132 @@ def odm_crs(text: str) -> str | None:
 
 
 def read_envi(path: str | os.PathLike[str], text: str) -> Table:
-    """Read an ENVI image-to-map ``.pts``: comments after ``;`` name the layout, the corner of the image is (1, 1)."""
+    """Read ground control of ENVI (``.pts``): comments after ``;`` name the layout, the corner of the image is (1, 1).
+
+    ``projection info`` on WGS84 (geographic or UTM) states the CRS. With ``ImageFile#`` each line begins with the
+    number of its image, which a comment ``FileName0=...`` names.
+    """
     table = Table("ENVI points")
     layout: list[str] = []
+    images: dict[str, str] = {}
     for line in lines_of(path, text):
         plain = line.text.strip()
         where = f"line {line.number}"
         if plain.startswith(";"):
-            found = re.search(r"(?i)map\s*\(x\s*,\s*y(\s*,\s*z)?\)\s*,\s*image\s*\(x\s*,\s*y\)", plain)
-            if found:
-                layout = ["x", "y", *(["z"] if found.group(1) else []), "image x", "image y"]
+            images.update({key: name.strip() for key, name in re.findall(r"(?i)FileName(\d+)\s*=\s*([^;]+)", plain)})
+            table.crs = _envi_crs(plain) or table.crs
+            layout = _envi_layout(plain) or layout
             continue
         if not layout:
             raise InputError(
                 "this layout of ENVI points is not known",
                 file=path,
                 field=where,
-                remedy="a comment line must say 'Map (x,y), Image (x,y)', with or without z",
+                remedy="a comment line must say 'Map (x,y), Image (x,y)' or 'Map (x,y,elev), Image (x,y)'",
             )
         cells = plain.split()
         if len(cells) < len(layout):
             raise InputError(f"{len(cells)} cells, not {', '.join(layout)}", file=path, field=where)
-        values = [number(cell, path, f"{where}, {name}") for cell, name in zip(cells, layout, strict=False)]
-        height = values[2] if "z" in layout else math.nan
-        image = (values[-2] - 1.0, values[-1] - 1.0)
-        table.rows.append(Row(where, None, image, (values[0], values[1], height)))
+        given = dict(zip(layout, cells, strict=False))
+        image = given.pop("image file", None)
+        if image is not None and image not in images:
+            raise InputError(
+                f"no comment FileName{short(image)[1:-1]}= names the image of this point", file=path, field=where,
+                remedy="name it, for example ; FileName0=scene.tif",
+            )  # fmt: skip
+        value = {name: number(cell, path, f"{where}, {name}") for name, cell in given.items()}
+        at = (value["image x"] - 1.0, value["image y"] - 1.0)
+        ground = (value["x"], value["y"], value.get("elev", math.nan))
+        name = None if image is None else re.split(r"[\\/]", images[image])[-1]
+        table.rows.append(Row(where, None, at, ground, image_name=name))
+    return table
+
+
+def _envi_layout(comment: str) -> list[str]:
+    found = re.search(r"(?i)(imagefile#\s*,\s*)?map\s*\(x\s*,\s*y(\s*,\s*\w+)?\)\s*,\s*image\s*\(x\s*,\s*y\)", comment)
+    if found is None:
+        return []
+    first, elevation = ["image file"] if found.group(1) else [], ["elev"] if found.group(2) else []
+    return [*first, "x", "y", *elevation, "image x", "image y"]
+
+
+def _envi_crs(comment: str) -> str | None:
+    found = re.search(r"(?i)projection info\s*=\s*\{([^}]*)\}", comment)
+    words = [word.strip().lower() for word in found.group(1).split(",")] if found else []
+    if "wgs-84" not in words:
+        return None
+    if words[0] == "geographic lat/lon" and "units=degrees" in words:
+        return "EPSG:4326"
+    if words[0] == "utm" and len(words) > 2 and "units=meters" in words and words[2] in ("north", "south"):
+        return odm_crs(f"WGS84 UTM {words[1]}{words[2][0]}")
+    return None
+
+
+# -- Ames Stereo Pipeline --------------------------------------------------------------------------------------------
+
+
+def read_asp(path: str | os.PathLike[str], text: str) -> Table:
+    """Read a ``.gcp`` of the Ames Stereo Pipeline: a line per point, with every image that it was measured in.
+
+    ``id latitude longitude height sigma sigma sigma`` and for each image ``name column row sigma sigma``, parted by
+    blanks or commas. Columns and rows count from the centre of the first pixel, heights are above the ellipsoid; a
+    comment ``# WKT:`` states the CRS. The three sigmas (m) are taken as those of latitude, longitude and height.
+    """
+    table = Table("ASP points", assumed_vertical="ellipsoid", of_ground="geographic")
+    for line in lines_of(path, text):
+        where = f"line {line.number}"
+        stated = re.match(r"#\s*WKT\s*:\s*(.+)", line.text)
+        if stated:
+            table.crs = stated.group(1).strip()
+        if line.text.lstrip().startswith("#"):
+            continue
+        cells = re.split(r"\s*,\s*|\s+", line.text.strip())
+        if len(cells) < 12 or (len(cells) - 7) % 5:
+            raise InputError(
+                f"{len(cells)} cells, not 7 of the point and 5 of each image", file=path, field=where,
+                remedy="id lat lon height sigma sigma sigma, then for each image: name column row sigma sigma",
+            )  # fmt: skip
+        lat, lon, height = (
+            number(cells[k], path, f"{where}, {name}") for k, name in ((1, "latitude"), (2, "longitude"), (3, "height"))
+        )
+        sigmas = [sigma_of(cells[k], path, f"{where}, sigma {k - 3}", zero=True) for k in (4, 5, 6)]
+        for k in range(7, len(cells), 5):
+            column, at_row = (number(cells[k + i], path, f"{where}, {name}") for i, name in ((1, "column"), (2, "row")))
+            spread = max(sigma_of(cells[k + i], path, f"{where}, pixel sigma", zero=False) for i in (3, 4))
+            row = Row(where, cells[0], (column + 0.5, at_row + 0.5), (lon, lat, height), image_name=cells[k])
+            row.sigma_image, row.sigma_xy, row.sigma_h = spread, max(sigmas[:2]), sigmas[2]
+            table.rows.append(row)
+    return table
+
+
+# -- ArcGIS ----------------------------------------------------------------------------------------------------------
+
+#: The first line of a link file; ArcGIS takes files without it too, which nothing tells from other columns of numbers.
+LINK_TABLE = re.compile(r"(?i)link table\s*$")
+
+
+def read_links(path: str | os.PathLike[str], text: str) -> Table:
+    """Read a link table of ArcGIS: ``[id] from-x from-y to-x to-y`` under a line ``link table``; no heights.
+
+    A raster without georeference lies below the x axis there: from-y is minus the row. Where its first pixel is counted
+    from is the user's to say.
+    """
+    table = Table("ArcGIS links", origin_allowed=True)
+    lines = list(lines_of(path, text))[1:]
+    for line in lines:
+        cells, where = line.text.split(), f"line {line.number}"
+        if len(cells) not in (4, 5):
+            raise InputError(f"{len(cells)} cells, not [id] from-x from-y to-x to-y", file=path, field=where)
+        x, minus_row, *to = (
+            number(cell, path, f"{where}, {name}")
+            for cell, name in zip(cells[-4:], ("from-x", "from-y", "to-x", "to-y"), strict=True)
+        )
+        if minus_row > 1.0:
+            raise InputError(
+                f"from-y is {minus_row:g}: counted upwards, from a place that the file does not say", file=path,
+                field=f"{where}, from-y", remedy="make the links on the raster without its georeference, where y is "
+                "minus the row, or give the points as CSV with the columns Pixel and Line",
+            )  # fmt: skip
+        label = cells[0] if len(cells) == 5 else None
+        table.rows.append(Row(where, label, (x, -minus_row), (to[0], to[1], math.nan)))
     return table

@@ -116,6 +116,12 @@ def load_text(path: str | os.PathLike[str]) -> str:
         data = Path(path).read_bytes()
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", file=path, remedy="check the path") from error
+    if data.startswith(b"EHFA_HEADER_TAG") or Path(path).suffix.lower() == ".gcc":
+        raise InputError(
+            "how GCP files of ERDAS IMAGINE (.gcc) are written is not published", file=path,
+            remedy="export the cell array of the GCP tool as text, and give its columns names such as Name, Pixel, "
+            "Line, Easting, Northing, Elev",
+        )  # fmt: skip
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError("this file is UTF-16", file=path, remedy="save it as UTF-8")
     if b"\0" in data:

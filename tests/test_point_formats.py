@@ -221,3 +221,118 @@ def test_a_height_datum_that_is_stated_twice_and_differs(tmp_path: Path) -> None
     named = 'VERTCRS["EGM96 height",VDATUM["unknown"],CS[vertical,1],AXIS["up",up,LENGTHUNIT["metre",1]]]'
     by_name = text.format("ellipsoid").replace("EPSG:32735+5773", f'COMPOUNDCRS["both",{flat},{named}]')
     assert read_points(write(tmp_path / "p.csv", by_name)).ground[0, 2] == 100.0
+
+
+# -- lists of other programs
+
+
+ASP = (
+    '# WKT: GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
+    'UNIT["degree",0.0174532925199433],AXIS["Latitude",NORTH],AXIS["Longitude",EAST]]\n'
+    "# id latitude longitude height\n"
+    "5 23.7 160.1 427.1 1.0 2.0 3.0 image1.tif 124.5 19.7 1.0 0.5 sub/image2.tif 254.3 73.9 0.25 0.25\n"
+    "6,23.8,160.2,-5,1,1,1,image1.tif,10,20,1,1\n"
+)
+
+
+@pytest.mark.parametrize("name", ["a.gcp", "points.txt"])
+def test_ames_stereo_pipeline(tmp_path: Path, name: str) -> None:
+    path = write(tmp_path / name, ASP)
+    points = read_points(path, image_name="image1.tif")
+    assert points.ids == ("5", "6")
+    assert points.image.tolist() == [[125.0, 20.2], [10.5, 20.5]]  # the centre of the first pixel is (0, 0) there
+    assert points.ground.tolist() == [[160.1, 23.7, 427.1], [160.2, 23.8, -5.0]]
+    assert points.sigma_image.tolist() == [1.0, 1.0]
+    assert points.sigma_ground.tolist() == [[2.0, 2.0, 3.0], [1.0, 1.0, 1.0]]
+    assert read_points(path, image_name="image2.tif").image.tolist() == [[254.8, 74.4]]
+    block = read_block_points(path)
+    assert (block.ids, len(block.measured)) == (("5", "6"), 3)
+    bare = write(tmp_path / "bare.gcp", "".join(ASP.splitlines(keepends=True)[2:]))
+    with pytest.raises(CrsError, match="--points-crs"):
+        read_points(bare, image_name="image1.tif")
+    assert read_points(bare, crs="EPSG:4326", image_name="image1.tif").ground[0].tolist() == [160.1, 23.7, 427.1]
+    with pytest.raises(CrsError, match="projected"):
+        read_points(bare, crs="EPSG:32735", image_name="image1.tif")
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("5 23.7 160.1 427.1 1 1 1 a.tif 124.5 19.7 1", "line 1: 11 cells"),
+        ("5 23.7 160.1 x 1 1 1 a.tif 124.5 19.7 1 1", "line 1, height"),
+        ("5 23.7 160.1 4 1 -1 1 a.tif 124.5 19.7 1 1", "line 1, sigma 2"),
+        ("5 23.7 160.1 4 1 1 1 a.tif 124.5 19.7 0 1", "line 1, pixel sigma"),
+        ("5 93.7 160.1 4 1 1 1 a.tif 124.5 19.7 1 1", "line 1: longitude 160.1, latitude 93.7"),
+    ],
+)
+def test_broken_lines_of_asp(tmp_path: Path, line: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        read_points(write(tmp_path / "a.gcp", line + "\n"), crs="EPSG:4326")
+
+
+def test_several_images_are_not_taken_for_one(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"image1\.tif, sub/image2\.tif") as caught:
+        read_points(write(tmp_path / "a.gcp", ASP))
+    assert "image_name" in str(caught.value.remedy)
+    text = "id,col,row,x,y,image\na,1,2,500100,6270000,one.tif\nb,3,4,500200,6270000,two.tif\n"
+    with pytest.raises(InputError, match=r"one\.tif, two\.tif"):
+        read(tmp_path, text)
+
+
+def test_arcgis_link_table(tmp_path: Path) -> None:
+    text = "link table\n10.5\t-20.25\t500100.5\t6270000.25\n30.5 -40.5 500200 6270100\n"
+    points = read(tmp_path, text, "links.txt")
+    assert points.image.tolist() == [[10.5, 20.25], [30.5, 40.5]]
+    assert points.ground[:, :2].tolist() == [[500100.5, 6270000.25], [500200.0, 6270100.0]]
+    assert np.isnan(points.ground[:, 2]).all()
+    assert read(tmp_path, "Link table\na 1 -2 500100 6270000\n", "l.txt", pixel_origin="center").image.tolist() == [
+        [1.5, 2.5]
+    ]
+    # The example of the vendor's own article counts upwards.
+    with pytest.raises(InputError, match=r"line 2, from-y.*counted upwards"):
+        read(tmp_path, "link table\n00.00000 10.00000 247192.14926 4529042.15691\n", "l.txt")
+    with pytest.raises(InputError, match="7 cells"):
+        read(tmp_path, "link table\n1 -2 3 4 5 6 7\n", "l.txt")
+
+
+@pytest.mark.parametrize("line", ["10.5 -20.25 500100 6270000", "1 10.5 20.25 500100 6270000 5", "1,2,3,4,5"])
+def test_numbers_without_names_are_refused_with_the_line(tmp_path: Path, line: str) -> None:
+    with pytest.raises(InputError, match="without names") as caught:
+        read(tmp_path, line + "\n", "points.txt")
+    assert line in str(caught.value)
+    assert "ID P L X Y Z" in str(caught.value.remedy)
+    assert "link table" in str(caught.value.remedy)
+
+
+ENVI = (
+    "; ENVI Rigorous Orthorectification GCP File\n; FileName0=C:\\data\\one.TIF; FileName1=two.tif\n"
+    "; projection info = {UTM, 35, South, WGS-84, units=Meters}\n; ImageFile#, Map (x,y,elev), Image (x,y)\n;\n"
+    "0 500100.5 6270000.25 123.5 11.5 21.25\n1 500200 6270000 100 31 41\n"
+)
+
+
+def test_envi_with_heights_images_and_a_system(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.pts", ENVI)
+    points = read_points(path, vertical="ellipsoid", image_name="one.tif")
+    assert points.image.tolist() == [[10.5, 20.25]]
+    assert points.ground.tolist() == [[500100.5, 6270000.25, 123.5]]
+    assert points.crs.to_epsg() == 32735
+    with pytest.raises(DatumError, match="points-vertical"):
+        read_points(path, image_name="one.tif")
+    with pytest.raises(InputError, match="line 6: no comment FileName0"):
+        read_points(write(tmp_path / "b.pts", ENVI.replace("FileName0", "File0")), vertical="ellipsoid")
+    plain = "; projection info = {Geographic Lat/Lon, WGS-84, units=Degrees}\n; Map (x,y,elev), Image (x,y)\n"
+    plain += "24.4 -33.6 5 2 3\n"
+    points = read_points(write(tmp_path / "c.pts", plain), vertical="ellipsoid")
+    assert (points.crs.to_epsg(), points.image.tolist()) == (4326, [[1.0, 2.0]])
+    # Another datum than WGS84 is not guessed.
+    with pytest.raises(CrsError, match="points-crs"):
+        read_points(write(tmp_path / "d.pts", plain.replace("WGS-84", "NAD27")), vertical="ellipsoid")
+
+
+def test_erdas_files_are_refused_by_name(tmp_path: Path) -> None:
+    for name, data in (("a.gcc", b"\0\1"), ("a.txt", b"EHFA_HEADER_TAG\0\0\0\0")):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(InputError, match="IMAGINE") as caught:
+            read_points(tmp_path / name)
+        assert "export" in str(caught.value.remedy)
