@@ -5,6 +5,8 @@ over minimal subsets for models with few parameters (linearised, and linearised 
 worst point over and over for models with many. Every excluded point is then tested against the fit of the others and
 comes back if it agrees with them.
 
+What is never left out is tested too, and named: check points, and control points that stay in the fit (`outlying`).
+
 Source: Baarda 1968 (data snooping); Rousseeuw 1984 (LMedS).
 """
 
@@ -12,16 +14,25 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
 from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.points import Points
 from ortho_pipeline.problem import Problem, Solution
 from ortho_pipeline.ridge import regularised
 
 #: Chance that a good set of points loses any of its points to the search for gross errors.
 BLUNDER_RISK = 0.001
+#: Chance that a set of good points has any that is named as outlying, for control and for check points.
+OUTLYING_RISK = 0.01
+#: From so many check points on their own scatter counts, where it is larger than that of the control points.
+_OWN_SCATTER = 5
+#: Median of a chi-squared variable of two degrees of freedom.
+_MEDIAN_OF_TWO = 2 * math.log(2)
 #: More than this share of rejected control points is an error, not a clean-up.
 REJECTED_LIMIT = 0.3
 #: Residuals are never tested at a finer scale than this part of their stated sigma (noise-free simulations).
@@ -184,3 +195,104 @@ def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
     freedom = max(solution.freedom, 1.0)
     scale = max(solution.sigma0 or 0.0, _SCALE_FLOOR)
     return fdtrc(2, freedom, distance / 2 / scale**2), np.hypot(miss[:, 0], miss[:, 1])
+
+
+# -- what is not left out --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Outlying:
+    """A point that contradicts the others and still counts.
+
+    `distance` (px) is that from where the fit of the others puts it, `expected` the root mean square of such
+    distances for good points, `chance` that of so large a one for a good point. `leverage` is the share (0 to 1) of its
+    own residual that it takes away: 0 for check points, and little for control points among many.
+    """
+
+    id: str
+    role: str
+    distance: float
+    expected: float
+    chance: float
+    leverage: float
+
+    @property
+    def reason(self) -> str:
+        """What is to be said of it, without its name."""
+        said = f"{self.distance:.3g} px from where the others put it, {self.expected:.2g} px expected"
+        if self.role == "check":
+            return f"{said}: measure it again, for it counts in the RMSE of the check points all the same"
+        return f"{said}: measure it again, for it stays in the adjustment (leverage {self.leverage:.2f})"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the point as JSON values."""
+        return {**asdict(self), "reason": self.reason}
+
+
+def outlying(solution: Solution, points: Points, used: np.ndarray) -> tuple[Outlying, ...]:
+    """Return check points, and used control points, that contradict the fit; none without redundancy.
+
+    A check point is tested with its own uncertainty and that of the model there; from five check points on their own
+    (median) scatter is the scale where it is larger than sigma0, so that a model that is poor everywhere makes none of
+    them an outlier. A control point is tested by its residual had it taken no part, against the sigma0 of the others.
+    """
+    if solution.sigma0 is None:
+        return ()
+    return (*_outlying_control(solution, points, used), *_outlying_checks(solution, points, float(solution.sigma0)))
+
+
+def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> list[Outlying]:
+    from scipy.special import fdtrc
+
+    spare = solution.spare()
+    standardised = solution.residuals / solution.sigma
+    freedom = solution.freedom - 2
+    good = np.linalg.det(spare) > 1e-6
+    if freedom < 1 or not good.any():
+        return []
+    left = solution.leave_one_out()
+    rows = np.flatnonzero(used)
+    found = []
+    for i in np.flatnonzero(good).tolist():
+        square = float(standardised[i] @ np.linalg.solve(spare[i], standardised[i]))
+        others = max((float(solution.sigma0 or 0) ** 2 * solution.freedom - square) / freedom, _SCALE_FLOOR**2)
+        chance = float(fdtrc(2, freedom, square / 2 / others))
+        if chance < OUTLYING_RISK / len(rows):
+            spread = np.trace(np.linalg.inv(spare[i]) * np.outer(solution.sigma[i], solution.sigma[i]))
+            found.append(
+                Outlying(
+                    points.ids[rows[i]], "control", float(np.hypot(*left[i])), math.sqrt(others * spread), chance,
+                    float(1 - np.trace(spare[i]) / 2),
+                )
+            )  # fmt: skip
+    return found
+
+
+def _outlying_checks(solution: Solution, points: Points, sigma0: float) -> list[Outlying]:
+    from scipy.special import fdtrc
+
+    usable = points.check & np.isfinite(solution.model.ground_to_image(points.ground)).all(axis=1)
+    if not usable.any():
+        return []
+    problem = Problem.of(solution.model, points, usable, {})
+    miss = problem.image - solution.model.ground_to_image(problem.ground)
+    if len(solution.model.params):
+        jacobian = solution.model.param_partials(problem.ground) / problem.sigma[:, :, None]
+    else:
+        jacobian = np.zeros((len(miss), 2, 0))
+    spread = np.eye(2) + jacobian @ solution.cofactors @ jacobian.transpose(0, 2, 1)
+    standardised = miss / problem.sigma
+    squares = (standardised * np.linalg.solve(spread, standardised[:, :, None])[:, :, 0]).sum(axis=1)
+    scale, freedom = max(sigma0, _SCALE_FLOOR) ** 2, max(solution.freedom, 1.0)
+    own = float(np.median(squares)) / _MEDIAN_OF_TWO
+    if len(squares) >= _OWN_SCATTER and own > scale:
+        # The median of n is about as certain as a mean square of half as many.
+        scale, freedom = own, float(len(squares))
+    chances = fdtrc(2, freedom, squares / 2 / scale)
+    expected = np.sqrt(scale * (np.diagonal(spread, axis1=1, axis2=2) * problem.sigma**2).sum(axis=1))
+    return [
+        Outlying(
+            points.ids[problem.rows[i]], "check", float(np.hypot(*miss[i])), float(expected[i]), float(chances[i]), 0.0
+        )
+        for i in np.flatnonzero(chances < OUTLYING_RISK / len(chances)).tolist()
+    ]

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.blunders import REJECTED_LIMIT, find_blunders
+from ortho_pipeline.blunders import REJECTED_LIMIT, Outlying, find_blunders, outlying
 from ortho_pipeline.errors import DegeneratePoints, InputError
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.notebook import fit_html
@@ -44,6 +44,9 @@ class Fit:
     are NaN for points that did not take part. `sigma0` is None without redundancy. Heights that a model of the plane
     does not need, and that the points do not have, are its reference height in `points`. With a regularisation of the
     strength `ridge`, the points determine `effective_parameters`, and `condition` is that of the design without it.
+    `corner_ratio` tells how many times less certain the model is at a corner of the scene than a measured point.
+    `outlying` are points that contradict the fit and were not left out: check points, and control points that the
+    search for gross errors does not take for such.
     """
 
     model: SensorModel
@@ -64,6 +67,18 @@ class Fit:
     effective_parameters: float = 0.0
     ridge: float | None = None
     priors: Mapping[str, Prior] = field(default_factory=dict)
+    corner_ratio: float = 0.0
+    outlying: tuple[Outlying, ...] = ()
+
+    @property
+    def reservations(self) -> tuple[str, ...]:
+        """Why the model is not to be relied on, whatever its residuals: ``unstable``, ``uncertain at a corner``."""
+        found = []
+        if len(self.param_names) > 1 and self.condition > _UNSTABLE:
+            found.append("unstable")
+        if not self.corner_ratio <= EXTRAPOLATION_WARNING:
+            found.append("uncertain at a corner")
+        return tuple(found)
 
     @property
     def param_names(self) -> tuple[str, ...]:
@@ -96,13 +111,19 @@ class Fit:
         return student_of(self.values, self.covariance, self.degrees_of_freedom if self.sigma0 is not None else 0.0)
 
     def rmse(self, which: str) -> dict[str, float | int] | None:
-        """Return root mean squares in pixels for 'control' (used), 'check' or 'loo'; None where there is no point."""
+        """Return root mean squares in pixels for 'control' (used), 'check' or 'loo'; None where there is no point.
+
+        'agreeing' is the check points without the outlying ones: never the accuracy, but what one wrong point hides.
+        """
         if which == "loo":
             residuals = self.loo_residuals[np.isfinite(self.loo_residuals).all(axis=1)]
         elif which == "control":
             residuals = self.residuals[self.used]
         else:
-            residuals = self.residuals[self.points.check]
+            checks = self.points.check
+            if which == "agreeing":
+                checks = checks & ~np.isin(np.array(self.points.ids), [one.id for one in self.outlying])
+            residuals = self.residuals[checks]
             # A point that does not project has no residual; a warning names it.
             residuals = residuals[np.isfinite(residuals).all(axis=1)]
         return root_mean_square(residuals)
@@ -132,6 +153,7 @@ class Fit:
             "effective_parameters": self.effective_parameters,
             "ridge": self.ridge,
             "condition": self.condition if math.isfinite(self.condition) else None,
+            "corner_ratio": self.corner_ratio if math.isfinite(self.corner_ratio) else None,
         }
 
     def __repr__(self) -> str:
@@ -168,6 +190,8 @@ class Fit:
             "redundancy": self.redundancy,
             "sigma0": self.sigma0,
             "rejected": [{"id": name, "reason": reason} for name, reason in self.rejected],
+            "outlying": [one.to_json() for one in self.outlying],
+            "rmse_of_agreeing_checks": self.rmse("agreeing"),
             "warnings": list(self.warnings),
             "statistics": self.statistics(),
         }
@@ -218,6 +242,45 @@ def fit(
     points = _placed(points, model)
     raw = points.image - model.ground_to_image(points.ground)
     known_bad = {points.ids.index(name): reason for name, reason in (exclude or {}).items() if name in points.ids}
+    problem, warnings = _posed(model, points, raw, priors, known_bad)
+    keep, rejected, problem, strength = _searched(problem, points, ridge, robust=robust)
+    solution = problem.solve(keep)
+    ratio = _corner_ratio(solution, points.source, strength)
+    warnings += _uncertain_edge(ratio) + _unstable(solution, strength)
+    used = np.zeros(len(points), dtype=bool)
+    used[problem.rows[keep]] = True
+    found = _result(solution, points, used, raw, {**known_bad, **rejected}, warnings, name, strength, problem.priors)
+    return replace(found, corner_ratio=ratio, outlying=outlying(solution, points, used))
+
+
+def gross_errors(
+    model: SensorModel,
+    points: Points,
+    *,
+    priors: Mapping[str, Prior] | None = None,
+    ridge: float | str | None = None,
+) -> dict[str, str]:
+    """Return the control points that `fit` would leave out, with the reason of each.
+
+    Raises
+    ------
+    TooFewPoints, DegeneratePoints, InputError
+        As `fit`, but not for what the remaining points leave open.
+    """
+    points = _placed(points, model)
+    problem, _ = _posed(model, points, points.image - model.ground_to_image(points.ground), priors, {})
+    _, rejected, _, _ = _searched(problem, points, ridge, robust=True)
+    return {points.ids[i]: reason for i, reason in sorted(rejected.items())}
+
+
+def _posed(
+    model: SensorModel,
+    points: Points,
+    raw: Array,
+    priors: Mapping[str, Prior] | None,
+    without: Mapping[int, str],
+) -> tuple[Problem, list[str]]:
+    """Return the problem of the usable control points, and warnings about those that are not."""
     projected = np.asarray(np.isfinite(raw).all(axis=1))
     if len(points) and not projected.any():
         raise InputError(
@@ -227,25 +290,28 @@ def fit(
             remedy="check the CRS and the heights of the points, and that they and the model belong to this scene",
         )
     usable = points.control & projected
-    warnings = _unusable(points, usable, projected)
-    usable[list(known_bad)] = False
-    problem = Problem.of(model, points, usable, dict(priors or {}))
+    wrong = np.isin(np.arange(len(points)), list(without))
+    warnings = _unusable(points, usable | wrong, projected)
+    usable &= ~wrong
+    return Problem.of(model, points, usable, dict(priors or {})), warnings
+
+
+def _searched(
+    problem: Problem, points: Points, ridge: float | str | None, *, robust: bool
+) -> tuple[np.ndarray, dict[int, str], Problem, float | None]:
+    """Return the points to keep ``(n,)``, the rows that are not with the reason, and the regularised problem."""
     keep = np.ones(len(problem.rows), dtype=bool)
     strength = None
     if ridge is not None:
         problem, strength = regularised(problem, keep, ridge, linear=robust)
     rejected: dict[int, str] = {}
-    if robust and len(model.params):
+    if robust and len(problem.model.params):
         keep, reasons = find_blunders(problem, ridge)
         rejected = {int(problem.rows[i]): reason for i, reason in reasons.items()}
         _refuse_many(points, rejected, len(keep))
         if ridge is not None:
             problem, strength = regularised(problem, keep, ridge)
-    solution = problem.solve(keep)
-    warnings += _uncertain_edge(solution, points.source, strength) + _unstable(solution, strength)
-    used = np.zeros(len(points), dtype=bool)
-    used[problem.rows[keep]] = True
-    return _result(solution, points, used, raw, {**known_bad, **rejected}, warnings, name, strength, problem.priors)
+    return keep, rejected, problem, strength
 
 
 def _placed(points: Points, model: SensorModel) -> Points:
@@ -316,13 +382,14 @@ def _refuse_many(points: Points, rejected: dict[int, str], count: int) -> None:
         )
 
 
-def _uncertain_edge(solution: Solution, source: str, strength: float | None) -> list[str]:
-    """Refuse, or warn of, a model that is much less certain at a corner of its image than a measured point.
+def _corner_ratio(solution: Solution, source: str, strength: float | None) -> float:
+    """Return how many times less certain a model is at a corner of its image than a measured point.
 
-    A regularised one is never refused: what the points leave open, the user has decided.
+    One that is much less certain is refused, but never a regularised one: what the points leave open, the user has
+    decided.
     """
     if not len(solution.model.params) or not len(solution.sigma):
-        return []
+        return 0.0
     partials = solution.model.param_partials(solution.model.corners)
     spread = np.sqrt(((partials @ solution.cofactors) * partials).sum(axis=2))
     factor = float(np.nanmax(spread, initial=0.0) / np.median(solution.sigma))
@@ -342,6 +409,10 @@ def _uncertain_edge(solution: Solution, source: str, strength: float | None) -> 
             file=source,
             remedy="spread the points over the image (and over height, for 3D models), or take a simpler model",
         )
+    return factor
+
+
+def _uncertain_edge(factor: float) -> list[str]:
     if factor <= EXTRAPOLATION_WARNING:
         return []
     return [f"uncertain at the edge: at a corner of the scene {factor:.0f} times less certain than a measured point"]

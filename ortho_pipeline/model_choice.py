@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, OrthoError
-from ortho_pipeline.estimation import Fit, Prior, fit
+from ortho_pipeline.estimation import Fit, Prior, fit, gross_errors
 from ortho_pipeline.models import family_of, start_model
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points
@@ -81,7 +81,12 @@ def fit_family(
         ridge = "gcv" if chosen.regularised else None
     start = start_model(family, points, crs=crs, size=size, heights=heights)
     try:
-        found = fit(start, points, priors=priors, robust=robust, ridge=ridge, name=family)
+        wrong = gross_errors(start, points, priors=priors, ridge=ridge) if robust else {}
+        if wrong:
+            # Where the model is meant for, and its normalisation, come from the points: from the good ones.
+            good = points.select(~np.isin(np.array(points.ids), list(wrong)))
+            start = start_model(family, good, crs=crs, size=size, heights=heights)
+        found = fit(start, points, priors=priors, robust=False, exclude=wrong, ridge=ridge, name=family)
         # The start is of no vendor's making: that it is off says nothing.
         return replace(found, raw_residuals=np.full_like(found.raw_residuals, np.nan))
     except (DegeneratePoints, NotConverged) as error:

@@ -213,7 +213,7 @@ def residuals_geojson(fit: Fit) -> dict[str, Any]:
     points = fit.points
     where = ground_transform(points.crs, "EPSG:4979")(points.ground) if len(points) else np.zeros((0, 3))
     metres = in_metres(fit, fit.residuals)
-    reasons = dict(fit.rejected)
+    reasons, doubts = dict(fit.rejected), {one.id: one.reason for one in fit.outlying}
     features = []
     for i, name in enumerate(points.ids):
         pairs = {
@@ -228,6 +228,7 @@ def residuals_geojson(fit: Fit) -> dict[str, Any]:
             "used": bool(fit.used[i]),
             **{key: _number(value) for key, value in numbers.items()},
             "rejected": reasons.get(name),
+            "outlying": doubts.get(name),
         }
         # A position without a height is legal GeoJSON, NaN is not.
         position = [float(value) for value in where[i] if np.isfinite(value)]
@@ -333,6 +334,7 @@ def write_report_html(
             # The headline's notes have said these already.
             warnings=[text for text in report["warnings"] if not text.startswith("no redundancy") and _FEW not in text],
             rejected={entry["id"]: entry["reason"] for entry in report["adjustment"]["rejected"]},
+            outlying={entry["id"]: entry["reason"] for entry in report["adjustment"]["outlying"]},
             has_loo=any(point["loo_residual"] for point in report["adjustment"]["points"]),
             provenance=list(flat({**report["scene"]["facts"], **_brief(report["provenance"])})),
             inputs=report["provenance"].get("inputs") or [],

@@ -40,6 +40,7 @@ def headline(report: Mapping[str, Any]) -> dict[str, Any]:
             else f"No redundancy: {count(control['n'], 'control point')} for {parameters} parameters fit exactly, "
             "which says nothing about accuracy."
         )
+    notes += _outlying_notes(adjustment)
     if check:
         what = f"RMSE at {count(check['n'], 'check point')} that took no part in the adjustment"
         if check["n"] < ENOUGH_CHECK_POINTS:
@@ -55,6 +56,16 @@ def headline(report: Mapping[str, Any]) -> dict[str, Any]:
         what = f"RMSE when each of {count(loo['n'], 'control point')} is left out in turn"
         return {**_figure(loo, report["rmse_m"]["loo"]), "what": what, "notes": notes}
     return {"figure": "Not tested", "metres": None, "what": "nothing is left over to test the fit with", "notes": notes}
+
+
+def _outlying_notes(adjustment: Mapping[str, Any]) -> list[str]:
+    """Say which check points contradict the others, and what the figure would be without them."""
+    names = [one["id"] for one in adjustment["outlying"] if one["role"] == "check"]
+    if not names:
+        return []
+    said = f"Probably wrong, but counted: check point{'s' if len(names) > 1 else ''} {', '.join(names)}"
+    rest = adjustment["rmse_of_agreeing_checks"]
+    return [f"{said}; without {px(rest['total'])} at {count(rest['n'], 'check point')}." if rest else f"{said}."]
 
 
 def _figure(rmse: Mapping[str, Any], rmse_m: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -65,6 +65,7 @@ class Adjusted:
         if surface is not None:
             found += surface.provenance.get("warnings", [])
         found += [f"point {name} was left out: {reason}" for name, reason in adjusted.rejected]
+        found += [f"{one.role} point {one.id} contradicts the others: {one.reason}" for one in adjusted.outlying]
         inside = ((points.image >= 0) & (points.image <= (scene.width, scene.height))).all(axis=1)
         if not inside.all():
             outside = ", ".join(np.array(points.ids)[~inside])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pyproj
 import pytest
@@ -289,3 +291,74 @@ def test_points_none_of_which_has_an_image_are_an_error(rpc):
     for kind in ("none", "shift"):
         with pytest.raises(InputError, match=r"simulated: none of the 12 points has an image(.|\n)*check the CRS"):
             fit(start(rpc, kind), away)
+
+
+# -- points that are tested and stay ---------------------------------------------------------------------------------
+
+
+def with_roles(points: Points, checks: int) -> Points:
+    roles = points.roles.copy()
+    roles[-checks:] = "check"
+    return points.with_roles(roles)
+
+
+def moved(points: Points, name: str, by: tuple[float, float]) -> Points:
+    image = points.image.copy()
+    image[points.ids.index(name)] += by
+    return dataclasses.replace(points, image=image)
+
+
+@pytest.mark.parametrize("checks", [1, 6, 20])
+def test_a_wrong_check_point_is_named_and_counts(rpc, checks):
+    good = with_roles(make_points(rpc, count=12 + checks), checks)
+    found = fit(start(rpc), moved(good, "p12", (7.0, 0.0)))
+    assert [(one.id, one.role) for one in found.outlying] == [("p12", "check")]
+    assert found.outlying[0].distance == pytest.approx(7.0, abs=1.5)
+    # As accurate as a point and the mean of twelve: 0.3 px in both axes.
+    assert found.outlying[0].expected == pytest.approx(0.3 * np.sqrt(2) * np.sqrt(13 / 12), rel=0.5)
+    assert found.rmse("check")["n"] == checks
+    assert found.rmse("check")["total"] >= 6 / np.sqrt(checks)
+    rest = found.rmse("agreeing")
+    assert rest is None if checks == 1 else (rest["n"] == checks - 1 and rest["total"] < 0.7)
+    assert found.to_json()["outlying"][0]["id"] == "p12"
+
+
+def test_a_model_that_is_poor_everywhere_makes_no_check_point_wrong(rpc):
+    # Control in one corner under a drift that the shift does not follow: check points are far off together.
+    points = make_points(rpc, "affine", count=40, noise=0.1)
+    near = np.argsort(np.hypot(*points.image.T))
+    roles = np.full(40, "check", dtype="<U7")
+    roles[near[:8]] = "control"
+    found = fit(start(rpc), points.with_roles(roles))
+    assert found.rmse("check")["total"] > 3 * found.rmse("control")["total"]
+    assert not [one for one in found.outlying if one.role == "check"]
+
+
+def test_an_outlying_control_point_that_stays_is_named_with_its_leverage(rpc):
+    # A chance of 1 in 10,000 for one of forty: below 1 % of all sets, above the 0.1 % at which points are left out.
+    points = make_points(rpc, count=40, noise=0.3, seed=1)
+    rest = fit(start(rpc), points.select(np.arange(40) != 7))
+    image = points.image.copy()
+    image[7] = rest.model.ground_to_image(points.ground[7:8])[0] + (rest.sigma0 * np.sqrt(2 * np.log(1e4)) * 1.05, 0.0)
+    found = fit(start(rpc), dataclasses.replace(points, image=image))
+    assert found.used.all()
+    (one,) = found.outlying
+    assert (one.id, one.role) == ("p7", "control")
+    assert one.leverage == pytest.approx(1 / 40)
+    assert one.distance == pytest.approx(np.hypot(*found.loo_residuals[7]))
+
+
+def test_good_sets_rarely_have_an_outlying_point(rpc):
+    # One in a hundred sets, for control and for check points: 600 sets have 6, and 16 at most with a chance of 0.0004.
+    named = {"control": 0, "check": 0}
+    for seed in range(600):
+        points = with_roles(make_points(rpc, count=8 + seed % 20, seed=seed), 3 + seed % 4)
+        roles = {one.role for one in fit(start(rpc), points).outlying}
+        for role in roles:
+            named[role] += 1
+    assert max(named.values()) <= 16, named
+
+
+def test_without_redundancy_no_point_is_called_wrong(rpc):
+    points = with_roles(make_points(rpc, count=3), 2)
+    assert fit(start(rpc), moved(points, "p1", (50.0, 0.0))).outlying == ()

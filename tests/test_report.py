@@ -432,6 +432,31 @@ def test_arrows_of_the_style_are_scaled_by_points_that_have_one():
     assert scale(wrong) == pytest.approx(scale(document(adjusted(measured))), rel=0.5)
 
 
+def test_a_wrong_check_point_is_said_everywhere_and_counts(tmp_path):
+    measured = points()
+    index = int(np.flatnonzero(measured.check)[1])
+    image = measured.image.copy()
+    image[index] += (7.0, 0.0)
+    result = adjusted(dataclasses.replace(measured, image=image))
+    name = measured.ids[index]
+    made = document(result)
+    good = document(adjusted(measured))["adjustment"]["rmse"]["check"]
+    (one,) = made["adjustment"]["outlying"]
+    assert (one["id"], one["role"]) == (name, "check")
+    assert made["adjustment"]["rmse"]["check"]["n"] == 6
+    assert made["adjustment"]["rmse"]["check"]["total"] > 2.5
+    assert made["adjustment"]["rmse_of_agreeing_checks"]["total"] == pytest.approx(good["total"], rel=0.3)
+    note = next(text for text in made["headline"]["notes"] if name in text)
+    assert "at 5 check points" in note
+    assert note in report.summary_text(made)
+    report.write_report_html(made, tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert note in page
+    assert page.count("<strong>outlying</strong>") == 1
+    doubts = {f["properties"]["id"]: f["properties"]["outlying"] for f in report.residuals_geojson(result)["features"]}
+    assert [key for key, value in doubts.items() if value] == [name]
+
+
 @pytest.mark.parametrize(("bands", "colour_type"), [(1, 4), (2, 4), (3, 6), (4, 6)])
 def test_preview_is_a_png_with_transparent_nodata(tmp_path, bands, colour_type):
     png = report.preview_png(_raster(tmp_path / "o.tif", bands), side=100)

@@ -55,7 +55,7 @@ def start_model(
     family : str
         A name of `ortho_pipeline.models.families`; ``affine14`` starts with the column as the paper's x.
     points : Points
-        Control points normalise and solve; all points lie in the domain.
+        Control points normalise and solve; all points lie in the domain, apart from check points far outside of it.
     crs : str, optional
         As for `model_crs`; the CRS of the points if not given.
     size : (int, int), optional
@@ -127,8 +127,11 @@ def _box(
     heights: tuple[float, float] | None,
     crs: pyproj.CRS,
 ) -> Array:
-    """Return the lowest and the highest ground ``(2, 3)`` of all points, the image's corners and the heights."""
-    reached = [ground[np.isfinite(ground).all(axis=1)]]
+    """Return the lowest and the highest ground ``(2, 3)`` of the points, the image's corners and the heights.
+
+    A check point that lies farther away than control points and corners span is a mistake, and not reached.
+    """
+    reached = [ground[usable]]
     if size is not None:
         corners = np.array([(0, 0), (size[0], 0), (size[0], size[1]), (0, size[1])], dtype=float)
         middle = image[usable].mean(axis=0)
@@ -138,6 +141,11 @@ def _box(
         found[:, 2] = ground[usable, 2].mean()
         reached.append(found)
     everything = np.concatenate(reached)
+    near = np.isfinite(ground).all(axis=1)
+    if size is not None:
+        low, high = everything[:, :2].min(axis=0), everything[:, :2].max(axis=0)
+        near &= (np.abs(ground[:, :2] - (low + high) / 2) <= 1.5 * (high - low)).all(axis=1)
+    everything = np.concatenate([everything, ground[near]])
     if heights is not None:
         extremes = np.tile(everything[:1], (2, 1))
         extremes[:, 2] = heights
