@@ -3,11 +3,19 @@
 A model that cannot be fitted is a row with its reason. Gross errors are found once and left out for all, because a
 model that may throw out what it cannot follow would win.
 
-The recommendation follows the one-standard-error rule: of all models whose mean squared error at the deciding points
-(check points if there are enough of them, control points left out in turn otherwise) is not larger than the best one's
-by more than the standard error of that difference, take the one with the fewest parameters.
+The recommendation follows the one-standard-error rule, on the mean squared errors at all points that took no part:
+check points, and control points each left out in turn.
 
-Source: Breiman et al. 1984, Classification and Regression Trees, section 3.4.3 (here with paired differences).
+1. A model that is unstable, uncertain at a corner of the scene or unsuited is never recommended.
+2. A simpler model is as good as the best if its mean squared error is within one standard error of the best one's, and,
+   should its RMSE be more than 5 % larger, not significantly so at the same points (paired differences, one standard
+   error). Paired differences alone would prefer one of two nested near-twins with the better part of its parameters
+   for nothing: they hardly differ, but do so everywhere.
+3. Where the scene has a model of its own, one of its corrections is taken, unless another model is significantly
+   better: beyond the standard error, and at 5 % in paired differences.
+4. Of those as good as the best, the one with the fewest parameters.
+
+Source: Breiman et al. 1984, Classification and Regression Trees, section 3.4.3.
 """
 
 from __future__ import annotations
@@ -27,11 +35,18 @@ from ortho_pipeline.model_choice import OWN, fit_family, fit_own
 from ortho_pipeline.models import ImageCorrection, SensorModel, families
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points
+from ortho_pipeline.statistics import student_of
 
 #: What is adjusted over a scene's own model.
 CORRECTIONS = ("none", "shift", "shift-drift", "affine")
-#: From this many check points on they decide; below, leave-one-out does.
-ENOUGH_TO_DECIDE = 8
+#: Chance of calling a model worse, in paired differences, that is as good: one standard error, one-sided.
+WORSE = 0.16
+#: The same for taking another model than a correction of the scene's own.
+SIGNIFICANTLY_WORSE = 0.05
+#: Smaller differences of the RMSE, as a factor, are not worth a parameter.
+_WORTH = 1.05
+#: Models whose median error is within this factor of the smallest one have a vote on gross errors.
+_CLEAR_SIGHTED = 2.0
 
 
 @dataclass(frozen=True)
@@ -198,7 +213,8 @@ def compare(
             Row(name, parameters, minimum, dimensions, fit=found) if isinstance(found, Fit)
             else Row(name, parameters, minimum, dimensions, error=found)
         )  # fmt: skip
-    recommended, reason, criterion = recommend(rows)
+    corrections = () if own is None else [own_name(own, name) for name in (*CORRECTIONS, OWN)]
+    recommended, reason, criterion = recommend(rows, preferred=corrections, unsuited=tuple(unsuited or ()))
     return Comparison(
         tuple(rows), tuple(blunders.items()), recommended, reason, criterion,
         control=int(kept.control.sum()), check=int(kept.check.sum()), model_crs=crs,
@@ -233,8 +249,14 @@ class _Job:
 
 
 def _blunders(fits: Sequence[Fit]) -> dict[str, str]:
-    """Return the points that more than half of the models reject, each with the first reason given."""
-    voting = [found for found in fits if found.redundancy >= 4 and found.model.params.size]
+    """Return the points that more than half of the models reject, each with the first reason given.
+
+    Models that do not follow the scene at all see no gross error: only those with about the smallest errors vote.
+    """
+    able = [found for found in fits if found.redundancy >= 4 and found.model.params.size]
+    sizes = [_median_error(found) for found in able]
+    limit = _CLEAR_SIGHTED * min(sizes, default=0.0)
+    voting = [found for found, size in zip(able, sizes, strict=True) if size <= limit]
     votes = Counter(name for found in voting for name, _ in found.rejected)
     reasons: dict[str, str] = {}
     for found in voting:
@@ -244,60 +266,134 @@ def _blunders(fits: Sequence[Fit]) -> dict[str, str]:
     return reasons
 
 
+def _median_error(found: Fit) -> float:
+    """Return the median over all control points, rejected ones too, of how far they are from their prediction (px)."""
+    errors = np.where(found.used[:, None], found.loo_residuals, found.residuals)[found.points.control]
+    sizes = np.hypot(*np.where(np.isfinite(errors), errors, np.inf).T)
+    return float(np.median(sizes))
+
+
 # -- choosing --------------------------------------------------------------------------------------------------------
 
+_Squares = dict[str, Array]
 
-def recommend(rows: Sequence[Row]) -> tuple[str | None, str, str]:
-    """Return the recommended model, the reason in words, and what decided: ``check``, ``leave-one-out`` or ``none``."""
-    fitted = [row for row in rows if row.fit is not None]
-    checks = max((int(row.fit.points.check.sum()) for row in fitted if row.fit), default=0)
-    by_check = checks >= ENOUGH_TO_DECIDE
-    criterion = "check" if by_check else "leave-one-out"
-    errors = {row.model: found for row in fitted if row.fit and (found := _squares(row.fit, by_check)) is not None}
-    if not errors:
+
+def recommend(
+    rows: Sequence[Row], *, preferred: Sequence[str] = (), unsuited: Sequence[str] = ()
+) -> tuple[str | None, str, str]:
+    """Return the recommended model, the reason in words, and what decided.
+
+    Parameters
+    ----------
+    preferred : sequence of str
+        The scene's own model with its corrections.
+    unsuited : sequence of str
+        Models that do not suit the scene.
+
+    Returns
+    -------
+    tuple
+        The third is ``check`` (check points, and control points left out in turn), ``leave-one-out`` or ``none``.
+    """
+    by_name = {row.model: row for row in rows if row.fit is not None}
+    squares, checks = _tests(list(by_name.values()))
+    if not squares:
         return None, "no model leaves redundancy: nothing can be tested on these points", "none"
-    common = np.all([np.isfinite(values) for values in errors.values()], axis=0)
-    if common.sum() < 3:
+    count = len(next(iter(squares.values())))
+    if count < 3:
         return None, "fewer than three points test every model: too few to choose by", "none"
-    count = int(common.sum())
-    squares = {name: values[common] for name, values in errors.items()}
-    by_name: Mapping[str, Row] = {row.model: row for row in rows}
-    best = min(squares, key=lambda name: (squares[name].mean(), by_name[name].parameters))
-    close = [name for name in squares if _as_good(squares[name], squares[best])]
-    chosen = min(close, key=lambda name: (by_name[name].parameters, squares[name].mean()))
+    doubts = {name: _doubts(by_name[name], unsuited) for name in squares}
+    sound = {name: values for name, values in squares.items() if not doubts[name]}
+    smallest = _best(squares, by_name)
+    if not sound:
+        return None, f"every model that can be tested is doubtful; {smallest} is {doubts[smallest]}", "none"
+    chosen, best = _choose(sound, by_name, [name for name in preferred if name in sound])
     shown = {name: f"{math.sqrt(values.mean()):.3g} px" for name, values in squares.items()}
-    what = f"{count} check points" if by_check else f"{count} control points, each left out in turn"
-    reason = f"{chosen}: {shown[chosen]} at {what}, with {by_name[chosen].parameters} parameters"
+    reason = f"{chosen}: {shown[chosen]} at {_what(checks, count - checks)}, with "
+    reason += f"{by_name[chosen].parameters} parameters"
     if chosen == best:
-        rival = len(close) > 1
-        reason += "; the smallest error" + (" and no simpler model is as good" if rival else "")
+        reason += "; the smallest error" + ("" if smallest == best else " of the models that can be relied on")
+    elif best not in preferred and chosen in preferred:
+        reason += f"; {best} has {shown[best]}, not significantly less than a correction of the scene's own model"
     else:
         reason += (
-            f"; {best} has {shown[best]} with {by_name[best].parameters} parameters, a difference within its standard "
+            f"; {best} has {shown[best]} with {by_name[best].parameters} parameters, a difference within the standard "
             "error, so the model with fewer parameters is preferred"
         )
-    return chosen, reason, criterion
+    if doubts[smallest]:
+        reason += f" ({smallest} has {shown[smallest]} and is {doubts[smallest]})"
+    return chosen, reason, "check" if checks else "leave-one-out"
 
 
-def _squares(found: Fit, by_check: bool) -> Array | None:
-    """Return squared errors (px²) per point ``(N,)``, NaN for points that do not count; None for an untested model."""
-    if by_check:
-        values = np.where(found.points.check[:, None], found.residuals, np.nan)
-    else:
-        # A model without parameters is tested by every control point.
-        values = found.loo_residuals if found.model.params.size else np.where(
-            found.used[:, None], found.residuals, np.nan
-        )  # fmt: skip
-        if found.redundancy <= 0:
-            return None
+def _tests(rows: Sequence[Row]) -> tuple[_Squares, int]:
+    """Return the squared errors (px²) of each model at the points that test all of them, and how many of them check.
+
+    Without redundancy no control point can be left out; such models are tested where check points alone test all.
+    Check points that contradict the model with the smallest median test none.
+    """
+    fits = {row.model: row.fit for row in rows if row.fit is not None}
+    errors = {name: _squares(found) for name, found in fits.items() if found.redundancy > 0}
+    if not errors:
+        errors = {name: np.where(found.points.check, _squares(found), np.nan) for name, found in fits.items()}
+    errors = {name: values for name, values in errors.items() if np.isfinite(values).any()}
+    if not errors:
+        return {}, 0
+    clearest = fits[min(errors, key=lambda name: float(np.nanmedian(errors[name])))]
+    wrong = [one.id for one in clearest.outlying if one.role == "check"]
+    common = np.all([np.isfinite(values) for values in errors.values()], axis=0)
+    common &= ~np.isin(np.array(clearest.points.ids), wrong)
+    return {name: values[common] for name, values in errors.items()}, int((common & clearest.points.check).sum())
+
+
+def _squares(found: Fit) -> Array:
+    """Return squared errors (px²) per point ``(N,)`` of check points and of control points left out; NaN for others."""
+    # A model without parameters is tested by every control point.
+    control = found.loo_residuals if found.model.params.size else np.where(found.used[:, None], found.residuals, np.nan)
+    values = np.where(found.points.check[:, None], found.residuals, control)
     squares: Array = (values**2).sum(axis=1)
-    return squares if np.isfinite(squares).any() else None
+    return squares
 
 
-def _as_good(squares: Array, best: Array) -> bool:
+def _doubts(row: Row, unsuited: Sequence[str]) -> str:
+    """Return why a model is not recommended whatever its errors; empty if there is no reason."""
+    found = list(row.fit.reservations) if row.fit else []
+    return " and ".join([*found, *(["unsuited to the scene"] if row.model in unsuited else [])])
+
+
+def _best(squares: _Squares, rows: Mapping[str, Row]) -> str:
+    return min(squares, key=lambda name: (squares[name].mean(), rows[name].parameters))
+
+
+def _choose(squares: _Squares, rows: Mapping[str, Row], preferred: Sequence[str]) -> tuple[str, str]:
+    """Return the model to take, and the one with the smallest error among those that it was chosen from."""
+    best = _best(squares, rows)
+    if preferred:
+        own = {name: squares[name] for name in preferred}
+        first = _best(own, rows)
+        if _as_good(own[first], squares[best], SIGNIFICANTLY_WORSE, either=True):
+            return _choose(own, rows, ())[0], best
+    close = [name for name in squares if _as_good(squares[name], squares[best], WORSE)]
+    return min(close, key=lambda name: (rows[name].parameters, squares[name].mean())), best
+
+
+def _as_good(squares: Array, best: Array, level: float, *, either: bool = False) -> bool:
+    """Say whether errors are within the standard error of the best ones, and (or) not significantly larger."""
     difference = squares - best
-    spread = float(difference.std(ddof=1)) / math.sqrt(len(difference))
-    return bool(difference.mean() <= spread)
+    if not difference.any():
+        return True
+    count = len(difference)
+    within = bool(squares.mean() <= best.mean() + best.std(ddof=1) / math.sqrt(count))
+    _, p = student_of(difference.mean()[None], np.array([[difference.var(ddof=1) / count]]), count - 1)
+    alike = not (squares.mean() > _WORTH**2 * best.mean() and p[0] / 2 < level)
+    return within or alike if either else within and alike
+
+
+def _what(checks: int, control: int) -> str:
+    """Return in words what points tested the models."""
+    left_out = f"{control} control points, each left out in turn"
+    if not checks:
+        return left_out
+    return f"{checks} check points" + (f" and {left_out}" if control else "")
 
 
 def _finite(value: float) -> float | None:

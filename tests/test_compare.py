@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import pytest
 from click.testing import CliRunner
 from osgeo import gdal
@@ -13,11 +16,16 @@ from osgeo import gdal
 from ortho_pipeline import pipeline
 from ortho_pipeline.cli import cli
 from ortho_pipeline.comparison import Row, available_models, compare, recommend
+from ortho_pipeline.crs import ground_transform
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.experiments import bilsat_scene, cartosat_scene, ikonos_scene, orbview3_scene
+from ortho_pipeline.experiments.ikonos import vendor_rpc
 from ortho_pipeline.landscape import Terrain
-from ortho_pipeline.models import families
+from ortho_pipeline.model_choice import fit_family
+from ortho_pipeline.models import RPC, families
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
+from ortho_pipeline.rpc import read_rpc
 from ortho_pipeline.simulate import LineScanner, simulate_points
 
 CAMERA = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(650.0, 1350.0))
@@ -230,3 +238,196 @@ def test_the_table_has_a_line_per_model_and_a_recommendation(tiny, units):
     assert f"RMSE in {units}" in done.stdout
     document = json.loads(run("compare", tiny.image, *given, "--models", "affine3d,dlt", "--json").stdout)
     assert [row["model"] for row in document["rows"]] == ["affine3d", "dlt"]
+
+
+# -- the recommendation ----------------------------------------------------------------------------------------------
+
+
+def spot6(folder: Path, noise: float, seed: int, count: int = 98) -> tuple[Points, RPC]:
+    """Return points with a shift, a drift and noise (px) in the box of a real RPC."""
+    rpc = read_rpc(folder / "rpcm" / "rpc_SPOT6.xml")
+    centre, half = rpc.domain
+    random = np.random.default_rng(seed)
+    ground = centre + half * random.uniform(-0.9, 0.9, (count, 3))
+    image = rpc.ground_to_image(ground)
+    bias = np.array([12.0, -7.0]) + np.outer(image[:, 1], (1e-4, -1e-4))
+    image = image + bias + random.normal(0, noise, (count, 2))
+    made = Points(
+        ids=tuple(f"p{k}" for k in range(count)), image=image, ground=ground, roles=np.full(count, "control"),
+        sigma_image=np.full(count, noise), sigma_ground=np.zeros((count, 3)), crs=pyproj.CRS("EPSG:4326"), source="",
+    )  # fmt: skip
+    lon, lat = centre[:2]
+    return made.to_crs(f"EPSG:{32600 + 100 * (lat < 0) + int((lon + 180) // 6) + 1}"), rpc
+
+
+@pytest.mark.realdata
+def test_no_unstable_model_is_recommended_on_spot_6(real):
+    points, rpc = spot6(real, 0.3, 2)
+    size = int(2 * rpc.col_scale), int(2 * rpc.row_scale)
+    done = compare(points, ("rfm1", "poly3d2", "poly3d3", "rfm2"), size=size)
+    rows = {row.model: row.fit for row in done.rows if row.fit}
+    errors = {name: found.rmse("loo")["total"] for name, found in rows.items()}
+    smallest = min(errors, key=errors.__getitem__)
+    assert rows[smallest].reservations == ("unstable",)
+    assert rows[done.recommended].reservations == ()
+    assert done.recommended in ("poly3d2", "poly3d3")
+    assert f"({smallest} has" in done.reason
+    # With the RPC, which is right up to shift and drift.
+    done = compare(points, ("rpc", "rpc+shift", "rpc+shift-drift", "rpc+affine", "poly3d2", "rfm2"), own=rpc, size=size)
+    assert done.recommended in ("rpc+shift-drift", "rpc+affine")
+
+
+def test_a_model_that_is_uncertain_at_a_corner_is_not_recommended():
+    # Control in the middle of the scene only: what bends freely fits there, and says nothing of the corners.
+    points = simulated(24, 0, sigma_image=0.3)
+    middle = 500 + 0.35 * (points.image - 500)
+    ground = CAMERA.image_to_ground(middle, points.ground[:, 2])
+    noise = np.random.default_rng(1).normal(0, 0.3, middle.shape)
+    points = dataclasses.replace(points, image=middle + noise, ground=ground)
+    done = compare(points, ("poly3d2", "affine14"), size=(1000, 1000))
+    fits = [row.fit for row in done.rows if row.fit]
+    assert fits
+    assert all("uncertain at a corner" in found.reservations for found in fits)
+    assert done.recommended is None
+    assert "uncertain at a corner" in done.reason
+
+
+def as_if(name: str, parameters: int, errors: np.ndarray) -> Row:
+    """Return a row whose check points have these errors (px) in columns, of a fit that is above suspicion."""
+    base = compare(simulated(12, len(errors)), ("affine3d",), size=(1000, 1000)).rows[0].fit
+    assert base is not None
+    residuals = np.zeros((len(base.points), 2))
+    residuals[base.points.check, 0] = errors
+    found = dataclasses.replace(
+        base, residuals=residuals, loo_residuals=np.full_like(residuals, np.nan), outlying=(), corner_ratio=1.0
+    )
+    return Row(name, parameters, 4, 3, fit=found)
+
+
+def test_near_twins_are_told_apart_by_the_best_ones_own_standard_error():
+    # The larger model is better by 3 % at every single point: certain in pairs, and of no use.
+    errors = np.random.default_rng(4).normal(0, 1, 40)
+    assert recommend([as_if("simple", 20, 1.03 * errors), as_if("many", 78, errors)])[0] == "simple"
+    # By 8 % at every point is worth it, though within the standard error of the mean square (1 / sqrt(20)).
+    assert recommend([as_if("simple", 20, 1.08 * errors), as_if("many", 78, errors)])[0] == "many"
+    # By 8 % at some points, and worse at others, is not.
+    other = np.random.default_rng(5).permutation(errors)
+    assert recommend([as_if("simple", 20, 1.08 * other), as_if("many", 78, errors)])[0] == "simple"
+
+
+def test_a_correction_of_the_scenes_model_is_preferred_unless_it_is_significantly_worse():
+    random = np.random.default_rng(1)
+    errors = random.normal(0, 1, 30)
+    rows = [as_if("rpc+shift", 2, 1.1 * random.permutation(errors)), as_if("poly3d2", 20, errors)]
+    assert recommend(rows, preferred=("rpc+shift",))[0] == "rpc+shift"
+    rows[0] = as_if("rpc+shift", 2, 3 * random.permutation(errors))
+    assert recommend(rows, preferred=("rpc+shift",))[0] == "poly3d2"
+    assert recommend(rows, unsuited=("poly3d2",))[0] == "rpc+shift"
+
+
+def test_a_wrong_check_point_decides_nothing():
+    points = simulated(24, 12)
+    wrong = points.ids.index("C03")
+    image = points.image.copy()
+    image[wrong] += (9.0, 7.0)
+    moved = dataclasses.replace(points, image=image)
+    models = ("affine2d", "poly2", "affine3d", "dlt")
+    before, after = compare(points, models, size=(1000, 1000)), compare(moved, models, size=(1000, 1000))
+    assert after.recommended == before.recommended
+    assert "11 check points" in after.reason
+    best = after.best
+    assert best is not None
+    assert best.fit is not None
+    assert best.fit.rmse("check")["n"] == 12
+    assert [one.id for one in best.fit.outlying] == ["C03"]
+
+
+def test_models_that_do_not_follow_the_scene_have_no_vote_on_gross_errors():
+    # 12 px drown in what a plane leaves of these hills, and three of five models are planes.
+    points = simulated(40, 0)
+    image = points.image.copy()
+    image[7] += (9.0, -8.0)
+    moved = dataclasses.replace(points, image=image)
+    done = compare(moved, ("affine2d", "poly2", "poly3", "affine3d", "dlt"), size=(1000, 1000))
+    assert [name for name, _ in done.left_out] == [points.ids[7]]
+
+
+@pytest.mark.parametrize("family", ["affine3d", "dlt", "rfm1"])
+def test_a_gross_error_on_the_ground_does_not_move_what_a_model_is_meant_for(family):
+    points = simulated(30, 10)
+    ground = points.ground.copy()
+    ground[4, 0] += 1.0  # a degree
+    good = fit_family(family, points.select(np.arange(40) != 4), size=(1000, 1000))
+    found = fit_family(family, points.with_ground(ground), size=(1000, 1000))
+    assert [name for name, _ in found.rejected] == [points.ids[4]]
+    np.testing.assert_allclose(found.model.domain, good.model.domain, rtol=1e-9)
+    np.testing.assert_allclose(found.values, good.values, rtol=1e-6, atol=1e-9)
+
+
+SENSORS = ("ikonos", "cartosat", "orbview3", "bilsat")
+
+
+def scene_of(sensor: str, seed: int, count: int) -> tuple[Points, Any, tuple[int, int], np.ndarray, np.ndarray]:
+    """Return measured points, RPC (or None), size, and true ground and image of points that nobody measured."""
+    if sensor == "ikonos":
+        scene = ikonos_scene.GeoScene.make(seed, points=count // 2)
+        unseen = ikonos_scene.GeoScene.make(seed, points=100)
+        points = scene.measure(seed)
+        truth = unseen.ground, unseen.project(unseen.ground)
+        return points.with_roles(["control"] * len(points)), vendor_rpc(scene), (scene.columns, scene.rows), *truth
+    if sensor == "cartosat":
+        pair = cartosat_scene.StereoPair.make(seed=seed, points=count)
+        unseen = cartosat_scene.StereoPair.make(seed=seed + 5000, points=200).ground
+        return (
+            pair.measure(seed)["fore"],
+            pair.rpc("fore"),
+            (pair.size, pair.size),
+            unseen,
+            pair.cameras["fore"].project(unseen),
+        )
+    if sensor == "orbview3":
+        coast, camera = orbview3_scene.Coast(), orbview3_scene.scanner("471890")
+        true = orbview3_scene.with_attitude_error(camera, seed)
+        points = orbview3_scene.measure(true, orbview3_scene.places(count, coast, seed), seed)
+        unseen = orbview3_scene.places(200, coast, seed + 5000)
+        size = orbview3_scene.COLUMNS, orbview3_scene.LINES
+        return points, orbview3_scene.vendor_rpc(camera), size, unseen, true.project(unseen)
+    frame = bilsat_scene.BilsatScene.make(seed=seed, points=count)
+    unseen = bilsat_scene.BilsatScene.make(seed=seed + 5000, points=200).ground
+    return frame.measure(seed), None, (bilsat_scene.SIZE, bilsat_scene.SIZE), unseen, frame.camera.project(unseen)
+
+
+MAPS = {"ikonos": "EPSG:32639", "cartosat": "EPSG:32755", "orbview3": "EPSG:32636", "bilsat": "EPSG:32636"}
+
+
+def loss(sensor: str, seed: int, count: int) -> float:
+    """Return the error of the recommended model at points that nobody measured over that of the truly best one.
+
+    The noise of a measured point is part of both: that is what further check points would show.
+    """
+    points, own, size, ground, image = scene_of(sensor, seed, count)
+    points = points.to_crs(MAPS[sensor])
+    names = [name for name in available_models(own) if name not in ("rfm3", "rfm3-common", "poly5", "poly1")]
+    done = compare(points, names, own=own, size=size, heights=(float(ground[:, 2].min()), float(ground[:, 2].max())))
+    noise = float(np.sqrt(2) * points.sigma_image.mean())
+    errors = {}
+    for row in done.rows:
+        if row.fit and not row.fit.reservations:
+            model = row.fit.model
+            miss = model.ground_to_image(ground_transform("EPSG:4979", model.crs)(ground)) - image
+            errors[row.model] = float(np.hypot(np.sqrt((miss**2).sum(axis=1).mean()), noise))
+    assert done.recommended is not None
+    return errors[done.recommended] / min(errors.values())
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_the_recommended_model_is_about_as_good_as_the_best(sensor):
+    assert loss(sensor, 1, 40) <= 1.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_the_recommended_model_is_mostly_the_best(sensor):
+    losses = [loss(sensor, seed, count) for seed in range(2, 8) for count in (40, 60)]
+    assert np.median(losses) <= 1.02
+    assert np.mean(np.array(losses) > 1.3) <= 0.1
