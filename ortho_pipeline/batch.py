@@ -192,7 +192,7 @@ def _as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
 
 def _folders(job: Job) -> list[str | os.PathLike[str]]:
     """Return the files in whose folders a new name could change the scene."""
-    return [path for path in (job.image, job.points.gcps, job.surface.dem, *job.scene.files.values())
+    return [path for path in (job.image, inputs.point_file(job.points), job.surface.dem, *job.scene.files.values())
             if path is not None and os.path.isabs(path)]  # fmt: skip
 
 

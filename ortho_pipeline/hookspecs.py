@@ -118,6 +118,10 @@ class Scene:
             object.__setattr__(self, "model_source", str(self.model_source))
         object.__setattr__(self, "rasters", tuple(map(Path, self.rasters)))
 
+    def __fspath__(self) -> str:
+        """Stand for the image file where a path is wanted."""
+        return str(self.path)
+
     @property
     def model(self) -> SensorModel:
         """The first, best model."""

@@ -40,13 +40,20 @@ POINTS_ONLY = "points only"
 
 
 def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> Scene:
-    """Open an image with its sensor, or with the model of a model file.
+    """Open an image with its sensor, or with the model of a model file; a scene that is open already stays as it is.
 
     Raises
     ------
     InputError
-        If no sensor recognises the image, or the model file belongs to an image of another size.
+        If no sensor recognises the image, the model file belongs to an image of another size, or options say how to
+        open what is open.
     """
+    if isinstance(image, Scene):
+        if dataclasses.replace(options, allow_network=False) != SceneOptions():
+            raise InputError(
+                "this scene is open already", file=image, field="scene", remedy="give its path, or open it so"
+            )  # fmt: skip
+        return image
     if options.model is None:
         given: dict[str, Any] = dict(options.sensor_options)
         if options.rpc is not None:
@@ -91,7 +98,7 @@ def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_mo
     Scene
         Without models and of the sensor "points only" where no sensor recognises the image.
     """
-    asked = bool(options.model or options.rpc or options.sensor or options.sensor_options)
+    asked = isinstance(image, Scene) or bool(options.model or options.rpc or options.sensor or options.sensor_options)
     if needs_model or asked:
         return open_scene(image, options)
     dataset = raster.open_dataset(image, allow_network=options.allow_network)
@@ -148,17 +155,7 @@ def read_control(scene: Scene, options: PointOptions, allow_network: bool = Fals
                 f"a {options.correction} needs control points", field="--gcps", remedy="give a file of points"
             )
         return no_points()
-    if os.fspath(options.gcps) == OWN_POINTS:
-        points = gcps_of_dataset(raster.open_dataset(scene.path, allow_network=allow_network))
-    else:
-        points = read_points(
-            options.gcps,
-            crs=None if options.crs is None else parse_crs(options.crs),
-            vertical=None if options.vertical is None else Vertical.parse(options.vertical),
-            pixel_origin=options.pixel_origin,
-            image_name=Path(scene.path).name,
-            pieces={Path(piece.path).name: (*piece.offset, piece.scale) for piece in scene.pieces},
-        )
+    points = _given_points(scene, options, allow_network)
     if options.select is not None and options.check is not None:
         raise InputError(
             "--select and --check both say which points check", field="--select", remedy="give one of them"
@@ -166,6 +163,35 @@ def read_control(scene: Scene, options: PointOptions, allow_network: bool = Fals
     if options.select is not None:
         return select_control(points, options.select)
     return points if options.check is None else assign_roles(points, options.check)
+
+
+def _given_points(scene: Scene, options: PointOptions, allow_network: bool) -> Points:
+    crs = None if options.crs is None else parse_crs(options.crs)
+    vertical = None if options.vertical is None else Vertical.parse(options.vertical)
+    path = point_file(options)
+    origin = options.pixel_origin
+    if path is None or os.fspath(path) == OWN_POINTS:
+        if origin != "corner" or (path is None and not (crs is vertical is None)):
+            raise InputError(
+                "these points say themselves what their coordinates are", field="--pixel-origin",
+                remedy="leave --pixel-origin out, and of points that are read already --points-crs, --points-vertical",
+            )  # fmt: skip
+        if isinstance(options.gcps, Points):
+            return options.gcps
+        return gcps_of_dataset(raster.open_dataset(scene.path, allow_network=allow_network), crs=crs, vertical=vertical)
+    pieces = {Path(piece.path).name: (*piece.offset, piece.scale) for piece in scene.pieces}
+    name = Path(scene.path).name
+    return read_points(path, crs=crs, vertical=vertical, pixel_origin=origin, image_name=name, pieces=pieces)
+
+
+def point_options(points: PointOptions | Points) -> PointOptions:
+    """Return options; points that are read already are used as they are."""
+    return PointOptions(gcps=points) if isinstance(points, Points) else points
+
+
+def point_file(options: PointOptions) -> str | os.PathLike[str] | None:
+    """Return the file of points, None where there is none or they are read already."""
+    return options.gcps if isinstance(options.gcps, str | os.PathLike) else None
 
 
 def no_points() -> Points:
@@ -216,7 +242,7 @@ def check_paths(
     InputError
         With the path that is in the way.
     """
-    given = (image, *scene.files.values(), points.gcps, surface.dem)
+    given = (image, *scene.files.values(), point_file(points), surface.dem)
     inputs = {Path(path).resolve() for path in given if path is not None}
     removed = old_side_cars(files["ortho"]) if overwrite and "ortho" in files else []
     for path in (*files.values(), *removed):
@@ -274,7 +300,7 @@ def files_read(
     add("metadata", sources)
     for role, path in scene.files.items():
         add(role, [path])
-    add("points", [points.gcps])
+    add("points", [point_file(points)])
     if surface.dem is not None:
         add("DEM", [surface.dem, *_files_of(surface.dem, scene.allow_network)])
     if surface.vertical is not None:
@@ -362,8 +388,10 @@ def provenance(
 
 def _as_asked(options: Any) -> dict[str, Any]:
     """Return options as JSON values, without the budget of the machine, on which no result depends."""
+    given = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+    texts = {key: str(value) if isinstance(value, Points) else value for key, value in given.items()}
     return {
         key: os.fspath(value) if isinstance(value, os.PathLike) else value
-        for key, value in dataclasses.asdict(options).items()
+        for key, value in texts.items()
         if key not in ("memory", "threads")
     }

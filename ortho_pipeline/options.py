@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 #: What a file of points calls the first pixel -> what is added to reach (0, 0) at its outer corner.
 PIXEL_ORIGINS = {
@@ -49,14 +50,23 @@ class SceneOptions:
         return {**{role: path for role, path in own.items() if path is not None}, **given}
 
 
+class PointTable(Protocol):
+    """Points that are read already: `ortho_pipeline.Points`."""
+
+    @property
+    def ids(self) -> tuple[str, ...]: ...
+    @property
+    def source(self) -> str: ...
+
+
 @dataclass(frozen=True)
 class PointOptions:
     """Which points there are, and what is adjusted to them.
 
     Parameters
     ----------
-    gcps : path, optional
-        A file of points, or ``own`` for those in the image.
+    gcps : path or Points, optional
+        A file of points, ``own`` for those in the image, or points that are read already, in pixels of this image.
     crs, vertical : str, optional
         For files that do not say.
     pixel_origin : one of `PIXEL_ORIGINS`
@@ -76,7 +86,7 @@ class PointOptions:
         Remove parameters that the points do not justify.
     """
 
-    gcps: str | os.PathLike[str] | None = None
+    gcps: str | os.PathLike[str] | PointTable | None = None
     crs: str | None = None
     vertical: str | None = None
     pixel_origin: str = "corner"

@@ -30,6 +30,7 @@ from ortho_pipeline.inputs import has_surface, open_scene, open_surface
 from ortho_pipeline.model_file import SavedModel, write_model_file
 from ortho_pipeline.models import SensorModel, families
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.points import Points
 from ortho_pipeline.raster_writer import Profile
 from ortho_pipeline.scene_fit import Adjusted, adjust, heights_around, heights_where_wanted, open_adjustable
 from ortho_pipeline.swaps import refuse_swapped
@@ -240,11 +241,11 @@ def compare(
 
 
 def rectify(
-    image: str | os.PathLike[str],
+    image: str | os.PathLike[str] | Scene,
     folder: str | os.PathLike[str],
     *,
     scene: SceneOptions = SceneOptions(),
-    points: PointOptions = PointOptions(),
+    points: PointOptions | Points = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
     output: OutputOptions = OutputOptions(),
     progress: Callable[[float], None] | None = None,
@@ -255,7 +256,8 @@ def rectify(
 ) -> Result:
     """Make the orthoimage of a scene, its adjusted model in every format, and the accuracy report.
 
-    Nothing is written before all that can be checked is checked. `name` is the id of the STAC item (the
+    `image` may be a scene that is open, `points` a table that is read already, in pixels of that image. Nothing is
+    written before all that can be checked is checked. `name` is the id of the STAC item (the
     image's stem without one), `digest` takes checksums of the inputs, which it may know. Outputs of the same name are
     replaced; with `overwrite` so are old side-cars of the ortho, and outputs of an earlier run that this one does not
     make are removed.
@@ -276,6 +278,7 @@ def rectify(
     files = {
         kind: Path(folder) / f"{stem}{ending}" for kind, ending in _ENDINGS.items() if kind not in _STAC or output.stac
     }
+    points = inputs.point_options(points)
     inputs.check_paths(files, image, scene, points, surface, overwrite)
     if not has_surface(surface):
         raise InputError(

@@ -11,10 +11,10 @@ import io
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 import pyproj
@@ -36,6 +36,17 @@ Array = NDArray[np.float64]
 
 #: Standard deviation (px) of an image measurement whose file gives none.
 DEFAULT_SIGMA_IMAGE = 0.5
+
+
+class Point(NamedTuple):
+    """One of the points of a table, in its units; `image` and `sigma_image` in px, sigmas of the ground in metres."""
+
+    id: str
+    image: tuple[float, float]
+    ground: tuple[float, float, float]
+    role: str
+    sigma_image: float
+    sigma_ground: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -97,6 +108,21 @@ class Points:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def __iter__(self) -> Iterator[Point]:
+        columns = self.image.tolist(), self.ground.tolist(), self.roles.tolist()
+        sigmas = self.sigma_image.tolist(), self.sigma_ground.tolist()
+        for name, image, ground, role, sigma, sigma_ground in zip(self.ids, *columns, *sigmas, strict=True):
+            yield Point(name, tuple(image), tuple(ground), role, sigma, tuple(sigma_ground))
+
+    @property
+    def __geo_interface__(self) -> dict[str, Any]:
+        """The points as GeoJSON values in longitude, latitude (WGS84) and ellipsoidal height, as files have them.
+
+        `ji` are column and row from the centre of the first pixel. A point without a place has no geometry. shapely,
+        GeoPandas (``GeoDataFrame.from_features(points, crs=4326)``) and others read it.
+        """
+        return {"type": "FeatureCollection", "features": [_feature(point) for point in self.to_crs("EPSG:4979")]}
 
     @property
     def control(self) -> NDArray[np.bool_]:
@@ -383,21 +409,22 @@ def _csv_text(points: Points, suffix: str) -> str:
 
 
 def _geojson_text(points: Points, suffix: str) -> str:
-    geographic = points.to_crs("EPSG:4979")
-    features = []
-    for k, name in enumerate(points.ids):
-        place = [float(value) for value in geographic.ground[k]]
-        properties = {
-            "id": name,
-            "ji": [float(value) - 0.5 for value in points.image[k]],
-            "role": str(points.roles[k]),
-            "sigma_image": float(points.sigma_image[k]),
-            "sigma_xy": float(points.sigma_ground[k, :2].max()),
-            "sigma_h": float(points.sigma_ground[k, 2]),
-        }
-        geometry = {"type": "Point", "coordinates": place[:2] if math.isnan(place[2]) else place}
-        features.append({"type": "Feature", "properties": properties, "geometry": geometry})
-    return json.dumps({"type": "FeatureCollection", "features": features}, indent=1, allow_nan=False) + "\n"
+    return json.dumps(points.__geo_interface__, indent=1, allow_nan=False) + "\n"
+
+
+def _feature(point: Point) -> dict[str, Any]:
+    """Return the GeoJSON feature of a point whose ground is longitude, latitude and height."""
+    place = list(point.ground if math.isfinite(point.ground[2]) else point.ground[:2])
+    properties = {
+        "id": point.id,
+        "ji": [value - 0.5 for value in point.image],
+        "role": point.role,
+        "sigma_image": point.sigma_image,
+        "sigma_xy": max(point.sigma_ground[:2]),
+        "sigma_h": point.sigma_ground[2],
+    }
+    geometry = {"type": "Point", "coordinates": place} if all(map(math.isfinite, place)) else None
+    return {"type": "Feature", "id": point.id, "properties": properties, "geometry": geometry}
 
 
 def _qgis_text(points: Points, suffix: str) -> str:

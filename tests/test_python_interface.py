@@ -1,0 +1,181 @@
+"""The Python interface as users have it: types, objects in place of paths, points that can be gone through."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+import shapely
+
+import ortho_pipeline as op
+from ortho_pipeline import pipeline
+from ortho_pipeline.cli import cli
+from ortho_pipeline.errors import InputError
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# -- types
+
+
+def test_the_package_is_typed_and_its_lazy_names_are_those_of_the_stub() -> None:
+    assert files("ortho_pipeline").joinpath("py.typed").is_file()
+    stub = ast.parse((ROOT / "ortho_pipeline" / "__init__.pyi").read_text())
+    homes = {
+        alias.name: node.module.removeprefix("ortho_pipeline.")
+        for node in stub.body
+        if isinstance(node, ast.ImportFrom) and node.module
+        for alias in node.names
+    }
+    assert homes == op._HOMES
+    for name in op.__all__:
+        assert getattr(op, name) is not None
+
+
+USER_SCRIPT = """
+import ortho_pipeline as op
+
+scene = op.open_scene("scene.tif")
+points = op.read_points("gcps.geojson")
+reveal_type(scene)
+reveal_type(scene.model.ground_to_image([[1.0, 2.0, 3.0]]))
+reveal_type(points)
+reveal_type([point.id for point in points])
+start = op.ImageCorrection.identity(scene.model, "shift", origin=(0.0, 0.0))
+reveal_type(op.fit(start, points))
+reveal_type(op.rectify(scene, "out", points=points))
+reveal_type(op.compare)
+reveal_type(op.__version__)
+op.rectify("scene.tif", "out", pionts=points)
+"""
+
+
+def test_mypy_knows_what_the_public_names_are(tmp_path: Path) -> None:
+    script = tmp_path / "user.py"
+    script.write_text(USER_SCRIPT)
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--config-file=", "--ignore-missing-imports", f"--cache-dir={tmp_path}", script],
+        capture_output=True, text=True, check=False, cwd=ROOT,
+    )  # fmt: skip
+    revealed = re.findall(r'Revealed type is "(.*)"', done.stdout)
+    assert len(revealed) == 8, done.stdout + done.stderr
+    assert not [text for text in revealed if text == "Any"]
+    assert revealed[0].endswith("hookspecs.Scene")
+    assert "ndarray" in revealed[1]
+    assert revealed[2].endswith("points.Points")
+    assert "list[" in revealed[3]
+    assert "str" in revealed[3]
+    assert revealed[4].endswith("estimation.Fit")
+    assert revealed[5].endswith("pipeline.Result")
+    assert revealed[6].startswith("def (")
+    assert revealed[7].endswith("str")
+    assert 'Unexpected keyword argument "pionts"' in done.stdout
+
+
+# -- objects in place of paths
+
+
+def test_rectify_takes_a_scene_and_points(tiny, tmp_path: Path) -> None:
+    surface, output = op.SurfaceOptions(dem=tiny.dem, vertical="ellipsoid"), op.OutputOptions(resolution=20.0)
+    options = op.PointOptions(gcps=tiny.gcps, crs="EPSG:4979", vertical="ellipsoid")
+    by_path = op.rectify(tiny.image, tmp_path / "a", points=options, surface=surface, output=output)
+    points = op.read_points(tiny.gcps, crs="EPSG:4979", vertical="ellipsoid")
+    scene = op.open_scene(tiny.image)
+    by_object = op.rectify(scene, tmp_path / "b", points=points, surface=surface, output=output)
+    assert by_object.files["ortho"].read_bytes() == by_path.files["ortho"].read_bytes()
+    assert sorted(by_object.files) == sorted(by_path.files)
+    one, other = (result.document["report"] for result in (by_path, by_object))
+    assert one["adjustment"] == other["adjustment"]
+    record = json.loads(by_object.files["report"].read_text())["provenance"]
+    assert record["points"]["gcps"] == str(points)
+    # With options around them: half of the points only check.
+    options = op.PointOptions(gcps=points, check="every:2", correction="shift")
+    found = pipeline.fit(scene, options).fit
+    assert (found.points.check.sum(), found.points.control.sum()) == (6, 6)
+
+
+def test_what_objects_say_themselves_is_not_said_again(tiny) -> None:
+    scene = op.open_scene(tiny.image)
+    points = op.read_points(tiny.gcps, crs="EPSG:4979", vertical="ellipsoid")
+    for more in ({"crs": "EPSG:4326"}, {"vertical": "egm96"}, {"pixel_origin": "center"}):
+        with pytest.raises(InputError, match="themselves"):
+            pipeline.fit(scene, op.PointOptions(gcps=points, **more))
+    with pytest.raises(InputError, match="open already"):
+        pipeline.fit(scene, op.PointOptions(gcps=points), op.SceneOptions(rpc="tag"))
+
+
+def test_own_points_take_the_options_of_points(tiny, tmp_path: Path) -> None:
+    from osgeo import gdal
+
+    rows = tiny.points(6)
+    dataset = gdal.Open(str(tiny.image), gdal.GA_Update)
+    dataset.SetGCPs([gdal.GCP(lon, lat, h, col, row) for _, col, row, lon, lat, h in rows], "")
+    dataset = None
+    given = op.PointOptions(gcps="own", crs="EPSG:4326", vertical="ellipsoid")
+    assert len(pipeline.fit(tiny.image, given).fit.points) == 6
+    with pytest.raises(InputError, match="points-crs"):
+        pipeline.fit(tiny.image, op.PointOptions(gcps="own"))
+
+
+# -- points
+
+
+def test_points_can_be_gone_through(sample: Path) -> None:
+    points = op.read_points(sample / "gcps.geojson")
+    found = list(points)
+    assert len(found) == len(points) == 18
+    for k, point in enumerate(found):
+        assert point.id == points.ids[k]
+        assert point.image == tuple(points.image[k])
+        assert point.ground == tuple(points.ground[k])
+        assert point.role == points.roles[k]
+        assert point.sigma_image == points.sigma_image[k]
+        assert point.sigma_ground == tuple(points.sigma_ground[k])
+
+
+def test_points_are_geojson(sample: Path, tmp_path: Path) -> None:
+    points = op.read_points(sample / "gcps.geojson")
+    utm = points.to_crs("EPSG:32636")
+    document = utm.__geo_interface__
+    assert document["type"] == "FeatureCollection"
+    for k, feature in enumerate(document["features"]):
+        shape = shapely.geometry.shape(feature["geometry"])  # longitude, latitude and height, wherever the table is
+        assert [shape.x, shape.y, shape.z] == pytest.approx(points.ground[k].tolist(), abs=1e-8)
+        assert feature["properties"]["id"] == points.ids[k]
+    # It is what a file has, and reads back as it was.
+    path = tmp_path / "again.geojson"
+    path.write_text(json.dumps(document, allow_nan=False))
+    again = op.read_points(path)
+    np.testing.assert_allclose(again.image, points.image, atol=1e-9)
+    assert again.ids == points.ids
+    assert again.roles.tolist() == points.roles.tolist()
+    ground = points.ground.copy()
+    ground[0, 2], ground[1] = np.nan, np.nan
+    one, two = points.with_ground(ground).__geo_interface__["features"][:2]
+    assert len(one["geometry"]["coordinates"]) == 2
+    assert two["geometry"] is None
+
+
+# -- names of options
+
+
+def test_the_table_of_options_is_that_of_the_command_line() -> None:
+    page = (ROOT / "docs" / "api.md").read_text()
+    rows = dict(re.findall(r"^\| `(\w+\.\w+)` \| `(--[\w-]+)` \|", page, re.MULTILINE))
+    command = cli.get_command(click.Context(cli), "rectify")
+    groups = {"scene": "SceneOptions", "points": "PointOptions", "surface": "SurfaceOptions", "output": "OutputOptions"}
+    other = {}
+    for parameter in command.params:
+        group, _, field = str(parameter.name).partition("_")
+        if group in groups and field and isinstance(parameter, click.Option):
+            flag = max((one for one in parameter.opts if one.startswith("--")), key=len)
+            if flag.removeprefix("--").replace("-", "_") not in (field, field.removesuffix("s")):
+                other[f"{groups[group]}.{field}"] = flag
+    assert rows == other
