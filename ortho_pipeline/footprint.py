@@ -1,17 +1,20 @@
 """Where a scene lies: its footprint on the surface, how much of it the DEM covers, and the output grid that follows.
 
-The extent never comes from the DEM alone: where the ray of a border pixel leaves the DEM, both ends of the model's
-height range stand in, so a DEM that covers half the scene cannot cut the ortho in half or change its pixel size.
+Heights come from the surface under the scene. The extent never comes from the DEM alone: where the ray of a border
+pixel leaves the DEM, both ends of the range of heights there stand in, so a DEM that covers half the scene cannot cut
+the ortho in half.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyproj
+from numpy.typing import NDArray
 
 from ortho_pipeline.crs import GroundTransform, ground_transform, utm_crs
 from ortho_pipeline.dem import Surface
@@ -19,12 +22,15 @@ from ortho_pipeline.errors import CoverageError, InputError, ModelError
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster import Grid
 from ortho_pipeline.rays import intersect
+from ortho_pipeline.report_text import count, share
 
 #: Points per side of the image at which the DEM is asked for.
 _COVERAGE_SIDE = 33
 _BORDER_SIDE = 65
 #: Samples of the DEM per side of the blocks in which voids are counted.
 _BLOCK = 1024
+#: A model is meant for the heights under its scene and this part of their range beyond, or so many metres.
+_MARGIN, _LEAST_MARGIN = 0.1, 10.0
 
 
 def image_grid(width: int, height: int, side: int) -> Array:
@@ -57,75 +63,162 @@ def facing(model: SensorModel, surface: Surface, width: int, height: int) -> Sur
     return surface.around(float(centre[0, 0]))
 
 
-def coverage(model: SensorModel, surface: Surface, width: int, height: int) -> float:
-    """Return the share (0 to 1) of the scene's footprint for which the DEM has a height, by a grid of rays.
+@dataclass(frozen=True, eq=False)
+class Footprint:
+    """Where a scene lies on a surface, and what heights it has there; from `lay`.
 
-    Fill rules of the surface do not count: it is what the DEM itself covers. A void between the rays is not seen
-    here but by `voids`.
+    Parameters
+    ----------
+    ring : (N, 3)
+        The border of the image on the ground, in the model's CRS: on the surface, and where a ray leaves the DEM, at
+        the height `middle`. Rays that do not meet the ground are left out.
+    reach : (M, 3)
+        Ground that the image may reach: `ring`, and the lost rays at both ends of `heights`.
+    heights : (float, float)
+        Lowest and highest ellipsoidal height (m) of the surface under the scene; the model's own range where no ray
+        meets the surface.
+    middle : float
+        Height (m) at which the middle of the image is seen.
+    coverage : float
+        Share (0 to 1) of the scene for which the surface has heights of its own, filled ones not counted.
+    complete : bool
+        Whether every ray met the surface at a height of its own; small voids between the rays may still be there.
+    voids : int
+        Samples of the DEM within the scene that have no height.
     """
-    if surface.constant_height is not None:
-        return 1.0
-    surface = facing(model, surface, width, height)
-    image = image_grid(width, height, _COVERAGE_SIDE)
-    ground = intersect(model, image, surface)
-    met = np.isfinite(ground).all(axis=1)
-    projects = met | np.isfinite(model.image_to_ground(image, model.reference_height)).all(axis=1)
-    if not projects.any():
-        raise ModelError("no image point meets the ground: the model does not belong to this image")
-    own = surface.coverage(ground[met, :2], model.crs)
-    return own * float(met.sum() / projects.sum())
+
+    ring: Array
+    reach: Array
+    heights: tuple[float, float]
+    middle: float
+    coverage: float = 1.0
+    complete: bool = True
+    voids: int = 0
+
+    def require_coverage(self, surface: Surface) -> None:
+        """Raise a `CoverageError` if the surface does not cover the scene and nothing was said about the rest.
+
+        Raises
+        ------
+        CoverageError
+            If a ray found no height and the surface has no fill rule.
+        """
+        if not self.complete and surface.fill == "error":
+            raise CoverageError(
+                f"the DEM covers {share(self.coverage)} of the scene",
+                file=surface.provenance.get("path"),
+                remedy="give a DEM that covers it all, or say what the rest shall be: --dem-fill mask (no pixels "
+                "there), nearest, or an ellipsoidal height in metres",
+            )
+
+    def notes(self, surface: Surface) -> list[str]:
+        """Return what is to be said of a scene that the DEM does not cover as a whole."""
+        if self.coverage >= 1.0:
+            return []
+        what = "have no pixels in the ortho" if surface.fill in ("error", "mask") else "were filled"
+        inside = f" ({count(self.voids, 'sample')} without a height within it)" if self.voids else ""
+        return [f"the DEM covers {share(self.coverage)} of the scene{inside}: the other places {what}"]
+
+    def fitted(self, model: SensorModel) -> SensorModel:
+        """Return the model, meant for the heights here and a margin, where its own range is no more than a guess."""
+        if self.heights == model.height_range:
+            return model
+        low, high = self.heights
+        margin = max(_LEAST_MARGIN, _MARGIN * (high - low))
+        return model.with_heights(low - margin, high + margin)
 
 
-@dataclass(frozen=True)
-class Voids:
-    """Samples of the DEM without a height within the footprint: how many, and their share (0 to 1) of it."""
-
-    count: int
-    share: float
-
-
-def voids(model: SensorModel, surface: Surface, width: int, height: int) -> Voids:
-    """Count every sample of the DEM within the footprint that has no height of its own, whatever the fill rule.
-
-    Where rays leave the DEM, the convex hull of both ends of the height range stands for the footprint.
-    """
-    if surface.constant_height is not None:
-        return Voids(0, 0.0)
-    import shapely
-
-    surface = facing(model, surface, width, height).with_fill("mask")
-    ground = ground_transform(model.crs, surface.crs)(footprint(model, surface, width, height))
-    samples = surface.samples_at(ground[:, :2])
-    outline = shapely.Polygon(samples)
-    if len(samples) != len(border(width, height)) or not outline.is_valid:
-        outline = shapely.MultiPoint(samples).convex_hull
-    shapely.prepare(outline)
-    left, top, right, bottom = (int(value) for value in (*np.floor(outline.bounds[:2]), *np.ceil(outline.bounds[2:])))
-    count = 0
-    for v in range(top, bottom + 1, _BLOCK):
-        for u in range(left, right + 1, _BLOCK):
-            heights = surface.window(u, v, min(_BLOCK, right + 1 - u), min(_BLOCK, bottom + 1 - v))
-            rows, columns = np.nonzero(np.isnan(heights))
-            if len(rows):
-                count += int(shapely.contains_xy(outline, columns + u, rows + v).sum())
-    return Voids(count, min(1.0, count / max(outline.area, 1.0)))
-
-
-def require_coverage(share: float, surface: Surface) -> None:
-    """Raise a `CoverageError` if the DEM does not cover the scene and nothing was said about the rest.
+def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footprint:
+    """Lay a scene on a surface.
 
     Raises
     ------
-    CoverageError
-        If `share` is below 1 and the surface has no fill rule.
+    ModelError
+        If no border pixel meets the ground.
     """
-    if share < 1.0 and surface.fill == "error":
-        raise CoverageError(
-            f"the DEM covers {math.floor(share * 1000) / 10:.1f} % of the scene",
-            file=surface.provenance.get("path"),
-            remedy="give a DEM that covers it all, or say what the rest shall be: --dem-fill mask (no pixels there), "
-            "nearest, or an ellipsoidal height in metres",
-        )
+    surface = facing(model, surface, width, height)
+    ring = border(width, height)
+    image = np.concatenate([image_grid(width, height, _COVERAGE_SIDE), ring])
+    ground = intersect(model, image, surface)
+    met = np.asarray(np.isfinite(ground).all(axis=1), dtype=bool)
+    heights, middle = _heights_under(model, surface, ground, met)
+    inner, outer = slice(len(image) - len(ring)), slice(len(image) - len(ring), None)
+    lost = outer.start + np.flatnonzero(~met[outer])
+    ground[lost] = model.image_to_ground(image[lost], middle)
+    closed = ground[outer]
+    ends = [model.image_to_ground(image[lost], level) for level in heights] if len(lost) else []
+    reach = np.concatenate([closed, *ends])
+    found = Footprint(_finite(closed), _finite(reach), heights, middle)
+    if not len(found.reach):
+        raise ModelError("no border pixel meets the ground: the model does not belong to this image")
+    if surface.constant_height is not None:
+        return found
+    projects = met[inner] | np.isfinite(model.image_to_ground(image[inner], middle)).all(axis=1)
+    own = surface.coverage(ground[inner][met[inner], :2], model.crs) * met[inner].sum() / max(projects.sum(), 1)
+    voids, area, sampled = _voids(model, surface, found.ring, whole=len(found.ring) == len(ring))
+    # Whichever looks closer has the say; where a ray finds no height, the DEM does not cover all.
+    fine = area > _COVERAGE_SIDE**2 and (sampled < 1.0 or own >= 1.0)
+    covered = sampled if fine else min(own, sampled)
+    return replace(found, coverage=float(covered), complete=bool(own >= 1.0), voids=voids)
+
+
+def _finite(ground: Array) -> Array:
+    return ground[np.isfinite(ground).all(axis=1)]
+
+
+def _heights_under(
+    model: SensorModel, surface: Surface, ground: Array, met: NDArray[np.bool_]
+) -> tuple[tuple[float, float], float]:
+    """Return the range of heights under a scene, and the height at which the middle of the image is seen."""
+    if surface.constant_height is not None:
+        return (surface.constant_height, surface.constant_height), surface.constant_height
+    if not met.any():
+        return model.height_range, model.reference_height
+    seen = ground[met]
+    low, high = float(seen[:, 2].min()), float(seen[:, 2].max())
+    # Peaks and hollows between the rays count too.
+    samples = surface.samples_at(ground_transform(model.crs, surface.crs)(seen)[:, :2])
+    first, last = np.floor(samples.min(axis=0)).astype(int), np.ceil(samples.max(axis=0)).astype(int) + 1
+    with contextlib.suppress(InputError):  # all of it filled
+        lowest, highest = surface.range_within(*first.tolist(), *(last - first).tolist())
+        low, high = min(low, lowest), max(high, highest)
+    centre = _COVERAGE_SIDE**2 // 2
+    return (low, high), float(ground[centre, 2] if met[centre] else np.median(seen[:, 2]))
+
+
+def _voids(model: SensorModel, surface: Surface, ring: Array, *, whole: bool) -> tuple[int, float, float]:
+    """Count the samples of the DEM within a footprint that have no height of their own, whatever the fill rule.
+
+    Returns
+    -------
+    (int, float, float)
+        Their number, the area of the footprint in samples, and its share that has heights: none beyond the DEM.
+    """
+    import shapely
+
+    surface = surface.with_fill("mask")
+    rows, columns = surface.shape
+    samples = surface.samples_at(ground_transform(model.crs, surface.crs)(ring)[:, :2])
+    outline = shapely.Polygon(samples)
+    if not whole or not outline.is_valid:
+        outline = shapely.MultiPoint(samples).convex_hull
+    inside = shapely.intersection(outline, shapely.box(0, 0, columns - 1, rows - 1))
+    if inside.is_empty or outline.area == 0:
+        return 0, 0.0, 1.0  # the rays have the only say
+    beyond = 0.0 if shapely.equals(inside, outline) else 1.0 - inside.area / outline.area
+    shapely.prepare(inside)
+    left, top, right, bottom = (int(value) for value in (*np.floor(inside.bounds[:2]), *np.ceil(inside.bounds[2:])))
+    void = total = 0
+    for v in range(top, bottom + 1, _BLOCK):
+        for u in range(left, right + 1, _BLOCK):
+            nu, nv = min(_BLOCK, right + 1 - u), min(_BLOCK, bottom + 1 - v)
+            heights = surface.window(u, v, nu, nv)
+            empty, within = np.isnan(heights), np.ones((nv, nu), dtype=bool)
+            if not shapely.contains(inside, shapely.box(u, v, u + nu - 1, v + nv - 1)):
+                across, down = np.meshgrid(np.arange(u, u + nu), np.arange(v, v + nv))
+                within = shapely.contains_xy(inside, across, down)
+            void, total = void + int((empty & within).sum()), total + int(within.sum())
+    return void, float(outline.area), (1.0 - beyond) * (1.0 - void / max(total, 1))
 
 
 def output_crs(model: SensorModel, width: int, height: int) -> pyproj.CRS:
@@ -135,15 +228,17 @@ def output_crs(model: SensorModel, width: int, height: int) -> pyproj.CRS:
     return utm_crs(float(geographic[0]), float(geographic[1]))
 
 
-def ground_sample_distance(model: SensorModel, crs: pyproj.CRS, width: int, height: int) -> float:
-    """Return the side of a pixel on the ground at the model's reference height, in units of `crs`.
+def ground_sample_distance(
+    model: SensorModel, crs: pyproj.CRS, width: int, height: int, level: float | None = None
+) -> float:
+    """Return the side of a pixel on the ground, in units of `crs`: geometric mean of both axes, middle of the image.
 
-    The geometric mean of both axes in the middle of the image: it knows nothing of the DEM, so the resolution of an
-    ortho does not either.
+    At the ellipsoidal height `level` (m), the model's reference height if there is none.
     """
+    level = model.reference_height if level is None else level
     middle = np.array([width, height]) / 2
     image = middle + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
-    ground = ground_transform(model.crs, crs)(model.image_to_ground(image, model.reference_height))
+    ground = ground_transform(model.crs, crs)(model.image_to_ground(image, level))
     across, down = ground[1, :2] - ground[0, :2], ground[3, :2] - ground[2, :2]
     area = abs(across[0] * down[1] - across[1] * down[0])
     if not (np.isfinite(area) and area > 0):
@@ -156,27 +251,9 @@ def two_digits(value: float) -> float:
     return float(f"{value:.1e}")
 
 
-def footprint(model: SensorModel, surface: Surface, width: int, height: int) -> Array:
-    """Return the border of the image on the ground ``(N, 3)``, in the model's CRS; all rows finite.
-
-    Points on the surface, and where a ray leaves the DEM, points at both ends of the model's height range.
-    """
-    ring = border(width, height)
-    ground = intersect(model, ring, facing(model, surface, width, height))
-    lost = ~np.isfinite(ground).all(axis=1)
-    parts = [ground]
-    if lost.any():
-        parts += [model.image_to_ground(ring[lost], level) for level in model.height_range]
-    everything = np.concatenate(parts)
-    everything = everything[np.isfinite(everything).all(axis=1)]
-    if not len(everything):
-        raise ModelError("no border pixel meets the ground: the model does not belong to this image")
-    return everything
-
-
 def choose_grid(
     model: SensorModel,
-    surface: Surface,
+    found: Footprint,
     size: tuple[int, int],
     *,
     crs: pyproj.CRS | None = None,
@@ -188,12 +265,15 @@ def choose_grid(
 
     Parameters
     ----------
+    found : Footprint
+        Where the scene lies.
     size : (int, int)
         Columns and rows of the image.
     crs : pyproj.CRS, optional
         Default: the UTM zone of the scene's centre.
     resolution : float or (float, float), optional
-        In units of `crs`, one number or x and y. Default: the ground sample distance, to two significant digits.
+        In units of `crs`, one number or x and y. Default: the ground sample distance at the height of the middle of the
+        image, to two significant digits.
     extent : xmin, ymin, xmax, ymax, optional
         Taken as it is, or widened to whole multiples of the resolution with `align`. Default: the footprint, widened.
 
@@ -205,11 +285,11 @@ def choose_grid(
     width, height = size
     crs = crs or output_crs(model, width, height)
     if resolution is None:
-        resolution = two_digits(ground_sample_distance(model, crs, width, height))
+        resolution = two_digits(ground_sample_distance(model, crs, width, height, found.middle))
     step = (resolution, resolution) if isinstance(resolution, int | float) else (resolution[0], resolution[1])
     if extent is not None:
         return Grid.of_extent(crs, extent, step, align=align)
-    ground = _continuous(GroundTransform(model.crs, crs)(footprint(model, surface, width, height)), crs)
+    ground = _continuous(GroundTransform(model.crs, crs)(found.reach), crs)
     if not np.isfinite(ground).any():
         raise InputError(
             f"the scene does not lie in the domain of {crs.name!r}", field="--output-crs", remedy="choose another CRS"

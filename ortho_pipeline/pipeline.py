@@ -32,7 +32,7 @@ from ortho_pipeline.models import SensorModel, families
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster_writer import Profile
-from ortho_pipeline.scene_fit import Adjusted, adjust, heights_around, heights_where_wanted, open_adjustable
+from ortho_pipeline.scene_fit import Adjusted, adjust, heights_around, heights_where_wanted, on_surface, open_adjustable
 from ortho_pipeline.swaps import refuse_swapped
 
 if TYPE_CHECKING:
@@ -209,9 +209,10 @@ def compare(
     if points.correction is not None or points.fit_model is not None:
         raise InputError("compare takes its models from --models", field="--models", remedy="for example all")
     opened = inputs.open_image(image, scene, needs_model=False)
-    own = opened.model if opened.models else None
-    names = comparing.choose_models(models, own)
+    names = comparing.choose_models(models, opened.model if opened.models else None)
     heights = open_surface(surface, scene.allow_network) if has_surface(surface) else None
+    opened = on_surface(opened, heights)
+    own = opened.model if opened.models else None
     given = inputs.read_control(opened, points, scene.allow_network)
     if own is not None:
         refuse_swapped(own, given, opened.height)
@@ -294,10 +295,12 @@ def rectify(
         adjusted = adjust(opened, points, scene, heights)
         opened, model, size = adjusted.scene, adjusted.model, (opened.width, opened.height)
         heights = footprint.facing(model, heights, *size)
-        share, notes = _coverage(model, heights, size)
+        found = footprint.lay(model, heights, *size)
+        found.require_coverage(heights)
+        model = found.fitted(model)
         crs = parse_crs(output.crs) if output.crs else None
         grid = footprint.choose_grid(
-            model, heights, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
+            model, found, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
         )
         exported, complaints = _as_rpc(model)
         source = raster.RasterSource(
@@ -311,8 +314,8 @@ def rectify(
     whole = raster.open_dataset(image, allow_network=scene.allow_network)
     _write_models(model, exported, opened, whole, files, {**record, "adjustment": adjusted.fit.to_json()})
     document = report.build_report(
-        scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=share, grid=grid, warp=warped,
-        provenance=record, warnings=[*adjusted.warnings(heights), *notes, *complaints],
+        scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
+        warp=warped, provenance=record, warnings=[*adjusted.warnings(heights), *found.notes(heights), *complaints],
     )  # fmt: skip
     _write_report(document, adjusted.fit, files)
     if acquired is not None:
@@ -476,27 +479,6 @@ _STAC = ("stac", "thumbnail", "overview")
 def _remove(paths: Iterable[Path]) -> None:
     for path in paths:
         path.unlink(missing_ok=True)
-
-
-def _coverage(model: SensorModel, surface: dem.Surface, size: tuple[int, int]) -> tuple[float, list[str]]:
-    """Return the share of the scene that has heights, and a warning about voids that are too small to stop for.
-
-    Raises
-    ------
-    CoverageError
-        If the DEM leaves a part of the scene without heights and nothing was said about the rest.
-    """
-    share = footprint.coverage(model, surface, *size)
-    footprint.require_coverage(share, surface)
-    voids = footprint.voids(model, surface, *size)
-    if not voids.count:
-        return share, []
-    what = "have no pixels in the ortho" if surface.fill in ("error", "mask") else "were filled"
-    note = (
-        f"the DEM has {voids.count} samples without a height within the scene ({100 * voids.share:.2g} % of its "
-        f"footprint): these places {what}"
-    )
-    return min(share, 1.0 - voids.share), [note]
 
 
 def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[str]]:

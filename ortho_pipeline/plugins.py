@@ -168,7 +168,7 @@ class Host:
         )
         if len(found) == 1:
             return found[0]
-        raise _not_one(found, self.sensors, dataset.GetDescription())
+        raise _not_one(found, self.sensors.values(), dataset.GetDescription())
 
     def open_scene(
         self,
@@ -384,13 +384,15 @@ def _unknown_sensor(name: str, sensors: Iterable[str]) -> InputError:
     )
 
 
-def _not_one(found: list[Sensor], sensors: Iterable[str], path: str) -> InputError:
+def _not_one(found: list[Sensor], sensors: Iterable[Sensor], path: str) -> InputError:
     if found:
         names = ", ".join(item.name for item in found)
         return InputError(f"several sensors recognise it: {names}", file=path, remedy="choose one with --sensor NAME")
-    names = ", ".join(sensors) or "none"
+    names = ", ".join(item.name for item in sensors) or "none"
+    general = ", ".join(item.name for item in sensors if item.fallback)
+    hint = f" (for images in general: {general})" if general else ""
     return InputError(
         f"no sensor recognises it (installed: {names})",
         file=path,
-        remedy="choose one with --sensor NAME, or give the RPC file with --rpc FILE",
+        remedy=f"choose one with --sensor NAME, which says what it needs{hint}, or give the RPC file with --rpc FILE",
     )

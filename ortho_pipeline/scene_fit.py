@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +13,9 @@ import numpy as np
 from ortho_pipeline import inputs
 from ortho_pipeline.crs import ground_transform
 from ortho_pipeline.dem import Surface
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, ModelError
 from ortho_pipeline.estimation import Fit, fit
+from ortho_pipeline.footprint import lay
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.model_choice import OWN, Removed, fit_family, fit_own, prune
 from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
@@ -126,6 +128,20 @@ def open_adjustable(image: Any, scene: SceneOptions, points: PointOptions) -> Sc
     return inputs.open_image(image, scene, needs_model=False)
 
 
+def on_surface(scene: Scene, surface: Surface | None) -> Scene:
+    """Return the scene with models that are meant for the heights under it, where their own range is but a guess."""
+    if surface is None:
+        return scene
+    models = dict(scene.models)
+    for name, model in models.items():
+        if model.with_heights(*model.height_range) is model:
+            continue
+        # A model that only starts an adjustment may look anywhere.
+        with contextlib.suppress(ModelError):
+            models[name] = lay(model, surface, scene.width, scene.height).fitted(model)
+    return dataclasses.replace(scene, models=models)
+
+
 def adjust(scene: Scene, options: PointOptions, opened: SceneOptions, surface: Surface | None) -> Adjusted:
     """Adjust the model of a scene, or fit the family of the options to the points alone.
 
@@ -136,6 +152,7 @@ def adjust(scene: Scene, options: PointOptions, opened: SceneOptions, surface: S
     InputError
         If points are missing or wrong, or do not determine the model.
     """
+    scene = on_surface(scene, surface)
     points = inputs.read_control(scene, options, opened.allow_network)
     done = _from_points(scene, options, points, surface) if options.fit_model else _corrected(
         scene, options, opened, points, surface

@@ -16,7 +16,7 @@ from ortho_pipeline.crs import GroundTransform, Vertical
 from ortho_pipeline.datum import dem_unit
 from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import CrsError, DatumError, InputError
-from ortho_pipeline.footprint import voids
+from ortho_pipeline.footprint import lay
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.rays import intersect
 
@@ -298,8 +298,7 @@ def test_a_look_with_another_rule_leaves_a_surface_as_it_was(tmp_path: Path, fil
     untouched = Surface.open(path, "ellipsoid", fill=fill).heights(ground)
     surface = Surface.open(path, "ellipsoid", fill=fill)
     # Its border must lie on the DEM: only then are tiles read.
-    counted = voids(Oblique(0.0), surface, 6000, 5000)
-    assert counted.count == 24
+    assert lay(Oblique(0.0), surface, 6000, 5000).voids == 24
     np.testing.assert_array_equal(surface.heights(ground), untouched)
     other = surface.with_fill("12.0")
     np.testing.assert_array_equal(other.heights(ground[1:2]), [12.0])

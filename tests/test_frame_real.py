@@ -12,11 +12,14 @@ from ortho_frame import open_scene
 from scipy.spatial.transform import Rotation
 from skimage.registration import phase_cross_correlation
 
+from ortho_pipeline import load_model, pipeline
 from ortho_pipeline.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.dem import Surface
 from ortho_pipeline.geometry import angles_of_rotation
 from ortho_pipeline.models.frame import MAP, TOPOCENTRIC, FrameCamera
+from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster import Grid, RasterSource, open_dataset
+from ortho_pipeline.rays import intersect
 from ortho_pipeline.warp import rectify
 
 pytestmark = pytest.mark.realdata
@@ -163,3 +166,47 @@ def test_odm_orthos_agree(real, tmp_path):
             medians.append(float(np.hypot(*np.median(found, axis=0))))
     assert len(medians) >= 4
     assert max(medians) < 0.1
+
+
+def test_opensfm_poses_open_by_the_option_exterior(real):
+    folder = real / "orthority"
+    path = folder / "odm" / "opensfm" / "reconstruction.json"
+    for name, (topocentric, in_map) in odm_cameras(folder).items():
+        dataset = open_dataset(folder / "odm" / "images" / f"{name}.tif")
+        # Truth: OpenSfM's own formulas, by which the test above holds these cameras.
+        local = open_scene(dataset, exterior=str(path), vertical="ellipsoid", heights="55,115").model
+        mapped = open_scene(
+            dataset, exterior=str(path), vertical="ellipsoid", heights="55,115", frame=MAP, crs="EPSG:32651"
+        ).model
+        image = np.random.default_rng(1).uniform(0, 1, (50, 2)) * (1368, 912)
+        for found, truth in ((local, topocentric), (mapped, in_map)):
+            ground = truth.image_to_ground(image, 80.0)
+            np.testing.assert_allclose(found.ground_to_image(ground), image, atol=1e-6)
+
+
+def test_a_drone_scene_is_usable_by_default(real, tmp_path):
+    folder = real / "orthority" / "odm"
+    name = "100_0005_0142"
+    options = {"exterior": str(folder / "opensfm" / "reconstruction.json"), "vertical": "ellipsoid"}
+    result = pipeline.rectify(
+        folder / "images" / f"{name}.tif", tmp_path,
+        scene=SceneOptions(sensor="frame", sensor_options={**options, "frame": "map", "crs": "EPSG:32651"}),
+        surface=SurfaceOptions(dem=folder / "odm_dem" / "dsm.tif", vertical="ellipsoid", fill="mask"),
+        output=OutputOptions(format="GTiff"),
+    )  # fmt: skip
+    report = result.document["report"]
+    saved = load_model(result.files["model"])
+    # The DSM lies between 57 and 113 m; the camera, 187 m high, sees down to it at 30 degrees: 0.11 to 0.18 m.
+    low, high = saved.height_range
+    assert 40 < low < 80 < high < 125
+    step, _ = report["ortho"]["resolution"]
+    assert 0.11 <= step <= 0.18
+    surface = Surface.open(folder / "odm_dem" / "dsm.tif", "ellipsoid")
+    rays = np.random.default_rng(2).uniform(0, 1, (4000, 2)) * (1368, 912)
+    met = np.isfinite(intersect(saved, rays, surface)).all(axis=1).mean()
+    assert report["surface"]["coverage"] == pytest.approx(met, abs=0.03)
+    percent = int(report["surface"]["coverage"] * 1000) / 10
+    said = [text for text in (*report["warnings"], result.summary) if "covers" in text]
+    assert said
+    assert all(f"covers {percent} %" in text or "covers 100 %" in text for text in said)
+    assert report["ortho"]["valid_share"] > 0.2

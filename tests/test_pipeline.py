@@ -390,7 +390,7 @@ def test_a_void_between_the_rays_is_reported_with_its_share(tiny, tmp_path):
     dem.WriteArray(heights)
     dem = None
     report = rectify(tiny, tmp_path / "out", surface=dem_of(tiny, dem=fine)).document["report"]
-    found = [text for text in report["warnings"] if "1 samples without a height" in text]
+    found = [text for text in report["warnings"] if "(1 sample without a height within it)" in text]
     assert len(found) == 1
     # The scene has 1.92 x 1.44 km, a sample 5 x 5 m.
     assert 1 - report["surface"]["coverage"] == pytest.approx(25 / (1920 * 1440), rel=0.1)

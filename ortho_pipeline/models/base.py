@@ -93,6 +93,13 @@ class SensorModel(ABC):
         """Ellipsoidal height (m) in the middle of `height_range`."""
         return float(self.domain[0][2])
 
+    def with_heights(self, low: float, high: float) -> Self:
+        """Return this model, meant for ground between two ellipsoidal heights (m).
+
+        The model itself where the range is part of its numbers, as the scale of an RPC is.
+        """
+        return self
+
     @property
     def corners(self) -> Array:
         """Ground points ``(N, 3)`` at the rim of what the model is meant for, at its lowest and highest height.

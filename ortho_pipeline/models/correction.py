@@ -90,6 +90,9 @@ class ImageCorrection(SensorModel):
     def domain(self) -> tuple[Array, Array]:
         return self.model.domain
 
+    def with_heights(self, low: float, high: float) -> Self:
+        return self._replace(model=self.model.with_heights(low, high))
+
     @property
     def corners(self) -> Array:
         return self.model.corners

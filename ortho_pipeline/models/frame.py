@@ -195,6 +195,10 @@ class FrameCamera(SensorModel):
         """Lowest and highest ellipsoidal height of the ground."""
         return self.heights
 
+    def with_heights(self, low: float, high: float) -> Self:
+        """Return the camera for ground between two ellipsoidal heights (m)."""
+        return self._replace(heights=(low, high))
+
     @cached_property
     def domain(self) -> tuple[Array, Array]:
         """Centre and half-size of the box that the frame sees between `heights`, as far as rays are not too flat."""

@@ -149,6 +149,9 @@ class MapPlane(SensorModel):
     def height_range(self) -> tuple[float, float]:
         return self.heights
 
+    def with_heights(self, low: float, high: float) -> Self:
+        return self._replace(heights=(min(low, self.plane), max(high, self.plane)))
+
     @property
     def reference_height(self) -> float:
         return self.plane

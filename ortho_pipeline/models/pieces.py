@@ -64,6 +64,9 @@ class Pieces(SensorModel):
         high = np.max([centre + half for centre, half in boxes], axis=0)
         return (low + high) / 2, (high - low) / 2
 
+    def with_heights(self, low: float, high: float) -> Self:
+        return self._replace(models=tuple(model.with_heights(low, high) for model in self.models))
+
     @property
     def corners(self) -> Array:
         return np.concatenate([model.corners for model in self.models])

@@ -148,6 +148,10 @@ class Pushbroom(SensorModel):
         """Lowest and highest ellipsoidal height of the ground."""
         return self.heights
 
+    def with_heights(self, low: float, high: float) -> Self:
+        """Return the camera for ground between two ellipsoidal heights (m)."""
+        return self._replace(heights=(low, high))
+
     @property
     def corners(self) -> Array:
         """Ground points ``(8, 3)`` of the corners of the image at both ends of `heights`; NaN where none is seen."""

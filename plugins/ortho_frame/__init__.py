@@ -11,7 +11,7 @@ from collections.abc import Iterable
 import numpy as np
 from osgeo import gdal
 
-from ortho_frame.tables import Pose, read_camera, read_exterior
+from ortho_frame.tables import Pose, Shot, is_reconstruction, read_camera, read_exterior
 from ortho_pipeline.crs import Vertical, ground_transform
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
@@ -22,7 +22,8 @@ from ortho_pipeline.problem import Prior, priors_at
 
 OPTIONS = {
     "camera": "camera file: JSON (docs/formats/frame.md) or OpenSfM's cameras.json or reconstruction.json",
-    "exterior": "CSV: filename, and x y z omega phi kappa or lon lat alt roll pitch yaw (degrees)",
+    "exterior": "CSV: filename, and x y z omega phi kappa or lon lat alt roll pitch yaw (degrees); or OpenSfM's "
+    "reconstruction.json, which holds the camera too",
     "crs": "projected CRS of x and y",
     "vertical": "what the camera heights are above: ellipsoid, egm96, egm2008, EPSG:n or a grid file",
     "frame": "work in a topocentric frame (default) or directly in the map projection: topocentric, map",
@@ -59,18 +60,22 @@ def open_scene(
 ) -> Scene:
     """Open a frame image with its camera and its row of the table of exterior orientations."""
     name = dataset.GetDescription()
+    if camera is None and exterior is not None and is_reconstruction(exterior):
+        camera = exterior
     if camera is None or exterior is None or vertical is None:
-        missing = [
-            key for key, value in (("camera", camera), ("exterior", exterior), ("vertical", vertical)) if not value
-        ]
+        given = {"camera": camera, "exterior": exterior, "vertical": vertical}
+        missing = [key for key, value in given.items() if not value]
         raise InputError(
-            f"a frame image needs {', '.join(missing)}", file=name, field=missing[0], remedy=OPTIONS[missing[0]]
-        )
+            f"a frame image needs {', '.join(missing)}", file=name, field=missing[0],
+            remedy="; ".join(f"--sensor-option {key}=... ({OPTIONS[key]})" for key in missing),
+        )  # fmt: skip
     if refraction not in ("yes", "no"):
         raise InputError(f"{refraction!r} is neither yes nor no", field="refraction")
-    interior = read_camera(camera, dataset.RasterXSize, dataset.RasterYSize)
     pose = read_exterior(exterior, name)
-    model = _model(interior, pose, crs, Vertical.parse(vertical), frame, heights, refraction == "yes")
+    kind = pose.camera if isinstance(pose, Shot) else None
+    interior = read_camera(camera, dataset.RasterXSize, dataset.RasterYSize, kind)
+    make = _shot_model if isinstance(pose, Shot) else _model
+    model = make(interior, pose, crs, Vertical.parse(vertical), frame, heights, refraction == "yes")
     return Scene(
         sensor="frame",
         path=name,
@@ -78,7 +83,7 @@ def open_scene(
         height=dataset.RasterYSize,
         models={"frame": model},
         model_source=exterior,
-        facts=_facts(model, pose),
+        facts=_facts(model, pose, heights),
         priors=_priors(model, sigmas),
     )
 
@@ -112,6 +117,32 @@ def _model(
     return FrameCamera.from_map(interior, str(crs), np.concatenate([position, angles]), frame=frame, **others)
 
 
+def _shot_model(
+    interior: Interior,
+    shot: Shot,
+    crs: str | None,
+    vertical: Vertical,
+    frame: str,
+    heights: str | None,
+    refraction: bool,
+) -> FrameCamera:
+    lon, lat, altitude = shot.origin
+    altitude += float(vertical.undulation(np.array([lon]), np.array([lat]))[0])
+    if not math.isfinite(altitude):
+        raise InputError("the height datum does not reach here", file=shot.source, field="reference_lla")
+    exterior = shot.exterior()
+    others = {"heights": _heights(heights, altitude + exterior[2]), "refraction": refraction}
+    if frame == TOPOCENTRIC:
+        return FrameCamera(interior, exterior, origin=(lon, lat, altitude), **others)
+    if crs is None:
+        raise InputError(
+            "a map projection is needed to work in", file=shot.source, field="crs", remedy="such as crs=EPSG:32636"
+        )
+    # OpenDroneMap takes east and north for axes of the map.
+    corner = ground_transform("EPSG:4979", crs)([[lon, lat, altitude]])[0]
+    return FrameCamera.from_map(interior, crs, exterior + np.array([*corner, 0.0, 0.0, 0.0]), frame=frame, **others)
+
+
 def _heights(text: str | None, camera: float) -> tuple[float, float]:
     if text is None:
         # What is known is only that the ground is below the camera.
@@ -141,10 +172,12 @@ def _pair(text: str) -> tuple[float, float]:
     return (first, second) if math.isfinite(first) and math.isfinite(second) else (math.nan, math.nan)
 
 
-def _facts(model: FrameCamera, pose: Pose) -> dict[str, object]:
+def _facts(model: FrameCamera, pose: Pose | Shot, heights: str | None) -> dict[str, object]:
     centre: Array = model.perspective_centre
     tilt = math.degrees(math.acos(min(1.0, abs(float(model.rotation[2, 2])))))
+    unknown = {"ground_heights": "not stated, so a guess: a DEM gives them, or the option heights=low,high"}
     return {
+        **({} if heights else unknown),
         "exterior_orientation": pose.where,
         "perspective_centre": [round(float(value), 9) for value in centre],
         "perspective_centre_crs": model.crs,

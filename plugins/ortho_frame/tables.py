@@ -10,10 +10,17 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.geometry import angles_of_rotation
+from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.lens import Interior
 
 MAX_BYTES = 5_000_000
+#: A reconstruction holds the points of the whole block too.
+MAX_JSON_BYTES = 200_000_000
 #: Columns of a table, by the ways to write them; the first of each is the name in messages.
 MAP_COLUMNS = (("x",), ("y",), ("z",), ("omega",), ("phi",), ("kappa",))
 GEOGRAPHIC_COLUMNS = (
@@ -36,11 +43,32 @@ class Pose:
     angles: tuple[float, float, float]
 
 
+@dataclass(frozen=True)
+class Shot:
+    """One shot of an OpenSfM reconstruction: a pose in east, north, up about `origin` (lon, lat, altitude)."""
+
+    source: str
+    where: str
+    origin: tuple[float, float, float]
+    rotation: tuple[float, float, float]
+    translation: tuple[float, float, float]
+    camera: str
+
+    def exterior(self) -> Array:
+        """Return the perspective centre (m) and omega, phi, kappa (rad) in east, north, up: ``(6,)``."""
+        turn = Rotation.from_rotvec(self.rotation).as_matrix()
+        # Its camera has y down and z forward.
+        angles = angles_of_rotation(np.diag([1.0, -1.0, -1.0]) @ turn)
+        return np.array([*(-turn.T @ self.translation), *angles])
+
+
 # -- the camera ------------------------------------------------------------------------------------------------------
 
 
-def read_camera(path: str | PathLike[str], width: int, height: int) -> Interior:
+def read_camera(path: str | PathLike[str], width: int, height: int, name: str | None = None) -> Interior:
     """Read the interior orientation for an image of `width` x `height` pixels.
+
+    `name` chooses among the cameras of an OpenSfM file.
 
     A camera of another size with the same proportions is scaled: the image is then a reduced copy.
 
@@ -49,11 +77,8 @@ def read_camera(path: str | PathLike[str], width: int, height: int) -> Interior:
     InputError
         If the file is no camera, a field is missing, unknown or wrong, or the proportions differ.
     """
-    try:
-        document = json.loads(_text(path), object_pairs_hook=_unique, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"this is no JSON ({error})", file=path, remedy="see docs/formats/frame.md") from error
-    given = _opensfm(path, document) if _is_opensfm(document) else _own(path, document)
+    document = _json(path)
+    given = _opensfm(path, document, name) if _is_opensfm(document) else _own(path, document)
     if given.width * height != given.height * width:
         raise InputError(
             f"the camera has {given.width} x {given.height} pixels, the image {width} x {height}",
@@ -93,20 +118,26 @@ def _own(path: str | PathLike[str], document: Any) -> Interior:
 
 
 def _is_opensfm(document: Any) -> bool:
-    first = document[0] if isinstance(document, list) and document else document
+    parts = document if isinstance(document, list) and document else [document]
+    first = parts[0]
     return (
-        isinstance(first, dict)
+        all(isinstance(part, dict) for part in parts)
         and "width" not in first
         and ("cameras" in first or any(isinstance(v, dict) and "projection_type" in v for v in first.values()))
     )
 
 
-def _opensfm(path: str | PathLike[str], document: Any) -> Interior:
-    first = document[0] if isinstance(document, list) else document
-    cameras = first.get("cameras", first)
-    if not isinstance(cameras, dict) or len(cameras) != 1 or not isinstance(next(iter(cameras.values())), dict):
-        raise InputError("give a file with one camera", file=path, field="cameras")
-    camera = next(iter(cameras.values()))
+def _opensfm(path: str | PathLike[str], document: Any, name: str | None) -> Interior:
+    cameras: dict[str, Any] = {}
+    for part in document if isinstance(document, list) else [document]:  # a block may be in several parts
+        cameras |= _object(part, "cameras") if "cameras" in part else part
+    if name in cameras:
+        cameras = {name: cameras[name]}
+    camera = next(iter(cameras.values()), None)
+    if len(cameras) != 1 or not isinstance(camera, dict):
+        raise InputError(
+            f"{len(cameras)} cameras are in this file", file=path, field="cameras", remedy="give a file with one camera"
+        )
     kind = camera.get("projection_type")
     if kind not in ("brown", "perspective"):
         raise InputError(
@@ -155,14 +186,16 @@ def _number(path: str | PathLike[str], field: str, value: Any) -> float:
 # -- exterior orientations -------------------------------------------------------------------------------------------
 
 
-def read_exterior(path: str | PathLike[str], image: str | PathLike[str]) -> Pose:
-    """Return the row of a table of exterior orientations that belongs to an image, by its file name.
+def read_exterior(path: str | PathLike[str], image: str | PathLike[str]) -> Pose | Shot:
+    """Return the row of a table of exterior orientations, or the shot of a reconstruction, of an image by its name.
 
     Raises
     ------
     InputError
         If the table has no header, the image is not in it or stands twice, or a number is wrong.
     """
+    if is_reconstruction(path):
+        return _shot(path, Path(image))
     header, rows = _table(path)
     geographic, columns = _columns(path, header)
     wanted = Path(image)
@@ -184,6 +217,46 @@ def read_exterior(path: str | PathLike[str], image: str | PathLike[str]) -> Pose
         raise InputError("this is not on Earth", file=path, field=f"line {line}, lon, lat")
     x, y, z, first, second, third = values
     return Pose(str(path), f"line {line}", geographic, (x, y, z), (first, second, third))
+
+
+def is_reconstruction(path: str | PathLike[str]) -> bool:
+    """Tell whether a file of exterior orientations is OpenSfM's ``reconstruction.json``, and no table."""
+    return Path(path).suffix.lower() == ".json"
+
+
+def _shot(path: str | PathLike[str], image: Path) -> Shot:
+    document = _json(path)
+    parts = [part for part in (document if isinstance(document, list) else [document]) if isinstance(part, dict)]
+    shots = [(part, name) for part in parts for name in (image.name, image.stem) if name in _object(part, "shots")]
+    if len(shots) != 1:
+        what = "stands twice" if shots else "is not in this reconstruction"
+        raise InputError(f"the image {image.name} {what}", file=path, field="shots", remedy="give one shot per image")
+    part, name = shots[0]
+    shot, place = _object(_object(part, "shots"), name), part.get("reference_lla")
+    if not isinstance(place, dict):
+        raise InputError(
+            "the reconstruction does not lie on the Earth", file=path, field="reference_lla",
+            remedy="give the georeferenced reconstruction.json, or a table (docs/formats/frame.md)",
+        )  # fmt: skip
+    keys = ("longitude", "latitude", "altitude")
+    lon, lat, altitude = (_number(path, f"reference_lla.{key}", place.get(key)) for key in keys)
+    if not (abs(lon) <= 360 and abs(lat) <= 90):
+        raise InputError("this is not on Earth", file=path, field="reference_lla")
+    where = f"shots.{name}"
+    rotation, translation = (_triple(path, f"{where}.{key}", shot.get(key)) for key in ("rotation", "translation"))
+    return Shot(str(path), where, (lon, lat, altitude), rotation, translation, str(shot.get("camera")))
+
+
+def _object(parent: Any, key: str) -> dict[str, Any]:
+    found = parent.get(key) if isinstance(parent, dict) else None
+    return found if isinstance(found, dict) else {}
+
+
+def _triple(path: str | PathLike[str], field: str, value: Any) -> tuple[float, float, float]:
+    if not isinstance(value, list) or len(value) != 3:
+        raise InputError("this is a list of three numbers", file=path, field=field)
+    x, y, z = (_number(path, field, part) for part in value)
+    return x, y, z
 
 
 def _table(path: str | PathLike[str]) -> tuple[list[str], list[tuple[int, list[str]]]]:
@@ -219,10 +292,19 @@ def _columns(path: str | PathLike[str], header: list[str]) -> tuple[bool, list[t
 # -- text ------------------------------------------------------------------------------------------------------------
 
 
-def _text(path: str | PathLike[str]) -> str:
+def _json(path: str | PathLike[str]) -> Any:
     try:
-        if Path(path).stat().st_size > MAX_BYTES:
-            raise InputError("a file of more than 5 MB is not read here", file=path)
+        return json.loads(
+            _text(path, MAX_JSON_BYTES), object_pairs_hook=_unique, parse_constant=_refuse_constant
+        )  # fmt: skip
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"this is no JSON ({error})", file=path, remedy="see docs/formats/frame.md") from error
+
+
+def _text(path: str | PathLike[str], limit: int = MAX_BYTES) -> str:
+    try:
+        if Path(path).stat().st_size > limit:
+            raise InputError(f"a file of more than {limit // 1_000_000} MB is not read here", file=path)
         text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", file=path, remedy="check the path") from error

@@ -1,0 +1,123 @@
+"""Where a scene lies: heights, pixel, extent and coverage from the surface under it, against plain geometry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ortho_pipeline.dem import Surface, write_dem
+from ortho_pipeline.errors import CoverageError
+from ortho_pipeline.footprint import Footprint, choose_grid, lay
+from ortho_pipeline.models import FrameCamera, ImageCorrection
+from ortho_pipeline.models.frame import MAP
+from ortho_pipeline.models.lens import Interior
+from ortho_pipeline.rpc import export_rpc
+
+CRS, X, Y = "EPSG:32651", 300_000.0, 2_700_000.0
+#: A drone 200 m above the ellipsoid and 120 m above the ground: pixels of 0.12 m, 120 x 80 m in all.
+WIDTH, HEIGHT, FLYING, GROUND = 1000, 668, 200.0, 80.0
+
+
+def drone(tilt: float = 0.0) -> FrameCamera:
+    """Return a camera of which nothing is known but that the ground is below it."""
+    interior = Interior(WIDTH, HEIGHT, 0.01, 1e-5, 1e-5)
+    exterior = [X, Y, FLYING, np.radians(tilt), 0.0, 0.0]
+    return FrameCamera.from_map(interior, CRS, exterior, frame=MAP, heights=(-800.0, 100.0))
+
+
+def surface(folder: Path, heights: Any = GROUND, west: float = -450.0, **options: Any) -> Surface:
+    """Return a DEM of 2 m from 450 m south to 450 m north of the camera, from `west` to 450 m east."""
+    rows, columns = 451, int(226 - west / 2)
+    field = np.broadcast_to(np.asarray(heights, dtype=float), (rows, columns)).copy()
+    path = folder / "dem.tif"
+    write_dem(path, field, (X + west - 1.0, Y + 451.0), 2.0, CRS)
+    return Surface.open(path, "ellipsoid", **options)
+
+
+def laid(model: Any, on: Surface) -> Footprint:
+    return lay(model, on, WIDTH, HEIGHT)
+
+
+def test_a_drone_lies_on_the_ground_and_not_between_guesses(tmp_path):
+    model, on = drone(), surface(tmp_path)
+    found = laid(model, on)
+    assert found.heights == pytest.approx((GROUND, GROUND), abs=1e-3)
+    assert found.middle == pytest.approx(GROUND, abs=1e-3)
+    assert (found.coverage, found.complete, found.voids) == (1.0, True, 0)
+    grid = choose_grid(model, found, (WIDTH, HEIGHT))
+    assert grid.dx == pytest.approx(0.12)
+    xmin, ymin, xmax, ymax = grid.extent
+    assert (xmax - xmin, ymax - ymin) == pytest.approx((120.0, 668 * 0.12), abs=0.25)
+
+
+@pytest.mark.parametrize(("west", "share"), [(-30.0, 0.75), (0.0, 0.5), (30.0, 0.25), (-2.0, 62 / 120)])
+def test_the_part_beyond_the_dem_is_laid_at_the_heights_there(tmp_path, west, share):
+    model, on = drone(), surface(tmp_path, west=west)
+    found = laid(model, on)
+    assert found.coverage == pytest.approx(share, abs=1e-3)
+    with pytest.raises(CoverageError, match=rf"covers {int(found.coverage * 1000) / 10:.1f} % of the scene"):
+        found.require_coverage(on)
+    whole = choose_grid(model, laid(model, surface(tmp_path)), (WIDTH, HEIGHT))
+    assert choose_grid(model, found, (WIDTH, HEIGHT)).extent == pytest.approx(whole.extent, abs=0.13)
+    masked = surface(tmp_path, west=west, fill="mask")
+    (note,) = laid(model, masked).notes(masked)
+    assert f"covers {int(found.coverage * 1000) / 10:.1f} % of the scene" in note
+
+
+@pytest.mark.parametrize("fill", ["mask", "nearest", "75"])
+def test_voids_count_whatever_fills_them(tmp_path, fill):
+    heights = np.full((451, 451), GROUND)
+    heights[220:225, 215:230] = -32768.0
+    found = laid(drone(), surface(tmp_path, heights, fill=fill))
+    assert found.voids == 75
+    # Of 4 m2 each, in 120 x 80.16 m, whose border cuts through samples.
+    assert 1 - found.coverage == pytest.approx(300 / (120 * 80.16), rel=0.04)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 35.0, 55.0])
+def test_rough_ground_and_an_oblique_view(tmp_path, tilt):
+    v, u = np.mgrid[:451, :451]
+    heights = GROUND + 20 * np.sin(u / 20) * np.cos(v / 15)
+    model = drone(tilt)
+    on = surface(tmp_path, heights, fill="mask")
+    found = laid(model, on)
+    low, high = found.heights
+    assert 60.0 - 0.1 <= low < high <= 100.0 + 0.1
+    # Every ground point of the DEM that the camera sees within its frame lies within the extent.
+    x, y = X - 450 + 2 * u.ravel(), Y + 450 - 2 * v.ravel()
+    ground = np.column_stack([x, y, heights.ravel()])
+    image = model.ground_to_image(ground)
+    inside = ((image >= 0) & (image <= (WIDTH, HEIGHT))).all(axis=1)
+    xmin, ymin, xmax, ymax = choose_grid(model, found, (WIDTH, HEIGHT), resolution=0.5).extent
+    seen = ground[inside]
+    assert (seen[:, 0].min() > xmin, seen[:, 0].max() < xmax) == (True, True)
+    assert (seen[:, 1].min() > ymin, seen[:, 1].max() < ymax) == (True, True)
+    # And the extent is not much larger than that.
+    assert (xmax - xmin) * (ymax - ymin) < 1.35 * np.prod(np.ptp(seen[:, :2], axis=0))
+
+
+def test_models_are_meant_for_the_heights_under_their_scene(tmp_path):
+    v, u = np.mgrid[:451, :451]
+    heights = GROUND + 10 * np.sin(u / 20) * np.cos(v / 15)
+    on = surface(tmp_path, heights)
+    model = drone()
+    fitted = laid(model, on).fitted(model)
+    there = heights[203:248, 193:258]
+    assert fitted.height_range == pytest.approx((there.min() - 10, there.max() + 10), abs=1.0)
+    # Nothing but the box changes; an RPC of the box of guesses is of no use (47 px).
+    image = np.array([[0.0, 0.0], [400.0, 300.0]])
+    np.testing.assert_array_equal(fitted.image_to_ground(image, 85.0), model.image_to_ground(image, 85.0))
+    assert export_rpc(fitted).max_error_px < 0.1
+    corrected = ImageCorrection.identity(model, "shift", (0.0, 0.0))
+    assert laid(corrected, on).fitted(corrected).height_range == fitted.height_range
+
+
+def test_a_model_that_misses_the_surface_keeps_its_heights(tmp_path):
+    model = drone()
+    far = model.with_params(model.params + np.array([50_000.0, 0, 0, 0, 0, 0]))
+    found = laid(far, surface(tmp_path, fill="mask"))
+    assert (found.coverage, found.heights) == (0.0, far.height_range)
+    assert found.fitted(far) is far
