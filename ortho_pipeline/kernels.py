@@ -134,6 +134,14 @@ def _row_heights(heights, u0, du, v0, dv, dem_left, dem_top, cubic_dem, spacing,
 
 
 @_jit
+def heights_at(uv: Any, heights: Any, dem_left: int, dem_top: int, cubic_dem: bool, out: Any) -> None:
+    """Fill `out` ``(n, m)`` with the heights at DEM coordinates `uv` ``(n, m, 2)``; NaN outside of the window."""
+    for j in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            out[j, i] = _dem_height_at(heights, uv[j, i, 0], uv[j, i, 1], dem_left, dem_top, cubic_dem)
+
+
+@_jit
 def _dem_height_at(heights, u, v, dem_left, dem_top, cubic_dem):
     """Interpolate the DEM at sample coordinates (u, v); NaN outside of its window."""
     rows, columns = heights.shape

@@ -1,14 +1,29 @@
-r"""The lattice of the warp: exact model evaluations, and how far the interpolation between them is off.
+r"""The lattice of the warp: exact model evaluations, and a bound on how far the interpolation between them is off.
 
 Image coordinates are smooth in (x, y) and height, terrain is not. So in each block of 256 x 256 output pixels the exact
 model is evaluated at lattice nodes (every 64 pixels to begin with) at a few heights that span the block's terrain; in
 between they are bilinear in plan and a polynomial in height. The height itself comes from the DEM at full resolution
 for every pixel. The cost of a pixel thus does not depend on the sensor model.
 
-The error is not assumed but measured: at points spread over each block (in plan and height) the lattice is compared
-with the exact model, and the block is refined until the difference is below half of the tolerance. With a block's
-parallax :math:`p` (pixels between its lowest and highest terrain), an error :math:`\delta` in DEM samples moves a point
-by at most :math:`p\,\delta`, whatever cliffs the DEM has; that is added.
+The error is not assumed but bounded, in every block, over the cells of its lattice that may show some of the image
+(also where all check points of the block lie beside it). The bound is the sum of
+
+- *an eighth of the largest second difference* of the nodes in either direction: the error of bilinear interpolation
+  where curvature changes little from node to node. The nodes are everywhere, so no place goes unseen;
+- *the largest change of second differences* from node to node. Where curvature does change, as at a knot of an attitude
+  table, a single bend between two nodes moves the curve by less than that;
+- *three times what neither explains* at the worst of 24 check points, in plan and height, which lie irregularly within
+  the visible part and differ from block to block: the remainder in height, and what nodes at regular distances cannot
+  see, such as a vibration of just their frequency. A wave stays below a third of its amplitude at one such point with
+  a probability of a fifth, at all of them in one of :math:`10^{16}` blocks;
+- with a block's parallax :math:`p` (pixels between its lowest and highest terrain), :math:`p\,\delta` for an error
+  :math:`\delta` in DEM samples, bounded in the same way: it holds whatever cliffs the DEM has.
+
+What is both rarer and smaller than the distance of nodes could hide from all of these, so a model with such detail says
+so (`SensorModel.detail`: a pushbroom knows the knots of its attitude), and gets a node in every piece of it.
+
+A block is refined until its bound is below half of the tolerance. Where no lattice is fine enough, and where the model
+ends within a block, every pixel is projected by the exact model at its own height.
 
 Blocks lie at fixed places of the output grid and are the unit of all decisions, so the output does not depend on tile
 size, memory or number of threads.
@@ -24,18 +39,24 @@ from typing import Any
 
 import numpy as np
 
+from ortho_pipeline import kernels, lattice_kernel
 from ortho_pipeline.crs import GroundTransform
 from ortho_pipeline.dem import Surface
-from ortho_pipeline.errors import InputError, ModelError
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster import Grid
 
 #: Side of a block in output pixels.
 BLOCK = 256
 #: (lattice spacing in output pixels, number of heights), tried one after the other.
-REFINEMENTS = ((64, 3), (32, 3), (16, 3), (16, 5), (8, 5), (8, 7), (4, 7), (2, 7), (1, 9))
-#: Points per block at which the lattice is verified.
+#: after the last one every pixel is projected, which takes as many evaluations as a spacing of 2 with these heights.
+REFINEMENTS = ((64, 3), (32, 3), (16, 3), (16, 5), (8, 5), (8, 7), (4, 7))
+#: Check points per block.
 VERIFIED = 24
+#: Least side (output pixels) of the cells into which a block is cut where memory is short.
+_CELL = 32
+#: What stands for the terrain of a block in which every pixel is projected: its heights are in its nodes already.
+_NO_TERRAIN = np.zeros((2, 2)), (0, 0)
 #: Source pixels beyond the lattice nodes of a window, for what lies higher or lower between the nodes.
 _MARGIN = 4
 
@@ -134,17 +155,21 @@ def _levels(count: int) -> Array:
     return -np.cos(np.pi * np.arange(count) / (count - 1))
 
 
-def _scatter(blocks: list[Block]) -> tuple[Array, Array, Array]:
-    """Return `VERIFIED` points of each block ``(blocks, n)``: column and row offsets, normalised height.
+def _scatter(blocks: list[Block], area: Array) -> Array:
+    """Return `VERIFIED` points of each block ``(blocks, n, 3)``: column and row offsets, normalised height.
 
-    A low-discrepancy sequence (Roberts' R3), started at a place that depends on the block: spread more evenly than
+    They lie in `area` ``(blocks, 4)``, first row, last row, first column, last column (offsets in pixels). A
+    low-discrepancy sequence (Roberts' R3), started at a place that depends on the block: spread more evenly than
     random points, other ones in each block, and the same in every run.
     """
     place = np.array([(block.row, block.column) for block in blocks], dtype=float)
     steps = np.array([0.8191725133961645, 0.6710436067037893, 0.5497004779019703])
     start = np.stack([0.5 + 0.7548776662 * place[:, 0], 0.25 + 0.5698402910 * place[:, 1], 0.3 * place.sum(axis=1)], 1)
     points = np.remainder(start[:, None, :] + np.arange(VERIFIED)[:, None] * steps, 1.0)
-    return points[..., 0] * (BLOCK - 1), points[..., 1] * (BLOCK - 1), 2 * points[..., 2] - 1
+    area = np.minimum(area, BLOCK - 1.0)[:, None]
+    low = np.concatenate([area[..., 2:3], area[..., 0:1], np.full((*area.shape[:2], 1), -1.0)], axis=2)
+    high = np.concatenate([area[..., 3:4], area[..., 1:2], np.full((*area.shape[:2], 1), 1.0)], axis=2)
+    return np.asarray(low + points * (high - low))
 
 
 class Lattices:
@@ -153,9 +178,9 @@ class Lattices:
     Attributes
     ----------
     worst : float
-        Largest error (source px) at a verified point so far.
+        Largest bound (source px) on the error of a block so far; 0 for blocks in which every pixel is projected.
     finest : int
-        Smallest spacing so far.
+        Smallest spacing so far; 1 where every pixel is projected.
     refined : int
         Number of blocks that needed more than the first lattice.
     """
@@ -173,21 +198,16 @@ class Lattices:
     ) -> None:
         self._exact = _Exact(model, surface, grid)
         self._size = np.array(size)
-        self._domain = self._exact.domain()
+        self._domain, self._detail = self._exact.domain(), model.detail
         self._tolerance, self._reach, self._averages = tolerance, reach, averages
         self._lock = threading.Lock()
         self.worst, self.finest, self.refined = 0.0, REFINEMENTS[0][0], 0
 
     def build(self, blocks: list[Block], terrain: Terrain) -> list[Block]:
-        """Give each block that has terrain its lattice; return those that see the source.
-
-        Raises
-        ------
-        ModelError
-            If no lattice holds the tolerance.
-        """
+        """Give each block that has terrain its lattice; return those that see the source."""
         uv = self._nodes_dem(blocks, REFINEMENTS[0][0])
-        return self._lattices(blocks, uv, terrain.ranges(blocks, uv))
+        with_terrain = terrain.ranges(blocks, uv)
+        return self._lattices([blocks[k] for k in with_terrain], uv[with_terrain], terrain)
 
     def _nodes_dem(self, blocks: list[Block], spacing: int) -> Array:
         columns, rows = self._offsets(blocks, *_positions(spacing))
@@ -203,32 +223,30 @@ class Lattices:
 
     # -- lattices ----------------------------------------------------------------------------------------------------
 
-    def _lattices(self, blocks: list[Block], uv: Array, with_terrain: list[int]) -> list[Block]:
-        """Give each block that has terrain its lattice; return those that see the source."""
-        blocks, uv = [blocks[k] for k in with_terrain], uv[with_terrain]
+    def _lattices(self, blocks: list[Block], uv: Array, terrain: Terrain) -> list[Block]:
+        """Give each block its lattice; return those that see the source."""
         if not blocks:
             return []
         # One call for all blocks of a tile, whatever the memory: the last bits of a result may depend on a call's size.
-        self._evaluate(blocks, *REFINEMENTS[0], uv)
-        for block, error in zip(blocks, self._verify(blocks), strict=True):
+        for block, error in zip(blocks, self._evaluate(blocks, *REFINEMENTS[0], uv), strict=True):
             final, steps = float(error), iter(REFINEMENTS[1:])
             while final > self._tolerance / 2:
-                try:
-                    spacing, levels = next(steps)
-                except StopIteration:
-                    raise ModelError(
-                        f"the warp cannot hold {self._tolerance} px (the error is {final:.3g} px)",
-                        remedy="allow more with --tolerance, or check the model near this part of the scene",
-                    ) from None
-                self._evaluate([block], spacing, levels, self._nodes_dem([block], spacing))
-                final = float(self._verify([block])[0])
+                finer = next(steps, None)
+                if finer is None:
+                    self._project(block, terrain)
+                    final = 0.0
+                else:
+                    final = float(self._evaluate([block], *finer, self._nodes_dem([block], finer[0]))[0])
             with self._lock:
                 self.worst, self.finest = max(self.worst, final), min(self.finest, block.spacing)
                 self.refined += block.spacing != REFINEMENTS[0][0]
         return [block for block in blocks if block.window is not None]
 
-    def _evaluate(self, blocks: list[Block], spacing: int, levels: int, uv: Array) -> None:
-        """Set the lattices of `blocks` from exact model evaluations."""
+    def _evaluate(self, blocks: list[Block], spacing: int, levels: int, uv: Array) -> Array:
+        """Set the lattices of `blocks` from exact model evaluations; return a bound on the error of each ``(blocks,)``.
+
+        Infinite for a block into which the scene may come between nodes that the model does not project.
+        """
         columns, rows = self._offsets(blocks, *_positions(spacing))
         steps = _levels(levels)
         middle = np.array([block.middle for block in blocks])[:, None, None, None]
@@ -238,14 +256,42 @@ class Lattices:
         polynomial = np.linalg.inv(np.vander(steps, increasing=True))
         coefficients = np.einsum("kl,...la->...ka", polynomial, image)
         for k, block in enumerate(blocks):
-            block.spacing, block.nodes, block.dem_nodes = spacing, coefficients[k], uv[k]
-            if self._averages:
-                block.box = _box(block)
-                block.reach = self._reach + math.ceil(max(block.box) / 2)
-            else:
-                block.reach = self._reach
-            block.image = image[k]
-            block.window = self.source_window(block)
+            self._set(block, spacing, coefficients[k], image[k], uv[k])
+        return self._bounds(blocks, image, coefficients, uv)
+
+    def _project(self, block: Block, terrain: Terrain) -> None:
+        """Give a block the exact image points of all its pixels, each at its own height."""
+        columns, rows = self._offsets([block], *_positions(1))
+        heights = terrain.heights(block, self._exact.dem(columns, rows)[0])
+        image = self._exact.image(columns, rows, heights[None, :, :, None])[0]
+        self._set(block, 1, image, image, np.full((*heights.shape, 2), 0.5))
+
+    def _set(self, block: Block, spacing: int, coefficients: Array, image: Array, uv: Array) -> None:
+        block.spacing, block.nodes, block.dem_nodes, block.image = spacing, coefficients, uv, image
+        block.reach = self._reach
+        if self._averages:
+            block.box = _box(block)
+            block.reach += math.ceil(max(block.box) / 2)
+        block.window = self.source_window(block)
+
+    def _bounds(self, blocks: list[Block], image: Array, coefficients: Array, uv: Array) -> Array:
+        """Return a bound on the error (source px) of each block's lattice where it may show some of the image."""
+        count, spacing = image.shape[1] - 1, blocks[0].spacing
+        unknown = np.array([block.window is not None or self._in_domain(block) for block in blocks])
+        cells, area = np.empty((len(blocks), count, count), dtype=bool), np.empty((len(blocks), 4))
+        lattice_kernel.visible(image, float(self._size[0]), float(self._size[1]), unknown, cells, area)
+        points = _scatter(blocks, area * spacing)
+        columns, rows = (np.array([getattr(block, name) for block in blocks])[:, None] for name in ("column", "row"))
+        output = columns * BLOCK + 0.5 + points[..., 0], rows * BLOCK + 0.5 + points[..., 1]
+        middle, half = (np.array([getattr(block, name) for block in blocks])[:, None] for name in ("middle", "half"))
+        exact = self._exact.image(*output, (middle + half * points[..., 2])[:, :, None])[:, :, 0]
+        error, step = np.empty(len(blocks)), np.empty(len(blocks))
+        lattice_kernel.bounds(
+            image, coefficients, uv, cells, spacing, points, exact, self._exact.dem(*output), error, step
+        )
+        # Between nodes farther apart than the model's detail anything may hide.
+        error[step > self._detail] = np.inf
+        return error
 
     def source_window(
         self, block: Block, rows: slice = slice(None), columns: slice = slice(None)
@@ -260,31 +306,6 @@ class Lattices:
         low = np.clip(np.floor(points.min(axis=0)) - pad, 0, size).astype(int)
         high = np.clip(np.ceil(points.max(axis=0)) + pad, 0, size).astype(int)
         return None if (high <= low).any() else (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-
-    def _verify(self, blocks: list[Block]) -> Array:
-        """Return the worst error (source px) of each block's lattice at its verification points ``(blocks,)``."""
-        columns, rows, t = _scatter(blocks)
-        if blocks[0].spacing == 1:
-            columns, rows = np.floor(columns), np.floor(rows)  # nothing between the nodes is ever used
-        corner_columns = np.array([block.column for block in blocks])[:, None] * BLOCK + 0.5
-        corner_rows = np.array([block.row for block in blocks])[:, None] * BLOCK + 0.5
-        middle = np.array([block.middle for block in blocks])[:, None]
-        half = np.array([block.half for block in blocks])[:, None]
-        output = columns + corner_columns, rows + corner_rows
-        exact = self._exact.image(*output, (middle + half * t)[:, :, None])[:, :, 0]
-        exact_uv = self._exact.dem(*output)
-        image, uv, parallax = _interpolate(blocks, columns, rows, t)
-        with np.errstate(invalid="ignore"):
-            inside = [((points >= -2) & (points <= self._size + 2)).all(axis=2) for points in (image, exact)]
-            errors = np.hypot(*np.moveaxis(image - exact, 2, 0)) + parallax * np.abs(uv - exact_uv).sum(axis=2)
-        # A point that one of them puts into the image and the other nowhere is infinitely wrong.
-        errors[np.isnan(errors)] = np.inf
-        worst = np.where(inside[0] | inside[1], errors, 0.0).max(axis=1)
-        for k, block in enumerate(blocks):
-            beside = block.window is not None or self._in_domain(block)
-            if block.spacing > 1 and beside and np.isnan(block.lattice).any():
-                worst[k] = np.inf  # the scene may hide between nodes that lie outside of the model's domain
-        return worst
 
     def _in_domain(self, block: Block) -> bool:
         left, top, right, bottom = self._domain
@@ -320,6 +341,8 @@ class Terrain:
         where the DEM is so much finer than the output that even a block's heights do not fit into the memory.
         """
         whole = (0, BLOCK, 0, BLOCK)
+        yield from (([block], *_NO_TERRAIN, whole) for block in blocks if block.spacing == 1)
+        blocks = [block for block in blocks if block.spacing > 1]
         if self._whole is not None:
             if blocks:
                 yield blocks, *self._whole, whole
@@ -328,13 +351,21 @@ class Terrain:
             if self._fits(block.terrain):
                 yield [block], self._read(block.terrain), block.terrain[:2], whole
                 continue
-            step = block.spacing
-            for j in range(BLOCK // step):
-                for i in range(BLOCK // step):
-                    window = self._window(block.dem_lattice[j : j + 2, i : i + 2])
-                    if window is not None:
-                        cell = (j * step, (j + 1) * step, i * step, (i + 1) * step)
-                        yield [block], self._read(window), window[:2], cell
+            for cell, nodes in block_cells(block.spacing):
+                window = self._window(block.dem_lattice[nodes])
+                if window is not None:
+                    yield [block], self._read(window), window[:2], cell
+
+    def heights(self, block: Block, uv: Array) -> Array:
+        """Return the heights ``(BLOCK + 1, BLOCK + 1)`` at DEM points of all pixels of a block; NaN in voids."""
+        found = np.full(uv.shape[:2], np.nan)
+        parts: Any = [((), slice(None))] if self._whole is not None or self._fits(block.terrain) else block_cells(1)
+        for _, nodes in parts:
+            window = self._window(uv[nodes])
+            if window is not None:
+                samples, origin = self._whole or (self._read(window), window[:2])
+                kernels.heights_at(uv[nodes], samples, *origin, self._cubic, found[nodes])
+        return found
 
     def _fits(self, window: Any) -> bool:
         return (window[2] - window[0]) * (window[3] - window[1]) * 8 <= self._window_bytes
@@ -379,33 +410,13 @@ class Terrain:
         return True
 
 
-def _interpolate(blocks: list[Block], columns: Array, rows: Array, t: Array) -> tuple[Array, Array, Array]:
-    """Return what the kernel gets from lattices of one spacing at points ``(blocks, n)`` of each.
-
-    Image points ``(blocks, n, 2)``, DEM points ``(blocks, n, 2)``, parallax ``(blocks, n)`` over a block's heights.
-    """
-    spacing, which = blocks[0].spacing, np.arange(len(blocks))[:, None]
-    i, j = (columns // spacing).astype(int), (rows // spacing).astype(int)
-    fx, fy = columns / spacing - i, rows / spacing - j
-
-    def plan(nodes: Array) -> Array:
-        shape = (*fx.shape, *[1] * (nodes.ndim - 3))
-        across, down = fx.reshape(shape), fy.reshape(shape)
-        # A node without weight may be NaN (outside of the model) and must not count.
-        upper = np.where(across == 0, nodes[which, j, i], _mean(nodes[which, j, i], nodes[which, j, i + 1], across))
-        below = nodes[which, j + 1, i]
-        lower = np.where(across == 0, below, _mean(below, nodes[which, j + 1, i + 1], across))
-        return np.where(down == 0, upper, _mean(upper, lower, down))
-
-    coefficients = plan(np.stack([block.lattice for block in blocks]))
-    powers = t[:, :, None] ** np.arange(coefficients.shape[2])
-    image = np.einsum("bnk,bnka->bna", powers, coefficients)
-    parallax = 2 * np.hypot(coefficients[:, :, 1, 0], coefficients[:, :, 1, 1])
-    return image, plan(np.stack([block.dem_lattice for block in blocks])), parallax
-
-
-def _mean(first: Array, second: Array, share: Array) -> Array:
-    return first + (second - first) * share
+def block_cells(spacing: int) -> Iterator[tuple[tuple[int, int, int, int], tuple[slice, slice]]]:
+    """Cut a block into cells for want of memory; yield the pixels of each (see `Terrain.groups`) and its nodes."""
+    step = max(spacing, _CELL)
+    for row in range(0, BLOCK, step):
+        for column in range(0, BLOCK, step):
+            rows, columns = (slice(first // spacing, (first + step) // spacing + 1) for first in (row, column))
+            yield (row, row + step, column, column + step), (rows, columns)
 
 
 def _box(block: Block) -> tuple[float, float]:

@@ -23,7 +23,7 @@ from ortho_pipeline.crs import GroundTransform
 from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.gdal_engine import warp_with_gdal
-from ortho_pipeline.lattice import BLOCK, Block, Lattices, Terrain
+from ortho_pipeline.lattice import BLOCK, Block, Lattices, Terrain, block_cells
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster import Grid, RasterSource, limit_cache
 from ortho_pipeline.raster_writer import Profile, RasterWriter, as_written
@@ -46,9 +46,9 @@ _REACH = {"nearest": 0, "bilinear": 1, "cubic": 2, "lanczos": 3, "average": 1}
 class WarpResult:
     """What `rectify` did.
 
-    `max_error_px` is the largest difference (source pixels) between lattice and exact model at the verified points;
-    `finest_spacing` the smallest lattice spacing that a block needed; `valid_pixels` how many output pixels have a
-    value.
+    `max_error_px` is a bound on the difference (source pixels) between the geometry used and the exact model at every
+    output pixel; `finest_spacing` the smallest lattice spacing that a block needed, 1 where every pixel was projected;
+    `valid_pixels` how many output pixels have a value.
     """
 
     max_error_px: float
@@ -340,13 +340,11 @@ class _Job:
         valid: NDArray[np.bool_],
     ) -> None:
         """Make a block whose window of the source is too large for the memory, one cell of its lattice at a time."""
-        step = block.spacing
-        for j in range(area[0] // step, area[1] // step):
-            for i in range(area[2] // step, area[3] // step):
-                window = self.lattices.source_window(block, slice(j, j + 2), slice(i, i + 2))
-                if window is not None:
-                    cell = j * step, (j + 1) * step, i * step, (i + 1) * step
-                    self._warp_block(block, _Pixels(self.source, *window), heights, origin, cell, tile, out, valid)
+        for cell, nodes in block_cells(block.spacing):
+            window = self.lattices.source_window(block, *nodes)
+            within = all(area[k] <= cell[k] and cell[k + 1] <= area[k + 1] for k in (0, 2))
+            if window is not None and within:
+                self._warp_block(block, _Pixels(self.source, *window), heights, origin, cell, tile, out, valid)
 
     def _warp_block(
         self,

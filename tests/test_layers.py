@@ -25,7 +25,7 @@ models least_squares statistics
 problem block_points ground_frame
 ridge block_system intersection
 blunders block_solver
-block_blunders registration estimation hookspecs swaps model_file kernels ray_kernel landscape rpc_files
+block_blunders registration estimation hookspecs swaps model_file kernels lattice_kernel ray_kernel landscape rpc_files
 model_choice selection ground_error drawing report_text contract
 comparison report_plots adjustment covariance
 raster
@@ -46,7 +46,7 @@ cli
 """
 LINE = {name: number for number, line in enumerate(LAYERS.split("\n")) for name in line.split()}
 GDAL_MODULES = {"rpc", "raster", "raster_writer", "gdal_engine", "dem", "plugins", "gcp_export", "mosaic"}
-NUMBA_MODULES = {"kernels", "ray_kernel", "models"}
+NUMBA_MODULES = {"kernels", "lattice_kernel", "ray_kernel", "models"}
 MAX_LINES, MAX_FUNCTION = 600, 50
 
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
@@ -108,6 +109,14 @@ class SensorModel(ABC):
         """
         centre, half = self.domain
         return centre + half * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+
+    @property
+    def detail(self) -> float:
+        """Length (px) of the finest detail of the map: half of its shortest wave, or the distance of knots.
+
+        Infinite, as here, for a model that is smooth all over its image. The warp never interpolates over more.
+        """
+        return math.inf
 
     # -- parameters --------------------------------------------------------------------------------------------------
 

@@ -98,6 +98,10 @@ class ImageCorrection(SensorModel):
         return self.model.corners
 
     @property
+    def detail(self) -> float:
+        return self.model.detail
+
+    @property
     def param_names(self) -> tuple[str, ...]:
         return tuple(name for name in FREE[self.correction] if name not in self.removed)
 

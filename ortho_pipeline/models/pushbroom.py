@@ -167,6 +167,11 @@ class Pushbroom(SensorModel):
         low[2], high[2] = self.heights
         return (low + high) / 2, (high - low) / 2
 
+    @property
+    def detail(self) -> float:
+        """Shortest distance (px) of two knots of path or attitude."""
+        return float(min(np.diff(spline.breaks).min() for spline in (self.path, self.attitude)) / self.line_period)
+
     def _seen(self, count: int) -> Array:
         fractions = np.stack(np.meshgrid(*[np.linspace(0, 1, count)] * 2), axis=-1).reshape(-1, 2)
         image = fractions * (self.camera.width, self.camera.height)

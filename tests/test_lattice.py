@@ -1,0 +1,254 @@
+"""The bound on the warp's error is a bound: every output pixel beside the exact model, with nasty models.
+
+The source is a ramp whose pixels are their own coordinates, computed as it is read, so that images may be as large as
+real ones. Warped bilinearly it gives the image coordinates that the warp used.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.crs import GroundTransform
+from ortho_pipeline.dem import Surface
+from ortho_pipeline.models import Pushbroom, SensorModel
+from ortho_pipeline.models.correction import ImageCorrection
+from ortho_pipeline.models.frame import FrameCamera
+from ortho_pipeline.models.lens import Interior
+from ortho_pipeline.models.line_camera import LineCamera
+from ortho_pipeline.models.pushbroom_start import pushbroom_of_tables
+from ortho_pipeline.raster import Grid, RasterSource
+from ortho_pipeline.simulate import LineScanner
+from ortho_pipeline.warp import WarpResult, rectify
+
+UTM = pyproj.CRS.from_epsg(32651)
+EAST, NORTH = 500_000.0, 1_000_000.0
+TOLERANCE = 0.01
+#: Of coordinates of some thousand pixels, in the two orders of computation (px).
+ROUNDING = 1e-9
+
+
+class Ramp(RasterSource):
+    """A source of two bands, column and row of their own pixels, of any size."""
+
+    def __init__(self, folder: Path, width: int, height: int) -> None:
+        path = folder / f"ramp_{width}_{height}.tif"
+        if not path.exists():
+            gdal.GetDriverByName("GTiff").Create(
+                str(path), width, height, 2, gdal.GDT_Float64, ["SPARSE_OK=TRUE", "TILED=YES"]
+            )
+        super().__init__(path)
+
+    def read(self, left, top, width, height):
+        rows, columns = np.mgrid[top : top + height, left : left + width] + 0.5
+        return np.stack([columns, rows])
+
+
+def compare(
+    model: SensorModel,
+    size: tuple[int, int],
+    grid: Grid,
+    folder: Path,
+    *,
+    height: float = np.nan,
+    surface: Surface | None = None,
+) -> tuple[float, int, WarpResult]:
+    """Return the worst error (px) of all output pixels that show the image, their number, and what the warp says."""
+    columns, rows = np.meshgrid(np.arange(grid.width) + 0.5, np.arange(grid.height) + 0.5)
+    x, y = grid.xy(columns.ravel(), rows.ravel())
+    ground = np.stack([x, y, np.full(x.size, height)], axis=1)
+    if surface is None:
+        surface = Surface.constant(height)
+    else:
+        ground[:, 2] = surface.heights(ground[:, :2])
+    path = folder / "o.tif"
+    result = rectify(model, Ramp(folder, *size), surface, grid, path, driver="GTiff", tolerance=TOLERANCE)
+    dataset = gdal.Open(str(path))
+    found, valid = dataset.ReadAsArray().reshape(2, -1).T, dataset.GetRasterBand(1).GetMaskBand().ReadAsArray().ravel()
+    exact = model.ground_to_image(GroundTransform(grid.crs, model.crs)(ground))
+    with np.errstate(invalid="ignore"):
+        # Values end half a pixel from the edge, where the ramp does; which pixels are valid counts up to the edge.
+        whole = ((exact > TOLERANCE) & (exact < np.array(size) - TOLERANCE)).all(axis=1)
+        near = ((exact > -TOLERANCE) & (exact < np.array(size) + TOLERANCE)).all(axis=1)
+        inside = ((exact > 0.5) & (exact < np.array(size) - 0.5)).all(axis=1)
+    assert valid[whole].all(), "a pixel of the image is missing"
+    assert not valid[~near].any(), "a pixel shows what lies outside of the image"
+    error = np.hypot(*(found - exact)[inside].T)
+    return float(error.max(initial=0.0)), int(inside.sum()), result
+
+
+# -- frames ----------------------------------------------------------------------------------------------------------
+
+
+def drone(focal: float, omega: float = 0.0, **distortion: float) -> FrameCamera:
+    interior = Interior.of_square_pixels(5472, 3648, focal, **distortion)
+    exterior = np.array([EAST, NORTH, 180.0, omega, 0.02, 0.3])
+    return FrameCamera(interior, exterior, frame="map", ground_crs="EPSG:32651", heights=(55.0, 115.0))
+
+
+@pytest.mark.parametrize("corner", range(4))
+def test_slivers_at_the_corners_of_a_drone_image(tmp_path, corner):
+    """Eight extents about each corner, some of which show but a few pixels: the camera of the `odm` scene."""
+    lens = {"k1": -0.26406, "k2": 0.10189, "k3": -0.02582, "p1": 7.3459e-4, "p2": 2.5952e-4}
+    model, step, side = drone(0.66646 * 5472, **lens), 0.03, 300
+    place = model.image_to_ground(np.array([[0, 0], [5472, 0], [5472, 3648], [0, 3648.0]]), 80.0)[corner]
+    random, shown = np.random.default_rng(corner), []
+    for shift in random.uniform(-0.9, 0.9, (8, 2)) * side * step / 2:
+        x, y = place[:2] + shift
+        grid = Grid(UTM, x - side * step / 2, y + side * step / 2, step, step, side, side)
+        worst, count, result = compare(model, (5472, 3648), grid, tmp_path, height=80.0)
+        assert worst - ROUNDING <= result.max_error_px <= TOLERANCE / 2
+        shown.append(count)
+    assert sum(count > 1000 for count in shown) >= 4
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {"focal": 1500.0, "k1": -0.264, "k2": 0.1},
+        {"focal": 1800.0, "k1": -0.3, "k2": 0.05, "omega": 0.6},
+        {"focal": 3000.0, "k1": 0.5, "k2": 0.3},
+        {"focal": 900.0, "k1": -0.1, "omega": 1.0},
+    ],
+    ids=["barrel", "barrel, oblique", "pincushion", "folds over"],
+)
+@pytest.mark.parametrize("step", [0.1, 0.6])
+def test_distortion_of_a_fisheye(tmp_path, camera, step):
+    model = drone(**camera)
+    x, y = model.image_to_ground(np.array([[2736.0, 1824.0]]), 80.0)[0, :2] + (25.0, -40.0)
+    grid = Grid(UTM, x - 200 * step, y + 170 * step, step, step, 400, 340)
+    worst, count, result = compare(model, (5472, 3648), grid, tmp_path, height=80.0)
+    assert count > 5000
+    assert worst - ROUNDING <= result.max_error_px <= TOLERANCE / 2
+
+
+# -- vibrations ------------------------------------------------------------------------------------------------------
+
+
+class Trembling(SensorModel):
+    """A line scanner whose columns swing with its rows; nothing tells the warp how fast."""
+
+    kind = "test_trembling"
+
+    def __init__(self, length: float, amplitude: float) -> None:
+        object.__setattr__(self, "length", length)
+        object.__setattr__(self, "amplitude", amplitude)
+
+    @property
+    def crs(self) -> str:
+        return "EPSG:32651"
+
+    @property
+    def domain(self):
+        return np.array([EAST, NORTH, 300.0]), np.array([5000.0, 5000.0, 400.0])
+
+    def ground_to_image(self, ground):
+        x, y, h = np.asarray(ground, float).T
+        row = 3000 - (y - NORTH + 0.4 * (h - 300)) / 0.5
+        swing = self.amplitude * np.sin(2 * np.pi * row / self.length + 0.3)
+        return np.stack([3000 + (x - EAST + 0.3 * (h - 300)) / 0.5 + swing, row], axis=1)
+
+
+#: Rows of a wave at 0.3 ms a row: 0.1 Hz to 50 Hz, those that lattices of 64, 32, 16 and 8 pixels cannot see, others.
+WAVES = (33_000.0, 3300.0, 1000.0, 330.0, 128.0, 66.0, 64.0, 64 / 3, 16.0)
+
+
+@pytest.mark.parametrize("length", WAVES)
+def test_a_vibration_of_any_frequency(tmp_path, length):
+    grid = Grid(UTM, EAST - 60.3, NORTH + 130.2, 0.5, 0.5, 240, 500)
+    for amplitude in (0.003, 1.0, 300.0):
+        model = Trembling(length, amplitude)
+        worst, count, result = compare(model, (6000, 6000), grid, tmp_path, height=310.0)
+        assert count == grid.width * grid.height
+        assert worst - ROUNDING <= result.max_error_px <= TOLERANCE / 2
+
+
+@pytest.mark.parametrize(("length", "amplitude"), [(33_000.0, 300.0), (1000.0, 1.0), (128.0, 0.02), (66.0, 300.0)])
+def test_a_vibration_over_mountains(tmp_path, length, amplitude):
+    """The heights of a block shift the rows over several waves, which no polynomial of the height follows."""
+    path = tmp_path / "dem.tif"
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), 80, 80, 1, gdal.GDT_Float64)
+    dataset.SetProjection(UTM.to_wkt())
+    dataset.SetGeoTransform((EAST - 400, 10.0, 0, NORTH + 400, 0, -10.0))
+    rows, columns = np.mgrid[:80, :80]
+    noise = np.random.default_rng(0).normal(0, 5, (80, 80))
+    dataset.WriteArray(300 + 150 * np.sin(columns / 5) * np.cos(rows / 7) + noise)
+    dataset = None
+    grid = Grid(UTM, EAST - 60.3, NORTH + 130.2, 0.5, 0.5, 240, 500)
+    surface = Surface.open(path, "ellipsoid")
+    worst, count, result = compare(Trembling(length, amplitude), (6000, 6000), grid, tmp_path, surface=surface)
+    assert count == grid.width * grid.height
+    assert worst - ROUNDING <= result.max_error_px <= TOLERANCE / 2
+
+
+def shaken(rate: float, roll_px: float, glitch: bool = False) -> Pushbroom:
+    """A pushbroom of 2.5 m with a table of its attitude twelve times per wave: a roll of `rate` Hz, or one jerk."""
+    camera = LineScanner.over(
+        121.0, 24.0, 300.0, image_width=6000, image_height=6000, gsd=2.5, heading_deg=192.0, altitude=618e3,
+        heights=(0.0, 1260.0),
+    )  # fmt: skip
+    period = camera.line_period
+    times = np.arange(-0.6 * 6000 * period, 1.6 * 6000 * period, min(1 / rate / 12, 0.05))
+    rows = times / period
+    positions, z = camera.rays(np.column_stack([np.full(len(rows), 3000.0), rows]))
+    across = camera.rays(np.column_stack([np.zeros(len(rows)), rows]))[1]
+    across = across / (across * z).sum(axis=1)[:, None] - z
+    x = -across / np.linalg.norm(across, axis=1)[:, None]
+    turns = np.stack([x, np.cross(z, x), z], axis=2)
+    angle = roll_px * camera.pixel_tan * np.sin(2 * np.pi * rate * times)
+    if glitch:
+        angle = np.where(np.abs(rows - 3000.0) <= rate, roll_px * camera.pixel_tan, 0.0)
+    roll = np.zeros((len(rows), 3, 3))
+    roll[:, 0, 0], roll[:, 0, 2], roll[:, 1, 1] = np.cos(angle), np.sin(angle), 1.0
+    roll[:, 2, 0], roll[:, 2, 2] = -np.sin(angle), np.cos(angle)
+    return pushbroom_of_tables(
+        LineCamera(6000, 6000, 3000.0, 0.0, 1 / camera.pixel_tan), line_period=period, first_time=0.0,
+        orbit=(times, positions), attitude=(times, turns @ roll), heights=camera.heights,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("rate", "roll_px"), [(0.5, 3.0), (2.0, 30.0), (10.0, 1.0), (50.0, 100.0)])
+def test_roll_of_a_pushbroom_in_degrees(tmp_path, rate, roll_px):
+    model = shaken(rate, roll_px)
+    lon, lat = model.image_to_ground(np.array([[3000.0, 3000.0]]), 400.0)[0, :2]
+    step = 2.5 / 111e3
+    grid = Grid(pyproj.CRS(4326), lon - 120 * step, lat + 250 * step, step, step, 240, 500)
+    worst, count, result = compare(model, (6000, 6000), grid, tmp_path, height=400.0)
+    assert count == grid.width * grid.height
+    assert worst - ROUNDING <= result.max_error_px <= TOLERANCE / 2
+    assert result.max_error_px > 0 or result.finest_spacing == 1
+
+
+class Jerk(Trembling):
+    """A single jerk of half a wave, which lies between the nodes and, in a coarse output, between check points."""
+
+    kind = "test_jerk"
+
+    @property
+    def detail(self) -> float:
+        return self.length / 2
+
+    def ground_to_image(self, ground):
+        image = super().ground_to_image(ground)
+        steady = (image[:, 1] < 3100) | (image[:, 1] > 3100 + self.length / 2)
+        image[:, 0] -= np.where(steady, self.amplitude * np.sin(2 * np.pi * image[:, 1] / self.length + 0.3), 0.0)
+        return image
+
+
+def test_a_model_that_names_its_detail_hides_none(tmp_path):
+    model, step = Jerk(24.0, 0.5), 4.0
+    for shift in (0.0, 9.0, 37.0):
+        grid = Grid(UTM, EAST - 400.0, NORTH + 600.0 + shift, step, step, 200, 300)
+        worst, _, result = compare(model, (6000, 6000), grid, tmp_path, height=300.0)
+        assert worst - ROUNDING <= result.max_error_px <= TOLERANCE / 2
+
+
+def test_detail_of_models():
+    model = shaken(50.0, 1.0)
+    assert model.detail == pytest.approx(1 / 50 / 12 / model.line_period, rel=0.01)
+    assert ImageCorrection.identity(model, "shift", (0.0, 0.0)).detail == model.detail
+    assert drone(3000.0).detail == np.inf
