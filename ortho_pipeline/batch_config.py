@@ -67,6 +67,10 @@ class PointSettings(_Strict):
         default=None, description="Ground of that model: geocentric, geographic, utm or EPSG:n."
     )
     prune: bool = Field(default=False, description="Remove parameters that the points do not justify.")
+    params: str | None = Field(default=None, description="'A,B,C': the only parameters that are adjusted.")
+    significance: float = Field(default=0.05, gt=0, lt=1, description="Chance of justifying a parameter that is zero.")
+    ridge: str = Field(default="auto", description="Of a fitted model: auto, none, gcv, lcurve or a weight.")
+    near: _Positive | None = Field(default=None, description="Distance (m) below which points are neighbours.")
 
 
 class SurfaceSettings(_Strict):

@@ -146,6 +146,30 @@ point_options = _grouped(
         help="Ground of fitted models: geocentric, geographic, utm or EPSG:n  [default: that of the points]",
     ),
     click.option("--prune", "points_prune", is_flag=True, help="Remove parameters that the points do not justify."),
+    click.option("--params", "points_params", metavar="A,B,C", help="Adjust these parameters only  [default: all]"),
+    click.option(
+        "--significance",
+        "points_significance",
+        type=click.FloatRange(0, 1, min_open=True, max_open=True),
+        default=0.05,
+        show_default=True,
+        help="Above this chance (p) a parameter is not justified.",
+    ),
+    click.option(
+        "--ridge",
+        "points_ridge",
+        metavar="auto|none|gcv|lcurve|W",
+        default="auto",
+        show_default=True,
+        help="Regularisation of fitted models: found, or of this weight.",
+    ),
+    click.option(
+        "--near",
+        "points_near",
+        type=click.FloatRange(min=0, min_open=True),
+        metavar="M",
+        help="Points closer than this are neighbours in the analysis of residuals.",
+    ),
 )
 
 block_options = _grouped(

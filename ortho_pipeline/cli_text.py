@@ -40,8 +40,7 @@ def print_fit(result: FitResult) -> None:
     """Print parameters, every residual and the RMSEs."""
     document = result.to_json()
     click.echo(f"Sensor {document['sensor']}, model {document['model']} of {document['model_source']}")
-    for name, parameter in document["parameters"].items():
-        click.echo(f"  {name:<12} {parameter['value']:+14.6g}  sigma {parameter['sigma']:.2g}")
+    _print_parameters(document)
     wide = max([len(point["id"]) for point in document["points"]] + [5])
     click.echo(f"\n{'point':<{wide}}  role     used    column       row   left out: col.    row")
     for point in document["points"]:
@@ -58,9 +57,31 @@ def print_fit(result: FitResult) -> None:
             f"column {rmse['col']:.3f}, row {rmse['row']:.3f}, both {rmse['total']:.3f}  ({rmse['n']} points)"
         )  # fmt: skip
         click.echo(f"RMSE {label:<14} {text}")
+    if document["outlying"] and (rest := document["rmse_of_agreeing_checks"]):
+        click.echo(f"RMSE of the check points that are not outlying: {rest['total']:.3f}  ({rest['n']} points)")
+    for role, found in document["covariance"].items():
+        if found:
+            click.echo(f"Residuals of {role} points: {found['statement']}")
     sigma0 = "unknown" if document["sigma0"] is None else f"{document['sigma0']:.3g}"
     click.echo(f"Redundancy {document['redundancy']}, sigma0 {sigma0}")
     print_warnings(document["warnings"])
+
+
+def _print_parameters(document: Mapping[str, Any]) -> None:
+    """Print each parameter with its Student test and its total correlation."""
+    if not document["parameters"]:
+        return
+    statistics = document["statistics"]
+    wide = max(len(name) for name in (*document["parameters"], "parameter"))
+    click.echo(f"  {'parameter':<{wide}} {'value':>14} {'sigma':>9} {'t':>8} {'p':>7}  total correlation")
+    for name, parameter in document["parameters"].items():
+        t, p, total = (statistics[key][name] for key in ("t", "p", "total_correlation"))
+        chance = "-" if p is None else ("< 0.001" if p < 0.001 else f"{p:.3f}")
+        numbers = f"{parameter['value']:>+14.6g} {parameter['sigma']:>9.2g} {'-' if t is None else f'{t:.1f}':>8}"
+        weak = "  not justified" if name in statistics["not_justified"] else ""
+        click.echo(f"  {name:<{wide}} {numbers} {chance:>7}  {'-' if total is None else f'{total:.3f}':>17}{weak}")
+    if statistics["not_justified"]:
+        click.echo(f"  not justified: p above {statistics['significance']:g}; --prune takes such parameters out")
 
 
 def view_text(view: Mapping[str, Any] | None) -> str:

@@ -29,10 +29,10 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.estimation import Fit, Prior, fit
+from ortho_pipeline.estimation import SIGNIFICANCE, Fit, Prior, fit
 from ortho_pipeline.ground_error import rmse_metres
 from ortho_pipeline.model_choice import OWN, fit_family, fit_own
-from ortho_pipeline.models import ImageCorrection, SensorModel, families
+from ortho_pipeline.models import ImageCorrection, SensorModel, families, family_of
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points
 from ortho_pipeline.statistics import student_of
@@ -176,6 +176,8 @@ def compare(
     crs: str | None = None,
     heights: tuple[float, float] | None = None,
     unsuited: Mapping[str, str] | None = None,
+    ridge: float | str | None = "auto",
+    significance: float = SIGNIFICANCE,
 ) -> Comparison:
     """Fit every model to the same control points and hold them against the same check points.
 
@@ -195,9 +197,13 @@ def compare(
         Heights (m) for which the models are meant.
     unsuited : mapping of str to str, optional
         Families that do not suit the scene, with a warning for each.
+    ridge : float, 'gcv', 'lcurve', 'auto' or None
+        Regularisation of rational functions, as for `ortho_pipeline.model_choice.fit_family`.
+    significance : float
+        Of the tests of parameters.
     """
     known = available_models(own)
-    job = _Job(own, dict(priors or {}), size, crs, heights)
+    job = _Job(own, dict(priors or {}), size, crs, heights, ridge)
     first = {name: job.attempt(name, points, robust=True) for name in models}
     blunders = _blunders([found for found in first.values() if isinstance(found, Fit)])
     kept = points.select(~np.isin(np.array(points.ids), list(blunders))) if blunders else points
@@ -206,6 +212,8 @@ def compare(
         found = first[name]
         if blunders or not isinstance(found, Fit) or found.rejected:
             found = job.attempt(name, kept, robust=False)
+        if isinstance(found, Fit):
+            found = replace(found, significance=significance)
         if isinstance(found, Fit) and unsuited and name in unsuited:
             found = replace(found, warnings=(*found.warnings, unsuited[name]))
         parameters, minimum, dimensions = known[name]
@@ -228,6 +236,7 @@ class _Job:
     size: tuple[int, int] | None
     crs: str | None
     heights: tuple[float, float] | None
+    ridge: float | str | None
 
     def attempt(self, name: str, points: Points, robust: bool) -> Fit | str:
         """Return the fit, or why there is none."""
@@ -238,7 +247,10 @@ class _Job:
                 for correction in CORRECTIONS:
                     if name == own_name(self.own, correction):
                         return self._correct(self.own, correction, points, robust)
-            return fit_family(name, points, crs=self.crs, size=self.size, heights=self.heights, robust=robust)
+            ridge = self.ridge if family_of(name).regularised else "auto"
+            return fit_family(
+                name, points, crs=self.crs, size=self.size, heights=self.heights, ridge=ridge, robust=robust
+            )
         except OrthoError as error:
             return f"{error.message}{f' ({error.remedy})' if error.remedy else ''}"
 

@@ -31,6 +31,8 @@ EXTRAPOLATION_LIMIT = 100.0
 EXTRAPOLATION_WARNING = 10.0
 #: Beyond this condition without its regularisation a model is called unstable.
 _UNSTABLE = 1e4
+#: Chance of calling a parameter justified that is zero.
+SIGNIFICANCE = 0.05
 #: Two parameters correlated beyond this are listed as 1.000: they cannot be told apart.
 _INSEPARABLE = 0.9995
 
@@ -67,6 +69,7 @@ class Fit:
     effective_parameters: float = 0.0
     ridge: float | None = None
     priors: Mapping[str, Prior] = field(default_factory=dict)
+    significance: float = SIGNIFICANCE
     corner_ratio: float = 0.0
     outlying: tuple[Outlying, ...] = ()
 
@@ -110,6 +113,12 @@ class Fit:
         """Student's t and two-sided p of the hypotheses that parameters are zero, each ``(P,)``."""
         return student_of(self.values, self.covariance, self.degrees_of_freedom if self.sigma0 is not None else 0.0)
 
+    @property
+    def not_justified(self) -> tuple[str, ...]:
+        """Parameters whose chance p of being zero is above `significance`: the points do not justify them."""
+        _, p = self.student
+        return tuple(name for name, chance in zip(self.param_names, p, strict=True) if not chance <= self.significance)
+
     def rmse(self, which: str) -> dict[str, float | int] | None:
         """Return root mean squares in pixels for 'control' (used), 'check' or 'loo'; None where there is no point.
 
@@ -149,6 +158,8 @@ class Fit:
         return {
             "correlation": [_numbers(row) for row in self.correlation],
             **{key: dict(zip(self.param_names, _numbers(values), strict=True)) for key, values in named.items()},
+            "significance": self.significance,
+            "not_justified": list(self.not_justified),
             "degrees_of_freedom": self.degrees_of_freedom,
             "effective_parameters": self.effective_parameters,
             "ridge": self.ridge,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,7 +15,9 @@ from ortho_pipeline.models import family_of, start_model
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.problem import Problem
-from ortho_pipeline.ridge import regularised
+from ortho_pipeline.ridge import METHODS, regularised
+
+SensorModelT = TypeVar("SensorModelT", bound=SensorModel)
 
 #: What is adjusted when it is the parameters that a scene's model has of its own.
 OWN = "model"
@@ -51,6 +55,7 @@ def fit_family(
     heights: tuple[float, float] | None = None,
     ridge: float | str | None = "auto",
     priors: Mapping[str, Prior] | None = None,
+    params: Sequence[str] | None = None,
     robust: bool = True,
 ) -> Fit:
     """Fit a classical model to control points.
@@ -64,6 +69,8 @@ def fit_family(
         As for `ortho_pipeline.models.start_model`.
     ridge : float, 'gcv', 'lcurve', 'auto' or None
         Regularisation; ``auto`` is generalised cross-validation for rational functions and none for the others.
+    params : sequence of str, optional
+        The only parameters that are adjusted, as of `restricted`.
 
     Raises
     ------
@@ -73,19 +80,22 @@ def fit_family(
     chosen = family_of(family)
     if chosen.variants:
         fits = [
-            fit_family(name, points, crs=crs, size=size, heights=heights, ridge=ridge, priors=priors, robust=robust)
+            fit_family(
+                name, points, crs=crs, size=size, heights=heights, ridge=ridge, priors=priors, params=params,
+                robust=robust,
+            )
             for name in chosen.variants
-        ]
+        ]  # fmt: skip
         return min(fits, key=_leave_one_out)
     if ridge == "auto":
         ridge = "gcv" if chosen.regularised else None
-    start = start_model(family, points, crs=crs, size=size, heights=heights)
+    start = restricted(start_model(family, points, crs=crs, size=size, heights=heights), params)
     try:
         wrong = gross_errors(start, points, priors=priors, ridge=ridge) if robust else {}
         if wrong:
             # Where the model is meant for, and its normalisation, come from the points: from the good ones.
             good = points.select(~np.isin(np.array(points.ids), list(wrong)))
-            start = start_model(family, good, crs=crs, size=size, heights=heights)
+            start = restricted(start_model(family, good, crs=crs, size=size, heights=heights), params)
         found = fit(start, points, priors=priors, robust=False, exclude=wrong, ridge=ridge, name=family)
         # The start is of no vendor's making: that it is off says nothing.
         return replace(found, raw_residuals=np.full_like(found.raw_residuals, np.nan))
@@ -99,6 +109,50 @@ def fit_family(
             field=error.field,
             remedy=f"{error.remedy}; these points do determine {simpler}",
         ) from error
+
+
+def restricted(model: SensorModelT, params: Sequence[str] | None) -> SensorModelT:
+    """Return a model of which only these parameters are adjusted; the others are zero.
+
+    Raises
+    ------
+    InputError
+        If a name is not that of a parameter, or the model's parameters cannot be taken out.
+    """
+    if params is None:
+        return model
+    unknown = [name for name in params if name not in model.param_names]
+    if unknown or not params:
+        raise InputError(
+            f"no parameter is called {', '.join(unknown)}" if unknown else "no parameter is named", field="--params",
+            remedy=f"some of {', '.join(model.param_names) or 'none: this model has no parameters'}",
+        )  # fmt: skip
+    rest = [name for name in model.param_names if name not in params]
+    return model.without(rest) if rest else model
+
+
+def ridge_of(text: str) -> float | str | None:
+    """Return what ``--ridge`` means: auto, gcv and lcurve as they are, ``none`` as None, or a weight.
+
+    Raises
+    ------
+    InputError
+        If it is none of these.
+    """
+    if text in ("auto", *METHODS):
+        return text
+    if text == "none":
+        return None
+    try:
+        weight = float(text)
+    except ValueError:
+        weight = math.nan
+    if not (math.isfinite(weight) and weight > 0):
+        raise InputError(
+            f"{text!r} is no regularisation", field="--ridge",
+            remedy=f"auto, none, {', '.join(METHODS)}, or a positive weight such as 1e-5",
+        )  # fmt: skip
+    return weight
 
 
 def _leave_one_out(found: Fit) -> float:
@@ -151,7 +205,7 @@ class Pruned:
     removed: tuple[Removed, ...]
 
 
-def prune(found: Fit, *, significance: float = 0.05) -> Pruned:
+def prune(found: Fit, *, significance: float | None = None) -> Pruned:
     """Take out the parameters that the points do not justify, one by one, the least significant first.
 
     A parameter goes if the hypothesis that it is zero is not rejected; then all others are estimated again. A term on
@@ -161,14 +215,15 @@ def prune(found: Fit, *, significance: float = 0.05) -> Pruned:
     ----------
     found : Fit
         Of an image correction or a classical model. Points that were rejected stay so.
-    significance : float
-        Chance of keeping a parameter that is zero.
+    significance : float, optional
+        Chance of keeping a parameter that is zero; that of the fit by default.
 
     Raises
     ------
     InputError
         If there is no redundancy to test with, or the model has no removable parameters.
     """
+    significance = found.significance if significance is None else significance
     if not 0 < significance < 1:
         raise InputError("a significance lies between 0 and 1", field="significance")
     if found.sigma0 is None:
@@ -198,7 +253,7 @@ def _again(found: Fit, without: str) -> Fit:
         ridge=found.ridge,
         exclude=dict(found.rejected),
     )
-    return replace(again, raw_residuals=found.raw_residuals)
+    return replace(again, raw_residuals=found.raw_residuals, significance=found.significance)
 
 
 # -- cross-validation ------------------------------------------------------------------------------------------------

@@ -84,6 +84,14 @@ class PointOptions:
         Ground CRS of that family: geocentric, geographic, utm or EPSG:n; that of the points by default.
     prune : bool
         Remove parameters that the points do not justify.
+    params : str, optional
+        ``a,b,c``: the only parameters that are adjusted.
+    significance : float
+        Chance of calling a parameter justified that is zero.
+    ridge : str
+        Regularisation of a fitted family: ``auto``, ``none``, ``gcv``, ``lcurve`` or its weight.
+    near : float, optional
+        Distance (m) below which points are neighbours in the analysis of the residuals.
     """
 
     gcps: str | os.PathLike[str] | PointTable | None = None
@@ -96,6 +104,10 @@ class PointOptions:
     fit_model: str | None = None
     model_crs: str | None = None
     prune: bool = False
+    params: str | None = None
+    significance: float = 0.05
+    ridge: str = "auto"
+    near: float | None = None
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from ortho_pipeline import comparison as comparing
 from ortho_pipeline import crs as crs_module
 from ortho_pipeline import dem, footprint, gcp_export, inputs, notebook, plugins, raster, report, resolution, rpc
 from ortho_pipeline import stac as stac_items
+from ortho_pipeline.covariance import analyse_fit
 from ortho_pipeline.crs import parse_crs
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import Fit
@@ -27,6 +28,7 @@ from ortho_pipeline.files import sha256, write_text
 from ortho_pipeline.ground_error import viewing
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.inputs import has_surface, open_scene, open_surface
+from ortho_pipeline.model_choice import ridge_of
 from ortho_pipeline.model_file import SavedModel, write_model_file
 from ortho_pipeline.models import SensorModel, families
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
@@ -51,6 +53,7 @@ class FitResult:
     fit: Fit
     warnings: tuple[str, ...] = ()
     removed: tuple[Mapping[str, Any], ...] = ()
+    near: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho fit --json`` (docs/formats.md)."""
@@ -63,6 +66,7 @@ class FitResult:
             "model_source": self.scene.model_source,
             **document,
             "removed": [dict(one) for one in self.removed],
+            "covariance": {role: one and one.to_json() for role, one in analyse_fit(self.fit, near=self.near).items()},
         }
 
 
@@ -175,7 +179,7 @@ def fit(
     heights = open_surface(surface, scene.allow_network) if has_surface(surface) else None
     adjusted = adjust(opened, points, scene, heights)
     return FitResult(
-        adjusted.scene, adjusted.fit, adjusted.warnings(heights), removed=tuple(adjusted.removed_json())
+        adjusted.scene, adjusted.fit, adjusted.warnings(heights), tuple(adjusted.removed_json()), points.near
     )  # fmt: skip
 
 
@@ -208,6 +212,10 @@ def compare(
         raise InputError("there are no points to fit to", field="--gcps", remedy="give a file of points with --gcps")
     if points.correction is not None or points.fit_model is not None:
         raise InputError("compare takes its models from --models", field="--models", remedy="for example all")
+    if points.params is not None or points.prune:
+        raise InputError(
+            "compare fits whole models", field="--params" if points.params else "--prune", remedy="take ortho fit"
+        )
     opened = inputs.open_image(image, scene, needs_model=False)
     names = comparing.choose_models(models, opened.model if opened.models else None)
     heights = open_surface(surface, scene.allow_network) if has_surface(surface) else None
@@ -219,7 +227,8 @@ def compare(
     given = heights_where_wanted(given, heights, *names)
     compared = comparing.compare(
         given, names, own=own, priors=opened.priors, size=(opened.width, opened.height), crs=points.model_crs,
-        heights=heights_around(given, heights), unsuited=opened.unsuited,
+        heights=heights_around(given, heights), unsuited=opened.unsuited, ridge=ridge_of(points.ridge),
+        significance=points.significance,
     )  # fmt: skip
     result = CompareResult(opened, compared)
     best = compared.best
@@ -234,8 +243,8 @@ def compare(
     hashed = inputs.hashed(inputs.files_read(image, scene, points, surface))
     record = inputs.provenance(opened, points, heights, hashed, command, {"scene": scene, "surface": surface})
     document = report.build_report(
-        scene=opened, fit=best.fit, surface=heights, comparison=result.to_json(), provenance=record,
-        warnings=adjusted.warnings(heights),
+        scene=opened, fit=best.fit, surface=heights, comparison=result.to_json(), near=points.near,
+        provenance=record, warnings=adjusted.warnings(heights),
     )  # fmt: skip
     _write_report(document, best.fit, files)
     return replace(result, files=files)
@@ -315,7 +324,8 @@ def rectify(
     _write_models(model, exported, opened, whole, files, {**record, "adjustment": adjusted.fit.to_json()})
     document = report.build_report(
         scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
-        warp=warped, provenance=record, warnings=[*adjusted.warnings(heights), *found.notes(heights), *complaints],
+        warp=warped, near=points.near, provenance=record,
+        warnings=[*adjusted.warnings(heights), *found.notes(heights), *complaints],
     )  # fmt: skip
     _write_report(document, adjusted.fit, files)
     if acquired is not None:

@@ -77,6 +77,7 @@ def build_report(
     grid: Grid | None = None,
     warp: WarpResult | None = None,
     comparison: Mapping[str, Any] | None = None,
+    near: float | None = None,
     provenance: Mapping[str, Any] | None = None,
     warnings: Iterable[str] = (),
 ) -> dict[str, Any]:
@@ -90,6 +91,8 @@ def build_report(
         Share (0 to 1) of the scene for which the DEM has a height.
     comparison : mapping, optional
         The document of ``ortho compare``.
+    near : float, optional
+        Distance (m) below which points are neighbours; as `covariance.analyse` chooses it without one.
     warnings : iterable of str
         What the reader ought to know; a suspicious difference between control and DEM heights is added to them.
     """
@@ -117,7 +120,7 @@ def build_report(
         "adjustment": adjustment,
         "rmse_m": rmse_metres(fit),
         "view_rmse": _view_rmse(fit, views),
-        "covariance": {role: found and found.to_json() for role, found in analyse_fit(fit).items()},
+        "covariance": {role: found and found.to_json() for role, found in analyse_fit(fit, near=near).items()},
         "control_hull": _control_hull(fit, scene.width, scene.height),
         "comparison": None if comparison is None else _plain(comparison),
         "heights": heights,

@@ -17,7 +17,7 @@ from ortho_pipeline.errors import InputError, ModelError
 from ortho_pipeline.estimation import Fit, fit
 from ortho_pipeline.footprint import lay
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.model_choice import OWN, Removed, fit_family, fit_own, prune
+from ortho_pipeline.model_choice import OWN, Removed, fit_family, fit_own, prune, restricted, ridge_of
 from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
 from ortho_pipeline.options import PointOptions, SceneOptions
 from ortho_pipeline.points import Points
@@ -108,9 +108,12 @@ def open_adjustable(image: Any, scene: SceneOptions, points: PointOptions) -> Sc
         If options contradict each other, or the image has no model and none is fitted.
     """
     if points.fit_model is None:
-        for name, value in (("--model-crs", points.model_crs),):
-            if value is not None:
-                raise InputError(f"{name} is the ground CRS of a fitted model", field=name, remedy="give --fit-model")
+        if points.model_crs is not None:
+            raise InputError(
+                "--model-crs is the ground CRS of a fitted model", field="--model-crs", remedy="give --fit-model"
+            )
+        if points.ridge != "auto":
+            raise InputError("--ridge regularises a fitted model", field="--ridge", remedy="give --fit-model")
         return inputs.open_scene(image, scene)
     if scene.model is not None or points.correction is not None:
         other = "--model" if scene.model is not None else "--correction"
@@ -157,6 +160,7 @@ def adjust(scene: Scene, options: PointOptions, opened: SceneOptions, surface: S
     done = _from_points(scene, options, points, surface) if options.fit_model else _corrected(
         scene, options, opened, points, surface
     )  # fmt: skip
+    done = dataclasses.replace(done, fit=dataclasses.replace(done.fit, significance=options.significance))
     if not options.prune:
         return done
     pruned = prune(done.fit)
@@ -164,6 +168,13 @@ def adjust(scene: Scene, options: PointOptions, opened: SceneOptions, surface: S
         scene = dataclasses.replace(done.scene, models={options.fit_model: pruned.fit.model})
         return Adjusted(scene, pruned.fit, tuple(pruned.removed))
     return Adjusted(done.scene, pruned.fit, tuple(pruned.removed))
+
+
+def params_of(options: PointOptions) -> tuple[str, ...] | None:
+    """Return the names of ``--params``, None without it."""
+    if options.params is None:
+        return None
+    return tuple(dict.fromkeys(name.strip() for name in options.params.split(",") if name.strip()))
 
 
 def _corrected(
@@ -184,8 +195,9 @@ def _corrected(
         )
     if correction == OWN:
         scene = _by_own_parameters(scene)
-        return Adjusted(scene, fit_own(scene.model, points, scene.priors))
+        return Adjusted(scene, fit_own(restricted(scene.model, params_of(options)), points, scene.priors))
     start = ImageCorrection.identity(shared_model(scene), correction, (scene.width / 2, scene.height / 2))
+    start = restricted(start, params_of(options))
     name = scene.model.kind if correction == "none" else f"{scene.model.kind}+{correction}"
     return Adjusted(scene, fit(start, points, robust=correction != "none", name=name))
 
@@ -217,8 +229,9 @@ def _from_points(scene: Scene, options: PointOptions, points: Points, surface: S
     name = str(options.fit_model)
     points = heights_where_wanted(points, surface, name)
     adjusted = fit_family(
-        name, points, crs=options.model_crs, size=(scene.width, scene.height), heights=heights_around(points, surface)
-    )
+        name, points, crs=options.model_crs, size=(scene.width, scene.height), heights=heights_around(points, surface),
+        ridge=ridge_of(options.ridge), params=params_of(options),
+    )  # fmt: skip
     source = f"{int(adjusted.used.sum())} control points of {Path(points.source).name or scene.path}"
     fitted = dataclasses.replace(scene, models={name: adjusted.model}, model_source=source)
     return Adjusted(fitted, adjusted)
