@@ -38,6 +38,8 @@ REJECTED_LIMIT = 0.3
 #: Residuals are never tested at a finer scale than this part of their stated sigma (noise-free simulations).
 _SCALE_FLOOR = 1e-3
 _SUBSETS = 500
+#: Bound on the residuals of all subsets that are in memory together.
+_RESIDUALS_AT_ONCE = 1_000_000
 #: Minimal subsets of models with more parameters hardly ever are without a bad point.
 _FEW_PARAMETERS = 14
 _ROUNDS = 4
@@ -127,13 +129,18 @@ def _median_subset(solution: Solution, priors: int) -> np.ndarray:
     # Linear in a step from the common solution; a minimal subset with 2 * size > params is solved by least squares.
     inverses = np.linalg.pinv(jacobian[subsets].reshape(len(subsets), 2 * size, params))
     steps = (inverses @ residuals[subsets].reshape(len(subsets), 2 * size, 1))[:, :, 0]
-    left = residuals[None] - (steps @ jacobian.reshape(-1, params).T).reshape(len(subsets), count, 2)
-    squares = (left**2).sum(axis=2)
     half = (count + size + 1) // 2
-    merit = np.sort(squares, axis=1)[:, half - 1]
+
+    def squares(some: np.ndarray) -> np.ndarray:
+        left = residuals[None] - (some @ jacobian.reshape(-1, params).T).reshape(len(some), count, 2)
+        return (left**2).sum(axis=2)
+
+    # All subsets at once are 500 residuals of every point: gigabytes where points are matched, not measured.
+    parts = np.array_split(steps, math.ceil(len(steps) * count / _RESIDUALS_AT_ONCE))
+    merit = np.concatenate([np.partition(squares(part), half - 1, axis=1)[:, half - 1] for part in parts])
     best = int(np.argmin(merit))
     keep = np.zeros(count, dtype=bool)
-    keep[np.argsort(squares[best], kind="stable")[: max(half, size + 1)]] = True
+    keep[np.argsort(squares(steps[best : best + 1])[0], kind="stable")[: max(half, size + 1)]] = True
     return keep
 
 

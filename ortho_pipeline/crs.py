@@ -74,7 +74,7 @@ def parse_crs(text: str | pyproj.CRS) -> pyproj.CRS:
         return text
     try:
         return pyproj.CRS.from_user_input(text)
-    except (CRSError, ProjError, ValueError, TypeError) as error:
+    except (CRSError, ProjError, ValueError, TypeError, RecursionError) as error:
         shown = str(text) if len(str(text)) < 80 else f"{str(text)[:80]}..."
         raise CrsError(
             f"{shown!r} is not a coordinate system", field="CRS", remedy="give EPSG:n, WKT or a PROJ string"

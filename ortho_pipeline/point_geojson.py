@@ -53,7 +53,8 @@ def _geojson_crs(path: str | os.PathLike[str], document: dict[str, Any]) -> str:
     stated = document.get("crs")
     if stated is None:
         return "EPSG:4979"
-    name = str(stated.get("properties", {}).get("name", "")) if isinstance(stated, dict) else ""
+    properties = stated.get("properties") if isinstance(stated, dict) else None
+    name = str(properties.get("name", "")) if isinstance(properties, dict) else ""
     if not re.search(r"(CRS84h?|:4326|:4979)$", name):
         raise CrsError(
             f"the CRS {short(name)} of this GeoJSON is not WGS84", file=path, field="crs", remedy="write EPSG:4979"

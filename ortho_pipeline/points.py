@@ -313,6 +313,32 @@ def _refuse_duplicates(
                 )
 
 
+#: Two points closer than this (m) are one mark; the targets of no survey stand so close together.
+_ONE_MARK = 0.01
+
+
+def one_mark(points: Points) -> list[tuple[str, str]]:
+    """Return pairs of ids of points that are within a centimetre on the ground: one mark that was measured twice.
+
+    Of a crowd each point stands in one pair, with its nearest neighbour.
+    """
+    from scipy.spatial import cKDTree
+
+    plan = np.isfinite(points.ground[:, :2]).all(axis=1)
+    place = np.nan_to_num(points.ground[plan])
+    if len(place) < 2:
+        return []
+    place = ground_transform(points.crs, "EPSG:4978")(place)
+    index = np.flatnonzero(plan)[np.isfinite(place).all(axis=1)]
+    place = place[np.isfinite(place).all(axis=1)]
+    distance, neighbour = cKDTree(place).query(place, k=2, distance_upper_bound=_ONE_MARK)
+    # Of points at one place the first neighbour may be the other.
+    other = np.where(neighbour[:, 0] == np.arange(len(place)), neighbour[:, 1], neighbour[:, 0])
+    near = np.flatnonzero(np.isfinite(distance).all(axis=1))
+    pairs = {(min(index[k], index[other[k]]), max(index[k], index[other[k]])) for k in near}
+    return [(points.ids[one], points.ids[two]) for one, two in sorted(pairs)]
+
+
 # -- roles -----------------------------------------------------------------------------------------------------------
 
 

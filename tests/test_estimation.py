@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tracemalloc
 
 import numpy as np
 import pyproj
@@ -211,6 +212,20 @@ def test_too_few_points(rpc, kind, count):
     with pytest.raises(TooFewPoints) as caught:
         fit(start(rpc, kind), make_points(rpc, kind, count=count))
     assert "at least" in caught.value.remedy
+
+
+def test_memory_of_fitting_many_points_is_bounded(rpc):
+    # The residuals of all minimal subsets at once took 20 kB for each point: 5.8 GB for 300,000.
+    count = 20_000
+    points = make_points(rpc, count=count)
+    tracemalloc.start()
+    try:
+        adjusted = fit(start(rpc), points)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert adjusted.values == pytest.approx([3.0, -2.0], abs=5 * 0.3 / np.sqrt(count))
+    assert peak < 150e6
 
 
 def test_no_redundancy_is_reported_and_has_no_sigma0(rpc):

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pyproj
 import pytest
 
+from ortho_pipeline import pipeline
 from ortho_pipeline.block_points import read_block_points
 from ortho_pipeline.errors import CrsError, DatumError, InputError
-from ortho_pipeline.points import Points, read_points, write_points
+from ortho_pipeline.options import PointOptions
+from ortho_pipeline.points import Points, one_mark, read_points, write_points
 
 
 def write(path: Path, text: str) -> Path:
@@ -336,3 +341,97 @@ def test_erdas_files_are_refused_by_name(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="IMAGINE") as caught:
             read_points(tmp_path / name)
         assert "export" in str(caught.value.remedy)
+
+
+# -- one mark twice
+
+
+def test_a_mark_that_was_measured_twice_is_told(tiny, tmp_path: Path) -> None:
+    rows = tiny.points(8)
+    id_, col, row, lon, lat, h = rows[3]
+    # 2 mm to the north: another line, other coordinates, the same mark.
+    twin = ("twin", col + 0.2, row - 0.1, lon, lat + 0.002 / 111_000, h)
+    path = tiny.write(tmp_path / "p.csv", [*rows, twin])
+    given = PointOptions(gcps=path, crs="EPSG:4979", vertical="ellipsoid")
+    told = [text for text in pipeline.fit(tiny.image, given).warnings if "measured twice" in text]
+    assert len(told) == 1
+    assert f"{id_} and twin" in told[0]
+    # Metres apart they are two, and a check point adds no redundancy.
+    far = tiny.write(tmp_path / "far.csv", [*rows, ("other", col + 0.5, row, lon, lat + 2.0 / 111_000, h)])
+    for more in ({"gcps": far}, {"check": "ids:twin"}):
+        found = pipeline.fit(tiny.image, dataclasses.replace(given, **more)).warnings
+        assert not [text for text in found if "measured twice" in text]
+
+
+def test_one_mark_in_any_system_and_in_a_crowd(tmp_path: Path) -> None:
+    lines = [f"p{k},{k},{k},{500000 + 100 * k},6270000,{'' if k % 2 else 5}" for k in range(6)]
+    lines += ["near,9,8,500100.004,6270000.003,", "up,9,7,500200,6270000,5.2", "same,8,9,500400.001,6270000.001,5"]
+    points = read(tmp_path, "id,col,row,x,y,h\n" + "\n".join(lines) + "\n")
+    assert one_mark(points) == [("p1", "near"), ("p4", "same")]
+    assert one_mark(points.to_crs("EPSG:4979")) == [("p1", "near"), ("p4", "same")]
+    assert one_mark(points.select([0])) == []
+
+
+# -- hostile input
+
+
+@pytest.mark.parametrize("stated", [5, [], {"properties": 5}, {"properties": {"name": {}}}, "x", {"properties": None}])
+def test_any_crs_of_a_geojson_is_a_typed_error(tmp_path: Path, stated: object) -> None:
+    document = {"type": "FeatureCollection", "crs": stated, "features": []}
+    with pytest.raises(CrsError, match="not WGS84") as caught:
+        read_points(write(tmp_path / "a.geojson", json.dumps(document)))
+    assert caught.value.remedy
+
+
+@pytest.mark.parametrize(
+    "stated", ['{"a":' * 20_000, "[" * 20_000, "GEOGCS[" * 10_000, '{"type":"GeographicCRS","name":5}']
+)
+def test_a_nested_crs_is_a_typed_error(tmp_path: Path, stated: str) -> None:
+    path = write(tmp_path / "a.csv", f"#CRS: {stated[:99_000]}\nid,col,row,x,y\na,1,2,24,-33\n")
+    with pytest.raises(CrsError, match="not a coordinate system") as caught:
+        read_points(path)
+    assert len(str(caught.value)) < 600
+
+
+def test_mutated_lists_are_read_or_refused_but_nothing_else(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    originals = {
+        "a.gcp": ASP,
+        "a.pts": ENVI,
+        "a.txt": "link table\n1 -2 24.4 -33.6\nb 3 -4 24.5 -33.7\n",
+        "a.csv": "Name;Pixel;Line;Lon;Lat;Elev;S\na;10,5;20;24,4;-33,6;100;G\n",
+    }
+    bits = [b",", b";", b"\t", b"\n", b"#CRS: EPSG:4978\n", b"nan", b"1e999", b"{", b'"', b"\xff"]
+    for name, text in originals.items():
+        for _ in range(60):
+            data = bytearray(text.encode())
+            for _ in range(rng.integers(1, 4)):
+                at = int(rng.integers(len(data)))
+                if rng.random() < 0.5:
+                    data[at] = rng.integers(256)
+                else:
+                    data[at:at] = bits[rng.integers(len(bits))]
+            (tmp_path / name).write_bytes(bytes(data))
+            for reader in (read_points, read_block_points):
+                try:
+                    found = reader(tmp_path / name, crs="EPSG:4979", vertical="ellipsoid")
+                except InputError:
+                    continue
+                assert np.isfinite(found.image).all()
+
+
+# -- many points
+
+
+def test_memory_of_reading_many_points_is_bounded(tmp_path: Path) -> None:
+    count = 5000
+    lines = [f"{k},{k}.5,{k}.25,{500000 + k}.125,6270000,{k % 100}" for k in range(count)]
+    path = write(tmp_path / "p.csv", "id,col,row,x,y,h\n" + "\n".join(lines) + "\n")
+    read_points(path, crs="EPSG:32735", vertical="ellipsoid")
+    tracemalloc.start()
+    try:
+        read_points(path, crs="EPSG:32735", vertical="ellipsoid")
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 2000 * count
