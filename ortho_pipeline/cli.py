@@ -61,10 +61,13 @@ class _Commands(Group):
             click.echo("Interrupted.", err=True)
             return ctx.exit(INTERRUPTED)
         except ImportError as error:
-            missing = _without_gdal(error)
-            if missing is None:
-                raise
-            return self._fail(ctx, missing, CORRECTABLE)
+            # Every command loads GDAL when it begins its work.
+            missing = _without_gdal()
+            return self._fail(ctx, missing or _fault(error), CORRECTABLE if missing else FAILED)
+        except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
+            raise
+        except Exception as error:
+            return self._fail(ctx, _fault(error), FAILED)
 
     def _fail(self, ctx: click.Context, error: OrthoError, code: int) -> None:
         """Print an error, with ``--debug`` after its traceback, and end with an exit code."""
@@ -76,8 +79,18 @@ class _Commands(Group):
         ctx.exit(code)
 
 
-def _without_gdal(error: ImportError) -> InputError | None:
-    """Return what to do if an import failed for want of GDAL; None if something else is missing."""
+def _fault(error: Exception) -> OrthoError:
+    """Return an error that nobody foresaw as one that people can report."""
+    fault = OrthoError(
+        f"{type(error).__name__}: {error}" if str(error) else type(error).__name__,
+        remedy="this is a fault of ortho-pipeline: run it again with --debug and report the traceback",
+    )
+    fault.__cause__ = error
+    return fault
+
+
+def _without_gdal() -> InputError | None:
+    """Return what to do if GDAL cannot be loaded; None if it can."""
     try:
         importlib.import_module("osgeo.gdal_array")
     except ImportError as problem:

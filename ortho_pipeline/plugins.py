@@ -204,6 +204,7 @@ class Host:
             raise PluginError(f"{self._name(chosen)} failed to open it ({text})", file=path) from error
         if fault:
             raise PluginError(f"{self._name(chosen)}: {fault}", file=path, remedy=_TEST_IT)
+        log.info("%s: sensor %s, models %s from %s", path, chosen.name, ", ".join(scene.models), scene.model_source)
         return scene
 
     def _register_installed(self) -> None:

@@ -6,6 +6,7 @@ GDAL read any file of the machine. One `gdal.Dataset` is used by one thread only
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import threading
@@ -23,6 +24,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import PIXEL_TYPES
 
 gdal.UseExceptions()
+log = logging.getLogger(__name__)
 
 #: Raster drivers that only read pixels out of the file they are given (and its side-cars).
 DRIVERS = (
@@ -76,6 +78,7 @@ def open_dataset(path: str | os.PathLike[str], *, allow_network: bool = False, s
             remedy="give a raster of a format that GDAL reads; 'ortho doctor' lists the allowed ones",
         ) from error
     _check_size(dataset, name)
+    log.info("%s: opened by %s", name, dataset.GetDriver().ShortName)
     return dataset
 
 

@@ -175,3 +175,66 @@ def test_failure_and_interruption_have_their_exit_codes(monkeypatch):
     done = run("doctor")
     assert done.exit_code == 130
     assert "Interrupted" in done.stderr
+
+
+# -- faults ----------------------------------------------------------------------------------------------------------
+
+WITHOUT_GDAL = """
+import json, sys
+sys.modules["osgeo"] = None
+from click.testing import CliRunner
+from ortho_pipeline.cli import cli
+done = {line: CliRunner().invoke(cli, line.split()) for line in sys.argv[1:]}
+print(json.dumps({line: [one.exit_code, one.stdout, one.stderr] for line, one in done.items()}))
+"""
+COMMANDS = [
+    "doctor", "sensors", "models", "info a.tif", "fit a.tif --gcps b.csv", "compare a.tif --gcps b.csv",
+    "rectify a.tif --height 5 -o out", "export a.tif -o out", "report a.json --plots out", "edge a.tif",
+    "adjust a.tif b.tif --points c.csv -o out", "intersect a.tif b.tif --points c.csv", "run a.yaml",
+    "simulate ikonos -o out", "reproduce bilsat",
+]  # fmt: skip
+
+
+def test_without_gdal_every_command_says_one_line_and_its_remedy(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_GDAL, *COMMANDS], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    for code, stdout, stderr in json.loads(done.stdout).values():
+        lines = stderr.splitlines()
+        assert (code, stdout, len(lines)) == (2, "", 2), stderr
+        assert lines[0].startswith("Error: GDAL's Python bindings cannot be loaded")
+        assert lines[1].startswith("  Remedy: pip install")
+    assert set(cli.commands) <= {line.split()[0] for line in COMMANDS}
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unforeseen_error_is_one_line_and_a_traceback_only_with_debug(monkeypatch):
+    def fail() -> None:
+        raise KeyError("nobody thought of this")
+
+    monkeypatch.setattr(pipeline, "doctor", fail)
+    done = run("doctor", "--json")
+    assert done.exit_code == 1
+    assert "nobody thought of this" in done.stderr
+    assert "--debug" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert json.loads(done.stdout)["error"]["kind"] == "OrthoError"
+    shown = run("doctor", "--debug")
+    assert shown.exit_code == 1
+    assert "Traceback" in shown.stderr
+    assert 'raise KeyError("nobody' in shown.stderr
+
+
+def test_debug_shows_where_a_wrong_request_was_found():
+    assert "Traceback" not in run("info", "no/such/file.tif").stderr
+    assert "Traceback" in run("info", "no/such/file.tif", "--debug").stderr
+
+
+def test_verbose_says_what_is_done(tiny):
+    words = [sys.executable, "-m", "ortho_pipeline", "info", str(tiny.image)]
+    quiet, loud = (
+        subprocess.run([*words, *more], capture_output=True, text=True, check=True).stderr for more in ([], ["-v"])
+    )
+    assert "GTiff" not in quiet
+    assert "tiny.tif: opened by GTiff" in loud
+    assert "sensor rpc" in loud
