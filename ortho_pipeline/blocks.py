@@ -23,6 +23,7 @@ from ortho_pipeline.files import write_text
 from ortho_pipeline.ground_frame import GEODETIC, GroundFrame
 from ortho_pipeline.intersection import Intersection
 from ortho_pipeline.intersection import intersect as intersect_rays
+from ortho_pipeline.locations import located
 from ortho_pipeline.model_file import SavedModel, read_model_file, write_model_file
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
@@ -66,7 +67,7 @@ def adjust(
     labels = labels_of(images)
     files = _files(labels, Path(folder))
     _check_paths(files, images, points, scene)
-    table, notes = _read(images, labels, points)
+    table, notes = _read(images, labels, points, scene.allow_network)
     heights = _heights(table)
     starts = {
         label: start_of(image, points, scene, table.in_image(label), heights)
@@ -123,10 +124,14 @@ def intersect(
     writer = None if output is None else _writer(output)
     files = {} if output is None else {"points": Path(output)}
     _check_paths(files, images, points, scene, *models)
-    table, notes = _read(images, labels, points)
+    table, notes = _read(images, labels, points, scene.allow_network)
     if models:
         plugins.Host.discover()  # model families of plugins, which a file may name
-        chosen = {label: read_model_file(path).model for label, path in zip(labels, models, strict=True)}
+        files_of = dict(zip(labels, models, strict=True))
+        chosen = {
+            label: read_model_file(located(path, allow_network=scene.allow_network)).model
+            for label, path in files_of.items()
+        }
     else:
         chosen = {
             label: _own(inputs.open_scene(image, scene), points.model)
@@ -147,11 +152,13 @@ def intersect(
 
 
 def _read(
-    images: Sequence[str | os.PathLike[str]], labels: Sequence[str], options: BlockOptions
+    images: Sequence[str | os.PathLike[str]], labels: Sequence[str], options: BlockOptions, allow_network: bool
 ) -> tuple[BlockPoints, list[str]]:
     """Return the points of these images, and what people ought to know of them."""
     read = read_block_points(
-        options.points, gcps=options.gcps, crs=None if options.crs is None else parse_crs(options.crs),
+        located(options.points, allow_network=allow_network),
+        gcps=None if options.gcps is None else located(options.gcps, allow_network=allow_network),
+        crs=None if options.crs is None else parse_crs(options.crs),
         vertical=None if options.vertical is None else Vertical.parse(options.vertical),
         pixel_origin=options.pixel_origin,
     )  # fmt: skip

@@ -351,7 +351,7 @@ def report(report_file: str, folder: str, kind: str, as_json: bool) -> None:
 @click.option("--edge", metavar="X1,Y1,X2,Y2", help="Columns and rows of its ends  [default: edges are looked for]")
 @click.option("--band", type=click.IntRange(min=1), default=1, show_default=True)
 @click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="For JSON and a plot.")
-@click.option("--allow-network", is_flag=True, help="Open URLs and /vsi paths too.")
+@click.option("--allow-network", is_flag=True, help="Open URLs and /vsi paths.")
 @json_option
 def edge(image: str, edge: str | None, band: int, folder: str | None, allow_network: bool, as_json: bool) -> None:
     """Measure the effective resolution of IMAGE from straight edges (edge spread, line spread, width in pixels)."""

@@ -81,7 +81,20 @@ _SENSOR_OPTIONS = (
         callback=lambda ctx, parameter, values: _key_values(values),
         help="Option of the sensor (see 'ortho sensors'); may be repeated.",
     ),
-    click.option("--allow-network", "scene_allow_network", is_flag=True, help="Open URLs and /vsi paths too."),
+    click.option(
+        "--allow-network",
+        "scene_allow_network",
+        is_flag=True,
+        help="Open URLs (http, https, s3, gs, az) and /vsi paths.",
+    ),
+    click.option(
+        "--root",
+        "scene_roots",
+        multiple=True,
+        type=click.Path(exists=True, file_okay=False),
+        metavar="DIR",
+        help="A folder that a VRT may refer to, besides its own; may be repeated.",
+    ),
 )
 scene_options = _grouped(
     "scene",

@@ -11,7 +11,7 @@ import math
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -67,7 +67,8 @@ class Surface:
         self._fill: str | float = "error"
         self.provenance: dict[str, Any] = {"constant_height": constant_height}
         self.vertical = Vertical("ellipsoid")
-        self._path, self._allow_network = "", False
+        self._path = ""
+        self._access: dict[str, Any] = {}
         self._metres_per_unit, self._scale, self._offset = 1.0, 1.0, 0.0
         self._crs_from_pixel = (0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
         self._roll = 0
@@ -122,6 +123,7 @@ class Surface:
         override: bool = False,
         fill: str | float = "error",
         allow_network: bool = False,
+        roots: Sequence[str | os.PathLike[str]] = (),
     ) -> Surface:
         """Open a DEM.
 
@@ -144,7 +146,7 @@ class Surface:
             If it cannot be opened.
         """
         surface = cls()
-        surface._path, surface._allow_network = os.fspath(path), allow_network
+        surface._path, surface._access = os.fspath(path), {"allow_network": allow_network, "roots": roots}
         surface._fill = _parse_fill(fill)
         dataset = surface._dataset()
         crs = surface._place(dataset)
@@ -172,7 +174,7 @@ class Surface:
 
     def _dataset(self) -> gdal.Dataset:
         if not hasattr(self._local, "dataset"):
-            self._local.dataset = open_dataset(self._path, allow_network=self._allow_network)
+            self._local.dataset = open_dataset(self._path, **self._access)
         return self._local.dataset
 
     def _place(self, dataset: gdal.Dataset) -> pyproj.CRS:

@@ -13,6 +13,7 @@ from concurrent.futures import CancelledError
 from pathlib import Path
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.locations import VsiPath
 
 #: Bytes that are read at once for a checksum.
 _CHUNK = 1 << 20
@@ -72,6 +73,8 @@ def read_bounded(path: str | os.PathLike[str], limit: int, **told: str) -> bytes
         If it cannot be read; with field and remedy as `told`.
     """
     try:
+        if isinstance(path, VsiPath):
+            return path.read(limit + 1)
         with open(path, "rb") as file:
             return file.read(limit + 1)
     except (OSError, ValueError) as error:

@@ -20,6 +20,7 @@ from ortho_pipeline.crs import Vertical, parse_crs
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import sha256
 from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.locations import archive_of, located
 from ortho_pipeline.model_file import read_model_file
 from ortho_pipeline.options import PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, read_points
@@ -49,7 +50,7 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
         open what is open.
     """
     if isinstance(image, Scene):
-        if dataclasses.replace(options, allow_network=False) != SceneOptions():
+        if dataclasses.replace(options, allow_network=False, roots=()) != SceneOptions():
             raise InputError(
                 "this scene is open already", file=image, field="scene", remedy="give its path, or open it so"
             )  # fmt: skip
@@ -60,15 +61,16 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
             if "rpc" in given:
                 raise InputError("the RPC is chosen twice", field="--rpc", remedy="leave out --sensor-option rpc=...")
             given["rpc"] = options.rpc
-        return plugins.open_scene(image, options.sensor, given, allow_network=options.allow_network)
+        given = {name: _perhaps_elsewhere(value, options.allow_network) for name, value in given.items()}
+        return plugins.open_scene(image, options.sensor, given, **options.access)
     if options.rpc is not None or options.sensor is not None or options.sensor_options:
         raise InputError(
             "a model file takes the place of the image's model", field="--model",
             remedy="leave out --rpc, --sensor and --sensor-option",
         )  # fmt: skip
-    dataset = raster.open_dataset(image, allow_network=options.allow_network)
+    dataset = raster.open_dataset(image, **options.access)
     plugins.Host.discover()  # model families of plugins, which the file may name
-    saved = read_model_file(options.model)
+    saved = read_model_file(located(options.model, allow_network=options.allow_network))
     size = dataset.RasterXSize, dataset.RasterYSize
     if saved.size is not None and saved.size != size:
         raise InputError(
@@ -101,7 +103,7 @@ def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_mo
     asked = isinstance(image, Scene) or bool(options.model or options.rpc or options.sensor or options.sensor_options)
     if needs_model or asked:
         return open_scene(image, options)
-    dataset = raster.open_dataset(image, allow_network=options.allow_network)
+    dataset = raster.open_dataset(image, **options.access)
     host = plugins.Host.discover()
     try:
         host.recognise(dataset)
@@ -112,7 +114,7 @@ def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_mo
     return open_scene(image, options)
 
 
-def open_surface(options: SurfaceOptions, allow_network: bool = False) -> dem.Surface:
+def open_surface(options: SurfaceOptions, scene: SceneOptions = SceneOptions()) -> dem.Surface:
     """Open the DEM, or make a surface of one height.
 
     Raises
@@ -129,8 +131,14 @@ def open_surface(options: SurfaceOptions, allow_network: bool = False) -> dem.Su
     vertical = None if options.vertical is None else Vertical.parse(options.vertical)
     return dem.Surface.open(
         options.dem, vertical, override=options.override_vertical, fill=options.fill,
-        allow_network=allow_network,
+        **scene.access,
     )  # fmt: skip
+
+
+def _perhaps_elsewhere(value: Any, allow_network: bool) -> Any:
+    """Return a file of an archive or of the network as one that can be read; any other value as it is."""
+    text = str(value)
+    return located(text, allow_network=allow_network) if text.startswith("/vsi") or "://" in text else value
 
 
 def has_surface(options: SurfaceOptions) -> bool:
@@ -141,7 +149,7 @@ def has_surface(options: SurfaceOptions) -> bool:
 # -- points ----------------------------------------------------------------------------------------------------------
 
 
-def read_control(scene: Scene, options: PointOptions, allow_network: bool = False) -> Points:
+def read_control(scene: Scene, options: PointOptions, opened: SceneOptions = SceneOptions()) -> Points:
     """Read the points of the options with their roles; none where none are given.
 
     Raises
@@ -155,7 +163,7 @@ def read_control(scene: Scene, options: PointOptions, allow_network: bool = Fals
                 f"a {options.correction} needs control points", field="--gcps", remedy="give a file of points"
             )
         return no_points()
-    points = _given_points(scene, options, allow_network)
+    points = _given_points(scene, options, opened)
     if options.select is not None and options.check is not None:
         raise InputError(
             "--select and --check both say which points check", field="--select", remedy="give one of them"
@@ -165,7 +173,7 @@ def read_control(scene: Scene, options: PointOptions, allow_network: bool = Fals
     return points if options.check is None else assign_roles(points, options.check)
 
 
-def _given_points(scene: Scene, options: PointOptions, allow_network: bool) -> Points:
+def _given_points(scene: Scene, options: PointOptions, opened: SceneOptions) -> Points:
     crs = None if options.crs is None else parse_crs(options.crs)
     vertical = None if options.vertical is None else Vertical.parse(options.vertical)
     path = point_file(options)
@@ -178,9 +186,9 @@ def _given_points(scene: Scene, options: PointOptions, allow_network: bool) -> P
             )  # fmt: skip
         if isinstance(options.gcps, Points):
             return options.gcps
-        return gcps_of_dataset(raster.open_dataset(scene.path, allow_network=allow_network), crs=crs, vertical=vertical)
+        return gcps_of_dataset(raster.open_dataset(scene.path, **opened.access), crs=crs, vertical=vertical)
     pieces = {Path(piece.path).name: (*piece.offset, piece.scale) for piece in scene.pieces}
-    name = Path(scene.path).name
+    name, path = Path(scene.path).name, located(path, allow_network=opened.allow_network)
     return read_points(path, crs=crs, vertical=vertical, pixel_origin=origin, image_name=name, pieces=pieces)
 
 
@@ -290,19 +298,20 @@ def files_read(
     read: dict[Path, str] = {}
 
     def add(role: str, paths: Iterable[str | os.PathLike[str] | None]) -> None:
-        for path in paths:
-            if path is not None and Path(path).is_file():
-                read.setdefault(Path(path), role)
+        for name in paths:
+            path = None if name is None else archive_of(os.fspath(name)) or Path(name)
+            if path is not None and path.is_file():
+                read.setdefault(path, role)
 
     add("image", [image])
-    add("image", _files_of(image, scene.allow_network))
+    add("image", _files_of(image, scene))
     add("image", rasters)
     add("metadata", sources)
     for role, path in scene.files.items():
         add(role, [path])
     add("points", [point_file(points)])
     if surface.dem is not None:
-        add("DEM", [surface.dem, *_files_of(surface.dem, scene.allow_network)])
+        add("DEM", [surface.dem, *_files_of(surface.dem, scene)])
     if surface.vertical is not None:
         add("geoid", [surface.vertical])
     return read
@@ -342,9 +351,9 @@ def hashed_beside(
             stop.set()
 
 
-def _files_of(path: str | os.PathLike[str], allow_network: bool) -> list[str]:
+def _files_of(path: str | os.PathLike[str], scene: SceneOptions) -> list[str]:
     try:
-        return files_of(raster.open_dataset(path, allow_network=allow_network))
+        return files_of(raster.open_dataset(path, **scene.access))
     except OrthoError:
         return []
 

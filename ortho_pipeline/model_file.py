@@ -7,11 +7,10 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError, PluginError
-from ortho_pipeline.files import write_text
+from ortho_pipeline.files import read_bounded, write_text
 from ortho_pipeline.models import model_from_dict
 from ortho_pipeline.models.base import SensorModel
 
@@ -82,7 +81,7 @@ def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
     InputError
         If it is no model file, of a later schema, or its model does not fit its kind.
     """
-    document = _document(Path(path))
+    document = _document(path)
     version = document.get("schema_version")
     if document.get("document") != DOCUMENT or not isinstance(document.get("model"), dict):
         raise InputError(
@@ -134,13 +133,12 @@ def load_model(path: str | os.PathLike[str]) -> SensorModel:
     return read_model_file(path).model
 
 
-def _document(path: Path) -> dict[str, Any]:
+def _document(path: str | os.PathLike[str]) -> dict[str, Any]:
     try:
-        if path.stat().st_size > _MAX_BYTES:
+        data = read_bounded(path, _MAX_BYTES, remedy="check the path")
+        if len(data) > _MAX_BYTES:
             raise InputError("a model file of more than 50 MB is not read", file=path)
-        document = json.loads(path.read_text(encoding="utf-8-sig"), parse_constant=_no_constant)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path, remedy="check the path") from error
+        document = json.loads(data.decode("utf-8-sig"), parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
         raise InputError(f"this is no JSON ({error})", file=path, remedy="give a <stem>_model.json") from error
     return document if isinstance(document, dict) else {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 #: What a file of points calls the first pixel -> what is added to reach (0, 0) at its outer corner.
 PIXEL_ORIGINS = {
@@ -31,7 +31,9 @@ class SceneOptions:
     model : path, optional
         A model file that takes the place of the image's own model.
     allow_network : bool
-        Whether URLs and GDAL's virtual file systems may be opened.
+        Whether URLs and GDAL's network file systems may be opened.
+    roots : sequence of path
+        Folders that an image may refer to, besides its own: sources of a VRT have to lie there.
     sensor_options : mapping of str to str
         Options that the sensor declares (`ortho sensors`).
     """
@@ -40,7 +42,13 @@ class SceneOptions:
     rpc: str | None = None
     model: str | os.PathLike[str] | None = None
     allow_network: bool = False
+    roots: Sequence[str | os.PathLike[str]] = ()
     sensor_options: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def access(self) -> dict[str, Any]:
+        """What may be opened, as `raster.open_dataset` takes it."""
+        return {"allow_network": self.allow_network, "roots": tuple(self.roots)}
 
     @property
     def files(self) -> dict[str, str | os.PathLike[str]]:

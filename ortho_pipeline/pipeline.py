@@ -176,7 +176,7 @@ def fit(
     if points.gcps is None:
         raise InputError("there are no points to fit to", field="--gcps", remedy="give a file of points with --gcps")
     opened = open_adjustable(image, scene, points)
-    heights = open_surface(surface, scene.allow_network) if has_surface(surface) else None
+    heights = open_surface(surface, scene) if has_surface(surface) else None
     adjusted = adjust(opened, points, scene, heights)
     return FitResult(
         adjusted.scene, adjusted.fit, adjusted.warnings(heights), tuple(adjusted.removed_json()), points.near
@@ -218,10 +218,10 @@ def compare(
         )
     opened = inputs.open_image(image, scene, needs_model=False)
     names = comparing.choose_models(models, opened.model if opened.models else None)
-    heights = open_surface(surface, scene.allow_network) if has_surface(surface) else None
+    heights = open_surface(surface, scene) if has_surface(surface) else None
     opened = on_surface(opened, heights)
     own = opened.model if opened.models else None
-    given = inputs.read_control(opened, points, scene.allow_network)
+    given = inputs.read_control(opened, points, scene)
     if own is not None:
         refuse_swapped(own, given, opened.height)
     given = heights_where_wanted(given, heights, *names)
@@ -297,7 +297,7 @@ def rectify(
             remedy="give --dem FILE, or --height METRES above the ellipsoid for flat ground",
         )
     opened = open_adjustable(image, scene, points)
-    heights = open_surface(surface, scene.allow_network)
+    heights = open_surface(surface, scene)
     acquired = stac_items.acquisition_time(opened.facts, output.acquired) if output.stac else None
     read = inputs.files_read(image, scene, points, surface, opened.rasters, opened.sources)
     with inputs.hashed_beside(read, digest) as hashing:
@@ -313,14 +313,14 @@ def rectify(
         )
         exported, complaints = _as_rpc(model)
         source = raster.RasterSource(
-            *(opened.rasters or (image,)), allow_network=scene.allow_network, bands=output.bands, dtype=output.dtype
+            *(opened.rasters or (image,)), **scene.access, bands=output.bands, dtype=output.dtype
         )
         if overwrite:
             _remove(inputs.old_side_cars(files["ortho"]))
         warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
         asked = {"scene": scene, "surface": surface, "output": output}
         record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
-    whole = raster.open_dataset(image, allow_network=scene.allow_network)
+    whole = raster.open_dataset(image, **scene.access)
     _write_models(model, exported, opened, whole, files, {**record, "adjustment": adjusted.fit.to_json()})
     document = report.build_report(
         scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
@@ -369,9 +369,9 @@ def export(
     files = {name: Path(folder) / f"{stem}{gcp_export.ENDINGS[name]}" for name in formats}
     inputs.check_paths(files, image, scene, points, surface)
     opened = open_adjustable(image, scene, points)
-    heights = open_surface(surface, scene.allow_network) if has_surface(surface) else None
+    heights = open_surface(surface, scene) if has_surface(surface) else None
     adjusted = adjust(opened, points, scene, heights)
-    dataset = raster.open_dataset(image, allow_network=scene.allow_network)
+    dataset = raster.open_dataset(image, **scene.access)
     size = opened.width, opened.height
     if heights is not None:
         heights = footprint.facing(adjusted.model, heights, *size)

@@ -10,7 +10,7 @@ import contextlib
 import difflib
 import functools
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from os import PathLike
@@ -177,10 +177,11 @@ class Host:
         options: Mapping[str, Any] | None = None,
         *,
         allow_network: bool = False,
+        roots: Sequence[str | PathLike[str]] = (),
     ) -> Scene:
         """Open a product with the sensor that recognises it; see `open_scene`."""
         options = dict(options or {})
-        dataset = open_dataset(path, allow_network=allow_network)
+        dataset = open_dataset(path, allow_network=allow_network, roots=roots)
         chosen = self.recognise(dataset, sensor, options)
         for name in options:
             if name not in chosen.options:
@@ -342,6 +343,7 @@ def open_scene(
     options: Mapping[str, Any] | None = None,
     *,
     allow_network: bool = False,
+    roots: Sequence[str | PathLike[str]] = (),
 ) -> Scene:
     """Open a product with the installed sensor that recognises it.
 
@@ -354,7 +356,9 @@ def open_scene(
     options : mapping, optional
         Options of the sensor; only those that it declares are taken.
     allow_network : bool
-        Whether URLs and GDAL's virtual file systems may be opened.
+        Whether URLs and GDAL's network file systems may be opened.
+    roots : sequence of path
+        Folders that an image may refer to, besides its own.
 
     Raises
     ------
@@ -363,7 +367,7 @@ def open_scene(
     PluginError
         If a plugin broke the contract.
     """
-    return Host.discover().open_scene(path, sensor, options, allow_network=allow_network)
+    return Host.discover().open_scene(path, sensor, options, allow_network=allow_network, roots=roots)
 
 
 @functools.cache

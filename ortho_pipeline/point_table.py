@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import read_bounded
 from ortho_pipeline.options import PIXEL_ORIGINS
 
 #: A point file beyond this is not read (bytes), nor a line beyond that (characters).
@@ -110,12 +111,9 @@ class Line(NamedTuple):
 
 def load_text(path: str | os.PathLike[str]) -> str:
     """Return a file as text: UTF-8, a byte-order mark allowed, no NUL, no larger than `MAX_FILE`."""
-    try:
-        if Path(path).stat().st_size > MAX_FILE:
-            raise InputError(f"a point file of more than {MAX_FILE // 1_000_000} MB is not read", file=path)
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path, remedy="check the path") from error
+    data = read_bounded(path, MAX_FILE, remedy="check the path")
+    if len(data) > MAX_FILE:
+        raise InputError(f"a point file of more than {MAX_FILE // 1_000_000} MB is not read", file=path)
     if data.startswith(b"EHFA_HEADER_TAG") or Path(path).suffix.lower() == ".gcc":
         raise InputError(
             "how GCP files of ERDAS IMAGINE (.gcc) are written is not published", file=path,

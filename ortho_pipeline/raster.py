@@ -10,7 +10,7 @@ import logging
 import math
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.locations import VsiPath, archive_of, in_local_archive, located, members, within
 from ortho_pipeline.options import PIXEL_TYPES
 
 gdal.UseExceptions()
@@ -39,13 +40,21 @@ MAX_BLOCK = 1 << 30
 _MAX_VRT = 5_000_000
 
 
-def open_dataset(path: str | os.PathLike[str], *, allow_network: bool = False, siblings: bool = True) -> gdal.Dataset:
+def open_dataset(
+    path: str | os.PathLike[str],
+    *,
+    allow_network: bool = False,
+    roots: Sequence[str | os.PathLike[str]] = (),
+    siblings: bool = True,
+) -> gdal.Dataset:
     """Open a raster for reading.
 
     Parameters
     ----------
     path : path
-        A file; `/vsi…` and URLs only with `allow_network`.
+        A file, also in an archive; URLs and GDAL's network file systems only with `allow_network`.
+    roots : sequence of path
+        Folders that sources of a VRT may lie in, besides its own.
     siblings : bool
         Whether GDAL may look at side-car files. Without them RPC metadata are those of the file itself.
 
@@ -54,21 +63,21 @@ def open_dataset(path: str | os.PathLike[str], *, allow_network: bool = False, s
     InputError
         If the file is missing, of no allowed format, damaged, or a VRT that reaches outside of its own folder.
     """
-    name = os.fspath(path)
-    drivers = list(DRIVERS)
-    if name.startswith("/vsi") or "://" in name:
-        if not allow_network:
-            raise InputError(
-                "network and virtual paths are not opened", file=name, remedy="allow them with --allow-network"
-            )
+    place = located(path, allow_network=allow_network)
+    name, drivers = os.fspath(place), list(DRIVERS)
+    if isinstance(place, VsiPath):
         drivers.remove("VRT")
+        if in_local_archive(name) and not place.exists():
+            raise InputError("there is no such file in an archive", file=name, remedy=_in_archive(name))
     elif not Path(name).is_file() and not (Path(name).is_dir()):
         raise InputError("there is no such file", file=name, remedy="check the path")
     elif Path(name).suffix.lower() == ".vrt":
-        _check_vrt(Path(name))
+        _check_vrt(Path(name), roots)
+    elif Path(name).suffix.lower() in (".zip", ".tar", ".tgz"):
+        raise InputError("this is an archive, not an image", file=name, remedy=_in_archive(name))
     else:
         drivers.remove("VRT")
-    options: dict[str, Any] = {} if siblings else {"sibling_files": [Path(name).name]}
+    options: dict[str, Any] = {} if siblings else {"sibling_files": [name.rpartition("/")[2]]}
     try:
         dataset = gdal.OpenEx(name, gdal.OF_RASTER | gdal.OF_READONLY, allowed_drivers=drivers, **options)
     except RuntimeError as error:
@@ -96,8 +105,14 @@ def _check_size(dataset: gdal.Dataset, name: str) -> None:
         )
 
 
-def _check_vrt(path: Path, seen: frozenset[Path] = frozenset()) -> None:
-    """Refuse a VRT that is more than a view of files in its own folder, whatever names its sources have."""
+def _in_archive(name: str) -> str:
+    archive = archive_of(name) if name.startswith("/vsi") else Path(name)
+    found = members(archive) if archive is not None else []
+    return f"name the image in it: {', '.join(found)}" if found else "name the image in it: /vsizip/FILE.zip/IMAGE"
+
+
+def _check_vrt(path: Path, roots: Sequence[str | os.PathLike[str]] = (), seen: frozenset[Path] = frozenset()) -> None:
+    """Refuse a VRT that is more than a view of files in its own folder or in `roots`, whatever names they have."""
     from defusedxml import ElementTree
     from defusedxml.common import DefusedXmlException
 
@@ -118,15 +133,20 @@ def _check_vrt(path: Path, seen: frozenset[Path] = frozenset()) -> None:
         if element.tag in ("SourceFilename", "SourceDataset"):
             name = element.text or ""
             source = (here.parent / name if element.get("relativeToVRT") == "1" else Path(name)).resolve()
-            if not source.is_relative_to(here.parent) or name.startswith("/vsi") or ":" in name.replace(":\\", ""):
+            if not within(source, (here.parent, *roots)) or name.startswith("/vsi") or ":" in name.replace(":\\", ""):
                 raise InputError(
                     f"this VRT reads {name!r}, which is outside of its own folder",
                     file=path,
                     field="SourceFilename",
-                    remedy="put the VRT beside its sources, or make a file of it (gdal_translate in.vrt out.tif)",
+                    remedy=f"name a folder that holds both with --root {_common(source, here)}, put the VRT beside its "
+                    "sources, or make a file of it (gdal_translate in.vrt out.tif)",
                 )
             if source.is_file() and _is_vrt(source):
-                _check_vrt(source, seen | {here})
+                _check_vrt(source, roots, seen | {here})
+
+
+def _common(*paths: Path) -> str:
+    return os.path.commonpath([path.parent for path in paths])
 
 
 def _is_vrt(path: Path) -> bool:
@@ -206,9 +226,11 @@ class Grid:
 class _RasterFile:
     """Some or all bands of one file of a `RasterSource`, with a GDAL handle for each thread."""
 
-    def __init__(self, path: str | os.PathLike[str], allow_network: bool, numbers: Sequence[int] | None = None) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], access: Mapping[str, Any], numbers: Sequence[int] | None = None
+    ) -> None:
         self.path = os.fspath(path)
-        self._allow_network = allow_network
+        self._access = access
         self._local = threading.local()
         dataset = self.dataset
         self.width, self.height = dataset.RasterXSize, dataset.RasterYSize
@@ -238,7 +260,7 @@ class _RasterFile:
     def dataset(self) -> gdal.Dataset:
         """The GDAL dataset of the calling thread."""
         if not hasattr(self._local, "dataset"):
-            self._local.dataset = open_dataset(self.path, allow_network=self._allow_network)
+            self._local.dataset = open_dataset(self.path, **self._access)
         return self._local.dataset
 
     @property
@@ -316,10 +338,12 @@ class RasterSource:
         path: str | os.PathLike[str],
         *others: str | os.PathLike[str],
         allow_network: bool = False,
+        roots: Sequence[str | os.PathLike[str]] = (),
         bands: Sequence[int] | None = None,
         dtype: str | None = None,
     ) -> None:
-        self._files = [_RasterFile(name, allow_network) for name in (path, *others)]
+        access = {"allow_network": allow_network, "roots": roots}
+        self._files = [_RasterFile(name, access) for name in (path, *others)]
         first = self._files[0]
         self.paths = tuple(file.path for file in self._files)
         self.path, self.width, self.height = first.path, first.width, first.height
@@ -331,7 +355,7 @@ class RasterSource:
                     remedy="rectify images of different sizes one by one",
                 )
         if bands is not None:
-            self._files = [_RasterFile(name, allow_network, numbers) for name, numbers in self._chosen(bands)]
+            self._files = [_RasterFile(name, access, numbers) for name, numbers in self._chosen(bands)]
         self.count = sum(file.count for file in self._files)
         self.dtype = _read_as(np.result_type(*(file.dtype for file in self._files)), dtype)
         self.nodata = tuple(value for file in self._files for value in file.nodata)

@@ -24,6 +24,7 @@ from osgeo import gdal
 from ortho_pipeline import files
 from ortho_pipeline.crs import GroundTransform
 from ortho_pipeline.errors import InputError, ModelError
+from ortho_pipeline.locations import VsiPath, place
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.rational import RPC, rpc_terms
@@ -73,7 +74,7 @@ def read_rpc(path: str | PathLike[str]) -> RPC:
     InputError
         If there is none in it, or a field is missing or wrong.
     """
-    path = Path(path)
+    path = path if isinstance(path, VsiPath) else Path(path)
     if path.suffix.lower() in TEXT_SUFFIXES or _begins_like_rpc(path):
         return read_rpc_text(path)
     return rpc_of_dataset(open_dataset(path))[0]
@@ -121,20 +122,15 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
     if tag:
         return rpc_of_fields(tag, name), f"{name} ({_own_kind(dataset)})"
     what = "RPC" if choice is None else {"tag": "RPC tag", "sidecar": "RPC side-car file"}[str(choice)]
-    damaged = ", ".join(_unreadable_beside(Path(name))) if choice != "tag" else ""
+    damaged = ", ".join(_unreadable_beside(place(name))) if choice != "tag" else ""
     raise InputError(
         f"there is no {what}" + (f" that can be read: {damaged} is damaged or encrypted" if damaged else ""),
         file=name, field="--rpc", remedy="give the RPC file with --rpc FILE",
     )  # fmt: skip
 
 
-def _begins_like_rpc(path: Path) -> bool:
-    try:
-        with open(path, "rb") as file:
-            head = file.read(20_000).lower()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"this file cannot be read ({reason})", file=path) from error
+def _begins_like_rpc(path: Path | VsiPath) -> bool:
+    head = files.read_bounded(path, 20_000).lower()
     return b"\0" not in head and b"<vrtdataset" not in head and (b"line_off" in head or b"lineoffset" in head)
 
 
@@ -156,9 +152,9 @@ def _unreadable_beside(path: Path) -> list[str]:
 def _own_fields(dataset: gdal.Dataset) -> dict[str, str]:
     """Return the RPC domain of the file itself, without what lies beside it."""
     name = dataset.GetDescription()
-    if not Path(name).is_file() or dataset.GetDriver().ShortName == "VRT":
+    if not place(name).is_file() or dataset.GetDriver().ShortName == "VRT":
         return dict(dataset.GetMetadata("RPC") or {})
-    return dict(open_dataset(name, siblings=False).GetMetadata("RPC") or {})
+    return dict(open_dataset(place(name), siblings=False).GetMetadata("RPC") or {})
 
 
 def _own_kind(dataset: gdal.Dataset) -> str:
@@ -178,7 +174,7 @@ def _sidecar_files(dataset: gdal.Dataset) -> list[Path]:
     if dataset.GetDriver().ShortName == "VRT":
         return []
     own = os.path.normpath(dataset.GetDescription())
-    return [Path(file) for file in files_of(dataset) if os.path.normpath(file) != own]
+    return [place(file) for file in files_of(dataset) if os.path.normpath(file) != own]
 
 
 def _is_rpc_file(path: Path) -> bool:

@@ -20,7 +20,6 @@ import math
 import re
 from collections.abc import Mapping
 from os import PathLike
-from pathlib import Path
 
 from ortho_pipeline import files
 from ortho_pipeline.errors import InputError
@@ -87,7 +86,7 @@ def read_rpc_text(path: str | PathLike[str]) -> RPC:
         If the file cannot be read, holds no RPC, or one with a field that is missing, not a finite number, or zero
         where it cannot be.
     """
-    text = _text_of(Path(path))
+    text = _text_of(path)
     lowered = text[:100_000].lower()
     if text.lstrip()[:1] == "<":
         fields, origin = _fields_of_xml(text, path)
@@ -143,7 +142,7 @@ def rpc_of_fields(fields: Mapping[str, str], file: str | PathLike[str] | None = 
         raise InputError(error.message, file=file, field=field, remedy=error.remedy) from error
 
 
-def _text_of(path: Path) -> str:
+def _text_of(path: str | PathLike[str]) -> str:
     data = files.read_bounded(path, MAX_SIZE)
     if len(data) > MAX_SIZE:
         raise InputError("this file has more than 5 MB, which no RPC file has", file=path)

@@ -169,7 +169,7 @@ def adjust(scene: Scene, options: PointOptions, opened: SceneOptions, surface: S
         If points are missing or wrong, or do not determine the model.
     """
     scene = on_surface(scene, surface)
-    points = inputs.read_control(scene, options, opened.allow_network)
+    points = inputs.read_control(scene, options, opened)
     done = _from_points(scene, options, points, surface) if options.fit_model else _corrected(
         scene, options, opened, points, surface
     )  # fmt: skip

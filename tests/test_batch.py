@@ -117,7 +117,7 @@ def test_the_published_schema_is_current():
 @pytest.mark.parametrize(
     ("settings", "options", "not_in_the_file"),
     [
-        (batch_config.SceneSettings, SceneOptions, {"allow_network"}),
+        (batch_config.SceneSettings, SceneOptions, {"allow_network", "roots"}),
         (batch_config.PointSettings, PointOptions, set()),
         (batch_config.SurfaceSettings, SurfaceOptions, set()),
         (batch_config.OutputSettings, OutputOptions, {"memory", "threads"}),

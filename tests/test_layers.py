@@ -16,6 +16,7 @@ PACKAGE = ROOT / "ortho_pipeline"
 #: A module imports only from lines above its own.
 LAYERS = """
 errors options
+locations
 files crs geometry notebook
 point_table datum
 point_csv point_geojson point_lists point_ground
@@ -45,7 +46,7 @@ cli_studies cli_blocks cli_batch
 cli
 """
 LINE = {name: number for number, line in enumerate(LAYERS.split("\n")) for name in line.split()}
-GDAL_MODULES = {"rpc", "raster", "raster_writer", "gdal_engine", "dem", "plugins", "gcp_export", "mosaic"}
+GDAL_MODULES = {"locations", "rpc", "raster", "raster_writer", "gdal_engine", "dem", "plugins", "gcp_export", "mosaic"}
 NUMBA_MODULES = {"kernels", "lattice_kernel", "ray_kernel", "models"}
 MAX_LINES, MAX_FUNCTION = 600, 50
 

@@ -1,0 +1,250 @@
+"""Where files lie: on disk, in an archive, or behind a URL, by the names that GDAL has for such places.
+
+A `VsiPath` is made by `located`, which asks whether the network is allowed, and from another one. What a file of
+strangers says of other files is text, which nothing here opens.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from ortho_pipeline.errors import InputError
+
+#: Kinds of URL and GDAL's name for the file system that reads them.
+SCHEMES = {"http": "/vsicurl/http://", "https": "/vsicurl/https://", "s3": "/vsis3/", "gs": "/vsigs/", "az": "/vsiaz/"}
+_ARCHIVES = ("/vsizip", "/vsitar", "/vsigzip", "/vsi7z", "/vsirar")
+_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
+_SHOWN = 5
+
+
+class VsiPath:
+    """A file in an archive or behind a URL, with as much of `pathlib.Path` as reading metadata takes."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name.rstrip("/")
+
+    def __fspath__(self) -> str:
+        return self._name
+
+    def __str__(self) -> str:
+        return self._name
+
+    def __repr__(self) -> str:
+        return f"VsiPath({self._name!r})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, VsiPath) and self._name == other._name
+
+    def __lt__(self, other: VsiPath) -> bool:
+        return self._name < other._name
+
+    def __hash__(self) -> int:
+        return hash(self._name)
+
+    @property
+    def name(self) -> str:
+        """Last part of the name, without what a URL asks for."""
+        return self._name.rpartition("/")[2].partition("?")[0]
+
+    @property
+    def stem(self) -> str:
+        """The name without its ending."""
+        return Path(self.name).stem
+
+    @property
+    def suffix(self) -> str:
+        """The ending of the name."""
+        return Path(self.name).suffix
+
+    @property
+    def parent(self) -> VsiPath:
+        """The folder."""
+        return VsiPath(self._name.rpartition("/")[0])
+
+    def with_name(self, name: str) -> VsiPath:
+        """Return the file of that name in the same folder."""
+        return self.parent / name
+
+    def __truediv__(self, name: str) -> VsiPath:
+        if "/" in name or name == "..":
+            raise InputError(f"{name!r} is not the name of a file in this folder", file=self._name)
+        return VsiPath(f"{self._name}/{name}")
+
+    def resolve(self) -> VsiPath:
+        """Return the path itself: there are no links."""
+        return self
+
+    def stat(self) -> Any:
+        """Return size and kind.
+
+        Raises
+        ------
+        FileNotFoundError
+        """
+        found = self._stat()
+        if found is None:
+            raise FileNotFoundError(2, "there is no such file", self._name)
+        return SimpleNamespace(st_size=found.size)
+
+    def exists(self) -> bool:
+        """Tell whether there is such a file or folder."""
+        return self._stat() is not None
+
+    def is_file(self) -> bool:
+        """Tell whether it is a file."""
+        found = self._stat()
+        return found is not None and not found.IsDirectory()
+
+    def is_dir(self) -> bool:
+        """Tell whether it is a folder."""
+        found = self._stat()
+        return found is not None and bool(found.IsDirectory())
+
+    def iterdir(self) -> Iterator[VsiPath]:
+        """Yield what lies in the folder."""
+        from osgeo import gdal
+
+        for name in gdal.ReadDir(self._name) or []:
+            if name not in (".", "..") and "/" not in name:
+                yield self / name
+
+    def read(self, limit: int) -> bytes:
+        """Return the first bytes, at most `limit`.
+
+        Raises
+        ------
+        OSError
+            If it cannot be read.
+        """
+        from osgeo import gdal
+
+        try:
+            file = gdal.VSIFOpenL(self._name, "rb")
+        except RuntimeError:
+            file = None
+        if file is None:
+            raise FileNotFoundError(2, "there is no such file, or it cannot be reached", self._name)
+        try:
+            return bytes(gdal.VSIFReadL(1, limit, file) or b"")
+        finally:
+            gdal.VSIFCloseL(file)
+
+    def read_bytes(self) -> bytes:
+        """Return all bytes."""
+        return self.read(max(1, int(self.stat().st_size)))
+
+    def read_text(self, encoding: str = "utf-8") -> str:
+        """Return all text."""
+        return self.read_bytes().decode(encoding)
+
+    def open(self, mode: str = "rb") -> io.BytesIO:
+        """Return the content as a file that is open for reading."""
+        return io.BytesIO(self.read_bytes())
+
+    def _stat(self) -> Any:
+        from osgeo import gdal
+
+        try:
+            return gdal.VSIStatL(self._name)
+        except RuntimeError:
+            return None
+
+
+#: What readers of metadata take.
+AnyPath = str | os.PathLike[str]
+
+
+def located(path: AnyPath, *, allow_network: bool = False) -> AnyPath:
+    """Return where a file lies that the user named: itself on disk, a `VsiPath` in an archive or behind a URL.
+
+    Parameters
+    ----------
+    path : path
+        A file, a URL (`SCHEMES`), or a name of GDAL's (``/vsizip/scene.zip/scene.tif``, ``/vsicurl/…``).
+    allow_network : bool
+        Whether anything but files and archives on disk may be read.
+
+    Raises
+    ------
+    InputError
+        If the network is not allowed, or the kind of URL not known.
+    """
+    if isinstance(path, VsiPath):
+        return path
+    name = os.fspath(path)
+    url = _URL.match(name)
+    if url is None and not name.startswith("/vsi"):
+        return path
+    if url is not None:
+        scheme = url[1].lower()
+        if scheme == "file":
+            return name[url.end() :]
+        if scheme not in SCHEMES:
+            raise InputError(
+                f"URLs of the kind {scheme!r} are not read", file=name, remedy=f"one of {', '.join(SCHEMES)}, or a file"
+            )
+        name = SCHEMES[scheme] + name[url.end() :]
+    if not allow_network and not in_local_archive(name):
+        raise InputError(
+            "files of the network are not opened unasked",
+            file=os.fspath(path),
+            remedy="allow them with --allow-network",
+        )
+    return VsiPath(name)
+
+
+def in_local_archive(name: str) -> bool:
+    """Tell whether a name of GDAL's leads into archives on disk and nowhere else."""
+    chain = [prefix for prefix in _ARCHIVES if name.startswith((prefix + "/", prefix + "{"))]
+    if not chain:
+        return False
+    # GDAL takes /vsizip//vsicurl/… and /vsizip/vsicurl/… for the same.
+    rest = name[len(chain[0]) :]
+    if not rest.startswith("/vsi"):
+        rest = rest.removeprefix("/")
+    rest = rest.removeprefix("{")
+    return in_local_archive(rest) if rest.startswith("/vsi") else "://" not in rest
+
+
+def place(name: AnyPath) -> Any:
+    """Return the path of a dataset that is open (``dataset.GetDescription()``): a `Path`, or a `VsiPath`."""
+    text = os.fspath(name)
+    return VsiPath(text) if text.startswith("/vsi") else Path(text)
+
+
+def within(path: Path, roots: Iterable[AnyPath]) -> bool:
+    """Tell whether a path lies in one of the folders, wherever links lead."""
+    resolved = path.resolve()
+    return any(resolved.is_relative_to(Path(root).resolve()) for root in roots)
+
+
+def archive_of(name: str) -> Path | None:
+    """Return the archive on disk that a name of GDAL's leads into; None where there is none."""
+    if not in_local_archive(name):
+        return None
+    rest = re.sub(r"^(/vsi[a-z0-9]+(/(?=/)|(?=/vsi))|/vsi[a-z0-9]+/)+", "", name).replace("{", "").replace("}", "")
+    parts = rest.split("/")
+    for count in range(1, len(parts) + 1):
+        path = Path("/".join(parts[:count]) or "/")
+        if path.is_file():
+            return path
+    return None
+
+
+def members(archive: AnyPath, endings: tuple[str, ...] = (".tif", ".ntf", ".jp2", ".xml", ".img")) -> list[str]:
+    """Return names by which the images in an archive are opened, the first few."""
+    from osgeo import gdal
+
+    prefix = "/vsizip/" if os.fspath(archive).lower().endswith(".zip") else "/vsitar/"
+    folder = prefix + os.path.abspath(archive)
+    try:
+        names = gdal.ReadDirRecursive(folder) or []
+    except RuntimeError:
+        return []
+    return [f"{folder}/{name}" for name in names if name.lower().endswith(endings)][:_SHOWN]
