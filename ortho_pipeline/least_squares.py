@@ -105,7 +105,9 @@ def condition_of(design: Array) -> float:
     return float(singular[0] / singular[-1]) if singular[-1] > 0 else math.inf
 
 
-def minimise(residuals: Callable[[Array], Array], slopes: Callable[[Array], Array], start: Array) -> Array:
+def minimise(
+    residuals: Callable[[Array], Array], slopes: Callable[[Array], Array], start: Array, *, singular: float = 1e12
+) -> Array:
     """Return the parameters ``(P,)`` that minimise the sum of squares of `residuals`.
 
     Parameters
@@ -115,6 +117,9 @@ def minimise(residuals: Callable[[Array], Array], slopes: Callable[[Array], Arra
     slopes : callable(params) -> (n, P)
         Derivatives of the *predicted* values, over the same sigma.
     start : (P,)
+    singular : float
+        Where the iteration stays in a valley without a bottom, of this condition or worse, the parameters there are
+        returned: the caller tells that they are not determined.
 
     Raises
     ------
@@ -131,7 +136,7 @@ def minimise(residuals: Callable[[Array], Array], slopes: Callable[[Array], Arra
     if found is not None:
         return found
     # In a valley without a bottom the caller tells what is undetermined by the condition of the design.
-    if arrived or condition_of(slopes(params)) > 1e12:
+    if arrived or condition_of(slopes(params)) > singular:
         return params
     raise NotConverged("the adjustment did not converge", remedy="give better start values or fewer parameters")
 

@@ -227,4 +227,4 @@ class Problem:
 
         # Far from singular at the start, or the iteration would only wander: say so at once.
         self._determined(condition_of(slopes(origin)))
-        return start.with_params(minimise(misfit, slopes, origin))
+        return start.with_params(minimise(misfit, slopes, origin, singular=CONDITION_LIMIT))

@@ -13,13 +13,17 @@ from ortho_cartosat.layout import partner_of, rpc_of
 from ortho_cartosat.metadata import read_metadata
 from osgeo import gdal
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import DegeneratePoints, InputError
+from ortho_pipeline.estimation import fit
 from ortho_pipeline.experiments import cartosat_scene as simulated
 from ortho_pipeline.experiments.cartosat_scene import BIASES, Attitude, Scanner, StereoPair, aim, local_metres
 from ortho_pipeline.geometry import geocentric
+from ortho_pipeline.models.pushbroom_start import SoftSigmas
 from ortho_pipeline.plugins import open_scene
+from ortho_pipeline.points import read_points
 from ortho_pipeline.raster import open_dataset
 from ortho_pipeline.rpc_files import read_rpc_text
+from ortho_pipeline.selection import select_control
 from ortho_pipeline.simulate import EARTH_A, LineScanner
 from ortho_pipeline.testing import check_sensor
 
@@ -437,3 +441,55 @@ def test_heights_of_the_satellite_are_as_the_scene_has_them():
     # What the experiments call 618 km is above the ground of the scene, not above the equator.
     camera = aim("aft")
     assert camera.radius < EARTH_A + 618e3
+
+
+# -- soft constraints ------------------------------------------------------------------------------------------------
+
+
+def fitted(folder, view: str, count: int, **options: str):
+    """Fit the pushbroom of the pair in a folder to so many of all its 69 points, evenly chosen."""
+    image = folder / {"fore": "BANDF.tif", "aft": "BANDA.tif"}[view]
+    points = read_points(folder / "points.csv", image_name=image.name)
+    points = points.with_roles(np.full(len(points), "control"))
+    scene = open_scene(image, "cartosat", options)
+    return fit(scene.models["pushbroom"], select_control(points, f"even:{count}"))
+
+
+NO_ATTITUDE = {"sigma_attitude_deg": "none", "sigma_rate_rad_s": "none"}
+
+
+@pytest.mark.parametrize("view", ["fore", "aft"])
+def test_without_the_constraints_of_attitude_nine_points_determine_nothing(pair_folder, view):
+    assert fitted(pair_folder, view, 9).rmse("check")["total"] < 1.0
+    with pytest.raises(DegeneratePoints):
+        fitted(pair_folder, view, 9, **NO_ATTITUDE)
+
+
+def test_soft_constraints_are_set_left_out_and_told(pair_folder):
+    image = pair_folder / "BANDF.tif"
+    plain = open_scene(image)
+    assert plain.facts["soft_constraints"] == {
+        "sigma_plane_m": 10.0, "sigma_circle_rad": 0.001, "sigma_altitude_m": 20000.0, "sigma_attitude_deg": 0.5,
+        "sigma_rate_rad_s": 1e-4,
+    }  # fmt: skip
+    assert len(plain.models["pushbroom"].constraints()) == 2 + 2 + 1 + 3 + 6
+    options = {**NO_ATTITUDE, "sigma_altitude_m": "None", "sigma_plane_m": "2.5"}
+    scene = open_scene(image, "cartosat", options)
+    model = scene.models["pushbroom"]
+    assert scene.facts["soft_constraints"] == {
+        "sigma_plane_m": 2.5, "sigma_circle_rad": 0.001, "sigma_altitude_m": None, "sigma_attitude_deg": None,
+        "sigma_rate_rad_s": None,
+    }  # fmt: skip
+    assert len(model.constraints()) == 2 + 2
+    np.testing.assert_allclose(model.constraints().sigma[:2], 2.5)
+
+
+@pytest.mark.parametrize("option", ["sigma_plane_m", "sigma_rate_rad_s"])
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "1e400", "much", ""])
+def test_a_sigma_is_a_positive_number_or_none(pair_folder, option, value):
+    with pytest.raises(InputError) as caught:
+        open_scene(pair_folder / "BANDF.tif", "cartosat", {option: value})
+    assert caught.value.field == option
+    assert "none" in caught.value.remedy
+    with pytest.raises(InputError, match="is no sigma"):
+        SoftSigmas(rate=-1.0)

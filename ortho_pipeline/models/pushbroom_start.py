@@ -252,25 +252,40 @@ def _observed(times: Array, values: Array, sigma: float | None) -> tuple[Observa
 
 @dataclass(frozen=True)
 class SoftSigmas:
-    """How well a start from metadata is believed: the sigmas of its pseudo-observations.
+    """How well a start from metadata is believed: the sigmas of its pseudo-observations; None leaves one out.
+
+    Willneff et al. have the first two. Those of the flying height and of the attitude are ours: without them nine
+    control points do not determine the eighteen coefficients of a scene (docs/models.md).
 
     Parameters
     ----------
-    plane, circular : float
+    plane, circular : float, optional
         Of the orbit's shape (m, rad), see `OrbitShape`.
-    radius : float
+    radius : float, optional
         Of the distance from the Earth's centre (m).
-    attitude : float
+    attitude : float, optional
         Of roll, pitch and yaw in the middle of the scene (rad).
-    rate : float
+    rate : float, optional
         Of their rates at first and last row (rad/s).
+
+    Raises
+    ------
+    InputError
+        If one is not positive and finite.
     """
 
-    plane: float = 10.0
-    circular: float = 1e-3
-    radius: float = 10_000.0
-    attitude: float = math.radians(0.5)
-    rate: float = 1e-4
+    plane: float | None = 10.0
+    circular: float | None = 1e-3
+    radius: float | None = 10_000.0
+    attitude: float | None = math.radians(0.5)
+    rate: float | None = 1e-4
+
+    def __post_init__(self) -> None:
+        for name, sigma in vars(self).items():
+            if sigma is not None and not (math.isfinite(sigma) and sigma > 0):
+                raise InputError(
+                    f"{sigma} is no sigma", field=name, remedy="give a positive number, or None for no constraint"
+                )
 
 
 def pushbroom_of_metadata(
@@ -327,7 +342,7 @@ def pushbroom_of_metadata(
         yaw += turn
         if abs(turn) < 1e-5:
             break
-    shape = OrbitShape(sigmas.plane, sigmas.circular, radius, sigmas.radius)
+    shape = OrbitShape(sigmas.plane, sigmas.circular, None if sigmas.radius is None else radius, sigmas.radius)
     return _softened(start._replace(shape=shape), sigmas)
 
 
@@ -465,8 +480,9 @@ def _softened(model: Pushbroom, sigmas: SoftSigmas) -> Pushbroom:
     attitude = model.attitude
     ends = attitude.breaks[[0, -1]]
     middle = ends.mean(keepdims=True)
-    tables = (
-        Observations(middle, attitude(middle), np.full((1, 3), sigmas.attitude), 0, True),
-        Observations(ends, attitude(ends, 1), np.full((2, 3), sigmas.rate), 1, True),
-    )
-    return model._replace(attitude_observations=tables).freed("path", "attitude")
+    tables = [
+        Observations(times, attitude(times, derivative), np.full((len(times), 3), sigma), derivative, True)
+        for times, derivative, sigma in ((middle, 0, sigmas.attitude), (ends, 1, sigmas.rate))
+        if sigma is not None
+    ]
+    return model._replace(attitude_observations=tuple(tables)).freed("path", "attitude")

@@ -10,7 +10,7 @@ from osgeo import gdal
 
 from ortho_cartosat.layout import metadata_of, partner_of, rpc_of, view_of
 from ortho_cartosat.metadata import Metadata, read_metadata
-from ortho_cartosat.start import pushbroom
+from ortho_cartosat.start import DEFAULT, SOFT, pushbroom, soft_facts, soft_sigmas
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models.base import SensorModel
@@ -45,6 +45,11 @@ def ortho_sensors() -> Iterable[Sensor]:
             "rpc": "which RPC to use: tag, sidecar, or an RPC file; by itself the first readable one of the delivery",
             "rpc_origin": "line and sample that the RPC gives to the centre of the first pixel: 0 (default) or 1",
             "view": "fore or aft, where neither name nor metadata say it",
+            **{
+                option: f"soft constraint of the pushbroom: sigma of the {what}, or none; by itself"
+                f" {soft_facts(DEFAULT)[option]:g}"
+                for option, (_, _, what) in SOFT.items()
+            },
         },
     )
 
@@ -59,7 +64,16 @@ def recognises(dataset: gdal.Dataset) -> bool:
 
 
 def open_scene(
-    dataset: gdal.Dataset, *, rpc: str | None = None, rpc_origin: str = "0", view: str | None = None
+    dataset: gdal.Dataset,
+    *,
+    rpc: str | None = None,
+    rpc_origin: str = "0",
+    view: str | None = None,
+    sigma_plane_m: str | None = None,
+    sigma_circle_rad: str | None = None,
+    sigma_altitude_m: str | None = None,
+    sigma_attitude_deg: str | None = None,
+    sigma_rate_rad_s: str | None = None,
 ) -> Scene:
     """Open an image with the RPC of its delivery, and with a pushbroom to be adjusted to control points."""
     name = dataset.GetDescription()
@@ -69,13 +83,22 @@ def open_scene(
     if rpc_origin not in ("0", "1") or view not in (None, "fore", "aft"):
         field, allowed = ("rpc_origin", "0 or 1") if rpc_origin not in ("0", "1") else ("view", "fore or aft")
         raise InputError("there is no such choice", field=field, remedy=f"give {allowed}")
+    sigmas = soft_sigmas(
+        {
+            "sigma_plane_m": sigma_plane_m,
+            "sigma_circle_rad": sigma_circle_rad,
+            "sigma_altitude_m": sigma_altitude_m,
+            "sigma_attitude_deg": sigma_attitude_deg,
+            "sigma_rate_rad_s": sigma_rate_rad_s,
+        }
+    )
     metadata = read_metadata(path)
     size = dataset.RasterXSize, dataset.RasterYSize
     view = view or view_of(name, metadata)
     found, source, warnings = _rpc(dataset, rpc, rpc_origin)
     models: dict[str, SensorModel] = {} if found is None else {"rpc": found}
     try:
-        models["pushbroom"] = pushbroom(metadata, view, size, HEIGHTS if found is None else found.height_range)
+        models["pushbroom"] = pushbroom(metadata, view, size, HEIGHTS if found is None else found.height_range, sigmas)
     except InputError as error:
         if not models:
             raise
@@ -88,6 +111,8 @@ def open_scene(
         warnings.append("there is no readable RPC: the model only starts an adjustment to at least nine control points")
     facts = _facts(name, metadata, warnings) | ({} if found is None else {"rpc_origin": int(rpc_origin)})
     facts = {"view": view} | facts if view else facts
+    if "pushbroom" in models:
+        facts["soft_constraints"] = soft_facts(sigmas)
     return Scene("cartosat", name, *size, models, source or str(path), facts, tuple(warnings), sources=(path,))
 
 

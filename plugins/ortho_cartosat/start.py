@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+
 import numpy as np
 
 from ortho_cartosat.metadata import TILTS_DEG, Metadata
@@ -13,9 +17,62 @@ from ortho_pipeline.models.pushbroom_start import SoftSigmas, pushbroom_of_metad
 FOCAL_LENGTH, PIXEL_SIZE, COLUMNS = 1.945, 7e-6, 12000
 #: Sigma (m) of the flying height: section 2.1 tells of metadata with 638 km for a satellite at 618 km.
 SIGMA_RADIUS = 20e3
+DEFAULT = SoftSigmas(radius=SIGMA_RADIUS)
+#: Options of the sensor: the sigma of a soft constraint each, its unit in those of `SoftSigmas`, and what it is of.
+SOFT: dict[str, tuple[str, float, str]] = {
+    "sigma_plane_m": ("plane", 1.0, "distance (m) of the path from a plane through the Earth's centre"),
+    "sigma_circle_rad": ("circular", 1.0, "angle (rad) between position and velocity beyond a right one"),
+    "sigma_altitude_m": ("radius", 1.0, "flying height (m)"),
+    "sigma_attitude_deg": ("attitude", math.radians(1.0), "roll, pitch and yaw (degrees) in the middle of the scene"),
+    "sigma_rate_rad_s": ("rate", 1.0, "their rates (rad/s) at first and last row"),
+}
+#: Where a constraint is left out.
+NONE = "none"
 
 
-def pushbroom(metadata: Metadata, view: str | None, size: tuple[int, int], heights: tuple[float, float]) -> Pushbroom:
+def soft_sigmas(given: Mapping[str, str | None]) -> SoftSigmas:
+    """Return the sigmas that the options of the sensor ask for, each a positive number or ``none``.
+
+    Raises
+    ------
+    InputError
+        If one is neither.
+    """
+    sigmas = asdict(DEFAULT)
+    for option, text in given.items():
+        name, unit, _ = SOFT[option]
+        if text is None:
+            continue
+        try:
+            value = None if text.strip().lower() == NONE else float(text) * unit
+        except ValueError:
+            value = math.nan
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise InputError(
+                f"{text[:40]!r} is no sigma",
+                field=option,
+                remedy=f"give a positive number, or {NONE} for no constraint",
+            )
+        sigmas[name] = value
+    return SoftSigmas(**sigmas)
+
+
+def soft_facts(sigmas: SoftSigmas) -> dict[str, float | None]:
+    """Return the sigmas by the names and in the units of the options; None where a constraint is left out."""
+    values = asdict(sigmas)
+    return {
+        option: None if values[name] is None else float(f"{values[name] / unit:.12g}")
+        for option, (name, unit, _) in SOFT.items()
+    }
+
+
+def pushbroom(
+    metadata: Metadata,
+    view: str | None,
+    size: tuple[int, int],
+    heights: tuple[float, float],
+    sigmas: SoftSigmas = DEFAULT,
+) -> Pushbroom:
     """Return the line scanner that starts an adjustment, from corners, flying height and nominal camera.
 
     Raises
@@ -36,7 +93,7 @@ def pushbroom(metadata: Metadata, view: str | None, size: tuple[int, int], heigh
         np.hstack([corners, middle]), *size, altitude=altitude, along_deg=_tilt(metadata, view),
         across_deg=metadata.number("ViewAngleAcrossTrack", low=-60, high=60) or 0.0,
         focal_length=FOCAL_LENGTH if nominal else None, pixel_size=PIXEL_SIZE if nominal else None, heights=heights,
-        sigmas=SoftSigmas(radius=SIGMA_RADIUS),
+        sigmas=sigmas,
     )  # fmt: skip
 
 
