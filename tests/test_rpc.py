@@ -112,6 +112,29 @@ def test_raw_rpc_agrees_with_gdal(tmp_path):
     assert np.abs(closed).max() < 1e-5
 
 
+def unclosed(rpc: RPC, ground: np.ndarray) -> np.ndarray:
+    """Return by how much ground -> image -> ground -> image misses (px), beyond the rounding of degrees to doubles."""
+    image = rpc.ground_to_image(ground)
+    back = rpc.image_to_ground(image, ground[:, 2])
+    rounding = np.einsum("nij,nj->ni", np.abs(rpc.ground_partials(back)[:, :, :2]), np.spacing(np.abs(back[:, :2])))
+    return (np.abs(rpc.ground_to_image(back) - image) - rounding).max(axis=1)
+
+
+@pytest.mark.parametrize("strength", [1.0, 20.0, 60.0])
+def test_the_inverse_closes_far_outside_of_the_image_too(strength):
+    """Strong terms far from the middle need many steps, and the last one must not be left out."""
+    plain = make_rpc()
+    bent = {name: getattr(plain, name).copy() for name in ("col_num", "col_den", "row_num", "row_den")}
+    for values in bent.values():
+        values[4:] *= strength
+    rpc = plain._replace(**bent)
+    centre, half = rpc.domain
+    ground = centre + np.random.default_rng(3).uniform(-1.45, 1.45, (100_000, 3)) * half
+    missed = unclosed(rpc, ground)
+    assert np.isfinite(missed).mean() > 0.95
+    assert np.nanmax(missed) < 1e-10
+
+
 def test_crop_and_scale_move_the_model_as_the_pixels():
     rpc = make_rpc()
     ground = in_box(rpc, 100)
@@ -635,6 +658,9 @@ def test_real_rpcs_agree_with_gdal_close_and_are_refitted(path, tmp_path):
     # This one, altered by its publisher, folds over in a part of its box, so that two grounds have one image.
     assert np.isfinite(closed).all() or path.endswith("md_eros.rpc")
     assert np.nanmax(np.abs(closed)) < 1e-5
+    centre, half = rpc.domain
+    wide = centre + np.random.default_rng(3).uniform(-1.45, 1.45, (20_000, 3)) * half
+    assert np.nanmax(unclosed(rpc, wide)) < 1e-10
     box, heights = rpc_module._domain_box(rpc)
     assert fit_rpc(rpc, box, heights).max_error_px < 1e-4
 

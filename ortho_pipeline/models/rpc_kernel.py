@@ -70,7 +70,7 @@ def intersect(image, heights, offsets, scales, coefficients, start, limit, toler
     """Fill `ground` ``(N, 3)`` with the points at ellipsoidal `heights` ``(N,)`` whose projections are `image`.
 
     `start` ``(2, 6)`` gives first longitudes and latitudes (normalised) as polynomials 1, c, r, z, cz, rz of normalised
-    column, row and height. Then Newton's method with the Jacobian of the first step, renewed while a step does not
+    column, row and height. Then Newton's method with the Jacobian of the first step, renewed when a step does not
     shrink the misfit to a hundredth.
     """
     a, b, c, d = coefficients[0], coefficients[1], coefficients[2], coefficients[3]
@@ -109,14 +109,15 @@ def intersect(image, heights, offsets, scales, coefficients, start, limit, toler
                 v = _polynomial(c, x, y, z) / _polynomial(d, x, y, z)
             du, dv = col - u, row - v
             miss = max(abs(du * scales[3]), abs(dv * scales[4]))
-            if not miss > tolerance:
-                break
-            stale = not stale and miss > 0.01 * before
+            stale = miss > 0.01 * before
             before = miss
             dx, dy = i00 * du + i01 * dv, i10 * du + i11 * dv
             # A step beyond the domain comes from a bad linearisation far from the solution: go a shorter way.
             longest = max(abs(dx), abs(dy), 1.0)
             x, y = x + dx / longest, y + dy / longest
+            # The step that was just made takes what is left to a hundredth, down to the rounding of degrees.
+            if not miss > tolerance:
+                break
         good = miss <= verified and abs(x) <= limit and abs(y) <= limit
         ground[k, 0] = x * scales[0] + offsets[0] if good else np.nan
         ground[k, 1] = y * scales[1] + offsets[1] if good else np.nan
