@@ -23,7 +23,7 @@ from ortho_pipeline.experiments.bilsat import ROWS, reproduce
 from ortho_pipeline.experiments.bilsat_page import page
 from ortho_pipeline.experiments.bilsat_scene import FOCAL_LENGTH, PITCH, SIZE
 from ortho_pipeline.experiments.page import text
-from ortho_pipeline.experiments.tables import is_within
+from ortho_pipeline.experiments.tables import is_missed
 from ortho_pipeline.geometry import geocentric
 from ortho_pipeline.models.frame import FrameCamera
 from ortho_pipeline.models.lens import Interior
@@ -253,19 +253,22 @@ def _ellipsoidal(path: Path, surface: Surface, out: Path) -> None:
 
 def test_reproduction_as_text_json_and_page(tmp_path):
     document = json.loads(run("reproduce", "bilsat", "--realisations", 2, "-o", tmp_path, "--json"))
-    assert {"paper", "settings", "tables"} <= set(document)
+    assert {"paper", "knobs", "tables"} <= set(document)
     assert [table["table"] for table in document["tables"]] == [3, 4, 5]
     lines = [line for table in document["tables"] for line in table["rows"]]
     assert {"label", "quantity", "paper", "median", "p5", "p95"} <= set(lines[0])
     assert len(lines) == sum(number is not None for row in ROWS for number in row.paper)
-    assert document["summary"]["within"] == sum(is_within(line) for line in lines)
+    assert document["summary"]["predicted"]["rows"] + document["summary"]["fitted"]["rows"] == len(lines)
     assert json.loads((tmp_path / "bilsat.json").read_text())["tables"] == document["tables"]
     html = (tmp_path / "bilsat.html").read_text()
-    assert html.count("<tr") == len(lines) + 3
+    # Heads and groups of three tables, and the settings.
+    assert html.count("<tr") == len(lines) + 3 + 5 + 1 + len(document["knobs"])
     assert html.count('class="control-head"') > 25
     assert "1 pixel" in html
     said = text(document)
-    assert said.count("\n!") == len(lines) - document["summary"]["within"]
+    assert said.count("\n!") == sum(is_missed(line) for line in lines) + sum(
+        one["verdict"] == "not reproduced" for one in document["statements"]
+    )
 
 
 def test_rows_that_cannot_be_fitted_are_said_to_be_so():

@@ -19,11 +19,11 @@ from ortho_pipeline.experiments.ikonos_scene import (
     MAP_CRS,
     GeoScene,
     Scan,
+    Slope,
     VendorModel,
     to_map,
 )
 from ortho_pipeline.experiments.page import text
-from ortho_pipeline.experiments.tables import FACTOR, is_within
 from ortho_pipeline.model_choice import fit_family
 from ortho_pipeline.rpc import fit_rpc, read_rpc
 from ortho_pipeline.simulate import geocentric
@@ -162,7 +162,7 @@ def table():
     """Errors of the check points ``(40, 6)``, in the order of table 2."""
     rows = []
     for seed in range(40):
-        points = GeoScene.make(seed).measure(seed)
+        points = ikonos.Realisation.scene_of(seed).measure(seed)
         rows.append([fit_family(name, points, robust=False).rmse("check")["total"] for name in ikonos.TABLE_2])
     return np.array(rows)
 
@@ -171,9 +171,25 @@ def test_table_2_ranks_as_in_the_paper(table):
     medians = dict(zip(ikonos.TABLE_2, np.median(table, axis=0), strict=True))
     assert sorted(medians, key=medians.get) == sorted(ikonos.TABLE_2, key=ikonos.TABLE_2.get)
     assert all(statement.holds for statement in ikonos.statements(table))
-    for name, paper in ikonos.TABLE_2.items():
-        assert 1 / FACTOR < medians[name] / paper < FACTOR, name
-    assert 1 <= medians["dlt"] < medians["affine3d"] <= 2
+    # Fitted: DLT and the quadratic polynomial. The others are predicted, from published heights of the city too small.
+    assert medians["dlt"] == pytest.approx(1.19, rel=0.1)
+    assert medians["poly2"] == pytest.approx(7.3, rel=0.15)
+    assert 0.6 < medians["affine2d"] / 13.79 < 0.85
+    assert 0.6 < medians["projective"] / 13.21 < 0.85
+    assert 0.7 < medians["affine3d"] / 1.89 < 1.0
+    assert 0.8 < medians["poly3"] / 5.58 < 1.2
+
+
+def test_the_slope_goes_through_the_published_heights_of_the_city():
+    # Without hills: railway station, centre, northern limit; latitude, metres above the sea (the geoid is 10 m off).
+    slope = Slope(roughness=0.0)
+    for latitude, height in ((35.6586, 1117.0), (35.6962, 1191.0), (35.82, 1700.0)):
+        assert slope(np.array([51.42]), np.array([latitude]))[0] == pytest.approx(height, abs=25.0)
+
+
+def test_two_of_three_scans_run_against_the_flight():
+    scenes = [ikonos.Realisation.scene_of(seed) for seed in range(60)]
+    assert np.mean([scene.scan.is_reverse for scene in scenes]) == pytest.approx(2 / 3, abs=0.15)
 
 
 def test_statements_that_do_not_hold_are_said_not_to(table):
@@ -210,15 +226,18 @@ def test_the_document_has_table_2_and_what_the_paper_did_not_have(reproduced):
     assert json.loads((folder / "ikonos.json").read_text())["tables"] == document["tables"]
     tables = {table["table"]: table["rows"] for table in document["tables"]}
     assert [row["paper"] for row in tables[2]] == list(ikonos.TABLE_2.values())
-    assert document["summary"]["rows"] == 6
-    assert document["summary"]["within"] == sum(is_within(row) for row in tables[2])
+    roles = {row["label"]: row["role"] for row in tables[2]}
+    assert {name for name, role in roles.items() if role == "fitted"} == {"DLT", "quadratic polynomial"}
+    assert document["summary"]["predicted"]["rows"] == 4
+    # A share has no metres.
+    assert {row["quantity"]: row["units"] for row in tables["A"]} == {"leave-one-out": "m", "share justified": ""}
     found = {(row["label"], row["quantity"]): row["median"] for table in document["tables"] for row in table["rows"]}
     assert all(value is not None for value in found.values())
     assert 1 < found["RPC + shift", "1 point"] < 3
     assert 10 < found["RPC", "0 points"] < 28
     # The direction to the satellite alone, and one point: a few metres, where the paper's plane models have ten.
     assert 1.5 < found["geo, from metadata + shift", "1 point"] < 6
-    assert found["3D affine", "forward scan"] < found["3D affine", "RMS check"]
+    assert found["3D affine", "forward scan"] < found["3D affine", "reverse scan"]
     assert all(0.2 < value <= 1 for (_, what), value in found.items() if what == "share justified")
 
 

@@ -12,10 +12,10 @@ from click.testing import CliRunner
 from ortho_pipeline.cli import cli
 from ortho_pipeline.edge import analyse_edge
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.experiments import orbview3, orbview3_page
+from ortho_pipeline.experiments import orbview3, orbview3_page, orbview3_statements
 from ortho_pipeline.experiments import orbview3_scene as simulated
 from ortho_pipeline.experiments.page import text
-from ortho_pipeline.experiments.tables import within_factor
+from ortho_pipeline.experiments.tables import is_missed, is_within
 from ortho_pipeline.model_choice import fit_family
 from ortho_pipeline.simulate import geocentric
 
@@ -204,19 +204,43 @@ def test_an_edge_of_the_rendered_image_has_that_width(monkeypatch):
 def test_the_table_comes_out(document):
     rows = [row for table in document["tables"] for row in table["rows"]]
     assert len(rows) == 38
-    assert within_factor(document) >= 0.8
+    assert np.mean([is_within(row) for row in rows if row["role"] == "fitted"]) >= 0.8
     assert all(row["failed"] <= 1 for row in rows)
+    # What no setting was fitted to is little: DLT, and 14 parameters in Y.
+    predicted = {(row["label"], row["quantity"]) for row in rows if row["role"] == "predicted"}
+    assert predicted == {("dlt", f"{scene} {axis}") for scene in SCENES for axis in "XY"} | {
+        ("affine14", f"{scene} Y") for scene in SCENES
+    }
     said = text(document)
-    assert said.count("\n!") == 38 - document["summary"]["within"] + sum(
-        not one["holds"] for one in document["statements"]
+    assert said.count("\n!") == sum(is_missed(row) for row in rows) + sum(
+        one["verdict"] == "not reproduced" for one in document["statements"]
     )
 
 
-def test_what_the_paper_says_holds(document):
-    failed = [one["text"] for one in document["statements"] if not one["holds"]]
-    # In a few realisations only what rests on a mean over many may fail.
-    assert len(document["statements"]) == 13
-    assert all("correlated" in one or "mean discrepancies" in one or "not justified" in one for one in failed)
+def test_mean_discrepancies_without_control_are_single_draws_with_their_sign(document):
+    rows = [row for row in document["tables"][0]["rows"] if row["label"] == "RPC absolute"]
+    assert [row["paper"] for row in rows] == [8.37, 8.56, 3.58, -13.61]
+    assert {row["role"] for row in rows} == {"draw"}
+    # A standard deviation of 14.3 m has 47 m between these percentiles; 12 realisations tell it to a third.
+    assert all(25 < row["p95"] - row["p5"] < 75 for row in rows)
+    assert all(abs(row["median"]) < 14.3 for row in rows)
+
+
+def test_what_is_not_reproduced_is_said_to_be_so(document):
+    verdicts = {one["text"]: one["verdict"] for one in document["statements"]}
+    assert len(verdicts) == 16
+
+    def verdict(start):
+        (found,) = [verdict for text, verdict in verdicts.items() if text.startswith(start)]
+        return found
+
+    for start in ("The slow-down", "DLT is not", "Discrepancies at"):
+        assert verdict(start) == "reproduced"
+    for start in ("Height to base", "Scene 471890", "Points closer", "Pixels are"):
+        assert verdict(start) == "by settings"
+    # Neighbours with 0.1, not 0.2 to 0.3; edges of 1.6 px; other parameters; changes beyond what cannot be seen.
+    for start in ("Neighbouring points", "Edges do not", "In scene 471890", "Without them", "Without control"):
+        assert verdict(start) == "not reproduced"
 
 
 def test_correlations_of_the_dlt_are_those_of_its_own_coordinates():
@@ -225,7 +249,7 @@ def test_correlations_of_the_dlt_are_those_of_its_own_coordinates():
     result = fit_family("dlt", points, robust=False)
     # Normalised they can be told apart, in map coordinates they cannot.
     normalised = np.abs(np.triu(result.correlation, 1)).max()
-    assert normalised < orbview3.INSEPARABLE < orbview3.largest_correlation(result) <= 1.0 + 1e-12
+    assert normalised < orbview3_statements.INSEPARABLE < orbview3.largest_correlation(result) <= 1.0 + 1e-12
 
 
 def test_the_page_has_figures_and_reasons(document, tmp_path):
@@ -243,5 +267,5 @@ def test_reproduce_writes_page_and_numbers(tmp_path):
     assert done.exit_code == 0, done.output
     document = json.loads(done.stdout)
     assert json.loads((tmp_path / "orbview3.json").read_text())["tables"] == document["tables"]
-    assert (document["sensor"], document["units"]) == ("orbview3", "m")
+    assert (document["sensor"], document["realisations"]) == ("orbview3", 2)
     assert "Figure 4" in (tmp_path / "orbview3.html").read_text()

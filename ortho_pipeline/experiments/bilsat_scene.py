@@ -37,6 +37,8 @@ MAP_CRS = "EPSG:32636"
 OFF_NADIR_DEG, SIGMA_IMAGE, SIGMA_GROUND = 7.3, 0.7, 0.7
 #: How much the plains roll, and among how many places of a cell the lowest is measured: see there as well.
 ROUGHNESS, PLACES = 0.65, 3
+#: Error of the ephemeris, per axis (m).
+SIGMA_POSITION = 300.0
 #: The four XS cameras: misalignment to the right, downwards and about the axis (rad), relative focal length, k1.
 XS_CAMERAS = {
     "red": (0.0, 0.0, 0.0, 1.0, 0.0),
@@ -295,7 +297,7 @@ class BilsatScene:
             source=f"simulated BILSAT-1 scene, seed {seed}",
         )
 
-    def survey(self, seed: int, *, sigma_position: float = 300.0, sigma_velocity: float = 0.3) -> SurveyTruth:
+    def survey(self, seed: int, *, sigma_position: float = SIGMA_POSITION, sigma_velocity: float = 0.3) -> SurveyTruth:
         """Return the ephemeris with the errors (m, m/s per axis) of a small satellite's orbit determination."""
         random = np.random.default_rng([seed, 1])
         position = self.camera.position + random.normal(0, sigma_position, 3)

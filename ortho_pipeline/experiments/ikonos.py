@@ -1,17 +1,8 @@
 """Table 2 and figure 4 of Amini and Hashemi on simulated IKONOS Geo scenes: the paper's numbers beside ours.
 
 Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws what the paper does
-not tell: the hills, the places of the points, the azimuth of the satellite and the vendor's error; and the noise.
-Nothing is tuned per row. Each free setting has the value that one row asks for:
-
-- pointing in the image 0.5 px (of a metre) per axis, from DLT (1.19 m); the 0.5 m per axis of the map are the paper's;
-- scan against the flight, from 3D affine (1.89 m): with a forward scan, in which the lines of sight are parallel along
-  the scan, it would be 1.4 m. Of three real products that were looked at, two were scanned in reverse;
-- how much steeper the city's slope is in the north, from 2D affine (13.79 m);
-- how much the hills rise, from the quadratic polynomial (7.31 m).
-
-The rows of the projective model and of the cubic polynomial set nothing. One choice was made in sight of all rows: how
-the hills fall off with their wavelength (the longest wave 25 km rather than 12 or 40) and how much the city rises.
+not tell: the hills, the places of the points, the azimuth of the satellite, the direction of its scan and the vendor's
+error; and the noise. `KNOBS` lists all settings, and the two rows that two of them were fitted to.
 """
 
 from __future__ import annotations
@@ -27,6 +18,7 @@ from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.estimation import Fit, fit
 from ortho_pipeline.experiments.ikonos_scene import (
     BEND,
+    BIAS,
     MAP_CRS,
     OFF_NADIR_DEG,
     POINTING,
@@ -34,10 +26,11 @@ from ortho_pipeline.experiments.ikonos_scene import (
     REFERENCE_HEIGHT,
     ROUGHNESS,
     SIGMA_GROUND,
+    STEEPNESS,
     GeoScene,
     VendorModel,
 )
-from ortho_pipeline.experiments.tables import Curve, Number, Statement, make_document
+from ortho_pipeline.experiments.tables import Curve, Knob, Number, Statement, make_document
 from ortho_pipeline.model_choice import fit_family, fit_own, prune
 from ortho_pipeline.models import family_of
 from ortho_pipeline.models.base import Array, SensorModel
@@ -66,6 +59,54 @@ NAMES = {
     "poly2": "quadratic polynomial",
     "poly3": "cubic polynomial",
 }
+#: What somebody guesses who knows one model of the paper from another of the same kind: see `NAIVE`.
+GUESSED = {"affine2d": "projective", "projective": "affine2d", "poly3": "poly2", "affine3d": "dlt"}
+NAIVE = (
+    "the paper’s own number for the nearest model: projective for 2D affine and the other way round, quadratic for "
+    "cubic, DLT for 3D affine."
+)
+#: How often a scan runs against the flight.
+REVERSED = 2 / 3
+KNOBS = (
+    Knob(
+        "POINTING", POINTING, "px per axis", "fitted",
+        "Noise of pointing, from the model that has nothing else left. It came out at the half pixel that is customary "
+        "a priori (Willneff et al. have it), but it was found in sight of this row, so the row is not counted.",
+        ("2|DLT|*",),
+    ),
+    Knob(
+        "ROUGHNESS", ROUGHNESS, "", "fitted",
+        "How much the hills rise. Only its product with the tangent of the tilt has an effect.",
+        ("2|quadratic polynomial|*",),
+    ),
+    Knob("SIGMA_GROUND", SIGMA_GROUND, "m per axis", "paper", "The accuracy of the map of 1:500."),
+    Knob(
+        "STEEPNESS, BEND", [STEEPNESS, BEND], "", "published",
+        "The slope of the city, through heights that are published: the railway station 1117 m, the centre (35.696 "
+        "degrees north) 1191 m, the northern limit (35.82 degrees) 1700 m. Formerly 4.0 and 0.9 fitted 2D affine; with "
+        "the heights of the city itself 2D affine and projective come out by a third too small. A tilt of 27 degrees "
+        "would make up for that, but nothing tells it.",
+    ),
+    Knob(
+        "REVERSED", REVERSED, "of the realisations", "published",
+        "A scan against the flight, in which lines of sight are not parallel along it: two of the three real products "
+        "that were looked at have it, so it is drawn. Formerly all scans were reversed, which 3D affine asked for.",
+    ),
+    Knob(
+        "OFF_NADIR_DEG", OFF_NADIR_DEG, "degrees", "chosen",
+        "Tilt. Geo products are ordered with at least 60 degrees of elevation; this is between. All models without "
+        "heights have errors in proportion to its tangent.",
+    ),
+    Knob(
+        "relief", "waves of 0.4 to 25 km, 1050 to 1800 m", "", "chosen",
+        "How the hills fall off with their wavelength. Of longest waves of 12, 25 and 40 km the second was taken in "
+        "sight of all rows, so that the cubic polynomial is no pure prediction.",
+    ),
+    Knob(
+        "BIAS", list(BIAS), "m", "published",
+        "Error of the vendor's line of sight: 10 to 25 m are usual for Geo products. All models of table 2 take it up.",
+    ),
+)  # fmt: skip
 #: What a vendor's model is good for: heights (m) of the RPC and of the model from metadata.
 HEIGHTS = (900.0, 2000.0)
 #: Own models of the scene by number of points: model, correction, points. ``own``: its own parameters are adjusted.
@@ -109,8 +150,14 @@ class Realisation:
     @classmethod
     def draw(cls, seed: int, **settings: Any) -> Realisation:
         """Draw all that the paper does not tell; settings are those of `GeoScene.make`."""
-        scene = GeoScene.make(seed, **settings)
+        scene = cls.scene_of(seed, **settings)
         return cls(scene, scene.measure(seed), {"geo": geo_model(scene), "rpc": vendor_rpc(scene)})
+
+    @staticmethod
+    def scene_of(seed: int, **settings: Any) -> GeoScene:
+        """Draw the scene; the scan runs against the flight as often as `REVERSED` says."""
+        reverse = bool(np.random.default_rng([seed, 8]).uniform() < REVERSED)
+        return GeoScene.make(seed, **{"reverse": reverse, **settings})
 
 
 def geo_model(scene: GeoScene) -> MapPlane:
@@ -156,20 +203,12 @@ def reproduce(realisations: int = 100, *, progress: Callable[[float], None] | No
     return make_document(
         PAPER,
         sensor="ikonos",
-        units="m",
-        settings={
-            "off_nadir_deg": OFF_NADIR_DEG,
-            "pointing_m": POINTING,
-            "sigma_ground_m": SIGMA_GROUND,
-            "bend": BEND,
-            "roughness": ROUGHNESS,
-            "scan": "reverse",
-            "realisations": realisations,
-        },
         settings_text=(
-            f"{realisations} realisations, {OFF_NADIR_DEG:g} degrees off nadir, scanned in reverse, noise of "
-            f"pointing {POINTING:g} px and of the map {SIGMA_GROUND:g} m, each per axis"
+            f"{realisations} realisations, {OFF_NADIR_DEG:g} degrees off nadir, two of three scanned in reverse, noise "
+            f"of pointing {POINTING:g} px and of the map {SIGMA_GROUND:g} m, each per axis"
         ),
+        knobs=KNOBS,
+        naive_text=NAIVE,
         numbers=numbers,
         found=found,
         titles=TITLES,
@@ -207,11 +246,16 @@ _Values = dict[tuple[int | str, str, str], float]
 
 
 def _numbers() -> list[Number]:
-    listed = [Number(2, NAMES[name], "RMS check", paper) for name, paper in TABLE_2.items()]
-    listed += [Number("A", NAMES[name], what) for name in TABLE_2 for what in ("leave-one-out", "share justified")]
-    listed += [Number("B", *_own_name(*row)) for row in OWN]
-    listed += [Number("C", NAMES[name], "forward scan") for name in ("affine3d", "dlt")]
-    return [*listed, Number("C", NAMES["affine3d"], "geocentric"), Number("C", NAMES["dlt"], "geocentric")]
+    listed = [
+        Number(2, NAMES[name], "RMS check", "m", paper, TABLE_2.get(GUESSED.get(name, "")))
+        for name, paper in TABLE_2.items()
+    ]
+    for name in TABLE_2:
+        listed += [Number("A", NAMES[name], "leave-one-out", "m"), Number("A", NAMES[name], "share justified", "")]
+    listed += [Number("B", *_own_name(*row), "m") for row in OWN]
+    for what in ("forward scan", "reverse scan", "geocentric"):
+        listed += [Number("C", NAMES[name], what, "m") for name in ("affine3d", "dlt")]
+    return listed
 
 
 def _own_name(own: str, correction: str, count: int) -> tuple[str, str]:
@@ -234,10 +278,14 @@ def _evaluate(drawn: Realisation) -> _Values:
 
 
 def _elsewhere(seed: int, drawn: Realisation) -> _Values:
-    forward = GeoScene.make(seed, reverse=False).measure(seed)
+    scans = {
+        what: GeoScene.make(seed, reverse=reverse).measure(seed)
+        for what, reverse in (("forward scan", False), ("reverse scan", True))
+    }
     values: _Values = {}
     for name in ("affine3d", "dlt"):
-        values["C", NAMES[name], "forward scan"] = _check_error(fit_family, name, forward, robust=False)
+        for what, points in scans.items():
+            values["C", NAMES[name], what] = _check_error(fit_family, name, points, robust=False)
         values["C", NAMES[name], "geocentric"] = _check_error(
             fit_family, name, drawn.points, crs="geocentric", robust=False
         )
@@ -298,9 +346,11 @@ def statements(table: Array) -> list[Statement]:
         Statement("The DLT model was the best model for the test area.", ours[0] == "dlt",
                   f"in {100 * best:.0f} % of the realisations"),
         Statement(
-            "An accuracy of 1.1 m is reached with DLT, 1.9 m with 3D affine: models with height reach 1 to 2 m.",
-            all(1 <= medians[names.index(name)] <= 2 for name in ("dlt", "affine3d")),
-            f"{said['dlt']}, {said['affine3d']} m",
+            "An accuracy of 1.1 m is achieved with DLT.",
+            medians[names.index("dlt")] < 1.25,
+            f"{said['dlt']} m; the paper’s table has 1.19 m",
+            "The noise of pointing was fitted to this row.",
+            by_settings=True,
         ),
         Statement(
             "Models without height are worse than those with it; polynomials are better than 2D affine and projective.",

@@ -7,7 +7,8 @@ displaced. The vendor projects with an attitude that is a little wrong, so that 
 
 So the true image of a ground point needs no camera constants at all: at the instant at which the scan plane passes the
 point, the line of sight goes from the satellite through the point; where it meets the plane is the pixel. This is
-written from first principles and shares no code with the models that are fitted to it. Light time, aberration and
+written from first principles and shares no code with the models that are fitted to it; only the vendor's RPC is made of
+`VendorModel` by the package's own `fit_rpc`. Light time, aberration and
 refraction are left out. How the direction of the lines of sight changes over the scene (1.6e-3 per km across the scan;
 3.5e-3 along a scan in reverse, nothing along a forward one) is as in RPCs of real products.
 
@@ -51,7 +52,7 @@ SIGMA_GROUND = 0.5
 #: Grey value of brightness 0, and how many more brightness 1 has; shortest wavelength in an image, in pixels.
 DARK, BRIGHT, FINEST = 60.0, 1400.0, 4.5
 #: Free settings of the experiment: see `ortho_pipeline.experiments.ikonos`.
-POINTING, BEND, ROUGHNESS, REVERSE = 0.5, 0.9, 0.27, True
+POINTING, STEEPNESS, BEND, ROUGHNESS, REVERSE = 0.5, 2.7, 0.3, 0.26, True
 
 
 # -- terrain and what lies on it -------------------------------------------------------------------------------------
@@ -59,12 +60,12 @@ POINTING, BEND, ROUGHNESS, REVERSE = 0.5, 0.9, 0.27, True
 
 @dataclass(frozen=True, eq=False)
 class Slope:
-    """The city's slope, gentle in the south and steep below the mountains in the north, and hills on it.
+    """The city's slope from the plain in the south to the mountains in the north, and hills on it.
 
     Attributes
     ----------
     bend : float
-        How much steeper the north is than the south.
+        How much steeper the north is than the south; how steep all is, is `STEEPNESS`.
     roughness : float
         How much the hills rise.
     seed : int
@@ -81,7 +82,7 @@ class Slope:
         hills = np.zeros_like(east)
         for kx, ky, phase, amplitude in self._waves:
             hills += amplitude * np.sin(kx * east + ky * north + phase)
-        rise = 4.0 * north / EXTENT - self.bend + self.roughness * hills
+        rise = STEEPNESS * north / EXTENT - self.bend + self.roughness * hills
         # Squashed between the bounds without ever reaching them.
         return LOW + (HIGH - LOW) / (1 + np.exp(-rise))
 

@@ -14,9 +14,8 @@ from ortho_pipeline.models.base import Array
 REASONS = (
     Reason(
         "RPC absolute",
-        "The mean discrepancy without control points is one draw of the attitude error of a scene, whose standard "
-        "deviation (14 m) is all that the headers tell: ours are drawn from that distribution and not set to what the "
-        "paper found.",
+        "One draw of the attitude error of a scene, beyond the percentiles of ours; the standard deviation (14 m) is "
+        "all that the headers tell.",
     ),
     Reason(
         "RPC affine, relative",
@@ -44,13 +43,8 @@ REASONS = (
 INTRODUCTION = (
     "The paper’s images are not public. Ours are two simulated scenes over the same coast, taken by a camera that "
     "turns all the time so that its line of sight follows a parallel westwards, then eastwards; each realisation "
-    "draws the 34 places, their noise and the attitude errors anew. The free settings have the values that the paper "
-    "asks for as a whole: the positions of the satellite from the height-to-base ratio and from RMSY of the 3D affine "
-    "transformation, the length of the scenes from the sagitta, the terrain and the law of rotation from the 3D "
-    "affine transformations with 8, 12 and 14 parameters, the noise from the relative accuracy, the wobble and drift "
-    "of the attitude from the corrected RPC, the significance of the Student test (10 %) from two of four parameters "
-    "being not justified in either scene. Numbers of both scenes and axes asked for each value; no row was tuned by "
-    "itself."
+    "draws the 34 places, their noise and the attitude errors anew. The paper tells little of how the satellite turned "
+    "and of how its attitude was off, so most of its table had to say that: few rows are left to predict."
 )
 #: Metres beyond the outermost points; width and rim of a figure in CSS pixels.
 _MARGIN, _WIDE, _RIM = 600.0, 484.0, 18.0

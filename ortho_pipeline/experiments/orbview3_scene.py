@@ -6,7 +6,7 @@ scene is taken the satellite turns all the time, so that its line of sight follo
 drift, and something that no affine correction removes.
 
 The camera is written from first principles and shares no code with `ortho_pipeline.models`, so that a mistake in one
-cannot hide in the other.
+cannot hide in the other. Only the vendor's RPC is fitted to it by the package's own `fit_rpc`.
 
 Source: Bueyueksalih, Akcin and Jacobsen, sections 2 and 3. What in the paper asks for the values of the free settings
 is in `ortho_pipeline.experiments.orbview3`.
@@ -58,6 +58,8 @@ SIGMA_IMAGE, SIGMA_GROUND = 1.15, 0.2
 RPC_HEIGHTS = (-100.0, 900.0)
 #: QuickBird over the same area, and the height (m) of the plane of its OR Standard image.
 QUICKBIRD = {"altitude": 450e3, "side": 60e3, "plane": 200.0, "pixel": 0.6}
+#: Its noise of pointing (px), and its attitude error as a part of OrbView-3's.
+QUICKBIRD_NOISE, QUICKBIRD_ATTITUDE = 0.6, 0.2
 HIGH = 900.0
 #: A distance (m) along the line of sight from 470 km at 20 degrees, by which metres become angles.
 _RANGE = 505e3

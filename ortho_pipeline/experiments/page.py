@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.drawing import Axes, Drawing, round_down, style_sheet
-from ortho_pipeline.experiments.tables import is_within
+from ortho_pipeline.experiments.tables import VERDICTS, is_covered, is_missed
 from ortho_pipeline.models.base import Array
 
 _SIDE, _MARGIN = 520.0, 18.0
-_UNITS = {
-    "px": ("pixels", "pixel", "pixels"), "m": ("metres", "metre", "metres"), "px, m": ("pixels and metres", "", ""),
+_UNITS = {"px": ("pixel", "pixels"), "m": ("metre", "metres")}
+_SOURCES = {
+    "paper": "this paper", "published": "published elsewhere, or customary", "chosen": "chosen", "fitted": "fitted to",
 }  # fmt: skip
 
 
@@ -38,34 +39,85 @@ UNEXPLAINED = Reason("", "Beyond the factor without a cause that we know of.")
 
 
 def text(document: Mapping[str, Any]) -> str:
-    """Return the tables for a terminal; `!` marks what is not within the factor, or does not hold."""
-    wide = max([24, *(len(row["label"]) for table in document["tables"] for row in table["rows"])])
-    narrow = max([8, *(len(row["quantity"]) for table in document["tables"] for row in table["rows"])])
+    """Return the tables for a terminal; `!` marks what does not agree, `f` what a setting was fitted to."""
+    rows = [row for table in document["tables"] for row in table["rows"]]
+    wide, narrow = (max([least, *(len(row[key]) for row in rows)]) for least, key in ((24, "label"), (8, "quantity")))
     lines = [document["paper"], document["settings_text"], ""]
     for table in document["tables"]:
-        lines.append(f"Table {table['table']}: {table['title']} ({_UNITS[document['units']][0]})")
-        lines.append(f"  {'':<{wide}} {'':<{narrow}} {'paper':>7} {'ours':>7} {'5 %':>7} {'95 %':>7}")
+        lines.append(f"Table {table['table']}: {table['title']}")
+        heads = "".join(f" {head:>7}" for head in ("paper", "ours", "5 %", "95 %", "naive"))
+        lines.append(f"   {'':<{wide}} {'':<{narrow}} {'':<2}{heads}")
         for row in table["rows"]:
-            ours = "".join(f" {_number(row[key]):>7}" for key in ("paper", "median", "p5", "p95"))
-            lines.append(f"{' ' if is_within(row) else '!'} {row['label']:<{wide}} {row['quantity']:<{narrow}}{ours}")
+            marks = f"{'!' if is_missed(row) else ' '}{'f' if row['role'] == 'fitted' else ' '}"
+            ours = "".join(f" {_number(row[key]):>7}" for key in ("paper", "median", "p5", "p95", "naive"))
+            lines.append(f"{marks} {row['label']:<{wide}} {row['quantity']:<{narrow}} {row['units']:<2}{ours}")
         lines.append("")
-    for statement in document["statements"]:
-        lines.append(f"{' ' if statement['holds'] else '!'} {statement['text']} ({statement['detail']})")
-    return "\n".join([*lines, *([""] if document["statements"] else []), verdict(document)])
+    for one in document["statements"]:
+        why = f" {one['why']}" if one["why"] else ""
+        lines.append(f"{'!' if one['verdict'] == VERDICTS[2] else ' '} {one['text']} {_capital(one['verdict'])}: "
+                     f"{one['detail']}.{why}")  # fmt: skip
+    return "\n".join([*lines, *([""] if document["statements"] else []), *verdict(document)])
 
 
-def verdict(document: Mapping[str, Any]) -> str:
-    """Return how many numbers and statements of the paper ours agree with."""
+def verdict(document: Mapping[str, Any]) -> list[str]:
+    """Return what the document proves: predictions, beside the naive guesses, then the rest; one sentence each."""
     found = document["summary"]
-    single, statements = found["single_realisation"], document["statements"]
-    said = (
-        f"{found['within']} of {found['rows']} rows ({100 * found['within'] / found['rows']:.1f} %) are within a "
-        f"factor {found['factor']:g} of the paper. Were the paper one of our realisations, "
-        f"{100 * single['median']:.0f} % ({100 * single['p5']:.0f} to {100 * single['p95']:.0f} %) would be."
-    )
-    if statements:
-        said += f" {sum(one['holds'] for one in statements)} of {len(statements)} statements of the paper hold."
+    wide, tight = (f"{factor:g}" for factor in found["factors"])
+    predicted, fitted, draws = (found[role] for role in ("predicted", "fitted", "draw"))
+    said = []
+    if predicted["rows"]:
+        said += [
+            f"Of {predicted['rows']} numbers that no setting was fitted to, {_share(predicted, 'within', wide)} are "
+            f"within a factor {wide} of the paper and {_share(predicted, 'within', tight)} within {tight}.",
+            f"A naive guess without any simulation has {_share(predicted, 'naive', wide)} and "
+            f"{_share(predicted, 'naive', tight)}: {document['naive_text']}",
+            f"{_of(predicted['covered'], predicted['rows'])} lie between our 5th and 95th percentile. Were the paper "
+            f"one of our realisations, {100 * found['single_realisation']['median']:.0f} % "
+            f"({100 * found['single_realisation']['p5']:.0f} to {100 * found['single_realisation']['p95']:.0f} %) "
+            f"would be within {wide} of our medians.",
+        ]
+    if fitted["rows"]:
+        said.append(
+            f"Not counted: {fitted['rows']} numbers that settings were fitted to ({_share(fitted, 'within', wide)} "
+            f"within {wide}, {_share(fitted, 'within', tight)} within {tight})."
+        )
+    if draws["rows"]:
+        said.append(
+            f"Nor are {draws['rows']} numbers that are single draws of an error whose spread alone is known "
+            f"({draws['covered']} lie between our 5th and 95th percentile)."
+        )
+    if document["statements"]:
+        numbers = [sum(one["verdict"] == which for one in document["statements"]) for which in VERDICTS]
+        said.append(
+            f"Of {sum(numbers)} statements of the paper {numbers[0]} are reproduced, {numbers[1]} hold by the settings "
+            f"and {numbers[2]} are not reproduced."
+        )
     return said
+
+
+def _share(counted: Mapping[str, Any], what: str, factor: str) -> str:
+    return _of(counted[what][factor], counted["rows"])
+
+
+def _of(part: int, rows: int) -> str:
+    return f"{part} ({100 * part / rows:.0f} %)"
+
+
+def _capital(words: str) -> str:
+    return words[:1].upper() + words[1:]
+
+
+def knob_text(knob: Mapping[str, Any]) -> str:
+    """Return value and units of a knob for people."""
+    return f"{_shown(knob['value'])} {knob['units']}".strip()
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "; ".join(f"{key}: {_shown(part)}" for key, part in value.items())
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_shown(part) for part in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def page(
@@ -83,7 +135,7 @@ def page(
     heading : str
         Title of the page.
     introduction : str
-        What the scenes are and how the free settings were chosen; the document's settings follow it.
+        What the scenes are; the document's settings follow it.
     reasons : sequence of Reason
         Tried in order; the rest is said to be unexplained.
     """
@@ -104,18 +156,21 @@ def page(
         curves=[{"svg": figure.drawing.svg(), "caption": figure.caption} for figure in curves],
         plot_style=style_sheet(),
         reasons=list(_reasons(document, [*reasons, UNEXPLAINED])),
-        is_within=is_within,
+        is_missed=is_missed,
+        knob_text=knob_text,
+        sources=_SOURCES,
+        capital=_capital,
     )
 
 
 def _reasons(document: Mapping[str, Any], reasons: Sequence[Reason]) -> Iterator[dict[str, Any]]:
-    """Yield the rows that are not within the factor, by their reason."""
-    missed = [row for table in document["tables"] for row in table["rows"] if not is_within(row)]
+    """Yield the rows that do not agree, by their reason."""
+    missed = [row for table in document["tables"] for row in table["rows"] if is_missed(row)]
     for reason in reasons:
         rows = [row for row in missed if f"{row['label']} {row['quantity']}".startswith(reason.start)]
         missed = [row for row in missed if row not in rows]
         if rows:
-            chance = sum(row["median"] is not None and row["p5"] <= row["paper"] <= row["p95"] for row in rows)
+            chance = sum(is_covered(row) for row in rows)
             yield {"why": reason.why, "rows": rows, "chance": chance}
 
 
@@ -157,7 +212,7 @@ def draw_vectors(
             drawing.arrow(kind, x, y, *(value * unit for value in miss))
     y = tall + 2 * _MARGIN + 12
     drawing.line("bar", _MARGIN, y, _MARGIN + bar * unit, y)
-    drawing.text(_MARGIN + bar * unit + 8, y + 4, f"{bar:g} {_UNITS[units][1 if bar == 1 else 2]}")
+    drawing.text(_MARGIN + bar * unit + 8, y + 4, f"{bar:g} {_UNITS[units][bar != 1]}")
     return drawing
 
 
