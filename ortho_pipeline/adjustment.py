@@ -11,15 +11,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 import pyproj
 
 from ortho_pipeline.block_blunders import Rejected, find_blunders
+from ortho_pipeline.block_checks import Outlying, outlying
 from ortho_pipeline.block_points import BlockPoints
 from ortho_pipeline.block_solver import BlockProblem, Pseudo, Selection, Solved, State
+from ortho_pipeline.block_variance import Posterior, Variances, estimate, posterior, reweighed
 from ortho_pipeline.crs import ground_transform
 from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
 from ortho_pipeline.estimation import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING, root_mean_square
@@ -36,6 +38,8 @@ __all__ = ["BlockFit", "BlockPoints", "Rejected", "adjust"]
 #: Without any control, each parameter is held at its start value by its effect in the image, with this sigma (px): the
 #: size of what vendors' orientations are off by.
 HOLD = 10.0
+#: Parameters that move by more than this part of their sigma with the sigmas that were found are solved for again.
+_MOVED, _WEIGHINGS = 0.02, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +50,10 @@ class BlockFit:
     at the known ground (NaN for ties), `raw_residuals` the same with the models as they were. `object_residuals`
     ``(N, 3)`` are known minus adjusted ground in metres east, north, up. `ground` is lon, lat, h (EPSG:4979), NaN where
     the rays do not determine it; `ground_covariance` ``(N, 3, 3)`` m², east, north, up. `parameters` are (image, name)
-    in the order of `covariance` ``(P, P)``. Where there is redundancy (else `sigma0` is None), sigmas are scaled by
-    sigma0, but for those that hold the datum or are fictitious.
+    in the order of `covariance` ``(P, P)``. `sigma0` is the factor of the stated sigmas of measurements (None without
+    redundancy), `variances` has it beside the sigmas of ground that states none. Covariances contain that these are
+    uncertain, so that 1.96 sigmas are right 95 times of 100 with few points too. `outlying` are known points that the
+    block contradicts and that were left as they are.
     """
 
     models: dict[str, SensorModel]
@@ -67,7 +73,9 @@ class BlockFit:
     degrees_of_freedom: float
     sigma0: float | None
     gauge: str
+    variances: Variances
     rejected: tuple[Rejected, ...] = ()
+    outlying: tuple[Outlying, ...] = ()
     warnings: tuple[str, ...] = ()
     condition: float = 1.0
     iterations: int = 0
@@ -153,6 +161,7 @@ class BlockFit:
             "degrees_of_freedom": self.degrees_of_freedom,
             "condition": _number(self.condition),
             "iterations": self.iterations,
+            "variances": self.variances.to_json(),
             "images": {
                 image: {
                     "parameters": {
@@ -172,6 +181,7 @@ class BlockFit:
             "points": [self._point(k) for k in range(len(points))],
             "rays": [self._ray(k) for k in range(points.rays)],
             "rejected": [asdict(one) for one in self.rejected],
+            "outlying": [asdict(one) for one in self.outlying],
             "warnings": list(self.warnings),
         }
 
@@ -237,22 +247,28 @@ def adjust(
     problem, state, selection, notes = _prepared(chosen, points, priors or {}, exclude)
     problem, gauge = _with_datum(problem, state, selection, hold)
     _enough(problem, selection)
+    if problem.unstated.any():
+        problem = _started(problem, state, selection)
     solved = problem.solve(state, selection)
     _determined(problem, solved)
+    if problem.unstated.any():
+        problem, solved = reweighed(problem, solved, selection, estimate(problem, solved))
     rejected: tuple[Rejected, ...] = ()
     if robust and problem.size and problem.unit_weight(solved)[1] >= 4:
-        found = find_blunders(problem, solved, selection)
-        rejected = found.rejected
-        if found.undecided:
-            names = ", ".join(found.undecided[:10])
+        blunders = find_blunders(problem, solved, selection)
+        rejected = blunders.rejected
+        if blunders.undecided:
+            names = ", ".join(blunders.undecided[:10])
             notes.append(f"points contradict each other, and without them the block is not determined: {names}")
         if rejected:
-            gauge = gauge.replace(_by_control(problem, selection), _by_control(problem, found.kept))
-            selection = found.kept
+            gauge = gauge.replace(_by_control(problem, selection), _by_control(problem, blunders.kept))
+            selection = blunders.kept
             solved = problem.solve(solved.state, selection)
             _determined(problem, solved)
+    problem, solved, found = _weighed(problem, solved, selection)
+    notes += found.variances.notes()
     notes += _uncertain(problem, solved, held=any(one.held for one in problem.pseudo))
-    return _result(problem, solved, selection, chosen, gauge, rejected, notes)
+    return _result(problem, solved, found, selection, points, chosen, gauge, rejected, notes)
 
 
 # -- before ----------------------------------------------------------------------------------------------------------
@@ -399,6 +415,26 @@ def _enough(problem: BlockProblem, selection: Selection) -> None:
             )
 
 
+def _started(problem: BlockProblem, state: State, selection: Selection) -> BlockProblem:
+    """Return the problem with a first guess of sigmas that are not stated: a pixel on the ground."""
+    linear = problem.linearise(state, problem.layout(selection), selection)
+    lengths = np.linalg.norm(linear.by_point, axis=2)
+    seen = lengths.any(axis=1)
+    sigma = np.median(1.0 / (lengths[seen].max(axis=1) * problem.points.sigma_image[seen])) if seen.any() else 1.0
+    return replace(problem, assumed=(float(sigma), float(sigma)))
+
+
+def _weighed(problem: BlockProblem, solved: Solved, selection: Selection) -> tuple[BlockProblem, Solved, Posterior]:
+    """Return problem and solution with the sigmas that the observations have, and what is known of these."""
+    found = posterior(problem, solved)
+    for _ in range(_WEIGHINGS):
+        if found.moved <= _MOVED:
+            break
+        problem, solved = reweighed(problem, solved, selection, found.variances)
+        found = posterior(problem, solved)
+    return problem, solved, found
+
+
 # -- after -----------------------------------------------------------------------------------------------------------
 
 
@@ -459,47 +495,56 @@ def _uncertain(problem: BlockProblem, solved: Solved, *, held: bool) -> list[str
 def _result(
     problem: BlockProblem,
     solved: Solved,
+    found: Posterior,
     selection: Selection,
+    points: BlockPoints,
     start: tuple[SensorModel, ...],
     gauge: str,
     rejected: tuple[Rejected, ...],
     notes: list[str],
 ) -> BlockFit:
-    points, state = problem.points, solved.state
+    state = solved.state
     sigma0, freedom = problem.unit_weight(solved)
     active = problem.active(selection)
     used = selection.rays & active[points.point]
-    factor = 1.0 if sigma0 is None else sigma0**2
+    variances = replace(found.variances, image=found.variances.image * problem.factor_of(points))
+    ground_covariance = problem.ground_covariance(solved, found.covariance, found.image_square)
+    ground_covariance[found.rows] = found.ground
     # Points that take no part still have a place where their rays meet, if they do.
     local = np.where(active[:, None], state.local, np.nan)
     ground = problem.frame.geodetic(local)
     # What is a tie is not compared with anything, whatever the file says of its ground.
     known = np.where(points.tie[:, None], np.nan, points.known_in(GEODETIC))
     apart = problem.frame.of_geodetic(known) - local
+    object_residuals = (problem.frame.horizons(known) @ apart[:, :, None])[:, :, 0]
+    used_ground = selection.ground & active
+    doubts = outlying(problem, solved, variances, object_residuals, ground_covariance, used_ground)
     return BlockFit(
         models=dict(zip(points.images, state.models, strict=True)),
         start=dict(zip(points.images, start, strict=True)),
         points=points,
         ground=ground,
-        ground_covariance=problem.ground_covariance(solved, factor),
+        ground_covariance=ground_covariance,
         residuals=points.measured - predict(problem.frame, state.models, points, local),
         back_projected=_at(problem, state.models, known),
         raw_residuals=_at(problem, start, known),
-        object_residuals=(problem.frame.horizons(known) @ apart[:, :, None])[:, :, 0],
+        object_residuals=object_residuals,
         used_rays=used,
-        used_ground=selection.ground & active,
+        used_ground=used_ground,
         parameters=tuple(
             (image, name)
             for image, model in zip(points.images, state.models, strict=True)
             for name in model.param_names
         ),
-        covariance=problem.covariance(solved, factor),
+        covariance=found.covariance,
         redundancy=math.floor(freedom + 1e-6),
         degrees_of_freedom=freedom,
-        sigma0=sigma0,
+        sigma0=None if sigma0 is None else variances.image,
+        variances=variances,
         gauge=gauge,
         rejected=rejected,
-        warnings=tuple(notes),
+        outlying=doubts,
+        warnings=(*map(str, doubts), *notes),
         condition=solved.condition,
         iterations=solved.iterations,
     )

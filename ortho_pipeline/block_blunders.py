@@ -19,8 +19,10 @@ import numpy as np
 
 from ortho_pipeline.block_points import Index
 from ortho_pipeline.block_solver import BlockProblem, Eliminated, Mask, Selection, Solved
+from ortho_pipeline.block_variance import Variances, estimate, reweighed
 from ortho_pipeline.blunders import BLUNDER_RISK, REJECTED_LIMIT
 from ortho_pipeline.errors import DegeneratePoints
+from ortho_pipeline.intersection import PARALLEL
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.problem import CONDITION_LIMIT
 
@@ -28,10 +30,15 @@ from ortho_pipeline.problem import CONDITION_LIMIT
 _SCALE_FLOOR = 1e-3
 #: Directions in which a part has less than this share of redundancy cannot be tested in it.
 _TESTABLE = 0.01
+#: The same chance for ground whose sigma is estimated: few points never reach a smaller one, and a gross error that
+#: stays does more harm than a good point that goes.
+_GROUND_RISK = 0.01
 _ROBUST_ROUNDS, _TEST_ROUNDS = 6, 8
 #: Robust weights that change less than this on average decide no more about who is a suspect.
 _SETTLED = 0.02
 _HUBER, _REDESCENDING, _SUSPECT = 2.0, 3.0, 4.0
+#: Gross errors inflate a sigma that is estimated from few points: so little is enough to look closer.
+_DOUBT = 2.0
 #: Median and 95th percentile of chi squared of 1, 2 and 3 degrees of freedom.
 _MEDIANS = np.array([np.nan, 0.4549, 1.3863, 2.3660])
 
@@ -67,18 +74,19 @@ class Tests:
     ground: Array
     ground_rank: Index
 
-    def scale(self) -> float:
-        """Return the robust standard error of unit weight."""
-        ground = (self.ground / _MEDIANS[self.ground_rank])[self.ground_rank > 0]
-        return _root_median(np.concatenate([self._of_rays(), ground]))
-
     def scale_of_rays(self) -> float:
-        """Return that of the rays alone."""
-        return _root_median(self._of_rays())
+        """Return the robust standard error of unit weight of the rays."""
+        return _root_median((self.rays / _MEDIANS[self.ray_rank])[self.ray_rank > 0])
 
-    def _of_rays(self) -> Array:
-        ratio: Array = (self.rays / _MEDIANS[self.ray_rank])[self.ray_rank > 0]
-        return ratio
+    def scale_of_ground(self, estimated: Mask) -> float:
+        """Return that of ground whose sigma is estimated; what is stated is taken as it is stated."""
+        of = estimated & (self.ground_rank > 0)
+        return _root_median((self.ground / _MEDIANS[self.ground_rank])[of])
+
+    def sizes(self, estimated: Mask) -> tuple[Array, Array]:
+        """Return standardised residuals of rays ``(M,)`` and ground ``(N,)``, over these scales."""
+        scale = np.where(estimated, self.scale_of_ground(estimated), 1.0)
+        return np.sqrt(self.rays) / self.scale_of_rays(), np.sqrt(self.ground) / scale
 
 
 def _root_median(ratio: Array) -> float:
@@ -102,10 +110,25 @@ def tests_of(problem: BlockProblem, solved: Solved) -> Tests:
             hat = q @ core @ q.swapaxes(1, 2) + own - cross - cross.swapaxes(1, 2)
             rays[used], ray_rank[used] = _test(hat, linear.ray_misfit[used])
         if rows.chunk.ground:
-            used, q = rows.chunk.points, rows.q[:, -3:]
-            ground[used], ground_rank[used] = _test(q @ core @ q.swapaxes(1, 2), linear.ground_misfit[used])
+            used = rows.chunk.points
+            ground[used], ground_rank[used] = _test_ground(rows, core)
     weights = linear.weights
     return Tests(rays / weights.ray_weights, ray_rank, ground / weights.ground_weights, ground_rank)
+
+
+def tests_of_ground(problem: BlockProblem, solved: Solved) -> tuple[Array, Index]:
+    """Return the squared standardised residuals ``(N,)`` of known ground alone, and their degrees of freedom."""
+    ground, rank = np.zeros(len(problem.points)), np.zeros(len(problem.points), dtype=np.int64)
+    for rows in solved.eliminated:
+        if rows.chunk.ground:
+            core = np.eye(3) + problem.taken(rows, solved.cofactors)[1]
+            ground[rows.chunk.points], rank[rows.chunk.points] = _test_ground(rows, core)
+    return ground, rank
+
+
+def _test_ground(rows: Eliminated, core: Array) -> tuple[Array, Index]:
+    q = rows.q[:, -3:]
+    return _test(q @ core @ q.swapaxes(1, 2), rows.linear.ground_misfit[rows.chunk.points])
 
 
 def _blocks(problem: BlockProblem, cofactors: Array, images: Index) -> Array:
@@ -149,11 +172,14 @@ def find_blunders(problem: BlockProblem, solved: Solved, selection: Selection) -
         If more than 30 % of the control points, or of the others, would have to go.
     """
     tests = tests_of(problem, solved)
-    significant = _significant(problem, solved, tests)
-    if not significant.any() and not _suspects(problem, tests).any():
+    variances = estimate(problem, solved)
+    significant = _significant(problem, solved, tests, variances)
+    if not significant.any() and not _suspects(problem, tests, variances, _DOUBT).any():
         return Found(selection)
-    problem, robust = _robust(problem, solved, selection, tests)
-    suspects = _suspects(problem, tests_of(problem, robust))
+    problem, robust = _robust(problem, solved, selection, tests, variances)
+    tests = tests_of(problem, robust)
+    suspects = _suspects(problem, tests, variances, _SUSPECT)
+    worst = _worst(problem, tests, variances)
     trusted = _trusted(problem, robust, selection, suspects)
     if trusted is None:
         # Weights of few points fall at random, and may leave too few: then only what all others contradict is doubted.
@@ -166,43 +192,63 @@ def find_blunders(problem: BlockProblem, solved: Solved, selection: Selection) -
             if suspects[problem.active(selection) & selection.ground].all():
                 _refuse_many(problem, selection, doubted)
             return Found(kept, tuple(rejected.values()), tuple(problem.points.ids[i] for i in doubted))
-        kept, rejected = _judged(problem, trusted, selection, suspects)
+        kept, rejected = _judged(trusted, selection, suspects)
         _refuse_many(problem, selection, list(rejected))
-        solved = problem.solve(trusted.state, kept)
-        more = suspects | _significant(problem, solved, tests_of(problem, solved))
-        if (more == suspects).all():
+        solved = trusted.problem.solve(trusted.solved.state, kept)
+        tests = tests_of(trusted.problem, solved)
+        more = _significant(trusted.problem, solved, tests, trusted.variances)
+        if variances.estimated:
+            # Suspects were the worst, and without them a sigma is found too small: the others return into it.
+            more[list(rejected)] = True
+            if not more.any():
+                more, worst = worst, more
+        else:
+            more |= suspects
+        if (more == suspects).all() or not more.any():
             break
         suspects = more
-        trusted = _trusted(problem, trusted, selection, suspects)
+        trusted = _trusted(trusted.problem, trusted.solved, selection, suspects)
     return Found(kept, tuple(rejected[number] for number in sorted(rejected)))
 
 
-def _trusted(problem: BlockProblem, start: Solved, selection: Selection, suspects: Mask) -> Solved | None:
+@dataclass(frozen=True, eq=False)
+class _Trusted:
+    """The solution of everything but the suspects, with the sigmas that its observations have by themselves."""
+
+    problem: BlockProblem
+    solved: Solved
+    variances: Variances
+
+
+def _trusted(problem: BlockProblem, start: Solved, selection: Selection, suspects: Mask) -> _Trusted | None:
     """Return the solution without the suspects; None if that leaves no control to judge them by, or is undetermined."""
     of_others = ~suspects[problem.points.point]
     others = Selection.of(selection.rays & of_others, selection.ground & ~suspects)
     if selection.ground.any() and not (problem.active(others) & others.ground).any():
         return None
-    trusted = problem.solve(start.state, others)
-    return trusted if trusted.condition <= CONDITION_LIMIT else None
+    solved = problem.solve(start.state, others)
+    if solved.condition > CONDITION_LIMIT:
+        return None
+    found = estimate(problem, solved)
+    found = replace(found, image=max(found.image, _SCALE_FLOOR))
+    return _Trusted(*reweighed(problem, solved, others, found), found)
 
 
-def _robust(problem: BlockProblem, solved: Solved, selection: Selection, tests: Tests) -> tuple[BlockProblem, Solved]:
-    """Return a solution that gross errors have little part in, and the problem with the sigmas that rays have in it.
+def _robust(
+    problem: BlockProblem, solved: Solved, selection: Selection, tests: Tests, variances: Variances
+) -> tuple[BlockProblem, Solved]:
+    """Return a solution that gross errors have little part in, and the problem with the sigmas that it has by itself.
 
     Sigmas of measurements are often guessed. Were good ground judged by how much better than that the images agree with
     each other, it would look wrong.
     """
     state = solved.state
+    estimated = _estimated(problem, variances)
     for weigh in (_huber, _geman_mcclure):
         before = np.zeros(problem.points.rays)
         for _ in range(_ROBUST_ROUNDS):
-            scale = tests.scale()
-            weights = replace(
-                selection,
-                ray_weights=weigh(np.sqrt(tests.rays) / scale),
-                ground_weights=weigh(np.sqrt(tests.ground) / scale),
-            )
+            rays, ground = tests.sizes(estimated)
+            weights = replace(selection, ray_weights=weigh(rays), ground_weights=weigh(ground))
             found, ahead = problem.once(state, weights)
             if not (math.isfinite(found.condition) and np.isfinite(found.linear.ray_misfit).all()):
                 return problem, replace(solved, linear=replace(solved.linear, state=state))
@@ -214,8 +260,15 @@ def _robust(problem: BlockProblem, solved: Solved, selection: Selection, tests: 
         if weigh is _huber:
             points = problem.points
             sigma_image = points.sigma_image * tests.scale_of_rays()
-            problem = replace(problem, points=replace(points, sigma_image=sigma_image))
+            scale = tests.scale_of_ground(estimated) if estimated.any() else 1.0
+            assumed = (problem.assumed[0] * scale, problem.assumed[1] * scale)
+            problem = replace(problem, points=replace(points, sigma_image=sigma_image), assumed=assumed)
     return problem, replace(solved, linear=replace(solved.linear, state=state))
+
+
+def _estimated(problem: BlockProblem, variances: Variances) -> Mask:
+    """Return the points ``(N,)`` whose ground has a sigma that is estimated."""
+    return np.asarray(problem.unstated.any(axis=1) & variances.estimated)
 
 
 def _huber(size: Array) -> Array:
@@ -233,13 +286,22 @@ def _points_of(problem: BlockProblem, rays: Mask, ground: Mask) -> Mask:
     return found
 
 
-def _suspects(problem: BlockProblem, tests: Tests) -> Mask:
+def _suspects(problem: BlockProblem, tests: Tests, variances: Variances, limit: float) -> Mask:
     """Return the points with a part that lies far off by the robust scale."""
-    limit = _SUSPECT * tests.scale()
-    return _points_of(problem, np.sqrt(tests.rays) > limit, np.sqrt(tests.ground) > limit)
+    rays, ground = tests.sizes(_estimated(problem, variances))
+    return _points_of(problem, rays > _SUSPECT, ground > np.where(_estimated(problem, variances), limit, _SUSPECT))
 
 
-def _significant(problem: BlockProblem, solved: Solved, tests: Tests) -> Mask:
+def _worst(problem: BlockProblem, tests: Tests, variances: Variances) -> Mask:
+    """Return the point alone whose ground, of an estimated sigma, is farthest off; none if that is not far."""
+    found = np.zeros(len(problem.points), dtype=bool)
+    sizes = np.where(_estimated(problem, variances), tests.sizes(_estimated(problem, variances))[1], 0.0)
+    if sizes.max(initial=0.0) > _DOUBT:
+        found[int(np.argmax(sizes))] = True
+    return found
+
+
+def _significant(problem: BlockProblem, solved: Solved, tests: Tests, variances: Variances) -> Mask:
     """Return the points with a part that the others contradict."""
     from scipy.special import fdtrc
 
@@ -247,30 +309,32 @@ def _significant(problem: BlockProblem, solved: Solved, tests: Tests) -> Mask:
     scale, freedom = max(1.0 if sigma0 is None else sigma0, _SCALE_FLOOR), max(freedom, 1.0)
     count = max(int((tests.ray_rank > 0).sum() + (tests.ground_rank > 0).sum()), 1)
 
-    def bad(squares: Array, rank: np.ndarray) -> Mask:
+    def bad(squares: Array, rank: np.ndarray, freedom: Array | float) -> Mask:
         size = np.maximum(rank, 1)
         return np.asarray((rank > 0) & (fdtrc(size, freedom, squares / size / scale**2) < BLUNDER_RISK / count))
 
-    return _points_of(problem, bad(tests.rays, tests.ray_rank), bad(tests.ground, tests.ground_rank))
+    of_ground = np.where(_estimated(problem, variances), min(variances.freedom, freedom), freedom)
+    return _points_of(
+        problem, bad(tests.rays, tests.ray_rank, freedom), bad(tests.ground, tests.ground_rank, of_ground)
+    )
 
 
 # -- judging suspects ------------------------------------------------------------------------------------------------
 
 
-def _judged(
-    problem: BlockProblem, trusted: Solved, selection: Selection, suspects: Mask
-) -> tuple[Selection, dict[int, Rejected]]:
+def _judged(trusted: _Trusted, selection: Selection, suspects: Mask) -> tuple[Selection, dict[int, Rejected]]:
     """Return the selection without the parts of suspects that contradict the trusted solution, and these by point."""
+    problem = trusted.problem
     of_suspects = suspects[problem.points.point]
     alone = Selection.of(selection.rays & of_suspects, selection.ground & suspects)
     rays, ground = selection.rays.copy(), selection.ground.copy()
     rejected: dict[int, Rejected] = {}
-    linear = problem.linearise(trusted.state, problem.layout(alone), alone)
-    bar = _Bar.of(problem, trusted, int(problem.active(selection).sum()))
+    linear = problem.linearise(trusted.solved.state, problem.layout(alone), alone)
+    bar = _Bar.of(trusted, selection)
+    estimated = _estimated(problem, trusted.variances)
     for rows in problem.eliminate(linear):
-        suspect = _Suspects(problem, rows, trusted.cofactors)
-        agree = bar.passes(*suspect.contradictions(None))
-        agree_without = {part: bar.passes(*suspect.contradictions(part)) for part in suspect.parts}
+        suspect = _Suspects(problem, rows, trusted.solved.cofactors)
+        agree, agree_without = bar.verdicts(suspect, estimated[rows.chunk.points])
         for k in np.flatnonzero(~agree).tolist():
             culprits = [part for part in suspect.parts if agree_without[part][k]]
             number = int(rows.chunk.points[k])
@@ -283,21 +347,57 @@ def _judged(
 
 @dataclass(frozen=True)
 class _Bar:
-    """How large the square of a contradiction may be, by its degrees of freedom."""
+    """How large the square of a contradiction may be, by its degrees of freedom.
 
-    scale: float
+    What contradicts ground of an estimated sigma is judged with all the sigmas that are possible, and its risk is
+    shared by the control points alone.
+    """
+
     freedom: float
     risk: float
+    ground_risk: float
+    variances: Variances
 
     @classmethod
-    def of(cls, problem: BlockProblem, trusted: Solved, count: int) -> _Bar:
-        sigma0, freedom = problem.unit_weight(trusted)
-        return cls(max(1.0 if sigma0 is None else sigma0, _SCALE_FLOOR), max(freedom, 1.0), BLUNDER_RISK / count)
+    def of(cls, trusted: _Trusted, selection: Selection) -> _Bar:
+        problem = trusted.problem
+        _, freedom = problem.unit_weight(trusted.solved)
+        active = problem.active(selection)
+        count, control = int(active.sum()), max(int((active & selection.ground).sum()), 1)
+        return cls(max(freedom, 1.0), BLUNDER_RISK / count, _GROUND_RISK / control, trusted.variances)
+
+    def verdicts(self, suspect: _Suspects, estimated: Mask) -> tuple[Mask, dict[int, Mask]]:
+        """Return which points agree with the trusted, and which do without each of their parts."""
+        found = {part: suspect.contradictions(part) for part in suspect.parts}
+        whole, spare = suspect.contradictions(None)
+        agree = self.passes(whole, spare)
+        agree_without = {part: self.passes(*found[part]) for part in found}
+        if _GROUND not in suspect.parts or not estimated.any():
+            return agree, agree_without
+        of_rays = found[_GROUND][1]
+        for k in np.flatnonzero(estimated):
+            placed = suspect.ground_apart(int(k)) if of_rays > 0 else None
+            if placed is None:
+                agree[k] = self.passes_ground(whole[k], spare)
+                continue
+            apart, spread, axes = placed
+            likely = self.variances.chance_of(apart, spread, axes) >= self.ground_risk
+            agree[k] = likely and agree_without[_GROUND][k]
+        for part, (squares, freedom) in found.items():
+            if part != _GROUND:
+                agree_without[part] = np.where(estimated, self.passes_ground(squares, freedom), agree_without[part])
+        return agree, agree_without
+
+    def passes_ground(self, squares: Array, spare: int) -> Mask:
+        return self._passes(squares, spare, min(self.freedom, self.variances.freedom), self.ground_risk)
 
     def passes(self, squares: Array, spare: int) -> Mask:
+        return self._passes(squares, spare, self.freedom, self.risk)
+
+    def _passes(self, squares: Array, spare: int, freedom: float, risk: float) -> Mask:
         from scipy.special import fdtri
 
-        limit = spare * self.scale**2 * fdtri(spare, self.freedom, 1 - self.risk) if spare > 0 else -1.0
+        limit = spare * fdtri(spare, freedom, 1 - risk) if spare > 0 else -1.0
         return np.asarray(squares <= limit)
 
 
@@ -331,6 +431,25 @@ class _Suspects:
         misfit = np.linalg.solve(half, self.misfit[:, keep, None])
         left = misfit - q @ (q.swapaxes(1, 2) @ misfit)
         return (left**2).sum(axis=(1, 2)), spare
+
+    def ground_apart(self, k: int) -> tuple[Array, Array, tuple[int, ...]] | None:
+        """Return how far known ground is from where its rays and the block put it: metres, covariance, known axes.
+
+        None where parallel rays put it nowhere.
+        """
+        sigmas = self.problem.ground_sigmas[self.rows.chunk.points[k]]
+        axes = tuple(np.flatnonzero(np.isfinite(sigmas)).tolist())
+        known = self.parts[_GROUND][list(axes)]
+        rays = self._all_but(_GROUND)
+        weights = np.linalg.inv(self.spread[k][np.ix_(rays, rays)])
+        design, sigma = self.design[k, rays], sigmas[list(axes)]
+        normal = design.T @ weights @ design
+        if np.linalg.cond(normal) > PARALLEL**2:
+            return None
+        inverse = np.linalg.inv(normal)
+        place = inverse @ design.T @ weights @ self.misfit[k, rays]
+        turned = self.design[k, known] * sigma[:, None]
+        return sigma * self.misfit[k, known] - turned @ place, turned @ inverse @ turned.T, axes
 
     def _all_but(self, without: int | None) -> np.ndarray:
         return np.concatenate([part for name, part in self.parts.items() if name != without])
@@ -381,5 +500,6 @@ def _refuse_many(problem: BlockProblem, selection: Selection, rejected: list[int
                 f"{len(names)} of {int(mask.sum())} {what} contradict the others ({some}): which of them are wrong "
                 "cannot be decided",
                 file=problem.points.source or None,
-                remedy="measure these points again, or remove the wrong ones",
+                remedy="measure these points again, remove the wrong ones, or state sigmas as large as their errors "
+                "(sigma_image, sigma_xy, sigma_h; --ground-sigma XY,H for ground that states none)",
             )

@@ -42,7 +42,7 @@ class BlockPoints:
     roles : ndarray (N,) of str
         ``control``, ``check`` or ``tie``.
     sigma_ground : ndarray (N, 3)
-        Standard deviation of the ground in metres east, north, up; 0 is perfect.
+        Standard deviation of the ground in metres east, north, up; 0 is not stated: an adjustment estimates it.
     crs : pyproj.CRS
         Horizontal CRS, x first.
     images : tuple of str
@@ -184,6 +184,16 @@ class BlockPoints:
     def with_roles(self, roles: ArrayLike) -> BlockPoints:
         """Return these points with other roles ``(N,)``."""
         return replace(self, roles=np.asarray(roles))
+
+    def with_ground_sigma(self, plan: float, height: float | None = None) -> BlockPoints:
+        """Return these points with standard deviations (m) for ground that states none; height as plan if not given."""
+        height = plan if height is None else height
+        if not (math.isfinite(plan) and plan > 0 and math.isfinite(height) and height > 0):
+            raise InputError(
+                "standard deviations of the ground are positive numbers", field="--ground-sigma",
+                remedy="give metres in plan, or in plan and height, such as 0.5,1",
+            )  # fmt: skip
+        return replace(self, sigma_ground=np.where(self.sigma_ground > 0, self.sigma_ground, (plan, plan, height)))
 
     def select(self, mask: ArrayLike) -> BlockPoints:
         """Return the points of a mask ``(N,)`` or of indices, with their rays."""

@@ -113,10 +113,28 @@ def summary_text(document: Mapping[str, Any]) -> str:
             text = ", ".join(f"{axis} {value:.3f} ({a:+.2f} to {b:+.2f})" for axis, value, a, b in axes)
             lines.append(f"{count(rms['n'], f'{role} point')}: RMSE {text} m")
     sigma0 = "unknown" if adjustment["sigma0"] is None else f"{adjustment['sigma0']:.3g}"
+    lines += variance_lines(adjustment["variances"])
     lines.append(f"Redundancy {adjustment['redundancy']}, sigma0 {sigma0}, {len(adjustment['rejected'])} gross errors")
     height = f", height {head['height']}" if head["height"] else ""
     lines += [f"{head['figure']}{height}: {head['what']}", *head["notes"]]
     return "\n".join([*lines, *(f"Warning: {text}" for text in document["warnings"])])
+
+
+def variance_lines(variances: Mapping[str, Any]) -> list[str]:
+    """Say what was found of ground that states no sigma."""
+    ground = variances["unstated_ground"]
+    number = max(part["points"] for part in ground.values())
+    if not number:
+        return []
+    who = count(number, "control point")
+    if not variances["separable"]:
+        return [f"Ground of {who} states no sigma; its errors count as errors of measurement"]
+    found = [
+        f"{part['sigma']:.2g} m in {what} (redundancy {part['redundancy']:.1f})"
+        for what, part in (("plan", ground["xy"]), ("height", ground["h"]))
+        if part["sigma"] is not None
+    ]
+    return [f"Ground of {who} states no sigma; estimated: {', '.join(found)}"]
 
 
 def merged(parts: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:
@@ -153,6 +171,7 @@ def page(document: Mapping[str, Any]) -> str:
             document=document,
             adjustment=adjustment,
             head=document["headline"],
+            ground_sigmas=variance_lines(adjustment["variances"]),
             warnings=document["warnings"],
             residuals=residuals,
             roles={role: sum(p["role"] == role for p in adjustment["points"]) for role in ("control", "check", "tie")},

@@ -32,7 +32,7 @@ from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.problem import CONDITION_LIMIT
 
 Mask = np.ndarray
-#: Ground that is stated as perfect is weighted with this sigma (m): far below any pixel, far above rounding.
+#: Ground is never weighted with less than this sigma (m): far below any pixel, far above rounding.
 PERFECT_GROUND = 1e-5
 #: Points that are eliminated at once.
 _CHUNK = 20_000
@@ -186,13 +186,17 @@ class Solved:
 
 @dataclass(frozen=True, eq=False)
 class BlockProblem:
-    """Everything that is observed; `known` ``(N, 3)`` is the ground of control as lon, lat, h (NaN: not observed)."""
+    """Everything that is observed; `known` ``(N, 3)`` is the ground of control as lon, lat, h (NaN: not observed).
+
+    `assumed` are the sigmas (m) in plan and height of known ground that states none.
+    """
 
     points: BlockPoints
     models: tuple[SensorModel, ...]
     frame: GroundFrame
     known: Array
     pseudo: tuple[Pseudo, ...] = ()
+    assumed: tuple[float, float] = (PERFECT_GROUND, PERFECT_GROUND)
     offsets: Index = field(init=False)
     columns: Index = field(init=False)  # (images, p): the columns of their parameters, -1 for none
     target: Array = field(init=False)
@@ -279,8 +283,23 @@ class BlockProblem:
     @property
     def ground_sigmas(self) -> Array:
         """Sigmas ``(N, 3)`` of known ground in metres; infinite for a height that is not known."""
-        sigmas: Array = np.maximum(self.points.sigma_ground, PERFECT_GROUND)
-        return np.where(np.isfinite(self.known), sigmas, np.inf)
+        return np.where(np.isfinite(self.known), self.sigmas_of_survey, np.inf)
+
+    @property
+    def sigmas_of_survey(self) -> Array:
+        """Sigmas ``(N, 3)`` of the ground of points of any role in metres, where it is known."""
+        stated, (plan, height) = self.points.sigma_ground, self.assumed
+        sigmas: Array = np.where(stated > 0, stated, (plan, plan, height))
+        return np.maximum(sigmas, PERFECT_GROUND)
+
+    def factor_of(self, points: BlockPoints) -> float:
+        """Return the factor between the sigmas of measurements of these points and those that they stated."""
+        return float(self.points.sigma_image[0] / points.sigma_image[0]) if self.points.rays else 1.0
+
+    @property
+    def unstated(self) -> Mask:
+        """Known ground ``(N, 3)`` that states no sigma."""
+        return np.asarray(np.isfinite(self.known) & (self.points.sigma_ground == 0))
 
     def linearise(self, state: State, layout: Layout, weights: Selection) -> Linear:
         """Return the observation equations at a state."""
@@ -410,15 +429,17 @@ class BlockProblem:
             product[group.start : group.stop, real] = part
         return product, rows.turned @ product
 
-    def covariance(self, solved: Solved, factor: float) -> Array:
-        """Return the covariance of the parameters ``(P, P)``: scaled, but for what holds the datum or is fictitious."""
-        stated = solved.linear.pseudo_rows[~solved.linear.pseudo_true] @ solved.cofactors
-        return np.asarray(factor * solved.cofactors + (1.0 - factor) * stated.T @ stated)
+    def ground_covariance(self, solved: Solved, covariance: Array, factor: float) -> Array:
+        """Return that of the points ``(N, 3, 3)`` in their own horizons, NaN for those that take no part.
 
-    def ground_covariance(self, solved: Solved, factor: float) -> Array:
-        """Return that of the points ``(N, 3, 3)`` in their own horizons, NaN for those that take no part."""
+        Parameters
+        ----------
+        covariance : ndarray (P, P)
+            Of the parameters.
+        factor : float
+            Square of the factor of the sigmas of measurements.
+        """
         found = np.full((len(self.points), 3, 3), np.nan)
-        covariance = self.covariance(solved, factor)
         for rows in solved.eliminated:
             root = np.linalg.inv(rows.r)
             inner = factor * np.eye(3) + self.taken(rows, covariance)[1]

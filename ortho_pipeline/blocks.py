@@ -7,6 +7,7 @@ import io
 import json
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ def adjust(
     points: BlockOptions,
     scene: SceneOptions = SceneOptions(),
     *,
+    models: Sequence[str | os.PathLike[str]] = (),
     command: str | None = None,
 ) -> Result:
     """Adjust images and points together; write a model of each image, the points, adjusted RPCs and one report.
@@ -52,6 +54,8 @@ def adjust(
         Of one or many scenes; each is opened with its own sensor.
     folder : path
         Where all files go; those of images are called by their stems (with folders ahead where stems are the same).
+    models : sequence of path
+        Saved models (``*_model.json``) to start from, one for each image in their order; none: each image's own.
 
     Returns
     -------
@@ -66,12 +70,14 @@ def adjust(
     """
     labels = labels_of(images)
     files = _files(labels, Path(folder))
-    _check_paths(files, images, points, scene)
+    _check_models(images, models)
+    scenes = [replace(scene, model=model) for model in models] or [scene] * len(images)
+    _check_paths(files, images, points, scene, *models)
     table, notes = _read(images, labels, points, scene.allow_network)
     heights = _heights(table)
     starts = {
-        label: start_of(image, points, scene, table.in_image(label), heights)
-        for label, image in zip(labels, images, strict=True)
+        label: start_of(image, points, own, table.in_image(label), heights)
+        for label, image, own in zip(labels, images, scenes, strict=True)
     }
     fit = adjust_block(
         {label: start.model for label, start in starts.items()}, table,
@@ -85,7 +91,7 @@ def adjust(
         except InputError as error:
             notes.append(f"image {label}: no RPC is written ({error.message})")
             del files[f"{label} rpc"]
-    record = _record(images, points, scene, starts, command)
+    record = _record(images, points, scenes, starts, command)
     document = block_report.build_document(
         fit=fit, starts=starts, exported=exported, provenance=record, warnings=[*_warnings(fit, starts), *notes]
     )
@@ -116,11 +122,7 @@ def intersect(
         If there are not as many models as images, and for whatever else the user can correct.
     """
     labels = labels_of(images)
-    if models and len(models) != len(images):
-        raise InputError(
-            f"{len(models)} models for {len(images)} images", field="--models",
-            remedy="give one model file for each image, in their order",
-        )  # fmt: skip
+    _check_models(images, models)
     writer = None if output is None else _writer(output)
     files = {} if output is None else {"points": Path(output)}
     _check_paths(files, images, points, scene, *models)
@@ -165,12 +167,28 @@ def _read(
     table, strangers = points_of_images(read, images, labels)
     if options.check is not None:
         table = assign_roles(table, options.check)
+    if options.ground_sigma is not None:
+        table = table.with_ground_sigma(*_sigmas(options.ground_sigma))
     notes = [f"points of images that are not given play no part: {', '.join(strangers[:10])}"] if strangers else []
     flat = table.control & ~np.isfinite(table.ground[:, 2])
     if flat.any():
         names = ", ".join(np.array(table.ids)[flat][:10])
         notes.append(f"control points without a height weigh in in plan only: {names}")
     return table, notes
+
+
+def _sigmas(text: str) -> list[float]:
+    """Return what ``XY`` or ``XY,H`` says."""
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        found = []
+    if len(found) not in (1, 2):
+        raise InputError(
+            f"{text!r} is not one sigma, or two", field="--ground-sigma",
+            remedy="give metres in plan, or in plan and height, such as 0.5,1",
+        )  # fmt: skip
+    return found
 
 
 def _heights(table: BlockPoints) -> tuple[float, float] | None:
@@ -186,6 +204,14 @@ def _own(scene: Any, name: str | None) -> SensorModel:
         )  # fmt: skip
     model: SensorModel = scene.model if name is None else scene.models[name]
     return model
+
+
+def _check_models(images: Sequence[str | os.PathLike[str]], models: Sequence[str | os.PathLike[str]]) -> None:
+    if models and len(models) != len(images):
+        raise InputError(
+            f"{len(models)} models for {len(images)} images", field="--models",
+            remedy="give one model file for each image, in their order",
+        )  # fmt: skip
 
 
 # -- paths -----------------------------------------------------------------------------------------------------------
@@ -219,13 +245,13 @@ def _check_paths(
 def _record(
     images: Sequence[str | os.PathLike[str]],
     options: BlockOptions,
-    scene: SceneOptions,
+    scenes: Sequence[SceneOptions],
     starts: Mapping[str, Start],
     command: str | None,
 ) -> dict[str, Any]:
     """Return what is needed to make the same result again."""
     read: dict[Path, str] = {}
-    for image, start in zip(images, starts.values(), strict=True):
+    for image, scene, start in zip(images, scenes, starts.values(), strict=True):
         for given in (options.points, options.gcps):
             for path, role in inputs.files_read(
                 image, scene, PointOptions(gcps=given), rasters=start.scene.rasters
@@ -233,7 +259,8 @@ def _record(
                 read.setdefault(path, role)
     first = next(iter(starts.values())).scene
     whole = inputs.provenance(
-        first, PointOptions(), None, inputs.hashed(read), command, {"block": options, "scene": scene}
+        first, PointOptions(), None, inputs.hashed(read), command,
+        {"block": options, "scene": replace(scenes[0], model=None)},
     )  # fmt: skip
     return {key: whole[key] for key in ("command", "inputs", "options", "software")}
 

@@ -144,6 +144,8 @@ class BlockOptions:
         has any, else a shift.
     hold : float, optional
         Sigma (px) with which the orientation is held at its start values.
+    ground_sigma : str, optional
+        ``XY`` or ``XY,H``: sigmas (m) in plan and height of ground that states none; estimated by default.
     """
 
     points: str | os.PathLike[str]
@@ -156,6 +158,7 @@ class BlockOptions:
     model_crs: str | None = None
     correction: str | None = None
     hold: float | None = None
+    ground_sigma: str | None = None
 
 
 @dataclass(frozen=True)

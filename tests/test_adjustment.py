@@ -186,7 +186,10 @@ def test_one_image_with_perfect_ground_is_the_fit_of_one_image(rpcs: dict[str, R
     found = adjust(starts(truth), points)
     alone = fit(starts(truth)["left"], points.in_image("left"))
     np.testing.assert_allclose(found.values, alone.values, rtol=1e-6, atol=1e-8)
-    np.testing.assert_allclose(found.sigmas, alone.sigmas, rtol=1e-5)
+    # With the uncertainty of sigma0 itself: the variance of Student's distribution, on a grid.
+    student = np.sqrt(found.redundancy / (found.redundancy - 2))
+    np.testing.assert_allclose(found.sigmas, student * alone.sigmas, rtol=3e-3)
+    assert not found.variances.separable
     assert found.sigma0 == pytest.approx(alone.sigma0, rel=1e-6)
     assert found.redundancy == alone.redundancy
     np.testing.assert_allclose(found.residuals, alone.residuals, atol=1e-5)
@@ -424,6 +427,159 @@ def test_good_ground_is_kept_where_measurements_are_better_than_stated(rpcs: dic
         points = measured(truth, places(44, seed=8), roles_of(9, 25, 10), noise=0.1, sigma_ground=0.3, seed=seed)
         lost += len(adjust(starts(truth), points).rejected)
     assert lost <= 1
+
+
+# -- ground that states no sigma -------------------------------------------------------------------------------------
+
+
+def surveyed(
+    rpcs: dict[str, RPC],
+    control: int,
+    sigma: tuple[float, float],
+    seed: int,
+    *,
+    noise: float = 0.1,
+    stated: bool = False,
+) -> tuple[dict[str, ImageCorrection], BlockPoints, np.ndarray]:
+    """Return true models, points (control with errors (m) in plan and height, 10 check, 20 tie), and true ground.
+
+    Pixels are of 2.5 m: 0.1 px are 0.25 m, below what the survey is wrong by, as in images of half a metre.
+    """
+    truth = biased(rpcs, seed=seed)
+    ground = places(control + 30, seed=seed + 50)
+    points = measured(truth, ground, roles_of(control, 10, 20), noise=noise, seed=seed)
+    random = np.random.default_rng(seed + 900)
+    frame = GroundFrame.about(ground)
+    wrong = random.normal(0, 1, (control, 3)) * (sigma[0], sigma[0], sigma[1])
+    east = frame.horizons(ground[:control]).swapaxes(1, 2)
+    known = points.ground.copy()
+    known[:control] = frame.geodetic(frame.of_geodetic(ground[:control]) + (east @ wrong[:, :, None])[:, :, 0])
+    points = replace(points, ground=known)
+    return truth, points.with_ground_sigma(*sigma) if stated else points, ground
+
+
+def ratios(found: BlockFit, truth: dict[str, ImageCorrection], ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (found - true) / sigma of parameters, and of the ground of all points but control."""
+    wanted = np.concatenate([model.params for model in truth.values()])
+    frame = GroundFrame.about(ground)
+    apart = frame.horizons(ground) @ (frame.of_geodetic(found.ground) - frame.of_geodetic(ground))[:, :, None]
+    return (found.values - wanted) / found.sigmas, (apart[:, :, 0] / found.ground_sigmas)[~found.points.control]
+
+
+def coverage(
+    rpcs: dict[str, RPC], control: int, error: float, runs: int, *, stated: bool = False
+) -> tuple[float, float, int, int]:
+    """Return how often 1.96 sigmas hold for parameters and for ground, and how many runs refused or lost points."""
+    orientation, places_, refused, dropped = [], [], 0, 0
+    for seed in range(runs):
+        truth, points, ground = surveyed(rpcs, control, (error, error), seed, stated=stated)
+        try:
+            found = adjust(starts(truth), points)
+        except DegeneratePoints:
+            refused += 1
+            continue
+        dropped += bool(found.rejected)
+        one, other = ratios(found, truth, ground)
+        orientation.append(np.abs(one) < 1.96)
+        places_.append(np.abs(other) < 1.96)
+    return float(np.mean(orientation)), float(np.mean(places_)), refused, dropped
+
+
+@pytest.mark.parametrize(("control", "error"), [(4, 0.5), (9, 1.0)])
+def test_control_without_sigmas_is_not_refused_and_intervals_hold(
+    rpcs: dict[str, RPC], control: int, error: float
+) -> None:
+    """The reduced form of the test below: the shares of 12 blocks are known to some hundredths."""
+    orientation, ground, refused, dropped = coverage(rpcs, control, error, 12)
+    assert refused == 0
+    assert dropped <= 1  # one of these sets has a point of 3.2 sigma among eight that are better than they should be
+    assert 0.86 <= orientation <= 1.0
+    assert 0.88 <= ground <= 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("control", [4, 6, 9, 20])
+@pytest.mark.parametrize("error", [0.2, 0.5, 1.0])
+def test_intervals_hold_whatever_the_survey_is_worth(rpcs: dict[str, RPC], control: int, error: float) -> None:
+    orientation, ground, refused, dropped = coverage(rpcs, control, error, 60)
+    assert refused <= 1
+    assert dropped <= 3
+    # Blocks share the errors of their control: a share of 60 blocks is known to 0.02.
+    assert 0.90 <= orientation <= 0.99
+    assert 0.92 <= ground <= 0.98
+
+
+def test_stated_sigmas_of_control_are_not_scaled(rpcs: dict[str, RPC]) -> None:
+    """Measurements five times better than stated do not make the survey any better, or any worse."""
+    orientation, ground, refused, dropped = coverage(rpcs, 9, 0.5, 12, stated=True)
+    assert (refused, dropped) == (0, 0)
+    assert 0.88 <= orientation <= 1.0
+    assert 0.90 <= ground <= 1.0
+    truth, points, _ = surveyed(rpcs, 9, (0.5, 1.0), 3, stated=True)
+    found = adjust(starts(truth), points)
+    assert found.sigma0 == pytest.approx(0.2, rel=0.3)
+    # Nine points of 0.5 m hold the datum to 0.17 m, and their sigma is not scaled by 0.2.
+    assert 0.15 < np.median(found.ground_sigmas[points.tie, 0]) < 0.45
+    assert found.variances.sigma_xy is None
+
+
+def test_sigmas_of_the_survey_are_found_and_said(rpcs: dict[str, RPC]) -> None:
+    truth, points, _ = surveyed(rpcs, 40, (0.5, 1.5), 5)
+    found = adjust(starts(truth), points)
+    # 74 and 37 spare observations: known to 8 and 12 percent.
+    assert found.variances.sigma_xy == pytest.approx(0.5, rel=0.25)
+    assert found.variances.sigma_h == pytest.approx(1.5, rel=0.35)
+    assert found.sigma0 == pytest.approx(0.2, rel=0.2)
+    assert any("without a stated sigma" in text and "--ground-sigma" in text for text in found.warnings)
+    document = found.to_json()["variances"]
+    assert document["unstated_ground"]["h"]["sigma"] == found.variances.sigma_h
+    assert document["unstated_ground"]["xy"]["points"] == 40
+    # What is stated by hand is the same as what the points state.
+    given = adjust(starts(truth), points.with_ground_sigma(0.5, 1.5))
+    assert given.variances.unstated == (0, 0)
+    assert (np.abs(given.values - found.values) < found.sigmas).all()
+    with pytest.raises(InputError, match="positive"):
+        points.with_ground_sigma(0.0)
+
+
+@pytest.mark.parametrize("control", [6, 9, 20])
+def test_a_blunder_among_control_without_sigmas_is_found(rpcs: dict[str, RPC], control: int) -> None:
+    """Ten times the true error of the survey, in any direction; of five others, few degrees of freedom have to tell."""
+    caught, others = 0, 0
+    for seed in range(4):
+        truth, points, ground = surveyed(rpcs, control, (0.5, 0.5), seed)
+        random = np.random.default_rng(seed)
+        apart = random.normal(0, 1, 3)
+        frame = GroundFrame.about(ground)
+        known = points.ground.copy()
+        moved = frame.of_geodetic(ground[:1]) + 5.0 * apart / np.linalg.norm(apart)
+        known[0] = frame.geodetic(moved)[0]
+        names = {one.point for one in adjust(starts(truth), replace(points, ground=known)).rejected}
+        caught += "p0" in names
+        others += len(names - {"p0"})
+    assert caught >= (2 if control == 6 else 3)
+    # One of these sets has a point of 3.2 sigma of its own.
+    assert others <= 1
+
+
+# -- known points that are off ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("axis", "size", "what"), [(2, 9.0, "height"), (0, 9.0, "plan")])
+def test_a_wrong_check_point_is_named_and_kept(rpcs: dict[str, RPC], axis: int, size: float, what: str) -> None:
+    truth = biased(rpcs)
+    points = measured(truth, places(40), roles_of(9, 31), noise=0.3, sigma_ground=0.3)
+    good = adjust(starts(truth), points)
+    assert good.outlying == ()
+    frame = GroundFrame.about(points.ground)
+    local, turn = frame.of_geodetic(points.ground), frame.horizons(points.ground)[20]
+    local[20] += turn[axis] * size * np.hypot(0.3, good.ground_sigmas[20, axis])
+    found = adjust(starts(truth), replace(points, ground=frame.geodetic(local)))
+    assert [(one.point, one.role, one.what) for one in found.outlying] == [("p20", "check", what)]
+    assert any("check point p20" in text and "sigma" in text for text in found.warnings)
+    assert found.object_rms()["n"] == 31  # type: ignore[index]
+    assert found.rejected == ()
+    assert found.to_json()["outlying"][0]["point"] == "p20"
 
 
 # -- rank defects ----------------------------------------------------------------------------------------------------

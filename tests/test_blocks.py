@@ -141,6 +141,46 @@ def test_written_points_are_read_as_ground_again(stereo: Stereo, tmp_path: Path)
     np.testing.assert_allclose(wide.ground, again.ground, atol=1e-9)
 
 
+def test_an_adjustment_starts_from_saved_models(stereo: Stereo, tmp_path: Path) -> None:
+    points = stereo.write()
+    first = json.loads(run("adjust", *stereo.images, "--points", points, "-o", tmp_path / "one", "--json"))
+    saved = [arg for name in BIAS for arg in ("--models", first["files"][f"{name}_BAND model"])]
+    again = json.loads(run("adjust", *stereo.images, "--points", points, *saved, "-o", tmp_path / "two", "--json"))
+    for name in BIAS:
+        one, two = (
+            load_model(tmp_path / folder / f"{name}_BAND_model.json").ground_to_image(stereo.ground)
+            for folder in ("one", "two")
+        )
+        np.testing.assert_allclose(two, one, rtol=0, atol=1e-4)
+        start = again["report"]["images"][f"{name}_BAND"]["model_source"]
+        assert f"{name}_BAND_model.json" in start
+    # It started there: as delivered the images were some pixels off, now a tenth.
+    raw = again["report"]["adjustment"]["images"]["aft_BAND"]["rms"]["raw_residuals"]["check"]
+    assert raw["total"] < 0.5
+    inputs = {entry["path"] for entry in again["report"]["provenance"]["inputs"]}
+    assert any(path.endswith("one/aft_BAND_model.json") for path in inputs)
+    # Other corrections go on top, and one model for two images is refused.
+    run("adjust", *stereo.images, "--points", points, *saved, "--correction", "affine", "-o", tmp_path / "three")
+    assert "1 models for 2 images" in run(
+        "adjust", *stereo.images, "--points", points, *saved[:2], "-o", tmp_path, code=2
+    )
+
+
+def test_ground_sigmas_are_estimated_or_stated_by_hand(stereo: Stereo, tmp_path: Path) -> None:
+    points = stereo.write()
+    points.write_text(points.read_text().replace(",0.2,0.1,0.1", ",0.2,,"))
+    text = run("adjust", *stereo.images, "--points", points, "-o", tmp_path / "out")
+    assert "Ground of 8 control points states no sigma; estimated: " in text
+    assert "--ground-sigma" in text
+    assert "Accuracy of the ground" in (tmp_path / "out" / "block_report.html").read_text()
+    args = ("adjust", *stereo.images, "--points", points, "-o", tmp_path / "out")
+    report = json.loads(run(*args, "--ground-sigma", "0.1,0.2", "--json"))["report"]
+    assert report["adjustment"]["variances"]["unstated_ground"]["h"]["points"] == 0
+    assert report["provenance"]["options"]["block"]["ground_sigma"] == "0.1,0.2"
+    for wrong in ("a", "1,2,3", "0", "-1", "nan"):
+        assert "--ground-sigma" in run(*args, "--ground-sigma", wrong, code=2)
+
+
 def points_without_ground(path: Path) -> Path:
     """Write the same rays without any ground."""
     lines = [line.split(",")[:4] for line in path.read_text().splitlines() if not line.startswith("#")]

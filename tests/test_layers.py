@@ -25,9 +25,11 @@ points
 models least_squares statistics
 problem block_points ground_frame
 ridge block_system intersection
-blunders block_solver
-block_blunders registration estimation hookspecs swaps model_file kernels lattice_kernel ray_kernel landscape rpc_files
-model_choice selection ground_error drawing report_text contract
+blunders block_solver report_text
+block_variance
+registration estimation hookspecs swaps model_file kernels lattice_kernel ray_kernel landscape rpc_files
+block_blunders
+model_choice block_checks selection ground_error drawing contract
 comparison report_plots adjustment covariance
 raster
 raster_writer
