@@ -137,7 +137,7 @@ def _median_subset(solution: Solution, priors: int) -> np.ndarray:
 
     # All subsets at once are 500 residuals of every point: gigabytes where points are matched, not measured.
     parts = np.array_split(steps, math.ceil(len(steps) * count / _RESIDUALS_AT_ONCE))
-    merit = np.concatenate([np.partition(squares(part), half - 1, axis=1)[:, half - 1] for part in parts])
+    merit = np.concatenate([np.partition(squares(part), half - 1, axis=1)[:, half - 1].copy() for part in parts])
     best = int(np.argmin(merit))
     keep = np.zeros(count, dtype=bool)
     keep[np.argsort(squares(steps[best : best + 1])[0], kind="stable")[: max(half, size + 1)]] = True

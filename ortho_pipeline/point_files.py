@@ -41,7 +41,7 @@ def read_table(
         For anything that is not a table of finite numbers; names file, line and column.
     """
     text = load_text(path)
-    table = _reader(path, text)(path, text)
+    table = _read(_reader(path, text), path, text)
     if not table.rows:
         raise InputError("this file holds no points", file=path, remedy=f"give one of: {_FORMATS}")
     return _of_image(path, table, image_name, pieces or {})
@@ -58,9 +58,9 @@ def read_block_table(path: str | os.PathLike[str], layout: Layout = OF_BLOCK) ->
     text = load_text(path)
     reader = _reader(path, text)
     if reader is read_csv or reader is read_geojson:
-        table = reader(path, text, layout)
+        table = _read(reader, path, text, layout)
     elif (reader is read_odm or reader is read_asp) and layout is OF_BLOCK:
-        table = reader(path, text)
+        table = _read(reader, path, text)
     else:
         raise InputError(
             "points of several images do not stand in this format", file=path,
@@ -69,6 +69,28 @@ def read_block_table(path: str | os.PathLike[str], layout: Layout = OF_BLOCK) ->
     if not table.rows:
         raise InputError("this file holds no points", file=path, remedy="add points to it")
     return table
+
+
+#: What a file of each format has to hold, for errors whose own place knows no better remedy.
+_WANTED: dict[Callable[..., Table], str] = {
+    read_csv: "write one point a line, its numbers under a header such as id,col,row,x,y,h",
+    read_geojson: "write a FeatureCollection of Points [lon, lat, height] with the property 'ji' = [column, row]",
+    read_qgis: "write mapX,mapY,sourceX,sourceY,enable and so on, as the georeferencer of QGIS does",
+    read_odm: "write x y z column row image [label], under a line with the CRS",
+    read_envi: "write numbers in the order of the comment 'Map (x,y,elev), Image (x,y)'",
+    read_asp: "write id lat lon height and three sigmas, then name column row and two sigmas of each image",
+    read_links: "write [id] from-x from-y to-x to-y",
+}
+
+
+def _read(reader: Callable[..., Table], path: str | os.PathLike[str], text: str, *layout: Layout) -> Table:
+    """Read a file; an error without a remedy gets that of the format."""
+    try:
+        return reader(path, text, *layout)
+    except InputError as error:
+        if error.remedy is not None:
+            raise
+        raise type(error)(error.message, file=error.file, field=error.field, remedy=_WANTED[reader]) from error
 
 
 def _reader(path: str | os.PathLike[str], text: str) -> Callable[[str | os.PathLike[str], str], Table]:

@@ -113,7 +113,9 @@ def load_text(path: str | os.PathLike[str]) -> str:
     """Return a file as text: UTF-8, a byte-order mark allowed, no NUL, no larger than `MAX_FILE`."""
     data = read_bounded(path, MAX_FILE, remedy="check the path")
     if len(data) > MAX_FILE:
-        raise InputError(f"a point file of more than {MAX_FILE // 1_000_000} MB is not read", file=path)
+        raise InputError(
+            f"a point file of more than {MAX_FILE // 1_000_000} MB is not read", file=path, remedy="thin the points out"
+        )
     if data.startswith(b"EHFA_HEADER_TAG") or Path(path).suffix.lower() == ".gcc":
         raise InputError(
             "how GCP files of ERDAS IMAGINE (.gcc) are written is not published", file=path,
@@ -124,7 +126,9 @@ def load_text(path: str | os.PathLike[str]) -> str:
         raise InputError("this file is UTF-16", file=path, remedy="save it as UTF-8")
     if b"\0" in data:
         line = data[: data.index(b"\0")].count(b"\n") + 1
-        raise InputError("a NUL byte: this is no text file", file=path, field=f"line {line}")
+        raise InputError(
+            "a NUL byte: this is not a text file", file=path, field=f"line {line}", remedy="save it as text (UTF-8)"
+        )
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

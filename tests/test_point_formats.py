@@ -16,6 +16,7 @@ from ortho_pipeline import pipeline
 from ortho_pipeline.block_points import read_block_points
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.options import PointOptions
+from ortho_pipeline.point_table import MAX_FILE
 from ortho_pipeline.points import Points, one_mark, read_points, write_points
 
 
@@ -401,6 +402,7 @@ def test_mutated_lists_are_read_or_refused_but_nothing_else(tmp_path: Path) -> N
         "a.txt": "link table\n1 -2 24.4 -33.6\nb 3 -4 24.5 -33.7\n",
         "a.csv": "Name;Pixel;Line;Lon;Lat;Elev;S\na;10,5;20;24,4;-33,6;100;G\n",
     }
+    remedies: list[str | None] = []
     bits = [b",", b";", b"\t", b"\n", b"#CRS: EPSG:4978\n", b"nan", b"1e999", b"{", b'"', b"\xff"]
     for name, text in originals.items():
         for _ in range(60):
@@ -415,9 +417,17 @@ def test_mutated_lists_are_read_or_refused_but_nothing_else(tmp_path: Path) -> N
             for reader in (read_points, read_block_points):
                 try:
                     found = reader(tmp_path / name, crs="EPSG:4979", vertical="ellipsoid")
-                except InputError:
+                except InputError as error:
+                    remedies.append(error.remedy)
                     continue
                 assert np.isfinite(found.image).all()
+    assert len(remedies) > 100
+    assert all(remedies)
+
+
+def test_a_file_without_an_end_is_refused() -> None:
+    with pytest.raises(InputError, match="more than 32 MB"):
+        read_points("/dev/zero")
 
 
 # -- many points
@@ -434,4 +444,5 @@ def test_memory_of_reading_many_points_is_bounded(tmp_path: Path) -> None:
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert peak < 2000 * count
+    # As much as a file may hold is set aside for its bytes.
+    assert peak < MAX_FILE + 2000 * count
