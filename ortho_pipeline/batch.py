@@ -24,7 +24,7 @@ from ortho_pipeline.batch_manifest import Digests, FileState, Record, key_of, lo
 from ortho_pipeline.batch_plan import RUN_FILES, STATE, Job, Plan, for_run, plan, versions
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.executors import Processes, Sequential, completed, dask_executor
-from ortho_pipeline.files import write_text
+from ortho_pipeline.files import clear_up, write_text
 from ortho_pipeline.stac import write_catalog
 
 SCHEMA_VERSION = 1
@@ -110,6 +110,7 @@ def make_scene(job: Job, verify: bool = False) -> Outcome:
 
 
 def _make_locked(job: Job, verify: bool, begin: float) -> Outcome:
+    clear_up(job.record)
     record = Record.read(job.record)
     # What an earlier run wrote, and this one may not write any more.
     before = record.outputs if record is not None else ()
@@ -124,7 +125,6 @@ def _make_locked(job: Job, verify: bool, begin: float) -> Outcome:
             return Outcome(job.name, "done" if mine else "unchanged", seconds, _paths(good, job), good.facts)
         if record is not None:
             Record(job.name, "", "started", outputs=before).write(job.record)
-        _clear(job.folder)
         result = pipeline.rectify(
             job.image, job.folder, scene=job.scene, points=job.points, surface=job.surface, output=job.ortho,
             name=job.name, digest=_digests,
@@ -211,12 +211,6 @@ def _states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:
 def _restated(outputs: Sequence[FileState], folder: Path) -> tuple[FileState, ...]:
     """Return outputs of unchanged content with their present dates."""
     return tuple(replace(one, mtime_ns=(folder / one.path).stat().st_mtime_ns) for one in outputs)
-
-
-def _clear(folder: Path) -> None:
-    """Remove what a killed process left of its temporary files; the lock says that nobody else works here."""
-    for left in folder.glob(".*.part*"):
-        left.unlink(missing_ok=True)
 
 
 def _remove(folder: Path, names: set[str]) -> None:

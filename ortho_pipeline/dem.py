@@ -23,8 +23,8 @@ from pyproj.exceptions import CRSError
 from ortho_pipeline.crs import Vertical, declared_vertical, ground_transform, horizontal, parse_crs
 from ortho_pipeline.datum import dem_unit, dem_vertical, dem_vertical_remedy
 from ortho_pipeline.errors import CrsError, DatumError, InputError
-from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.raster_output import close, raster_output
 
 Array = NDArray[np.float64]
 
@@ -524,15 +524,15 @@ def write_dem(path: str | os.PathLike[str], heights: Array, corner: tuple[float,
     system.SetFromUserInput(crs)
     rows, columns = heights.shape
     options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9", "TILED=YES"]
-    with whole_or_nothing(path) as temporary:
+    with raster_output(path) as temporary:
         dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, 1, gdal.GDT_Float32, options)
         dataset.SetGeoTransform((corner[0], step, 0.0, corner[1], 0.0, -step))
         dataset.SetProjection(system.ExportToWkt())
         band = dataset.GetRasterBand(1)
         band.SetNoDataValue(-32768.0)
         band.WriteArray(heights.astype(np.float32))
-        dataset.FlushCache()
-        del band, dataset
+        del band
+        close(dataset)
 
 
 def write_terrain(

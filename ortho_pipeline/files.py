@@ -299,7 +299,9 @@ def _place(path: str | os.PathLike[str]) -> Path:
     except (OSError, RuntimeError) as error:
         # Links that point at each other are a RuntimeError before Python 3.13.
         raise InputError(
-            f"this path leads nowhere ({getattr(error, 'strerror', None) or error})", file=path, remedy="check its links"
+            f"this path leads nowhere ({getattr(error, 'strerror', None) or error})",
+            file=path,
+            remedy="check its links",
         ) from error
 
 
@@ -314,6 +316,14 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write `text` as UTF-8 to `path`, whole or not at all."""
     with whole_or_nothing(path, side_cars=False) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def clear_up(path: str | os.PathLike[str]) -> None:
+    """Remove what a killed command left of a file that it was writing alone."""
+    final = _place(path)
+    if final.parent.is_dir():
+        with together(final.parent, final.name):
+            pass
 
 
 def read_bounded(path: str | os.PathLike[str], limit: int, **told: str) -> bytes:

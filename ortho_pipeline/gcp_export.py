@@ -17,18 +17,17 @@ from typing import Any
 import numpy as np
 from osgeo import gdal, osr
 
-from ortho_pipeline import files
 from ortho_pipeline.crs import ground_transform
 from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import InputError, ModelError
 from ortho_pipeline.footprint import image_grid
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points
+from ortho_pipeline.raster_output import close, raster_output
 from ortho_pipeline.rays import intersect
 from ortho_pipeline.rpc import (
     RpcExport,
     export_rpc,
-    gdal_errors,
     name_sources_relatively,
     write_rpb,
     write_rpc_txt,
@@ -215,18 +214,15 @@ def write_gcps(dataset: gdal.Dataset, gcps: Gcps, path: str | PathLike[str]) -> 
     points = [gdal.GCP(x, y, h, column, row, "", str(k + 1)) for k, (column, row, x, y, h) in enumerate(gcps.tolist())]
     view = _without_georeferencing(dataset)
     view.SetGCPs(points, _wgs84().ExportToWkt())
-    with files.whole_or_nothing(path) as temporary:
-        with gdal_errors(path):
-            if path.suffix.lower() == ".vrt":
-                gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), view).FlushCache()
-            else:
-                options = ["COMPRESS=DEFLATE", "TILED=YES", "BIGTIFF=IF_SAFER"]
-                gdal.GetDriverByName("GTiff").CreateCopy(os.fspath(temporary), view, options=options).FlushCache()
+    with raster_output(path) as temporary:
         if path.suffix.lower() == ".vrt":
+            close(gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), view))
             name_sources_relatively(temporary, path)
-        with gdal_errors(path):
-            written = gdal.OpenEx(os.fspath(temporary), gdal.OF_RASTER, allowed_drivers=["VRT", "GTiff"])
-            again = np.array([[p.GCPPixel, p.GCPLine, p.GCPX, p.GCPY, p.GCPZ] for p in written.GetGCPs()])
+        else:
+            options = ["COMPRESS=DEFLATE", "TILED=YES", "BIGTIFF=IF_SAFER"]
+            close(gdal.GetDriverByName("GTiff").CreateCopy(os.fspath(temporary), view, options=options))
+        written = gdal.OpenEx(os.fspath(temporary), gdal.OF_RASTER, allowed_drivers=["VRT", "GTiff"])
+        again = np.array([[p.GCPPixel, p.GCPLine, p.GCPX, p.GCPY, p.GCPZ] for p in written.GetGCPs()])
         # A VRT keeps four decimals of pixels and twelve of degrees.
         other = written.GetMetadata("RPC") or written.GetGeoTransform(can_return_null=True)
         if again.shape != gcps.shape or np.abs(again - gcps).max() > 1e-4 or other:
@@ -284,13 +280,13 @@ def write_geolocation(
             remedy="give a DEM that covers the whole scene, or --height",
         )  # fmt: skip
     arrays = path.resolve().with_suffix(".tif")
-    with files.whole_or_nothing(arrays) as temporary, gdal_errors(path):
+    with raster_output(arrays) as temporary:
         raster = gdal.GetDriverByName("GTiff").Create(
             os.fspath(temporary), len(across), len(down), 2, gdal.GDT_Float64, options=["COMPRESS=DEFLATE"]
         )
         for k in (0, 1):
             raster.GetRasterBand(k + 1).WriteArray(np.ascontiguousarray(lonlat[:, :, k]))
-        del raster
+        close(raster)
     view = _without_georeferencing(dataset)
     view.SetMetadata(
         {"X_DATASET": str(arrays), "X_BAND": "1", "Y_DATASET": str(arrays), "Y_BAND": "2", "PIXEL_OFFSET": "0",
@@ -298,9 +294,8 @@ def write_geolocation(
          "GEOREFERENCING_CONVENTION": "TOP_LEFT_CORNER"},
         "GEOLOCATION",
     )  # fmt: skip
-    with files.whole_or_nothing(path) as temporary:
-        with gdal_errors(path):
-            gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), view).FlushCache()
+    with raster_output(path) as temporary:
+        close(gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), view))
         name_sources_relatively(temporary, path)
     return _mesh_error(model, image, lonlat, surface)
 

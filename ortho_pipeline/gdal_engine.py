@@ -15,6 +15,7 @@ from osgeo import gdal, gdal_array
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster import Grid, RasterSource
+from ortho_pipeline.raster_output import gdal_errors
 from ortho_pipeline.raster_writer import Profile, RasterWriter
 
 
@@ -53,8 +54,8 @@ def warp_with_gdal(
     dem = f"/vsimem/ortho_dem_{os.getpid()}_{threading.get_ident()}.tif"
     options = ["METHOD=RPC"]  # GDAL would otherwise prefer GCPs
     writer = RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads)
-    target = writer.path.with_name(f".{writer.path.stem}.{os.getpid()}.gdal.part.tif")
-    with writer, writer.disk_errors():
+    with writer, gdal_errors(path):
+        target = writer.scratch("gdal")
         try:
             if isinstance(heights, tuple):
                 _write_dem(dem, *heights)

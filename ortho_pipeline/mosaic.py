@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.outline import grid_of, valid_outline
 from ortho_pipeline.raster import Grid, RasterSource, limit_cache
+from ortho_pipeline.raster_output import close, raster_output
 from ortho_pipeline.raster_writer import Profile, RasterWriter
 from ortho_pipeline.registration import details, measure
 
@@ -137,15 +137,14 @@ def write_vrt(layout: Layout, path: Path) -> None:
         If GDAL leaves an ortho out.
     """
     names = [str(layer.ortho.path) for layer in reversed(layout.layers)]
-    with whole_or_nothing(path) as temporary:
+    with raster_output(path) as temporary:
         dataset = gdal.BuildVRT(
             str(temporary), names, outputBounds=layout.grid.extent, xRes=layout.grid.dx, yRes=layout.grid.dy,
             resolution="user",
         )  # fmt: skip
         size = dataset.RasterXSize, dataset.RasterYSize
         listed = {Path(name).resolve() for name in dataset.GetFileList()}
-        dataset.FlushCache()
-        dataset = None
+        close(dataset)
         missing = [layer.ortho.name for layer in layout.layers if layer.ortho.path.resolve() not in listed]
         if missing or size != (layout.grid.width, layout.grid.height):
             raise InputError(f"GDAL leaves out {', '.join(missing) or 'pixels'}", file=path, remedy="make a COG of it")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import threading
@@ -16,7 +17,8 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import whole_or_nothing
-from ortho_pipeline.raster import Grid, RasterSource, first_line, holds, pixel_type
+from ortho_pipeline.raster import Grid, RasterSource, holds, pixel_type
+from ortho_pipeline.raster_output import check_written, checked_options, close, gdal_errors
 
 
 @dataclass(frozen=True)
@@ -132,39 +134,34 @@ class RasterWriter:
         if driver not in ("COG", "GTiff"):
             raise InputError(f"orthos are not written as {driver!r}", field="format", remedy="COG or GTiff")
         self.path, self.grid, self.profile, self.driver = Path(path), grid, profile, driver
-        self.options = _creation_options(driver, dict(creation_options or {}), threads)
+        self.options = checked_options(driver, dict(creation_options or {}), threads)
         self._lock = threading.Lock()
+        self._open = contextlib.ExitStack()
 
     def __enter__(self) -> RasterWriter:
-        self._final = whole_or_nothing(self.path)
-        self._temporary = self._final.__enter__()
-        try:
+        with contextlib.ExitStack() as stack:
+            self._temporary = stack.enter_context(whole_or_nothing(self.path))
             if self.driver == "COG":
                 # The COG driver copies a finished raster: overviews come before the pixels in the file.
-                self._work = self._temporary.with_name(self._temporary.name + ".work.tif")
+                self._work = self.scratch("work")
                 options = {"TILED": "YES", "BIGTIFF": "IF_SAFER", "BLOCKXSIZE": "512", "BLOCKYSIZE": "512"}
             else:
                 self._work, options = self._temporary, self.options
             self._dataset = self._create(self._work, options)
-        except BaseException as error:
-            self._final.__exit__(type(error), error, error.__traceback__)
-            raise
+            self._open = stack.pop_all()
         return self
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        if kind is None:
-            try:
-                self._finish()
-            except BaseException as problem:
+        # What is written last is left first: the pixels are complete before the file gets its name.
+        with self._open:
+            if error is not None:
                 self._dataset = None
-                self._final.__exit__(type(problem), problem, problem.__traceback__)
-                raise
-        self._dataset = None
-        self._final.__exit__(kind, error, trace)
+                raise error
+            self._finish()
 
     def write(self, left: int, top: int, pixels: NDArray[Any], valid: NDArray[np.bool_] | None) -> None:
         """Write a window ``(count, h, w)``; `valid` ``(h, w)`` goes to the mask, if the profile has one."""
-        with self._lock, self.disk_errors():
+        with self._lock, gdal_errors(self.path):
             self._dataset.WriteArray(pixels, left, top)
             if self.profile.validity == "mask" and valid is not None:
                 mask = valid.view(np.uint8) * np.uint8(255)
@@ -175,7 +172,7 @@ class RasterWriter:
 
         profile, grid = self.profile, self.grid
         code = gdal_array.NumericTypeCodeToGDALTypeCode(profile.dtype.type)
-        with self.disk_errors():
+        with gdal_errors(self.path):
             dataset = gdal.GetDriverByName("GTiff").Create(
                 str(path), grid.width, grid.height, profile.count, code, [f"{k}={v}" for k, v in options.items()]
             )
@@ -195,20 +192,23 @@ class RasterWriter:
         return dataset
 
     def _finish(self) -> None:
-        with self.disk_errors():
-            self._dataset.FlushCache()
+        with gdal_errors(self.path):
+            close(self._dataset)
             self._dataset = None
             if self.driver == "COG":
-                source = gdal.Open(str(self._work))
+                source = gdal.OpenEx(str(self._work), gdal.OF_RASTER, allowed_drivers=["GTiff"])
                 options = [f"{k}={v}" for k, v in self.options.items()]
-                gdal.GetDriverByName("COG").CreateCopy(str(self._temporary), source, options=options)
-        check = gdal.Open(str(self._temporary))
-        if (check.RasterXSize, check.RasterYSize) != (self.grid.width, self.grid.height):
-            raise InputError("the output was not written whole", file=self.path, remedy="check the free disk space")
+                close(gdal.GetDriverByName("COG").CreateCopy(str(self._temporary), source, options=options))
+        sparse = self.options.get("SPARSE_OK", "NO").upper() in ("YES", "TRUE", "ON")
+        check_written(self._temporary, self.path, size=(self.grid.width, self.grid.height), sparse=sparse)
+
+    def scratch(self, name: str) -> Path:
+        """Return the path of a temporary raster beside the output, which is removed with the output's own."""
+        return self._temporary.with_name(f"{self._temporary.name}.{name}.tif")
 
     def copy(self, path: Path) -> int:
         """Fill the raster from another of its size, whose last band is the mask; return the count of valid pixels."""
-        dataset, count, step = gdal.Open(str(path)), 0, 2048
+        dataset, count, step = gdal.OpenEx(str(path), gdal.OF_RASTER, allowed_drivers=["GTiff"]), 0, 2048
         for top in range(0, self.grid.height, step):
             for left in range(0, self.grid.width, step):
                 size = min(step, self.grid.width - left), min(step, self.grid.height - top)
@@ -222,28 +222,6 @@ class RasterWriter:
                 self.write(left, top, pixels[: self.profile.count].astype(self.profile.dtype, copy=False), valid)
                 count += int(np.count_nonzero(valid))
         return count
-
-    def disk_errors(self) -> _DiskErrors:
-        """Return a context in which GDAL's errors become an `InputError` that names the output."""
-        return _DiskErrors(self.path)
-
-
-class _DiskErrors:
-    """Turns GDAL's write errors (a full disk, mostly) into an `InputError`."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        if kind is not None and issubclass(kind, RuntimeError):
-            raise InputError(
-                f"the output cannot be written ({first_line(error)})",
-                file=self.path,
-                remedy="check the free disk space and the creation options",
-            ) from error
 
 
 def _describe(band: gdal.Band, profile: Profile, index: int) -> None:
@@ -260,27 +238,3 @@ def _describe(band: gdal.Band, profile: Profile, index: int) -> None:
         band.SetScale(scale)
         band.SetOffset(offset)
         band.SetUnitType(unit)
-
-
-def _creation_options(driver: str, given: dict[str, str], threads: int) -> dict[str, str]:
-    """Return lossless defaults under what the user gave; an option that the driver does not know is an error."""
-    given = {key.upper(): value for key, value in given.items()}
-    listed = gdal.GetDriverByName(driver).GetMetadataItem("DMD_CREATIONOPTIONLIST") or ""
-    unknown = [key for key in given if f"name='{key}'" not in listed and f'name="{key}"' not in listed]
-    if unknown:
-        raise InputError(
-            f"the {driver} driver has no creation option {', '.join(unknown)}",
-            field="creation option",
-            remedy=f"see the page of the {driver} driver in GDAL's documentation",
-        )
-    defaults = {"BIGTIFF": "IF_SAFER"}
-    if driver == "GTiff":
-        defaults |= {"TILED": "YES", "BLOCKXSIZE": "512", "BLOCKYSIZE": "512"}
-        if given.get("TILED", "YES").upper() == "NO":
-            defaults = {"BIGTIFF": "IF_SAFER"}
-    else:
-        defaults |= {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "LEVEL": "6", "NUM_THREADS": str(max(1, threads))}
-        if given.get("COMPRESS", "DEFLATE").upper() not in ("DEFLATE", "ZSTD", "LZW"):
-            defaults.pop("PREDICTOR")
-            defaults.pop("LEVEL")
-    return defaults | given

@@ -11,8 +11,6 @@ import logging
 import math
 import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -29,6 +27,7 @@ from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.rational import RPC, rpc_terms
 from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.raster_output import close, raster_output
 from ortho_pipeline.rpc_files import (
     TEXT_SUFFIXES,
     read_rpc_text,
@@ -42,7 +41,6 @@ __all__ = [
     "RpcExport",
     "export_rpc",
     "fit_rpc",
-    "gdal_errors",
     "has_rpc",
     "name_sources_relatively",
     "read_rpc",
@@ -223,16 +221,13 @@ def write_vrt(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> Non
     ModelError
         If the file does not give the same RPC again.
     """
-    with files.whole_or_nothing(path) as temporary:
-        with gdal_errors(path):
-            copy = gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), dataset)
-            copy.SetGCPs([], "")
-            copy.SetMetadata(rpc_metadata(rpc), "RPC")
-            copy.FlushCache()
-            del copy
+    with raster_output(path) as temporary:
+        copy = gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), dataset)
+        copy.SetGCPs([], "")
+        copy.SetMetadata(rpc_metadata(rpc), "RPC")
+        close(copy)
         name_sources_relatively(temporary, Path(path))
-        with gdal_errors(path):
-            _check_written(gdal.OpenEx(os.fspath(temporary), gdal.OF_RASTER, allowed_drivers=["VRT"]), rpc, path)
+        _check_written(gdal.OpenEx(os.fspath(temporary), gdal.OF_RASTER, allowed_drivers=["VRT"]), rpc, path)
 
 
 def name_sources_relatively(vrt: Path, final: Path) -> None:
@@ -264,12 +259,12 @@ def write_tagged_copy(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]
     stale = [file for file in _sidecar_names(Path(path)) if file.exists()]
     if stale:
         raise InputError("this RPC file would override the tag of the copy", file=stale[0], remedy="remove it")
-    with files.whole_or_nothing(path) as temporary, gdal_errors(path):
+    with raster_output(path) as temporary:
         view = gdal.GetDriverByName("VRT").CreateCopy("", dataset)
         view.SetGCPs([], "")
         view.SetMetadata(rpc_metadata(rpc), "RPC")
         options = ["COMPRESS=DEFLATE", "TILED=YES", "BIGTIFF=IF_SAFER"]
-        gdal.GetDriverByName("GTiff").CreateCopy(os.fspath(temporary), view, options=options).FlushCache()
+        close(gdal.GetDriverByName("GTiff").CreateCopy(os.fspath(temporary), view, options=options))
         _check_written(open_dataset(temporary, siblings=False), rpc, path)
 
 
@@ -283,19 +278,6 @@ def _check_written(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -
     worst = np.nanmax(np.abs(written.ground_to_image(ground) - rpc.ground_to_image(ground)))
     if not worst < 1e-6 or dataset.GetGCPCount():
         raise ModelError(f"the RPC that was written is off by {worst:g} px when it is read again", file=path)
-
-
-@contextmanager
-def gdal_errors(path: str | PathLike[str]) -> Iterator[None]:
-    """Turn GDAL's complaints about writing `path` into an `InputError`; masks go into the file itself."""
-    previous = gdal.GetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK")
-    gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", "YES")
-    try:
-        yield
-    except RuntimeError as error:
-        raise InputError(f"GDAL cannot write this ({error})", file=path) from error
-    finally:
-        gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", previous)
 
 
 # -- RPC of any model ------------------------------------------------------------------------------------------------

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 import subprocess
 import sys
-import textwrap
 from pathlib import Path
 
 import pytest
@@ -42,6 +42,10 @@ print(calls)
 """
 
 
+def run(code: str, *given: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code, *given], check=False, capture_output=True, text=True)
+
+
 def contents(folder: Path) -> dict[str, str]:
     return {path.name: path.read_text() for path in folder.iterdir()}
 
@@ -55,9 +59,7 @@ def test_killed_at_any_moment_the_next_command_finds_one_whole_set(tmp_path):
         folder.mkdir()
         for name, text in old.items():
             (folder / name).write_text(text)
-        done = subprocess.run(
-            [sys.executable, "-c", textwrap.dedent(DYING), str(folder), str(deadline)], capture_output=True, text=True
-        )
+        done = run(DYING, str(folder), str(deadline))
         assert done.returncode in (0, 7), done.stderr
         with together(folder, "scene"):
             pass
@@ -102,9 +104,9 @@ def test_two_commands_for_the_same_outputs_notice_each_other(tmp_path):
     other = "import sys; from ortho_pipeline.files import together\nwith together(sys.argv[1], sys.argv[2]): pass"
     with together(tmp_path, "scene"):
         write_text(tmp_path / "scene.txt", "mine")
-        same = subprocess.run([sys.executable, "-c", other, str(tmp_path), "scene"], capture_output=True, text=True)
+        same = run(other, str(tmp_path), "scene")
         assert "another command is writing 'scene' in this folder" in same.stderr
-        apart = subprocess.run([sys.executable, "-c", other, str(tmp_path), "scene2"], capture_output=True, text=True)
+        apart = run(other, str(tmp_path), "scene2")
         assert apart.returncode == 0, apart.stderr
     assert contents(tmp_path) == {"scene.txt": "mine"}
 
@@ -123,8 +125,6 @@ def test_a_journal_of_somebody_else_leads_nowhere(tmp_path):
         {"renames": [[1, 2]], "obsolete": {}},
         [],
     ):
-        import json
-
         (folder / f"{prefix}x.part").write_text("evil")
         journal.write_text(json.dumps(listed))
         lock.touch()
@@ -147,7 +147,7 @@ def test_odd_output_paths_are_typed_errors(tmp_path, make):
         path.symlink_to(tmp_path / "b.txt")
         (tmp_path / "b.txt").symlink_to(path)
     before = sorted(tmp_path.iterdir())
-    with pytest.raises(InputError, match="folder lies|leads nowhere|too long"):
+    with pytest.raises(InputError, match=r"folder lies|leads nowhere|too long"):
         write_text(path, "x")
     assert sorted(tmp_path.iterdir()) == before
 
@@ -157,12 +157,9 @@ def test_a_name_as_long_as_the_file_system_allows_is_written(tmp_path):
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_a_full_disk_is_a_typed_error():
+def test_a_full_disk_is_a_typed_error(tmp_path):
     if not Path("/dev/full").exists():
         pytest.skip("this system has no /dev/full")
-
-    class Full(Exception):
-        pass
 
     def write(folder: Path) -> None:
         with whole_or_nothing(folder / "a.txt") as temporary:
@@ -170,12 +167,9 @@ def test_a_full_disk_is_a_typed_error():
             temporary.symlink_to("/dev/full")
             temporary.write_text("x" * 100_000)
 
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as name:
-        with pytest.raises(InputError, match="No space left"):
-            write(Path(name))
-        assert not list(Path(name).iterdir())
+    with pytest.raises(InputError, match="No space left"):
+        write(tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_files_have_the_rights_that_the_user_gives(tmp_path):

@@ -32,6 +32,7 @@ block_blunders
 model_choice block_checks selection ground_error drawing contract
 comparison report_plots adjustment covariance
 raster
+raster_output
 raster_writer
 rpc dem preview edge outline
 plugins rays gdal_engine resolution
@@ -48,7 +49,8 @@ cli_studies cli_blocks cli_batch
 cli
 """
 LINE = {name: number for number, line in enumerate(LAYERS.split("\n")) for name in line.split()}
-GDAL_MODULES = {"locations", "rpc", "raster", "raster_writer", "gdal_engine", "dem", "plugins", "gcp_export", "mosaic"}
+GDAL_MODULES = {"locations", "raster", "raster_output", "raster_writer", "dem", "mosaic", "plugins"}
+GDAL_MODULES |= {"rpc", "gcp_export", "gdal_engine"}
 NUMBA_MODULES = {"kernels", "lattice_kernel", "ray_kernel", "models"}
 MAX_LINES, MAX_FUNCTION = 600, 50
 

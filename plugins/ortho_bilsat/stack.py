@@ -10,8 +10,8 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.raster_output import close, raster_output
 from ortho_pipeline.registration import Registration, register
 
 
@@ -66,7 +66,7 @@ def write_bands(
     """Write pixels ``(bands, rows, columns)``, 8 or 16 bit, as a GeoTIFF whose bands have names."""
     count, rows, columns = stack.shape
     kind = gdal.GDT_Byte if stack.dtype == np.uint8 else gdal.GDT_UInt16
-    with whole_or_nothing(output) as temporary:
+    with raster_output(output) as temporary:
         options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "TILED=YES", "BIGTIFF=IF_SAFER"]
         dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, count, kind, options)
         for index, name in enumerate(names, start=1):
@@ -75,5 +75,5 @@ def write_bands(
             if nodata is not None:
                 band.SetNoDataValue(nodata)
             band.WriteArray(stack[index - 1])
-        dataset.FlushCache()
-        del band, dataset
+        del band
+        close(dataset)

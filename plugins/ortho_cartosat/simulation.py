@@ -16,9 +16,10 @@ from osgeo import gdal
 from ortho_pipeline.dem import write_terrain
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.experiments import cartosat_scene as simulated
-from ortho_pipeline.files import whole_or_nothing, write_text
+from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points
+from ortho_pipeline.raster_output import close, raster_output
 from ortho_pipeline.rpc import write_rpc_txt
 from ortho_pipeline.selection import select_control
 
@@ -113,11 +114,10 @@ def metadata_text(pair: simulated.StereoPair, view: str) -> str:
 def _write_image(pixels: np.ndarray[Any, Any], path: Path) -> None:
     rows, columns = pixels.shape
     options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9", "TILED=YES"]
-    with whole_or_nothing(path) as temporary:
+    with raster_output(path) as temporary:
         dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, 1, gdal.GDT_UInt16, options)
         dataset.GetRasterBand(1).WriteArray(pixels)
-        dataset.FlushCache()
-        del dataset
+        close(dataset)
 
 
 def _write_points(tables: Mapping[str, Points], path: Path) -> None:

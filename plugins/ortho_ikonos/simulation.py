@@ -16,9 +16,10 @@ from ortho_pipeline.dem import write_terrain
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.experiments import ikonos_scene as simulated
 from ortho_pipeline.experiments.ikonos_scene import GeoScene, VendorModel
-from ortho_pipeline.files import whole_or_nothing, write_text
+from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import write_points
+from ortho_pipeline.raster_output import close, raster_output
 from ortho_pipeline.rpc import fit_rpc, write_rpc_txt
 
 ORDER = "39001"
@@ -161,14 +162,14 @@ def _write_tiff(path: Path, pixels: Array, grid: GeoScene) -> None:
     system = osr.SpatialReference()
     system.SetFromUserInput(simulated.MAP_CRS)
     options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9"]
-    with whole_or_nothing(path) as temporary:
+    with raster_output(path) as temporary:
         dataset = gdal.GetDriverByName("GTiff").Create(
             str(temporary), grid.columns, grid.rows, 1, gdal.GDT_UInt16, options
         )
         dataset.SetGeoTransform((grid.west, grid.pixel, 0.0, grid.north, 0.0, -grid.pixel))
         dataset.SetProjection(system.ExportToWkt())
         dataset.GetRasterBand(1).WriteArray(pixels)
-        dataset = None
+        close(dataset)
 
 
 def _write_heights(scene: GeoScene, step: float, path: Path) -> None:

@@ -16,10 +16,11 @@ from ortho_orbview3.product import COEFFICIENT_KEYS, CORNERS, ERROR_KEYS, SCALAR
 from ortho_pipeline.dem import write_terrain
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.experiments import orbview3_scene as simulated
-from ortho_pipeline.files import whole_or_nothing, write_text
+from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.points import write_points
+from ortho_pipeline.raster_output import close, raster_output
 from ortho_pipeline.rpc import rpc_metadata, write_rpc_txt
 
 GEOID = "EPSG:5773"
@@ -157,11 +158,10 @@ def _spacing(camera: simulated.Scanner) -> tuple[float, float]:
 def _write_image(pixels: NDArray[np.uint16], path: Path) -> None:
     rows, columns = pixels.shape
     options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9", "TILED=YES", "BIGTIFF=IF_SAFER"]
-    with whole_or_nothing(path) as temporary:
+    with raster_output(path) as temporary:
         dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, 1, gdal.GDT_UInt16, options)
         dataset.GetRasterBand(1).WriteArray(pixels)
-        dataset.FlushCache()
-        del dataset
+        close(dataset)
 
 
 def _write_heights(cameras: dict[str, simulated.Scanner], coast: simulated.Coast, step: float, path: Path) -> None:

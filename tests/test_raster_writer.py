@@ -1,0 +1,143 @@
+"""Rasters are whole when they get their name: files cut off anywhere are refused, full disks are typed errors."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.crs import parse_crs
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.raster import Grid
+from ortho_pipeline.raster_output import check_written, close, raster_output
+from ortho_pipeline.raster_writer import Profile, RasterWriter
+
+GRID = Grid(parse_crs("EPSG:32633"), 500_000.0, 4_000_000.0, 1.0, 1.0, 700, 600)
+NOISE = np.random.default_rng(1).integers(0, 60_000, (1, 600, 700)).astype(np.uint16)
+OPTIONS = [
+    ("COG", {}),
+    ("COG", {"COMPRESS": "NONE"}),
+    ("GTiff", {}),
+    ("GTiff", {"TILED": "NO"}),
+    ("GTiff", {"TILED": "NO", "COMPRESS": "LZW", "PREDICTOR": "2"}),
+    ("GTiff", {"INTERLEAVE": "BAND", "COMPRESS": "DEFLATE"}),
+]
+
+
+def write(path, driver, options, validity="mask"):
+    count = 2 if "INTERLEAVE" in options else 1
+    profile = Profile(count, np.dtype(np.uint16), validity)
+    with RasterWriter(path, GRID, profile, driver=driver, creation_options=options) as writer:
+        writer.write(0, 0, np.repeat(NOISE, count, axis=0), np.ones((600, 700), bool))
+    return path
+
+
+@pytest.mark.parametrize(("driver", "options"), OPTIONS)
+def test_a_file_that_is_cut_off_anywhere_is_refused(tmp_path, driver, options):
+    path = write(tmp_path / "o.tif", driver, options)
+    check_written(path, path, size=(700, 600))
+    whole = path.read_bytes()
+    cut = tmp_path / "cut.tif"
+    for length in np.unique(np.linspace(0, len(whole) - 1, 60).astype(int)).tolist():
+        cut.write_bytes(whole[:length])
+        with pytest.raises(InputError, match=r"not written whole|cannot be read again"):
+            check_written(cut, cut, size=(700, 600))
+
+
+def test_a_block_of_zeros_is_refused(tmp_path):
+    """What a disk that was full for a while leaves in the middle of a compressed file."""
+    path = write(tmp_path / "o.tif", "GTiff", {"COMPRESS": "DEFLATE"})
+    content = bytearray(path.read_bytes())
+    dataset = gdal.Open(str(path))
+    offset = int(dataset.GetRasterBand(1).GetMetadataItem("BLOCK_OFFSET_1_0", "TIFF"))
+    del dataset
+    content[offset : offset + 1000] = bytes(1000)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="cannot be read again"):
+        check_written(path, path)
+
+
+LIMITED = """
+import resource, signal, sys
+import numpy as np
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.raster import Grid
+from tests_of_writer import GRID, NOISE, OPTIONS, write
+from pathlib import Path
+folder = Path(sys.argv[1])
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+for number, (driver, options) in enumerate(OPTIONS):
+    whole = write(folder / f"whole{number}.tif", driver, options).stat().st_size
+    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+    for step in range(1, 12):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (whole * step // 12, hard))
+        try:
+            write(folder / "limited.tif", driver, options)
+        except InputError as error:
+            assert "written" in str(error) or "cannot" in str(error), error
+        else:
+            raise SystemExit(f"{driver} {options} limited to {step}/12 of its size was accepted")
+        assert not [path for path in folder.iterdir() if "limited" in path.name or ".part" in path.name]
+    resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+"""
+
+
+def test_no_write_limit_leaves_a_broken_file(tmp_path):
+    code = f"import importlib.util as u, sys\ns = u.spec_from_file_location('tests_of_writer', {__file__!r})\n"
+    code += "m = u.module_from_spec(s); sys.modules['tests_of_writer'] = m; s.loader.exec_module(m)\n" + LIMITED
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], check=False, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_what_gdal_says_when_it_closes_a_file_is_not_lost(tmp_path):
+    """`del dataset` would print 'Exception ignored' and go on."""
+    code = """
+import resource, signal, sys
+import numpy as np
+from osgeo import gdal
+from ortho_pipeline.raster_writer import close, raster_output
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+with raster_output(sys.argv[1]) as temporary:
+    dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), 500, 500, 1, gdal.GDT_Float64)
+    dataset.GetRasterBand(1).WriteArray(np.random.rand(500, 500))
+    close(dataset)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "o.tif")], check=False, capture_output=True, text=True
+    )
+    assert "InputError" in done.stderr
+    assert "the output cannot be written" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"COMPRESS": "NOPE"}, "COMPRESS"),
+        ({"TILED": "MAYBE"}, "TILED"),
+        ({"BLOCKXSIZE": "wide"}, "BLOCKXSIZE"),
+        ({"COMPRES": "LZW"}, "COMPRES"),
+    ],
+)
+def test_creation_options_that_gdal_would_only_warn_of_are_refused(tmp_path, options, named):
+    with pytest.raises(InputError, match=named):
+        write(tmp_path / "o.tif", "GTiff", options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_creation_options_of_the_documentation_are_taken(tmp_path):
+    write(tmp_path / "a.tif", "GTiff", {"compress": "zstd", "PREDICTOR": "2", "NUM_THREADS": "ALL_CPUS", "TILED": "on"})
+    write(tmp_path / "b.tif", "COG", {"COMPRESS": "LERC", "OVERVIEWS": "NONE", "BLOCKSIZE": "256"})
+
+
+def test_a_raster_of_a_plugin_appears_whole(tmp_path):
+    with raster_output(tmp_path / "o.tif") as temporary:
+        dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), 20, 10, 1)
+        close(dataset)
+    assert [path.name for path in tmp_path.iterdir()] == ["o.tif"]
