@@ -20,7 +20,7 @@ from ortho_pipeline.block_images import Start, labels_of, points_of_images, star
 from ortho_pipeline.block_points import BlockPoints, read_block_points
 from ortho_pipeline.crs import Vertical, parse_crs
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import write_text
+from ortho_pipeline.files import together, write_text
 from ortho_pipeline.ground_frame import GEODETIC, GroundFrame
 from ortho_pipeline.intersection import Intersection
 from ortho_pipeline.intersection import intersect as intersect_rays
@@ -95,7 +95,8 @@ def adjust(
     document = block_report.build_document(
         fit=fit, starts=starts, exported=exported, provenance=record, warnings=[*_warnings(fit, starts), *notes]
     )
-    _write(files, document, fit, starts, exported, record)
+    with together(folder, "block"):
+        _write(files, document, fit, starts, exported, record)
     return Result(files, {"report": document}, block_report.summary_text(document))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import logging
 import shlex
+import signal
 import sys
 import traceback
 from typing import Any
@@ -116,7 +117,16 @@ def _error_document(error: OrthoError) -> dict[str, str | None]:
 def main() -> None:
     """Run the command line."""
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING, stream=sys.stderr)
+    for ending in (signal.SIGTERM, signal.SIGHUP):
+        # Under nohup a command is to survive the end of its terminal.
+        if signal.getsignal(ending) == signal.SIG_DFL:
+            signal.signal(ending, _end)
     cli(prog_name="ortho")
+
+
+def _end(number: int, _: Any) -> None:
+    """End as after an exception, so that temporary files go and locks are released."""
+    raise SystemExit(128 + number)
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})

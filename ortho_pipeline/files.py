@@ -284,6 +284,13 @@ def whole_or_nothing(path: str | os.PathLike[str], *, side_cars: bool = True) ->
             raise
 
 
+def retire(paths: Iterable[str | os.PathLike[str]]) -> None:
+    """Let files of an earlier command go when the outputs that are under way get their names."""
+    outer = _under_way.get()
+    if outer is not None:
+        outer.obsolete += [place for place in map(_place, paths) if outer.holds(place)]
+
+
 def staged(path: str | os.PathLike[str]) -> Path:
     """Return where the content of an output is to be found now: before it has its name, under its temporary one."""
     outer = _under_way.get()

@@ -18,7 +18,7 @@ import pyproj
 from ortho_pipeline import dem, plugins, raster
 from ortho_pipeline.crs import Vertical, parse_crs
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.files import sha256
+from ortho_pipeline.files import sha256, states
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.locations import archive_of, located
 from ortho_pipeline.model_file import read_model_file
@@ -250,8 +250,7 @@ def check_paths(
     InputError
         With the path that is in the way.
     """
-    given = (image, *scene.files.values(), point_file(points), surface.dem)
-    inputs = {Path(path).resolve() for path in given if path is not None}
+    inputs = {Path(path).resolve() for path in given_files(image, scene, points, surface)}
     removed = old_side_cars(files["ortho"]) if overwrite and "ortho" in files else []
     for path in (*files.values(), *removed):
         if path.resolve() in inputs:
@@ -266,12 +265,43 @@ def check_paths(
             field="-o", remedy="choose an output folder of its own",
         )  # fmt: skip
     if "ortho" in files and not overwrite:
+        # Statistics, overviews and masks go with an ortho that is replaced; a model is nothing that an ortho has.
         for stale in old_side_cars(files["ortho"]):
-            if stale.name.endswith(SIDE_CARS):
+            if stale.name.endswith(SIDE_CARS) or not files["ortho"].exists():
                 raise InputError(
                     "an old side-car lies here that GDAL would attach to the ortho", file=stale,
                     remedy="remove it (--overwrite does), or choose another output folder",
                 )  # fmt: skip
+
+
+def given_files(
+    image: str | os.PathLike[str],
+    scene: SceneOptions = SceneOptions(),
+    points: PointOptions = PointOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+) -> list[str | os.PathLike[str]]:
+    """Return the files that the user gave."""
+    given = (image, *scene.files.values(), point_file(points), surface.dem)
+    return [path for path in given if path is not None]
+
+
+def refuse_changed(before: Mapping[str, tuple[int, int, int]]) -> None:
+    """Refuse a result whose inputs changed meanwhile: its pixels, its model and its checksums may be of two files.
+
+    Parameters
+    ----------
+    before : mapping
+        From `files.states`, when the work began.
+
+    Raises
+    ------
+    InputError
+        With the file.
+    """
+    now = states(before)
+    for path, state in before.items():
+        if now.get(path) != state:
+            raise InputError("this file changed while it was being used", file=path, remedy="run again")
 
 
 def old_side_cars(ortho: Path) -> list[Path]:

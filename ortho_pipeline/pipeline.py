@@ -5,13 +5,16 @@ Every function here takes options, does the work and returns a result with `to_j
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import inspect
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
 import pyproj
@@ -24,7 +27,7 @@ from ortho_pipeline.covariance import analyse_fit
 from ortho_pipeline.crs import parse_crs
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import Fit
-from ortho_pipeline.files import sha256, write_text
+from ortho_pipeline.files import retire, sha256, staged, states, together, write_text
 from ortho_pipeline.ground_error import viewing
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.inputs import has_surface, open_scene, open_surface
@@ -41,6 +44,25 @@ if TYPE_CHECKING:
     from ortho_pipeline import warp
 
 SCHEMA_VERSION = 1
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+def _outputs_together(command: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Let the outputs of a command (its first parameter is a file, another one `folder`) appear together."""
+    signature = inspect.signature(command)
+
+    @functools.wraps(command)
+    def wrapper(*given: _P.args, **named: _P.kwargs) -> _R:
+        bound = signature.bind(*given, **named).arguments
+        if bound.get("folder") is None:
+            return command(*given, **named)
+        with together(bound["folder"], Path(next(iter(bound.values()))).stem):
+            return command(*given, **named)
+
+    return wrapper
+
 
 # -- results ---------------------------------------------------------------------------------------------------------
 
@@ -183,6 +205,7 @@ def fit(
     )  # fmt: skip
 
 
+@_outputs_together
 def compare(
     image: str | os.PathLike[str],
     points: PointOptions,
@@ -250,6 +273,7 @@ def compare(
     return replace(result, files=files)
 
 
+@_outputs_together
 def rectify(
     image: str | os.PathLike[str] | Scene,
     folder: str | os.PathLike[str],
@@ -269,8 +293,8 @@ def rectify(
     `image` may be a scene that is open, `points` a table that is read already, in pixels of that image. Nothing is
     written before all that can be checked is checked. `name` is the id of the STAC item (the
     image's stem without one), `digest` takes checksums of the inputs, which it may know. Outputs of the same name are
-    replaced; with `overwrite` so are old side-cars of the ortho, and outputs of an earlier run that this one does not
-    make are removed.
+    replaced, with their statistics and overviews, and outputs of an earlier run that this one does not make are
+    removed; with `overwrite` also where no report says that a run made them, and old models beside the ortho.
 
     Returns
     -------
@@ -296,10 +320,12 @@ def rectify(
             field="--dem",
             remedy="give --dem FILE, or --height METRES above the ellipsoid for flat ground",
         )
+    begun = states(inputs.given_files(image, scene, points, surface))
     opened = open_adjustable(image, scene, points)
     heights = open_surface(surface, scene)
     acquired = stac_items.acquisition_time(opened.facts, output.acquired) if output.stac else None
     read = inputs.files_read(image, scene, points, surface, opened.rasters, opened.sources)
+    begun = states(read) | begun
     with inputs.hashed_beside(read, digest) as hashing:
         adjusted = adjust(opened, points, scene, heights)
         opened, model, size = adjusted.scene, adjusted.model, (opened.width, opened.height)
@@ -315,8 +341,6 @@ def rectify(
         source = raster.RasterSource(
             *(opened.rasters or (image,)), **scene.access, bands=output.bands, dtype=output.dtype
         )
-        if overwrite:
-            _remove(inputs.old_side_cars(files["ortho"]))
         warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
         asked = {"scene": scene, "surface": surface, "output": output}
         record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
@@ -330,11 +354,12 @@ def rectify(
     _write_report(document, adjusted.fit, files)
     if acquired is not None:
         stac_items.write_item(files["stac"], document, files, acquired, name or stem)
-    if overwrite:
-        _remove(Path(folder) / f"{stem}{ending}" for kind, ending in _ENDINGS.items() if kind not in files)
+    inputs.refuse_changed(begun)
+    retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
     return Result(files, {"report": document}, report.summary_text(document))
 
 
+@_outputs_together
 def export(
     image: str | os.PathLike[str],
     folder: str | os.PathLike[str],
@@ -386,6 +411,7 @@ def export(
     return Result(files, document, job.summary(adjustment.model_name, adjusted.scene.model_source))
 
 
+@_outputs_together
 def write_plots(report_file: str | os.PathLike[str], folder: str | os.PathLike[str], kind: str = "svg") -> Result:
     """Write the plots of a report again, each as a picture of its own.
 
@@ -406,6 +432,7 @@ def write_plots(report_file: str | os.PathLike[str], folder: str | os.PathLike[s
     return Result(files, {}, f"{len(files)} plots of {document['scene']['name']}")
 
 
+@_outputs_together
 def edge(
     image: str | os.PathLike[str],
     folder: str | os.PathLike[str] | None = None,
@@ -486,9 +513,17 @@ _ENDINGS = {
 _STAC = ("stac", "thumbnail", "overview")
 
 
-def _remove(paths: Iterable[Path]) -> None:
-    for path in paths:
-        path.unlink(missing_ok=True)
+def _of_earlier_run(folder: Path, stem: str, files: Mapping[str, Path], *, all_of_them: bool) -> list[Path]:
+    """Return what an earlier run wrote for this scene and this one does not, and side-cars of the ortho it wrote.
+
+    Without its report, only `all_of_them` takes files of such names for its own.
+    """
+    ours = all_of_them
+    if not ours:
+        with contextlib.suppress(InputError):
+            ours = bool(report.read_report_json(folder / f"{stem}{_ENDINGS['report']}"))
+    left = [folder / f"{stem}{ending}" for ending in _ENDINGS.values()] if ours else []
+    return [*(path for path in left if path not in files.values()), *inputs.old_side_cars(files["ortho"])]
 
 
 def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[str]]:
@@ -559,7 +594,7 @@ def _write_report(document: Mapping[str, Any], fit: Fit, files: dict[str, Path])
     else:
         del files["residuals"], files["style"]
     report.write_report_json(document, files["report"])
-    report.write_report_html(document, files["html"], ortho=files.get("ortho"))
+    report.write_report_html(document, files["html"], ortho=staged(files["ortho"]) if "ortho" in files else None)
 
 
 def crs_text(crs: pyproj.CRS) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import sha256, whole_or_nothing, write_text
+from ortho_pipeline.files import sha256, staged, whole_or_nothing, write_text
 from ortho_pipeline.outline import grid_of, to_geojson, valid_outline
 from ortho_pipeline.preview import preview_png
 from ortho_pipeline.raster import RasterSource
@@ -104,7 +104,8 @@ def write_item(
     """
     import pystac
 
-    grid, outline = grid_of(files["ortho"]), valid_outline(files["ortho"])
+    ortho = staged(files["ortho"])
+    grid, outline = grid_of(ortho), valid_outline(ortho)
     if outline.is_empty:
         raise InputError("no pixel of the ortho is valid: it has no place", file=files["ortho"])
     geometry, box = to_geojson(outline, grid.crs)
@@ -123,9 +124,9 @@ def write_item(
     for key, side in _PICTURES.items():
         if key in files:
             with whole_or_nothing(files[key]) as temporary:
-                temporary.write_bytes(preview_png(files["ortho"], side=side))
+                temporary.write_bytes(preview_png(ortho, side=side))
     for key, title, media, roles in _ASSETS:
-        if key in files and files[key].is_file():
+        if key in files and staged(files[key]).is_file():
             item.add_asset(key, pystac.Asset(_href(files[key], path.parent), title, media_type=media, roles=roles))
     document = item.to_dict(include_self_link=False, transform_hrefs=False)
     write_text(path, json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
@@ -151,7 +152,8 @@ def _href(path: Path, folder: Path) -> str:
 def _ortho_asset(path: Path, report: Mapping[str, Any], folder: Path) -> Any:
     import pystac
 
-    source = RasterSource(path)
+    content = staged(path)
+    source = RasterSource(content)
     band: dict[str, Any] = {"data_type": source.dtype.name, "sampling": "area"}
     if report["ortho"]["unit"] == "m":
         band["spatial_resolution"] = float(np.mean(report["ortho"]["resolution"]))
@@ -167,8 +169,8 @@ def _ortho_asset(path: Path, report: Mapping[str, Any], folder: Path) -> Any:
         roles=["data"],
         extra_fields={
             "raster:bands": bands,
-            "file:size": path.stat().st_size,
-            "file:checksum": _SHA256 + sha256(path),
+            "file:size": content.stat().st_size,
+            "file:checksum": _SHA256 + sha256(content),
         },
     )
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.experiments.page import text
-from ortho_pipeline.files import write_text
+from ortho_pipeline.files import together, write_text
 from ortho_pipeline.pipeline import Result
 
 
@@ -39,8 +39,8 @@ def simulate_bilsat(
 
     from ortho_pipeline.experiments.bilsat_scene import OFF_NADIR_DEG, SIZE, XS_CAMERAS
 
-    files = write_product(
-        folder, seed=seed, off_nadir_deg=OFF_NADIR_DEG if off_nadir_deg is None else off_nadir_deg,
+    files = _simulated(
+        write_product, folder, seed=seed, off_nadir_deg=OFF_NADIR_DEG if off_nadir_deg is None else off_nadir_deg,
         size=size or SIZE, cameras=tuple(XS_CAMERAS) if all_cameras else ("red",),
     )  # fmt: skip
     return Result(files, {}, f"A simulated BILSAT-1 scene (seed {seed}); try\n  ortho rectify {files['image']} "
@@ -102,9 +102,9 @@ def simulate_ikonos(
 
     from ortho_pipeline.experiments.ikonos_scene import OFF_NADIR_DEG
 
-    files = write_product(
-        folder, seed=seed, off_nadir_deg=OFF_NADIR_DEG if off_nadir_deg is None else off_nadir_deg, size=size,
-        pixel=pixel, rpc=rpc, multispectral=multispectral, components=components,
+    files = _simulated(
+        write_product, folder, seed=seed, off_nadir_deg=OFF_NADIR_DEG if off_nadir_deg is None else off_nadir_deg,
+        size=size, pixel=pixel, rpc=rpc, multispectral=multispectral, components=components,
     )  # fmt: skip
     return Result(files, {}, f"A simulated IKONOS Geo scene (seed {seed}); try\n  ortho rectify {files['image']} "
                   f"--gcps {files['gcps']} --dem {files['dem']} -o out")  # fmt: skip
@@ -148,7 +148,7 @@ def simulate_cartosat(
     """
     from ortho_cartosat.simulation import write_product
 
-    files = write_product(folder, seed=seed, size=size, jitter=jitter)
+    files = _simulated(write_product, folder, seed=seed, size=size, jitter=jitter)
     return Result(files, {}, f"A simulated CARTOSAT-1 stereo pair (seed {seed}); try\n  ortho adjust {files['fore']} "
                   f"{files['aft']} --points {files['points']} --model rpc --correction affine -o out")  # fmt: skip
 
@@ -188,7 +188,7 @@ def simulate_orbview3(folder: str | os.PathLike[str], *, seed: int = 0, pixel: i
     """
     from ortho_orbview3.simulation import write_product
 
-    files = write_product(folder, seed=seed, pixel=pixel)
+    files = _simulated(write_product, folder, seed=seed, pixel=pixel)
     return Result(files, {}, f"Two simulated OrbView-3 scenes (seed {seed}); try\n  ortho fit {files['image_471890']} "
                   f"--gcps {files['gcps_471890']} --correction affine --prune")  # fmt: skip
 
@@ -212,12 +212,22 @@ def reproduce_orbview3(
     return _written("orbview3", document, folder, lambda: orbview3_page.page(document, orbview3.error_vectors()))
 
 
+def _simulated(
+    write: Callable[..., dict[str, Path]], folder: str | os.PathLike[str], **options: Any
+) -> dict[str, Path]:
+    """Write a simulated product; all of its files appear together."""
+    with together(folder, "simulated"):
+        return write(folder, **options)
+
+
 def _written(
     name: str, document: Mapping[str, Any], folder: str | os.PathLike[str] | None, page: Callable[[], str]
 ) -> Result:
     """Write document and page of a reproduction where there is a folder for them."""
     files = {} if folder is None else {ending: Path(folder) / f"{name}.{ending}" for ending in ("json", "html")}
-    if files:
+    if not files or folder is None:
+        return Result(files, document, text(document))
+    with together(folder, name):
         write_text(files["json"], json.dumps(document, indent=1, allow_nan=False) + "\n")
         write_text(files["html"], page())
     return Result(files, document, text(document))

@@ -100,7 +100,7 @@ def test_what_gdal_says_when_it_closes_a_file_is_not_lost(tmp_path):
 import resource, signal, sys
 import numpy as np
 from osgeo import gdal
-from ortho_pipeline.raster_writer import close, raster_output
+from ortho_pipeline.raster_output import close, raster_output
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 with raster_output(sys.argv[1]) as temporary:

@@ -1,0 +1,112 @@
+"""The outputs of a command as a set: old ones survive a failure, those of an earlier run go."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ortho_pipeline import pipeline
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import OutputOptions, PointOptions, SurfaceOptions
+
+
+def rectify(tiny, folder, points=True, **options):
+    control = PointOptions(gcps=tiny.gcps, crs="EPSG:4326", vertical="ellipsoid") if points else PointOptions()
+    surface = SurfaceOptions(dem=tiny.dem, vertical="ellipsoid")
+    return pipeline.rectify(tiny.image, folder, points=control, surface=surface, output=OutputOptions(**options))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_an_image_that_changes_meanwhile_is_refused_and_the_old_outputs_stay(tiny, tmp_path, monkeypatch):
+    """The pixels would be of one file, and the checksum in the report of another."""
+    out = tmp_path / "out"
+    rectify(tiny, out)
+    before = contents(out)
+    warp = pipeline._warp
+
+    def meddling(*given):
+        found = warp(*given)
+        os.utime(tiny.dem, ns=(1, 1))
+        return found
+
+    monkeypatch.setattr(pipeline, "_warp", meddling)
+    with pytest.raises(InputError, match="changed while it was being used"):
+        rectify(tiny, out)
+    assert contents(out) == before
+
+
+def test_a_failure_at_the_end_leaves_no_mixture(tiny, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    rectify(tiny, out)
+    before = contents(out)
+
+    def fail(*_, **__):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(pipeline.report, "write_report_html", fail)
+    with pytest.raises(ZeroDivisionError):
+        rectify(tiny, out, resampling="cubic")
+    assert contents(out) == before
+
+
+def test_what_an_earlier_run_wrote_and_this_one_does_not_goes(tiny, tmp_path):
+    out = tmp_path / "out"
+    rectify(tiny, out, stac=True, acquired="2005-08-03T08:12:31Z")
+    (out / "tiny_notes.txt").write_text("mine")
+    (out / "tiny_ortho.tif.aux.xml").write_text("<PAMDataset/>")
+    (out / "tiny_ortho.tif.ovr").write_bytes(b"")
+    rectify(tiny, out, points=False)
+    left = {path.name for path in out.iterdir()}
+    assert left == {"tiny_notes.txt", "tiny_ortho.tif", "tiny_report.json", "tiny_report.html", "tiny_model.json",
+                    "tiny_RPC.TXT", "tiny.vrt"}  # fmt: skip
+
+
+def test_files_that_no_run_of_ours_wrote_are_not_touched(tiny, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "tiny_residuals.geojson").write_text("somebody else's")
+    rectify(tiny, out, points=False)
+    assert (out / "tiny_residuals.geojson").read_text() == "somebody else's"
+
+
+@pytest.mark.parametrize("ending", [".aux.xml", ".ovr", ".msk"])
+def test_a_side_car_of_nothing_would_attach_to_the_ortho(tiny, tmp_path, ending):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / f"tiny_ortho.tif{ending}").write_bytes(b"")
+    with pytest.raises(InputError, match="attach to the ortho"):
+        rectify(tiny, out)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_a_signal_ends_the_command_and_leaves_nothing(tiny, tmp_path, number):
+    out = tmp_path / "out"
+    code = """
+import sys, time
+from ortho_pipeline import cli, pipeline
+warp = pipeline._warp
+def slow(*given):
+    found = warp(*given)
+    print("ready", flush=True)
+    time.sleep(60)
+pipeline._warp = slow
+cli.main()
+"""
+    command = [sys.executable, "-c", code, "rectify", str(tiny.image), "--dem", str(tiny.dem), "--dem-vertical",
+               "ellipsoid", "-o", str(out)]  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    assert [path.name for path in out.iterdir()] != []
+    process.send_signal(number)
+    assert process.wait(30) == (130 if number == signal.SIGINT else 128 + number)
+    process.stdout.close()
+    assert not out.exists()
