@@ -11,7 +11,7 @@ import inspect
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
@@ -21,9 +21,8 @@ import pyproj
 
 from ortho_pipeline import comparison as comparing
 from ortho_pipeline import crs as crs_module
-from ortho_pipeline import dem, footprint, gcp_export, inputs, notebook, plugins, raster, report, resolution, rpc
+from ortho_pipeline import dem, footprint, gcp_export, inputs, plugins, raster, report, resolution, rpc
 from ortho_pipeline import stac as stac_items
-from ortho_pipeline.covariance import analyse_fit
 from ortho_pipeline.crs import parse_crs
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import Fit
@@ -37,13 +36,12 @@ from ortho_pipeline.models import SensorModel, families
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster_writer import Profile
+from ortho_pipeline.results import SCHEMA_VERSION, CompareResult, FitResult, Result
 from ortho_pipeline.scene_fit import Adjusted, adjust, heights_around, heights_where_wanted, on_surface, open_adjustable
 from ortho_pipeline.swaps import refuse_swapped
 
 if TYPE_CHECKING:
     from ortho_pipeline import warp
-
-SCHEMA_VERSION = 1
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -62,73 +60,6 @@ def _outputs_together(command: Callable[_P, _R]) -> Callable[_P, _R]:
             return command(*given, **named)
 
     return wrapper
-
-
-# -- results ---------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class FitResult:
-    """A scene and what was adjusted to its points."""
-
-    scene: Scene
-    fit: Fit
-    warnings: tuple[str, ...] = ()
-    removed: tuple[Mapping[str, Any], ...] = ()
-    near: float | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of ``ortho fit --json`` (docs/formats.md)."""
-        document = self.fit.to_json()
-        document["warnings"] = list(self.warnings)
-        return {
-            "schema_version": SCHEMA_VERSION,
-            "sensor": self.scene.sensor,
-            "model": document.pop("model"),
-            "model_source": self.scene.model_source,
-            **document,
-            "removed": [dict(one) for one in self.removed],
-            "covariance": {role: one and one.to_json() for role, one in analyse_fit(self.fit, near=self.near).items()},
-        }
-
-
-@dataclass(frozen=True)
-class Result:
-    """Files that a command wrote, what it says about them, and a summary for people."""
-
-    files: Mapping[str, Path]
-    document: Mapping[str, Any]
-    summary: str
-
-    def to_json(self) -> dict[str, Any]:
-        """Return files and document as JSON values."""
-        files = {name: str(path) for name, path in self.files.items()}
-        return {"schema_version": SCHEMA_VERSION, "files": files, **self.document}
-
-    def _repr_html_(self) -> str:
-        """Show the report in a notebook, or the summary where there is none."""
-        if "html" in self.files:
-            return notebook.page_html(self.files["html"].read_text(encoding="utf-8"))
-        return notebook.text_html(self.summary)
-
-
-@dataclass(frozen=True)
-class CompareResult:
-    """A comparison of models, and the report that was written, if any."""
-
-    scene: Scene
-    comparison: comparing.Comparison
-    files: Mapping[str, Path] = field(default_factory=dict)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of ``ortho compare --json`` (docs/formats.md)."""
-        return {
-            "schema_version": SCHEMA_VERSION,
-            "image": str(self.scene.path),
-            "sensor": self.scene.sensor,
-            **self.comparison.to_json(),
-            "files": {name: str(path) for name, path in self.files.items()},
-        }
 
 
 # -- commands --------------------------------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ rpc dem preview edge outline
 plugins rays gdal_engine resolution
 footprint lattice simulate inputs testing
 gcp_export scene_fit warp mosaic
-report experiments stac block_images
+report experiments stac block_images results
 pipeline block_report
 studies batch_config batch_manifest executors
 batch_plan

@@ -1,0 +1,80 @@
+"""What commands return: documents for ``--json``, files, and what people see of them in a notebook."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ortho_pipeline import comparison as comparing
+from ortho_pipeline import notebook
+from ortho_pipeline.covariance import analyse_fit
+from ortho_pipeline.estimation import Fit
+from ortho_pipeline.hookspecs import Scene
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A scene and what was adjusted to its points."""
+
+    scene: Scene
+    fit: Fit
+    warnings: tuple[str, ...] = ()
+    removed: tuple[Mapping[str, Any], ...] = ()
+    near: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of ``ortho fit --json`` (docs/formats.md)."""
+        document = self.fit.to_json()
+        document["warnings"] = list(self.warnings)
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "sensor": self.scene.sensor,
+            "model": document.pop("model"),
+            "model_source": self.scene.model_source,
+            **document,
+            "removed": [dict(one) for one in self.removed],
+            "covariance": {role: one and one.to_json() for role, one in analyse_fit(self.fit, near=self.near).items()},
+        }
+
+
+@dataclass(frozen=True)
+class Result:
+    """Files that a command wrote, what it says about them, and a summary for people."""
+
+    files: Mapping[str, Path]
+    document: Mapping[str, Any]
+    summary: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return files and document as JSON values."""
+        files = {name: str(path) for name, path in self.files.items()}
+        return {"schema_version": SCHEMA_VERSION, "files": files, **self.document}
+
+    def _repr_html_(self) -> str:
+        """Show the report in a notebook, or the summary where there is none."""
+        if "html" in self.files:
+            return notebook.page_html(self.files["html"].read_text(encoding="utf-8"))
+        return notebook.text_html(self.summary)
+
+
+@dataclass(frozen=True)
+class CompareResult:
+    """A comparison of models, and the report that was written, if any."""
+
+    scene: Scene
+    comparison: comparing.Comparison
+    files: Mapping[str, Path] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of ``ortho compare --json`` (docs/formats.md)."""
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "image": str(self.scene.path),
+            "sensor": self.scene.sensor,
+            **self.comparison.to_json(),
+            "files": {name: str(path) for name, path in self.files.items()},
+        }
