@@ -230,3 +230,17 @@ def test_the_paper_on_orbview3_has_its_three_authors_everywhere():
     assert "Jacobsen, formula" not in (PAGES.parent / "models.md").read_text(encoding="utf-8").replace(
         "Büyüksalih, Akcin and Jacobsen, formula", ""
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_published_numbers_are_those_of_the_command(name):
+    document = published(name)
+    again = EXPERIMENTS[name].reproduce(document["realisations"])
+    assert again["statements"] == document["statements"]
+    for old, new in zip(document["tables"], again["tables"], strict=True):
+        for before, now in zip(old["rows"], new["rows"], strict=True):
+            assert {**before, "median": 0, "p5": 0, "p95": 0} == {**now, "median": 0, "p5": 0, "p95": 0}
+            # Sums in another order change the last digits, which badly determined models make larger.
+            for key in ("median", "p5", "p95"):
+                assert now[key] == pytest.approx(before[key], rel=0.005, abs=0.002)
