@@ -59,6 +59,8 @@ def print_fit(result: FitResult) -> None:
         click.echo(f"RMSE {label:<14} {text}")
     if document["outlying"] and (rest := document["rmse_of_agreeing_checks"]):
         click.echo(f"RMSE of the check points that are not outlying: {rest['total']:.3f}  ({rest['n']} points)")
+    if document["map_scale"]:
+        click.echo(f"Map scale: {document['map_scale']['statement']}")
     for role, found in document["covariance"].items():
         if found:
             click.echo(f"Residuals of {role} points: {found['statement']}")

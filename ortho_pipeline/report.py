@@ -27,6 +27,7 @@ from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.estimation import Fit, root_mean_square
 from ortho_pipeline.files import whole_or_nothing, write_text
 from ortho_pipeline.ground_error import along_view, in_metres, rmse_metres, viewing
+from ortho_pipeline.map_scale import map_scale
 from ortho_pipeline.preview import preview_png
 from ortho_pipeline.report_plots import analysed_role, kind_of, plots
 from ortho_pipeline.report_text import fixed, flat, headline, metres, plain_size, px, share, short, signed, summary_text
@@ -121,6 +122,7 @@ def build_report(
         "rmse_m": rmse_metres(fit),
         "view_rmse": _view_rmse(fit, views),
         "covariance": {role: found and found.to_json() for role, found in analyse_fit(fit, near=near).items()},
+        "map_scale": _map_scale(fit, seen),
         "control_hull": _control_hull(fit, scene.width, scene.height),
         "comparison": None if comparison is None else _plain(comparison),
         "heights": heights,
@@ -133,6 +135,12 @@ def build_report(
     }
     report["headline"] = headline(report)
     return report
+
+
+def _map_scale(fit: Fit, seen: Mapping[str, Any]) -> dict[str, Any] | None:
+    pixels = seen["ground_pixel_m"]
+    found = map_scale(fit, max(pixels) if pixels else None)
+    return None if found is None else found.to_json()
 
 
 def _view_rmse(fit: Fit, views: Array) -> dict[str, Any]:

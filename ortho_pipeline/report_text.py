@@ -86,6 +86,8 @@ def summary_text(report: Mapping[str, Any]) -> str:
     ground = f" ({head['metres']})" if head["metres"] else ""
     rows.append(("accuracy", f"{head['figure']}{ground}: {head['what']}"))
     rows += [("", note) for note in head["notes"]]
+    if scale := report.get("map_scale"):
+        rows.append(("map scale", scale["statement"]))
     for role, found in (report.get("covariance") or {}).items():
         if found and found["verdict"] == "systematic":
             rows.append(("pattern", f"{role} points: {found['statement']}"))

@@ -11,7 +11,9 @@ from ortho_pipeline import comparison as comparing
 from ortho_pipeline import notebook
 from ortho_pipeline.covariance import analyse_fit
 from ortho_pipeline.estimation import Fit
+from ortho_pipeline.ground_error import viewing
 from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.map_scale import map_scale
 
 SCHEMA_VERSION = 1
 
@@ -30,6 +32,8 @@ class FitResult:
         """Return the document of ``ortho fit --json`` (docs/formats.md)."""
         document = self.fit.to_json()
         document["warnings"] = list(self.warnings)
+        pixels = viewing(self.fit.model, self.scene.width, self.scene.height)["ground_pixel_m"]
+        scale = map_scale(self.fit, max(pixels) if pixels else None)
         return {
             "schema_version": SCHEMA_VERSION,
             "sensor": self.scene.sensor,
@@ -37,6 +41,7 @@ class FitResult:
             "model_source": self.scene.model_source,
             **document,
             "removed": [dict(one) for one in self.removed],
+            "map_scale": None if scale is None else scale.to_json(),
             "covariance": {role: one and one.to_json() for role, one in analyse_fit(self.fit, near=self.near).items()},
         }
 

@@ -91,7 +91,7 @@ def test_fit_prints_the_documented_json(tiny):
     expected = {
         "schema_version", "sensor", "model", "model_source", "parameters", "points", "rmse", "raw_bias",
         "redundancy", "sigma0", "rejected", "outlying", "rmse_of_agreeing_checks", "warnings", "statistics", "removed",
-        "covariance",
+        "covariance", "map_scale",
     }  # fmt: skip
     assert set(document) == expected
     assert document["model"] == "rpc+shift"
