@@ -310,6 +310,28 @@ def list_scenes(config: str | os.PathLike[str] | Plan) -> list[dict[str, Any]]:
     return listed
 
 
+def check_scenes(
+    config: str | os.PathLike[str] | Plan, only: Sequence[str] = (), shard: tuple[int, int] | None = None
+) -> list[dict[str, Any]]:
+    """Open what every scene is made from (images, points, DEM and its coverage) and read no pixel.
+
+    Returns
+    -------
+    list of dict
+        Name and image, and what `pipeline.check` says or ``error``.
+    """
+    planned = config if isinstance(config, Plan) else plan(config)
+    checked: list[dict[str, Any]] = []
+    for job in planned.chosen(only, shard):
+        one: dict[str, Any] = {"name": job.name, "image": str(job.image)}
+        try:
+            one |= pipeline.check(job.image, scene=job.scene, points=job.points, surface=job.surface, output=job.ortho)
+        except OrthoError as error:
+            one["error"] = error_document(error)
+        checked.append(one)
+    return checked
+
+
 class _Run:
     """One call of `run`: the log, the count, the end."""
 

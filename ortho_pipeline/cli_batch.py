@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ortho_pipeline.cli_command import Command, Megabytes
 from ortho_pipeline.cli_options import json_option
-from ortho_pipeline.cli_text import print_json, progress
+from ortho_pipeline.cli_text import count, print_json, progress
 
 if TYPE_CHECKING:
     from ortho_pipeline.batch import BatchResult, Outcome
@@ -50,12 +51,14 @@ class _Shard(click.ParamType):
 @click.option("--shard", type=_Shard(), metavar="K/N", help="Only the K-th of N parts, for arrays of jobs.")
 @click.option("--verify", is_flag=True, help="Judge all files by their content, whatever their dates say.")
 @click.option("--list", "as_list", is_flag=True, help="List the scenes and their state, and do nothing.")
+@click.option("--check", "as_check", is_flag=True, help="Open images, points and DEM, look for gaps, and make nothing.")
 @click.option("--schema", "as_schema", is_flag=True, help="Print the JSON Schema of the file, and do nothing.")
 @json_option
 def run(
     pipeline_file: str | None,
     memory: int,
     as_list: bool,
+    as_check: bool,
     as_schema: bool,
     as_json: bool,
     **options: Any,
@@ -81,6 +84,8 @@ def run(
         for scene in listed:
             click.echo(f"{scene['name']}\t{scene['state']}\t{scene['image']}")
         return None
+    if as_check:
+        return _check(pipeline_file, options["only"], options["shard"], as_json)
     try:
         with progress("Orthorectifying scenes") as advance:
             result = batch.run(pipeline_file, memory=memory, progress=advance, **options)
@@ -96,12 +101,43 @@ def run(
     return None
 
 
+def _check(pipeline_file: str, only: Sequence[str], shard: tuple[int, int] | None, as_json: bool) -> None:
+    """Print what stands in the way of each scene; exit as a run would if that were all."""
+    from ortho_pipeline import batch
+
+    checked = batch.check_scenes(pipeline_file, only, shard)
+    failed = [one for one in checked if "error" in one]
+    if as_json:
+        print_json({"schema_version": batch.SCHEMA_VERSION, "scenes": checked})
+    else:
+        for one in checked:
+            click.echo(_checked_text(one))
+        click.echo(f"{count(len(checked), 'scene')}: {len(checked) - len(failed)} ready, {len(failed)} not")
+    if failed:
+        click.get_current_context().exit(FAILED if len(failed) == len(checked) else PARTLY_DONE)
+
+
+def _checked_text(one: Mapping[str, Any]) -> str:
+    if "error" in one:
+        return f"{one['name']}: {_error_text(one['error'])}"
+    points, grid = one["points"], one["grid"]
+    parts = [
+        f"{one['sensor']}, {one['model']}",
+        f"{count(points['control'], 'control point')}, {count(points['check'], 'check point')}",
+        f"DEM covers {100 * one['coverage']:.1f} %",
+        f"{grid['size'][0]} x {grid['size'][1]} px of {grid['resolution'][0]:g} in {grid['crs']}",
+    ]
+    return "\n".join([f"{one['name']}: {'; '.join(parts)}", *(f"  Warning: {text}" for text in one["warnings"])])
+
+
 def _print_summary(result: BatchResult) -> None:
     """Print a table of the scenes and what went wrong; of many scenes only those that failed."""
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False, soft_wrap=True)
+    # A table is cut to the width of the terminal; a file or a pipe has none.
+    wide = None if sys.stdout.isatty() else 10_000
+    console = Console(highlight=False, soft_wrap=True, width=wide)
     scenes = result.scenes if len(result.scenes) <= _SHOWN else [one for one in result.scenes if one.status == "failed"]
     table = Table(box=None, pad_edge=False)
     for title in ("scene", "state", "model", "check px", "left out px", "control px", "seconds"):
@@ -114,7 +150,7 @@ def _print_summary(result: BatchResult) -> None:
         if scene.error:
             console.print(f"\n{scene.name}: {_error_text(scene.error)}", markup=False)
     counts = ", ".join(f"{result.count(status)} {status}" for status in ("done", "unchanged", "failed"))
-    console.print(f"\n{len(result.scenes)} scenes: {counts}  ({result.seconds:.1f} s)")
+    console.print(f"\n{count(len(result.scenes), 'scene')}: {counts}  ({result.seconds:.1f} s)")
     if result.mosaic:
         console.print(_mosaic_text(result.mosaic), markup=False)
     for name, path in result.files.items():

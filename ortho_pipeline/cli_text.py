@@ -15,6 +15,11 @@ if TYPE_CHECKING:
     from ortho_pipeline.pipeline import CompareResult, FitResult, Result
 
 
+def count(number: int, what: str) -> str:
+    """Return a number and what it counts."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
 def print_json(document: Any) -> None:
     """Print a document for programs."""
     click.echo(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False))
@@ -126,7 +131,7 @@ def print_comparison(result: CompareResult, units: str) -> None:
     rows, points = document["rows"], document["points"]
     wide = max([len(row["model"]) for row in rows] + [5])
     axes = ("column", "row") if units == "px" else ("x", "y")
-    click.echo(f"{points['control']} control points, {points['check']} check points; RMSE in {units}")
+    click.echo(f"{count(points['control'], 'control point')}, {count(points['check'], 'check point')}; RMSE in {units}")
     click.echo(
         f"\n{'':<{wide}}  {'':>6} {'control (the fit)':^28}  {'check':^28}  {'left out':>8} {'condi-':>8}\n"
         f"{'model':<{wide}}  {'param.':>6} "

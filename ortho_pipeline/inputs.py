@@ -135,6 +135,15 @@ def open_surface(options: SurfaceOptions, scene: SceneOptions = SceneOptions()) 
     )  # fmt: skip
 
 
+def require_heights(options: SurfaceOptions) -> None:
+    """Raise an `InputError` if there are no heights."""
+    if not has_surface(options):
+        raise InputError(
+            "an orthoimage needs heights", field="--dem",
+            remedy="give --dem FILE, or --height METRES above the ellipsoid for flat ground",
+        )  # fmt: skip
+
+
 def _perhaps_elsewhere(value: Any, allow_network: bool) -> Any:
     """Return a file of an archive or of the network as one that can be read; any other value as it is."""
     text = str(value)
@@ -160,7 +169,9 @@ def read_control(scene: Scene, options: PointOptions, opened: SceneOptions = Sce
     if options.gcps is None:
         if options.correction not in (None, "none"):
             raise InputError(
-                f"a {options.correction} needs control points", field="--gcps", remedy="give a file of points"
+                f"the correction {options.correction!r} needs control points",
+                field="--gcps",
+                remedy="give a file of points",
             )
         return no_points()
     points = _given_points(scene, options, opened)
@@ -219,7 +230,7 @@ def with_heights(points: Points, surface: dem.Surface | None) -> Points:
     if surface is None:
         names = ", ".join(np.array(points.ids)[missing][:5])
         raise InputError(
-            f"{int(missing.sum())} points have no height ({names})", file=points.source, field="h",
+            f"{int(missing.sum())} of {len(points)} points without a height ({names})", file=points.source, field="h",
             remedy="give heights in the file, or a DEM with --dem to take them from",
         )  # fmt: skip
     ground = points.ground.copy()

@@ -23,7 +23,6 @@ from ortho_pipeline import comparison as comparing
 from ortho_pipeline import crs as crs_module
 from ortho_pipeline import dem, footprint, gcp_export, inputs, plugins, raster, report, resolution, rpc
 from ortho_pipeline import stac as stac_items
-from ortho_pipeline.crs import parse_crs
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import Fit
 from ortho_pipeline.files import retire, sha256, staged, states, together, write_text
@@ -38,6 +37,7 @@ from ortho_pipeline.points import Points
 from ortho_pipeline.raster_writer import Profile
 from ortho_pipeline.results import SCHEMA_VERSION, CompareResult, FitResult, Result
 from ortho_pipeline.scene_fit import Adjusted, adjust, heights_around, heights_where_wanted, on_surface, open_adjustable
+from ortho_pipeline.scene_layout import lay_out, source_of
 from ortho_pipeline.swaps import refuse_swapped
 
 if TYPE_CHECKING:
@@ -245,12 +245,7 @@ def rectify(
     }
     points = inputs.point_options(points)
     inputs.check_paths(files, image, scene, points, surface, overwrite)
-    if not has_surface(surface):
-        raise InputError(
-            "an orthoimage needs heights",
-            field="--dem",
-            remedy="give --dem FILE, or --height METRES above the ellipsoid for flat ground",
-        )
+    inputs.require_heights(surface)
     begun = states(inputs.given_files(image, scene, points, surface))
     opened = open_adjustable(image, scene, points)
     heights = open_surface(surface, scene)
@@ -258,20 +253,10 @@ def rectify(
     read = inputs.files_read(image, scene, points, surface, opened.rasters, opened.sources)
     begun = states(read) | begun
     with inputs.hashed_beside(read, digest) as hashing:
-        adjusted = adjust(opened, points, scene, heights)
-        opened, model, size = adjusted.scene, adjusted.model, (opened.width, opened.height)
-        heights = footprint.facing(model, heights, *size)
-        found = footprint.lay(model, heights, *size)
-        found.require_coverage(heights)
-        model = found.fitted(model)
-        crs = parse_crs(output.crs) if output.crs else None
-        grid = footprint.choose_grid(
-            model, found, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
-        )
+        adjusted, model, heights, found, grid = lay_out(opened, points, scene, heights, output)
+        opened = adjusted.scene
         exported, complaints = _as_rpc(model)
-        source = raster.RasterSource(
-            *(opened.rasters or (image,)), **scene.access, bands=output.bands, dtype=output.dtype
-        )
+        source = source_of(opened, image, scene, output)
         warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
         asked = {"scene": scene, "surface": surface, "output": output}
         record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
@@ -288,6 +273,35 @@ def rectify(
     inputs.refuse_changed(begun)
     retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
     return Result(files, {"report": document}, report.summary_text(document))
+
+
+def check(
+    image: str | os.PathLike[str],
+    *,
+    scene: SceneOptions = SceneOptions(),
+    points: PointOptions = PointOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+    output: OutputOptions = OutputOptions(),
+) -> dict[str, Any]:
+    """Do all that `rectify` does before the first pixel: what it would say then, it says now.
+
+    Returns
+    -------
+    dict
+        Sensor, model, counts of points, RMSEs in pixels, coverage by the DEM, grid and warnings, as JSON values.
+
+    Raises
+    ------
+    InputError
+        As `rectify`.
+    """
+    inputs.require_heights(surface)
+    opened = open_adjustable(image, scene, points)
+    if output.stac:
+        stac_items.acquisition_time(opened.facts, output.acquired)
+    laid = lay_out(opened, points, scene, open_surface(surface, scene), output)
+    Profile.of(source_of(laid.scene, image, scene, output), output.dtype, output.nodata)
+    return laid.to_json()
 
 
 @_outputs_together

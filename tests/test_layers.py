@@ -38,6 +38,7 @@ rpc dem preview edge outline
 plugins rays gdal_engine resolution
 footprint lattice simulate inputs testing
 gcp_export scene_fit warp mosaic
+scene_layout
 report experiments stac block_images results
 pipeline block_report
 studies batch_config batch_manifest executors
