@@ -274,8 +274,10 @@ def _grid_of_message(message: str) -> str | None:
 
 
 def _grid_remedy(grid: str, otherwise: str) -> str:
-    sync = f"`pyproj sync --file {grid}` (or `projsync --file {grid}`)"
-    return f"install PROJ's grids (Debian: proj-data), or run {sync}, {otherwise}"
+    sync = f"`pyproj sync --file {grid}` (or `projsync --file {grid}`, both from PROJ's network)"
+    # Of the worldwide geoids Debian's package has this one alone.
+    debian = " or install Debian's proj-data," if "egm96" in grid else ""
+    return f"run {sync},{debian} {otherwise}"
 
 
 def _unavailable_grids(source: Any, target: Any) -> list[str]:

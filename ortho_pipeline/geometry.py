@@ -131,8 +131,8 @@ def meet_height(origin: Array, direction: Array, height: Array) -> Array:
 def rotation_of_angles(omega: float, phi: float, kappa: float) -> Array:
     """Return the rotation ``(3, 3)`` from ground to camera axes of the angles omega, phi, kappa.
 
-    Source: Ok and Turker, equation 3 (three of its nine printed elements lost a sign or a letter; these are the usual
-    ones, M = R3(kappa) R2(phi) R1(omega)).
+    Source: Ok and Turker, equation 3 (as printed, cos phi sin kappa lacks its minus sign and sin omega stands for sin
+    phi; these are the usual elements, M = R3(kappa) R2(phi) R1(omega)).
     """
     so, co, sp, cp, sk, ck = *_sin_cos(omega), *_sin_cos(phi), *_sin_cos(kappa)
     return np.array(

@@ -48,8 +48,14 @@ def test_a_missing_grid_is_an_error_that_names_it_and_the_remedy(name: str) -> N
         pytest.skip("the grid is installed here")
     with pytest.raises(DatumError, match=grid) as caught:
         Vertical.parse(name).undulation([-100.0], [40.0])
-    assert "proj-data" in str(caught.value)
-    assert "sync --file" in str(caught.value)
+    # Debian's package has EGM96 alone of these: it is no remedy here.
+    assert "proj-data" not in str(caught.value)
+    assert "pyproj sync --file" in str(caught.value)
+
+
+def test_only_egm96_is_to_be_had_from_debian() -> None:
+    assert "Debian's proj-data" in module._grid_remedy("us_nga_egm96_15.tif", "or give a grid")
+    assert "Debian" not in module._grid_remedy("us_nga_egm08_25.tif", "or give a grid")
 
 
 def test_ellipsoid_needs_nothing() -> None:

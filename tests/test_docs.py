@@ -61,3 +61,11 @@ def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
         if not re.match(r"[a-z]+:", target):
             assert os.path.exists(page.parent / target), f"{page.name} links to {target}"
+
+
+@pytest.mark.parametrize("group", ["simulate", "reproduce"])
+def test_every_study_is_in_the_table_of_commands(group):
+    command = cli.get_command(click.Context(cli), group)
+    text = (ROOT / "docs/cli.md").read_text()
+    for name in command.list_commands(click.Context(command)):
+        assert f"| `ortho {group} {name} " in text

@@ -5,7 +5,8 @@ seconds apart; in between the Earth turns on, so each image is aimed by a roll a
 are. The vendor knows the attitude with an error, and fits his RPCs to what he believes.
 
 The cameras are written from first principles and share no code with `ortho_pipeline.models`, so that a mistake in one
-cannot hide in the other.
+cannot hide in the other. The vendor's RPCs do: they are the project's class `RPC`, fitted by `fit_rpc` to what the
+vendor believes, so the RPCs of this scene prove nothing about either.
 
 Source: Willneff, Weser, Rottensteiner and Fraser, sections 2 and 4, tables 1 and 3. The free settings and the rows of
 the tables that ask for them are explained in `ortho_pipeline.experiments.cartosat`.
