@@ -468,6 +468,23 @@ def _lanczos(source, x, y):
 
 
 @_inline
+def _lanczos_valid(source, valid, masked, x, y, left, top, full_width, full_height):
+    """As `_lanczos`, of the valid pixels of the source only, with weights that sum to one; NaN if they cancel."""
+    across, down = int(np.floor(x)), int(np.floor(y))
+    by_column, by_row = _lanczos_weights(x - across), _lanczos_weights(y - down)
+    total, weights = 0.0, 0.0
+    for b in range(6):
+        j = down - 2 + b
+        for a in range(6):
+            i = across - 2 + a
+            if 0 <= i < full_width and 0 <= j < full_height and (not masked or valid[j - top, i - left]):
+                weight = by_column[a] * by_row[b]
+                total += weight * source[j - top, i - left]
+                weights += weight
+    return total / weights if weights > 1e-6 else np.nan
+
+
+@_inline
 def _row_average(source, columns, rows, left, top, box, integer, out):
     everywhere = np.ones((1, 1), dtype=np.bool_)
     for k in range(columns.size):
@@ -496,7 +513,7 @@ def _average_valid(source, valid, masked, col, row, box):
 def _edge_value(kernel, source, valid, masked, col, row, left, top, full_width, full_height, box):
     """Value at image point (col, row) where neighbours may be missing; its own pixel is valid.
 
-    Kernels with negative weights fall back to the bilinear one there, which takes the valid neighbours alone.
+    As GDAL does: Lanczos takes the valid neighbours alone, with weights that sum to one; cubic falls back to bilinear.
     """
     x, y = col - 0.5, row - 0.5
     i, j = int(np.floor(x)), int(np.floor(y))
@@ -508,8 +525,12 @@ def _edge_value(kernel, source, valid, masked, col, row, left, top, full_width, 
         return _average_valid(source, valid, masked, col - left, row - top, box)
     if kernel == CUBIC and inner:
         return _cubic(source, x, y, left, top)
-    if kernel == LANCZOS and inner:
-        return _lanczos(source, x - left, y - top)
+    if kernel == LANCZOS:
+        if inner:
+            return _lanczos(source, x - left, y - top)
+        value = _lanczos_valid(source, valid, masked, x, y, left, top, full_width, full_height)
+        if abs(value) < np.inf:
+            return value
     if masked:
         return _bilinear_valid(source, valid, x, y, left, top, full_width, full_height)
     return _bilinear(source, x, y, left, top, full_width, full_height)

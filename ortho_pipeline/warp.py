@@ -132,6 +132,7 @@ def rectify_gdal(
     grid: Grid,
     path: str | os.PathLike[str],
     *,
+    rpc_error: float = 0.0,
     resampling: str = "bilinear",
     memory: int = 512_000_000,
     threads: int | None = None,
@@ -146,6 +147,8 @@ def rectify_gdal(
     ----------
     rpc : mapping
         GDAL's ``RPC`` metadata of the model (`rpc.rpc_metadata`).
+    rpc_error : float
+        How far (px) that RPC is off the model which it stands for: GDAL's transformer adds nothing to it.
     """
     begin = time.monotonic()
     _check(source, resampling, "bilinear", 1.0)
@@ -156,8 +159,8 @@ def rectify_gdal(
         progress=progress,
     )  # fmt: skip
     return WarpResult(
-        max_error_px=0.0,
-        tolerance_px=0.0,
+        max_error_px=rpc_error,
+        tolerance_px=rpc_error,
         finest_spacing=1,
         refined_blocks=0,
         blocks=0,

@@ -17,7 +17,7 @@ from ortho_pipeline.errors import CoverageError, DatumError, DegeneratePoints, I
 from ortho_pipeline.model_file import read_model_file
 from ortho_pipeline.models import KINDS
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.rpc import read_rpc, rpc_metadata, write_rpc_txt
+from ortho_pipeline.rpc import export_rpc, read_rpc, rpc_metadata, write_rpc_txt
 
 CRS = "EPSG:4979"
 
@@ -123,6 +123,18 @@ def test_both_engines_agree(tiny, tmp_path):
     inside = (ours > 0) & (theirs > 0)
     assert inside.mean() > 0.7
     assert (np.abs(ours - theirs)[inside] <= 1).mean() > 0.999
+
+
+def test_the_engine_of_gdal_reports_how_far_its_rpc_is_off_the_model(tiny, tmp_path):
+    """A model of the map has no exact RPC: the one that stands in is fitted."""
+    output = OutputOptions(engine="gdal", format="GTiff")
+    result = rectify(tiny, tmp_path / "gdal", points=points_of(tiny, fit_model="affine3d"), output=output)
+    found = json.loads(result.files["report"].read_text())["warp"]["max_error_px"]
+    model = read_model_file(result.files["model"]).model
+    exported = export_rpc(model)
+    assert not exported.exact
+    assert found == pytest.approx(exported.max_error_px, rel=1e-3)
+    assert found > 0
 
 
 def test_export_writes_every_format_exactly(tiny, tmp_path):
