@@ -46,6 +46,9 @@ class SceneSettings(_Strict):
     sensor_options: dict[str, Scalar] = Field(
         default={}, description="Options that the sensor declares ('ortho sensors')."
     )
+    crop_offset: Annotated[list[float], Field(min_length=2, max_length=2)] | None = Field(
+        default=None, description="Column and row of the first pixel in the image of the model, for a crop of it."
+    )
 
 
 class PointSettings(_Strict):

@@ -197,7 +197,10 @@ class _Planner:
             options[key] = self._perhaps_file(text, image, f"{where}.scene.sensor_options.{key}")
         rpc = given.rpc if given.rpc in ("tag", "sidecar") else self._file(given.rpc, image, f"{where}.scene.rpc")
         model = self._file(given.model, image, f"{where}.scene.model")
-        return SceneOptions(sensor=given.sensor, rpc=rpc, model=model, roots=(str(self.root),), sensor_options=options)
+        return SceneOptions(
+            sensor=given.sensor, rpc=rpc, model=model, roots=(str(self.root),), sensor_options=options,
+            crop_offset=given.crop_offset,
+        )  # fmt: skip
 
     def _points(self, settings: Settings, image: Path, where: str) -> PointOptions:
         values = dict(settings.points)

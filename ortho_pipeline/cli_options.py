@@ -95,6 +95,12 @@ _SENSOR_OPTIONS = (
         metavar="DIR",
         help="A folder that a VRT may refer to, besides its own; may be repeated.",
     ),
+        "--crop-offset",
+        "scene_crop_offset",
+        metavar="COL,ROW",
+        callback=lambda ctx, parameter, value: None if value is None else _pair(value),
+        help="First pixel of this image in the one that its model belongs to, where it is a crop.",
+    ),
 )
 scene_options = _grouped(
     "scene",
@@ -366,6 +372,14 @@ image_argument = click.argument("image", type=click.Path())
 folder_option = click.option(
     "--output", "-o", "folder", type=click.Path(file_okay=False), required=True, metavar="DIR", help="Output folder."
 )
+
+
+def _pair(text: str) -> tuple[float, float]:
+    try:
+        column, row = (float(part) for part in text.split(","))
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is not COL,ROW") from None
+    return column, row
 
 
 def _key_values(texts: tuple[str, ...]) -> dict[str, str]:

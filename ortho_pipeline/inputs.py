@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pyproj
 
-from ortho_pipeline import dem, plugins, raster
+from ortho_pipeline import crop, dem, plugins, raster
 from ortho_pipeline.crs import Vertical, parse_crs
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import sha256, states
@@ -62,7 +62,7 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
                 raise InputError("the RPC is chosen twice", field="--rpc", remedy="leave out --sensor-option rpc=...")
             given["rpc"] = options.rpc
         given = {name: _perhaps_elsewhere(value, options.allow_network) for name, value in given.items()}
-        return plugins.open_scene(image, options.sensor, given, **options.access)
+        return plugins.open_scene(image, options.sensor, given, crop_offset=options.crop_offset, **options.access)
     if options.rpc is not None or options.sensor is not None or options.sensor_options:
         raise InputError(
             "a model file takes the place of the image's model", field="--model",
@@ -72,19 +72,23 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
     plugins.Host.discover()  # model families of plugins, which the file may name
     saved = read_model_file(located(options.model, allow_network=options.allow_network))
     size = dataset.RasterXSize, dataset.RasterYSize
-    if saved.size is not None and saved.size != size:
+    offset = options.crop_offset
+    if offset is None and saved.size != size:
+        offset = crop.noted_offset(dataset)
+    if saved.size is not None and not crop.fits(size, saved.size, offset):
         raise InputError(
             f"this model is of an image of {saved.size[0]} x {saved.size[1]} pixels, {Path(image).name} has "
             f"{size[0]} x {size[1]}",
             file=options.model,
             field="size",
-            remedy="give the model file of this image",
+            remedy="give the model file of this image, or --crop-offset COL,ROW if it is a crop of that one",
         )
-    return Scene(
+    scene = Scene(
         sensor=saved.sensor or "model file", path=image, width=size[0], height=size[1],
         models={saved.model.kind: saved.model}, model_source=str(options.model),
         facts={"delivered_model_source": saved.model_source} if saved.model_source else {},
     )  # fmt: skip
+    return scene if offset is None else crop.placed(scene, dataset, offset)
 
 
 def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_model: bool) -> Scene:

@@ -36,6 +36,8 @@ class SceneOptions:
         Folders that an image may refer to, besides its own: sources of a VRT have to lie there.
     sensor_options : mapping of str to str
         Options that the sensor declares (`ortho sensors`).
+    crop_offset : (float, float), optional
+        Column and row of the first pixel in the image that the model belongs to, where this one is a crop of it.
     """
 
     sensor: str | None = None
@@ -44,6 +46,7 @@ class SceneOptions:
     allow_network: bool = False
     roots: Sequence[str | os.PathLike[str]] = ()
     sensor_options: Mapping[str, str] = field(default_factory=dict)
+    crop_offset: Sequence[float] | None = None
 
     @property
     def access(self) -> dict[str, Any]:

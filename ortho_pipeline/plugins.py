@@ -21,6 +21,7 @@ import pluggy
 
 from ortho_pipeline import hookspecs
 from ortho_pipeline.contract import described, scene_faults, sensor_faults
+from ortho_pipeline.crop import placed
 from ortho_pipeline.errors import InputError, OrthoError, PluginError
 from ortho_pipeline.hookspecs import PROJECT_NAME, Scene, Sensor
 from ortho_pipeline.models import KINDS, SensorModel
@@ -178,6 +179,7 @@ class Host:
         *,
         allow_network: bool = False,
         roots: Sequence[str | PathLike[str]] = (),
+        crop_offset: Sequence[float] | None = None,
     ) -> Scene:
         """Open a product with the sensor that recognises it; see `open_scene`."""
         options = dict(options or {})
@@ -206,7 +208,7 @@ class Host:
         if fault:
             raise PluginError(f"{self._name(chosen)}: {fault}", file=path, remedy=_TEST_IT)
         log.info("%s: sensor %s, models %s from %s", path, chosen.name, ", ".join(scene.models), scene.model_source)
-        return scene
+        return placed(scene, dataset, crop_offset)
 
     def _register_installed(self) -> None:
         for entry in sorted(metadata.entry_points(group=PROJECT_NAME), key=lambda entry: entry.name):
@@ -344,6 +346,7 @@ def open_scene(
     *,
     allow_network: bool = False,
     roots: Sequence[str | PathLike[str]] = (),
+    crop_offset: Sequence[float] | None = None,
 ) -> Scene:
     """Open a product with the installed sensor that recognises it.
 
@@ -359,6 +362,8 @@ def open_scene(
         Whether URLs and GDAL's network file systems may be opened.
     roots : sequence of path
         Folders that an image may refer to, besides its own.
+    crop_offset : (float, float), optional
+        Column and row of the first pixel, where the image is a crop and its model is of the whole (`crop`).
 
     Raises
     ------
@@ -367,7 +372,9 @@ def open_scene(
     PluginError
         If a plugin broke the contract.
     """
-    return Host.discover().open_scene(path, sensor, options, allow_network=allow_network, roots=roots)
+    return Host.discover().open_scene(
+        path, sensor, options, allow_network=allow_network, roots=roots, crop_offset=crop_offset
+    )
 
 
 @functools.cache

@@ -34,7 +34,7 @@ comparison report_plots adjustment covariance map_scale
 raster
 raster_output
 raster_writer
-rpc dem preview edge outline
+rpc dem preview edge outline crop
 plugins rays gdal_engine resolution
 footprint lattice simulate inputs testing
 gcp_export scene_fit warp mosaic

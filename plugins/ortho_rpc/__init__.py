@@ -79,22 +79,4 @@ def _warnings(dataset: gdal.Dataset, model: RPC) -> tuple[str, ...]:
     warnings = []
     if dataset.GetGCPCount():
         warnings.append(f"the file also has {dataset.GetGCPCount()} GCPs of its own, which GDAL programs prefer to RPC")
-    outside = _distance(model.col_off, model.col_scale, dataset.RasterXSize) > 0 or (
-        _distance(model.row_off, model.row_scale, dataset.RasterYSize) > 0
-    )
-    if outside:
-        warnings.append(
-            f"the RPC is for columns {_range(model.col_off, model.col_scale)} and rows"
-            f" {_range(model.row_off, model.row_scale)}, which does not meet this image of"
-            f" {dataset.RasterXSize} x {dataset.RasterYSize} pixels: is it a crop with the RPC of the whole?"
-        )
     return tuple(warnings)
-
-
-def _distance(off: float, scale: float, size: int) -> float:
-    """Return by how far the interval off ± scale misses the interval from 0 to size."""
-    return max(off - abs(scale) - size, -(off + abs(scale)))
-
-
-def _range(off: float, scale: float) -> str:
-    return f"{off - abs(scale):.0f} to {off + abs(scale):.0f}"

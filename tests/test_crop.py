@@ -1,0 +1,189 @@
+"""Crops: a model belongs to the pixels of the image that it came with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline import pipeline
+from ortho_pipeline.crop import moved, noted_offset
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.inputs import open_scene
+from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.options import PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.plugins import open_scene as open_product
+from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.rpc import read_rpc, rpc_metadata, write_rpc_txt
+
+gdal.UseExceptions()
+CORNER = (100.0, 50.0)
+
+
+@pytest.fixture
+def whole(tiny, tmp_path) -> Path:
+    """Return the RPC of the whole image."""
+    write_rpc_txt(tiny.model, tmp_path / "whole_RPC.TXT")
+    return tmp_path / "whole_RPC.TXT"
+
+
+def cut(tiny: Any, path: Path, note: tuple[float, ...] | None = (*CORNER[:1], 1, 0, CORNER[1], 0, 1)) -> Path:
+    """Cut 200 x 150 pixels out as programs do that know no RPC."""
+    pixels = gdal.Open(str(tiny.image)).ReadAsArray(int(CORNER[0]), int(CORNER[1]), 200, 150)
+    made = gdal.GetDriverByName("GTiff").Create(
+        str(path), 200, 150, 1, gdal.GDT_Byte if pixels.dtype == np.uint8 else gdal.GDT_UInt16
+    )
+    if note is not None:
+        made.SetGeoTransform(note)
+    made.GetRasterBand(1).WriteArray(pixels)
+    return path
+
+
+def ground_of(scene: Any) -> np.ndarray:
+    """Return the ground of a pixel of the crop, at the corner of its quarter."""
+    return scene.model.image_to_ground([[50.0, 30.0]], 500.0)
+
+
+def truth(tiny: Any) -> np.ndarray:
+    return tiny.model.image_to_ground([[150.0, 80.0]], 500.0)
+
+
+def test_a_noted_crop_with_the_rpc_of_the_whole_lies_where_it_belongs(tiny, whole, tmp_path):
+    scene = open_scene(cut(tiny, tmp_path / "crop.tif"), SceneOptions(rpc=whole))
+    np.testing.assert_allclose(ground_of(scene), truth(tiny), atol=1e-9)
+    assert scene.facts["crop_offset"] == [100.0, 50.0]
+    (said,) = [text for text in scene.warnings if "crop" in text]
+    assert "column 100, row 50" in said
+
+
+def test_a_crop_by_gdal_is_not_moved_twice(tiny, tmp_path):
+    noted = tmp_path / "noted.tif"
+    gdal.Translate(str(noted), str(tiny.image))
+    dataset = gdal.Open(str(noted), gdal.GA_Update)
+    # GDAL keeps no geotransform that is the identity.
+    dataset.SetGeoTransform((0.0, 1.0, 0.0, 0.0, 0.0, 1.000000001))
+    dataset.SetMetadata(rpc_metadata(tiny.model), "RPC")
+    dataset = None
+    crop = tmp_path / "crop.tif"
+    gdal.Translate(str(crop), str(noted), srcWin=[100, 50, 200, 150])
+    dataset = gdal.Open(str(crop), gdal.GA_Update)
+    assert dataset.GetGeoTransform()[0] == 100.0
+    dataset.SetGeoTransform((100.0, 1.0, 0.0, 50.0, 0.0, 1.0))
+    dataset = None
+    scene = open_scene(crop)
+    np.testing.assert_allclose(ground_of(scene), truth(tiny), atol=1e-9)
+    assert not [text for text in scene.warnings if "crop" in text]
+
+
+def test_the_place_by_hand_counts_more(tiny, whole, tmp_path):
+    bare = cut(tiny, tmp_path / "bare.tif", None)
+    scene = open_scene(bare, SceneOptions(rpc=whole, crop_offset=CORNER))
+    np.testing.assert_allclose(ground_of(scene), truth(tiny), atol=1e-9)
+    wrong = cut(tiny, tmp_path / "wrong.tif", (7.0, 1.0, 0.0, 9.0, 0.0, 1.0))
+    scene = open_scene(wrong, SceneOptions(rpc=whole, crop_offset=CORNER))
+    np.testing.assert_allclose(ground_of(scene), truth(tiny), atol=1e-9)
+    scene = open_scene(wrong, SceneOptions(rpc=whole, crop_offset=(0.0, 0.0)))
+    np.testing.assert_allclose(ground_of(scene), tiny.model.image_to_ground([[50.0, 30.0]], 500.0), atol=1e-9)
+
+
+def test_an_image_much_smaller_than_its_rpc_is_remarkable(tiny, whole, tmp_path):
+    small = tmp_path / "small.tif"
+    gdal.GetDriverByName("GTiff").Create(str(small), 90, 60, 1)
+    (said,) = open_scene(small, SceneOptions(rpc=whole)).warnings
+    assert "90 x 60" in said
+    assert "--crop-offset" in said
+    # Crops by GDAL are small too, but their RPC says where they lie; the whole image is not.
+    part = tmp_path / "part.tif"
+    gdal.Translate(str(part), str(tiny.image), srcWin=[300, 200, 60, 60])
+    assert open_scene(part).warnings == ()
+    assert open_scene(tiny.image).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("transform", "crs", "expected"),
+    [
+        ((5000, 1, 0, 5000, 0, 1), None, (5000.0, 5000.0)),
+        ((0, 1, 0, 12, 0, 1), None, (0.0, 12.0)),
+        ((0, 1, 0, 0, 0, 1), None, None),
+        ((5000, 1, 0, 5000, 0, -1), None, None),
+        ((5000, 2, 0, 5000, 0, 2), None, None),
+        ((5000, 1, 0.1, 5000, 0, 1), None, None),
+        ((5000, 1, 0, 5000, 0, 1), "EPSG:32636", None),
+    ],
+)
+def test_which_geotransforms_count_pixels(transform, crs, expected):
+    dataset = gdal.GetDriverByName("MEM").Create("", 3, 3)
+    dataset.SetGeoTransform(transform)
+    if crs:
+        dataset.SetProjection(crs)
+    assert noted_offset(dataset) == expected
+
+
+def test_every_command_knows_the_place(tiny, whole, tmp_path):
+    crop = cut(tiny, tmp_path / "crop.tif")
+    rows = [(name, col - 100, row - 50, *ground) for name, col, row, *ground in tiny.points(12)]
+    points = PointOptions(gcps=tiny.write(tmp_path / "p.csv", rows), crs="EPSG:4979", vertical="ellipsoid")
+    options, surface = SceneOptions(rpc=whole), SurfaceOptions(dem=tiny.dem, vertical="ellipsoid")
+    values = pipeline.fit(crop, points, options).fit.model.params
+    np.testing.assert_allclose(values, tiny.bias, atol=0.15)
+    assert pipeline.info(crop, options)["facts"]["crop_offset"] == [100.0, 50.0]
+    result = pipeline.rectify(crop, tmp_path / "out", scene=options, points=points, surface=surface)
+    assert any("column 100, row 50" in text for text in result.document["report"]["warnings"])
+    exported = read_rpc(result.files["rpc"])
+    found = exported.image_to_ground([[50.0, 30.0]], 500.0)
+    expected = tiny.model.image_to_ground(np.array([[150.0, 80.0]]) - values, 500.0)
+    np.testing.assert_allclose(found, expected, atol=1e-7)
+    # The model file is one of the crop now.
+    again = open_scene(crop, SceneOptions(model=result.files["model"]))
+    np.testing.assert_allclose(ground_of(again), expected, atol=1e-9)
+    compared = pipeline.compare(crop, points, models="rpc,rpc+shift", scene=options)
+    assert compared.comparison.best.model == "rpc+shift"
+
+
+def test_a_saved_model_of_the_whole_serves_its_crops(tiny, tmp_path):
+    surface = SurfaceOptions(dem=tiny.dem, vertical="ellipsoid")
+    model = pipeline.rectify(tiny.image, tmp_path / "out", surface=surface).files["model"]
+    crop = cut(tiny, tmp_path / "crop.tif")
+    np.testing.assert_allclose(ground_of(open_scene(crop, SceneOptions(model=model))), truth(tiny), atol=1e-9)
+    bare = cut(tiny, tmp_path / "bare.tif", None)
+    with pytest.raises(InputError, match="400 x 300"):
+        open_scene(bare, SceneOptions(model=model))
+    scene = open_scene(bare, SceneOptions(model=model, crop_offset=CORNER))
+    np.testing.assert_allclose(ground_of(scene), truth(tiny), atol=1e-9)
+    with pytest.raises(InputError, match="400 x 300"):
+        open_scene(bare, SceneOptions(model=model, crop_offset=(250.0, 50.0)))
+
+
+def test_any_model_can_be_moved(tiny):
+    affine = ImageCorrection.identity(tiny.model, "affine", (200.0, 150.0)).with_params([1.0, 1e-3, 0, -2.0, 0, 1e-3])
+    ground = tiny.model.image_to_ground([[120.0, 90.0], [310.0, 20.0]], 500.0)
+    for model in (tiny.model, affine):
+        crop = moved(model, CORNER)
+        np.testing.assert_allclose(crop.ground_to_image(ground), model.ground_to_image(ground) - CORNER, atol=1e-9)
+        back = crop.image_to_ground(crop.ground_to_image(ground), 500.0)
+        np.testing.assert_allclose(back, ground, atol=1e-9)
+        assert moved(model, (0.0, 0.0)) is model
+
+
+@pytest.mark.parametrize("offset", [(1.0,), (1.0, float("nan")), (1.0, 2.0, 3.0)])
+def test_places_that_are_none(tiny, offset):
+    with pytest.raises(InputError, match="not the place of a crop") as error:
+        open_scene(tiny.image, SceneOptions(crop_offset=offset))
+    assert error.value.field == "--crop-offset"
+
+
+@pytest.mark.realdata
+def test_pleiades_crops_meet_each_other(real):
+    folder = real / "shareloc"
+    images = {side: folder / "image" / "phr_ventoux" / f"{side}_image.tif" for side in ("left", "right")}
+    rpcs = {side: folder / "rpc" / "phr_ventoux" / f"{side}_image.geom" for side in images}
+    scenes = {side: open_product(images[side], options={"rpc": str(rpcs[side])}) for side in images}
+    assert scenes["left"].facts["crop_offset"] == [5000.0, 5000.0]
+    # The notes of the data: the left crop's first pixel in the right image, in pixels of the whole, by height.
+    for height, column, row in ((0.0, 4906.5, 5195.7), (700.0, 5034.3, 4727.7), (1500.0, 5180.4, 4192.9)):
+        seen = scenes["right"].model.ground_to_image(scenes["left"].model.image_to_ground([[0.0, 0.0]], height))
+        corner = noted_offset(open_dataset(images["right"]))
+        np.testing.assert_allclose(seen[0] + corner, (column, row), atol=0.1)
