@@ -46,16 +46,21 @@ lon, lat, height = ground.ground[0]
 print(f"{points.ids[0]}: {lon:.5f}, {lat:.5f}, {height:.0f} m; sigmas {np.round(ground.sigmas[0]).tolist()} m")
 
 # %% [markdown]
-# ## Each adjusted model is written as RPC, and one image is orthorectified with it
+# ## Each adjusted model is written as RPC and as model file, and one image is orthorectified with it
+# The model file also holds what the model was adjusted by, so that the report of the ortho can say how accurate it is.
 
 # %%
 (OUT / "adjusted").mkdir(parents=True, exist_ok=True)
+record = block.to_json()
 for name, model in block.models.items():
-    op.write_rpc_txt(op.export_rpc(model).rpc, OUT / "adjusted" / f"{Path(name).stem}_RPC.TXT")
+    adjusted = OUT / "adjusted" / Path(name).stem
+    op.write_rpc_txt(op.export_rpc(model).rpc, f"{adjusted}_RPC.TXT")
+    adjustment = {"gauge": block.gauge, "sigma0": block.sigma0, **record["images"][name]}
+    op.save_model(model, f"{adjusted}_model.json", adjustment=adjustment)
 result = op.rectify(
     SAMPLE / "BANDA.tif",
     OUT,
-    scene=op.SceneOptions(rpc=OUT / "adjusted" / "BANDA_RPC.TXT"),
+    scene=op.SceneOptions(model=OUT / "adjusted" / "BANDA_model.json"),
     surface=op.SurfaceOptions(dem=SAMPLE / "dem.tif"),
 )
 print(result.summary)

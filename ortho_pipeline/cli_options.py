@@ -95,18 +95,19 @@ _SENSOR_OPTIONS = (
         metavar="DIR",
         help="A folder that a VRT may refer to, besides its own; may be repeated.",
     ),
-        "--crop-offset",
-        "scene_crop_offset",
-        metavar="COL,ROW",
-        callback=lambda ctx, parameter, value: None if value is None else _pair(value),
-        help="First pixel of this image in the one that its model belongs to, where it is a crop.",
-    ),
 )
 scene_options = _grouped(
     "scene",
     SceneOptions,
     *_SENSOR_OPTIONS[:2],
     click.option("--model", "scene_model", type=_FILE, help="A saved *_model.json in place of the image's model."),
+    click.option(
+        "--crop-offset",
+        "scene_crop_offset",
+        metavar="COL,ROW",
+        callback=lambda ctx, parameter, value: None if value is None else _pair(value),
+        help="First pixel of this image in the one that its model belongs to, where it is a crop.",
+    ),
     *_SENSOR_OPTIONS[2:],
 )
 #: The same for the images of a block, where a saved model cannot take the place of all.

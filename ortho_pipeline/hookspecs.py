@@ -96,6 +96,8 @@ class Scene:
         Files that were read besides the image and `model_source`, for the record.
     unsuited : mapping of str to str
         Model families (`ortho models`) that do not suit this product, each with what to say where it is fitted.
+    adjusted : mapping, optional
+        What the model was adjusted by before: the section ``adjustment`` of the model file that it comes from.
     """
 
     sensor: str
@@ -111,6 +113,7 @@ class Scene:
     pieces: tuple[Piece, ...] = ()
     sources: tuple[str | PathLike[str], ...] = ()
     unsuited: Mapping[str, str] = field(default_factory=dict)
+    adjusted: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", Path(self.path))

@@ -87,6 +87,7 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
         sensor=saved.sensor or "model file", path=image, width=size[0], height=size[1],
         models={saved.model.kind: saved.model}, model_source=str(options.model),
         facts={"delivered_model_source": saved.model_source} if saved.model_source else {},
+        adjusted=saved.adjusted,
     )  # fmt: skip
     return scene if offset is None else crop.placed(scene, dataset, offset)
 

@@ -42,6 +42,15 @@ class SavedModel:
     size: tuple[int, int] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def adjusted(self) -> Mapping[str, Any] | None:
+        """What the model was adjusted by, of a scene or in a block; None where it is as delivered."""
+        found = self.provenance.get("adjustment")
+        if not isinstance(found, dict) or not (found.get("gauge") or found.get("points")):
+            return None
+        # Points alone, as checks, adjust nothing.
+        return found if found.get("parameters") else None
+
 
 def write_model_file(saved: SavedModel, path: str | os.PathLike[str]) -> None:
     """Write a model file, whole or not at all; numbers are kept to the last bit.
@@ -117,9 +126,18 @@ def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
     )
 
 
-def save_model(model: SensorModel, path: str | os.PathLike[str]) -> None:
-    """Write `model` alone as a model file; `load_model` returns it again."""
-    write_model_file(SavedModel(model), path)
+def save_model(
+    model: SensorModel, path: str | os.PathLike[str], *, adjustment: Mapping[str, Any] | None = None
+) -> None:
+    """Write `model` as a model file; `load_model` returns it again.
+
+    Parameters
+    ----------
+    adjustment : mapping, optional
+        What it was adjusted by, as JSON values: ``Fit.to_json()``, or the image's part of ``BlockFit.to_json()`` with
+        its `gauge` and `sigma0`. Reports of this model then say how accurate it is.
+    """
+    write_model_file(SavedModel(model, provenance={} if adjustment is None else {"adjustment": dict(adjustment)}), path)
 
 
 def load_model(path: str | os.PathLike[str]) -> SensorModel:

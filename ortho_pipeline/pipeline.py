@@ -261,7 +261,7 @@ def rectify(
         asked = {"scene": scene, "surface": surface, "output": output}
         record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
     whole = raster.open_dataset(image, **scene.access)
-    _write_models(model, exported, opened, whole, files, {**record, "adjustment": adjusted.fit.to_json()})
+    _write_models(model, exported, opened, whole, files, {**record, "adjustment": adjusted.record()})
     document = report.build_report(
         scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
         warp=warped, near=points.near, provenance=record,

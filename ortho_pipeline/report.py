@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.covariance import analyse_fit
 from ortho_pipeline.crs import Vertical, ground_transform
+from ortho_pipeline.delivered import accuracy_before
 from ortho_pipeline.drawing import round_down, style_sheet
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.estimation import Fit, root_mean_square
@@ -133,7 +134,7 @@ def build_report(
         "provenance": _plain(provenance or {}),
         "warnings": noted,
     }
-    report["headline"] = headline(report)
+    report["headline"] = headline(report, accuracy_before(scene), adjusted=scene.adjusted is not None)
     return report
 
 

@@ -11,8 +11,17 @@ from typing import Any
 ENOUGH_CHECK_POINTS = 30
 
 
-def headline(report: Mapping[str, Any]) -> dict[str, Any]:
+def headline(
+    report: Mapping[str, Any], before: Mapping[str, Any] | None = None, *, adjusted: bool = False
+) -> dict[str, Any]:
     """Say how accurate the result is, in words, from the best evidence that there is.
+
+    Parameters
+    ----------
+    before : mapping, optional
+        The headline where there are no points (`delivered.accuracy_before`).
+    adjusted : bool
+        Whether the model was adjusted before.
 
     Returns
     -------
@@ -24,8 +33,13 @@ def headline(report: Mapping[str, Any]) -> dict[str, Any]:
     rmse, redundancy, parameters = adjustment["rmse"], adjustment["redundancy"], len(adjustment["parameters"])
     control, check, loo = rmse["control"], rmse["check"], rmse["loo"]
     if not adjustment["points"]:
-        notes = ["The model is used as it was delivered. Vendors' models are commonly off by 5 to 25 m."]
-        return {"figure": "Not tested", "metres": None, "what": "there were no ground control points", "notes": notes}
+        untested: dict[str, Any] = {
+            "figure": "Not tested",
+            "metres": None,
+            "what": "there were no ground control points",
+            "notes": [],
+        }
+        return dict(before or untested)
     notes = []
     if lost := len(adjustment["rejected"]):
         notes.append(
@@ -49,7 +63,11 @@ def headline(report: Mapping[str, Any]) -> dict[str, Any]:
             )
         return {**_figure(check, report["rmse_m"]["check"]), "what": what, "notes": notes}
     if control and not parameters:
-        what = f"RMSE at {count(control['n'], 'point')} of the model as delivered, none of which it was adjusted to"
+        what = (
+            f"RMSE at {count(control['n'], 'point')} of the model as it was adjusted before: a test only if to others"
+            if adjusted
+            else f"RMSE at {count(control['n'], 'point')} of the model as delivered, none of which it was adjusted to"
+        )
         return {**_figure(control, report["rmse_m"]["control"]), "what": what, "notes": notes}
     notes.append("No check points were kept apart.")
     if loo and redundancy:

@@ -55,6 +55,10 @@ class Adjusted:
         inner = model.model.first if isinstance(model.model, Pieces) else model.model
         return inner if model.correction == "none" else dataclasses.replace(model, model=inner)
 
+    def record(self) -> dict[str, Any]:
+        """Return what the model was adjusted by as JSON values: now, or before where it comes adjusted from a file."""
+        return self.fit.to_json() if self.scene.adjusted is None else dict(self.scene.adjusted)
+
     def removed_json(self) -> list[dict[str, Any]]:
         """Return the removed parameters as JSON values."""
         return [{"name": one.name, "t": one.t, "p": one.p} for one in self.removed]

@@ -30,7 +30,7 @@ block_variance
 registration estimation hookspecs swaps model_file kernels lattice_kernel ray_kernel landscape rpc_files
 block_blunders
 model_choice block_checks selection ground_error drawing contract
-comparison report_plots adjustment covariance map_scale
+comparison report_plots adjustment covariance map_scale delivered
 raster
 raster_output
 raster_writer
