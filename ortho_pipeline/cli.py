@@ -371,6 +371,31 @@ def edge(image: str, edge: str | None, band: int, folder: str | None, allow_netw
 
 
 @cli.command()
+@click.argument("images", nargs=-1, required=True, type=click.Path())
+@folder_option
+@click.option("--reference", metavar="IMAGE", help="Onto which the others are brought  [default: the first]")
+@click.option(
+    "--transform",
+    type=click.Choice(["similarity", "affine", "projective", "poly2"]),
+    default="projective",
+    show_default=True,
+)
+@scene_options
+@json_option
+def register(
+    images: tuple[str, ...], folder: str, reference: str | None, transform: str, scene: SceneOptions, as_json: bool
+) -> None:
+    """Bring single bands IMAGES onto one of them and write one image of all, which opens as the reference did.
+
+    For bands of one acquisition that were taken by cameras of their own. The metadata file of the reference is carried
+    along, or its model written as a model file.
+    """
+    from ortho_pipeline import bands
+
+    print_result(bands.register(images, folder, reference=reference, transform=transform, scene=scene), as_json)
+
+
+@cli.command()
 @json_option
 def doctor(as_json: bool) -> None:
     """Show what is installed: GDAL, PROJ, geoid grids, plugins."""

@@ -55,6 +55,8 @@ def sensor_faults(sensor: object) -> Iterator[str]:
     said = f"sensor {sensor.name!r}"
     if not callable(sensor.recognises) or not callable(sensor.open_scene):
         yield f"{said}: recognises and open_scene must be callable"
+    if sensor.metadata_beside is not None and not callable(sensor.metadata_beside):
+        yield f"{said}: metadata_beside must be callable"
     if not isinstance(sensor.options, Mapping) or not all(
         isinstance(text, str) for pair in sensor.options.items() for text in pair
     ):

@@ -157,6 +157,10 @@ class Sensor:
     fallback : bool
         A fallback sensor serves any product of a general kind: it is asked only when no other sensor
         recognises the dataset, and it is taken when it alone declares the options that the user gave.
+    metadata_beside : callable(image) -> Path, optional
+        Where the metadata of an image are looked for, if a product is an image and one file beside it
+        (`Scene.model_source`): a copy there makes another image of the same pixels such a product, as `ortho register`
+        does.
     """
 
     name: str
@@ -165,6 +169,7 @@ class Sensor:
     open_scene: Callable[..., Scene]
     options: Mapping[str, str] = field(default_factory=dict)
     fallback: bool = False
+    metadata_beside: Callable[[str], Path] | None = None
 
 
 @hookspec

@@ -9,7 +9,6 @@ import numpy as np
 import ortho_bilsat
 import ortho_frame
 import pytest
-from ortho_bilsat.stack import stack_bands
 from ortho_bilsat.survey import Survey, read_survey, write_survey
 from osgeo import gdal
 
@@ -35,6 +34,7 @@ from ortho_pipeline.models.resection import resect
 from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.registration import TRANSFORMS, Transform, register
 from ortho_pipeline.rpc import export_rpc
+from ortho_pipeline.stack import stack_bands
 from ortho_pipeline.testing import check_sensor
 
 XS = Interior(SIZE, SIZE, FOCAL_LENGTH, PITCH, PITCH)

@@ -13,7 +13,7 @@ from ortho_bilsat.simulation import write_product
 from ortho_bilsat.survey import read_survey
 from osgeo import gdal
 
-from ortho_pipeline import pipeline
+from ortho_pipeline import bands, pipeline
 from ortho_pipeline.cli import cli
 from ortho_pipeline.crs import parse_crs
 from ortho_pipeline.dem import Surface
@@ -278,3 +278,46 @@ def test_rows_that_cannot_be_fitted_are_said_to_be_so():
     html = page(document, np.zeros((1, 2)), np.ones((1, 2)))
     assert "Fourteen unknowns from sixteen measurements" in html
     assert " - " in text(document)
+
+
+# -- some cameras, one product ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def cameras(tmp_path_factory) -> dict[str, Path]:
+    """Return the images of three XS cameras with the survey of the red one."""
+    folder = tmp_path_factory.mktemp("xs")
+    return write_product(folder, size=512, cameras=("red", "blue", "nir"))
+
+
+def test_registered_bands_open_as_the_scene_that_they_are(cameras, tmp_path):
+    order = [cameras[name] for name in ("image_blue", "image", "image_nir")]
+    result = bands.register(order, tmp_path, reference=cameras["image"])
+    stack, red = open_scene(result.files["image"]), open_scene(cameras["image"])
+    assert stack.sensor == "bilsat"
+    assert result.files["metadata"].read_bytes() == cameras["survey"].read_bytes()
+    ground = red.model.image_to_ground([[10.0, 20.0], [200.0, 100.0]], 900.0)
+    np.testing.assert_array_equal(stack.model.ground_to_image(ground), red.model.ground_to_image(ground))
+    dataset = gdal.Open(str(result.files["image"]))
+    assert dataset.RasterCount == 3
+    np.testing.assert_array_equal(
+        dataset.GetRasterBand(2).ReadAsArray(), gdal.Open(str(cameras["image"])).ReadAsArray()
+    )
+    rows = json.loads(result.files["table"].read_text())["registrations"]
+    # The simulated cameras are misaligned by several pixels; what is left is that of sub-pixel correlation.
+    assert [row["band"] for row in rows] == ["bilsat_blue", "bilsat_nir"]
+    assert max(row["rmse"] for row in rows) < 0.15
+
+
+def test_bands_that_do_not_match_leave_nothing(cameras, tmp_path):
+    noise = tmp_path / "noise.tif"
+    made = gdal.GetDriverByName("GTiff").CreateCopy(str(noise), gdal.Open(str(cameras["image_blue"])))
+    made.WriteArray(np.random.default_rng(0).integers(1, 255, (512, 512)).astype(np.uint8))
+    made = None
+    with pytest.raises(InputError):
+        bands.register([cameras["image"], noise], tmp_path / "out")
+    assert not list((tmp_path / "out").glob("*"))
+    with pytest.raises(InputError, match="not among the images"):
+        bands.register([cameras["image"], noise], tmp_path / "out", reference=cameras["image_nir"])
+    with pytest.raises(InputError, match="one name"):
+        bands.register([cameras["image"], cameras["image"]], tmp_path / "out")

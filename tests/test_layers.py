@@ -34,14 +34,14 @@ comparison report_plots adjustment covariance map_scale delivered
 raster
 raster_output
 raster_writer
-rpc dem preview edge outline crop
+rpc dem preview edge outline crop stack
 plugins rays gdal_engine resolution
 footprint lattice simulate inputs testing
 gcp_export scene_fit warp mosaic
 scene_layout
 report experiments stac block_images results
 pipeline block_report
-studies batch_config batch_manifest executors
+studies bands batch_config batch_manifest executors
 batch_plan
 blocks batch
 cli_command
@@ -51,7 +51,7 @@ cli
 """
 LINE = {name: number for number, line in enumerate(LAYERS.split("\n")) for name in line.split()}
 GDAL_MODULES = {"locations", "raster", "raster_output", "raster_writer", "dem", "mosaic", "plugins"}
-GDAL_MODULES |= {"rpc", "gcp_export", "gdal_engine"}
+GDAL_MODULES |= {"rpc", "stack", "gcp_export", "gdal_engine"}
 NUMBA_MODULES = {"kernels", "lattice_kernel", "ray_kernel", "models"}
 MAX_LINES, MAX_FUNCTION = 600, 50
 

@@ -29,6 +29,7 @@ def ortho_sensors() -> Iterable[Sensor]:
             "survey": "the imaging survey file, where it is not <image>_survey.txt",
             "attitude": "survey (default where there is one) or zero: start from equation 5 of the paper",
         },
+        metadata_beside=survey_of,
     )
 
 

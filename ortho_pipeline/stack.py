@@ -1,4 +1,4 @@
-"""The four XS bands of one acquisition, taken by four cameras, made into one 4-band image."""
+"""Single bands of one acquisition, each taken by a camera of its own, made into one image."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ def stack_bands(
 ) -> tuple[Registration, ...]:
     """Register single-band images onto one of them and write a GeoTIFF with all bands.
 
-    The stack has the geometry of the reference camera, whose imaging survey belongs to it. Pixels that a band does not
-    cover are 0, which is declared as nodata.
+    The stack has the geometry of the reference. Pixels that a band does not cover are 0, which is declared as nodata.
 
     Parameters
     ----------
