@@ -268,8 +268,8 @@ def compare(
     "--overwrite",
     "-overwrite",
     is_flag=True,
-    help="Remove old side-cars that would attach to the ortho, and outputs of an earlier run that this one does not "
-    "make. Outputs of the same name are replaced without it.",
+    help="Remove old models that would attach to the ortho, and what an unreported earlier run left. Outputs of the "
+    "same name are replaced without it.",
 )
 @point_options
 @scene_options

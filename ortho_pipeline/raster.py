@@ -196,7 +196,9 @@ class Grid:
         dx, dy = resolution
         if not all(map(math.isfinite, (xmin, ymin, xmax, ymax, dx, dy))) or not (xmin < xmax and ymin < ymax):
             raise InputError(
-                f"{xmin} {ymin} {xmax} {ymax} is no extent", field="extent", remedy="give xmin ymin xmax ymax"
+                f"{xmin:.12g} {ymin:.12g} {xmax:.12g} {ymax:.12g} is no extent",
+                field="extent",
+                remedy="give xmin ymin xmax ymax",
             )
         if not (dx > 0 and dy > 0):
             raise InputError("a pixel has a positive size", field="resolution")
