@@ -430,7 +430,10 @@ def _weighed(problem: BlockProblem, solved: Solved, selection: Selection) -> tup
     for _ in range(_WEIGHINGS):
         if found.moved <= _MOVED:
             break
+        before = problem
         problem, solved = reweighed(problem, solved, selection, found.variances)
+        if problem is before:
+            break
         found = posterior(problem, solved)
     return problem, solved, found
 

@@ -52,6 +52,8 @@ _LEAST = 0.5
 _FINEST = 1e-4
 #: Steps of the factor of the measurements to its best value, the ground's sigmas being given.
 _ROUNDS = 4
+#: Sigmas of measurements that change by less than this part are the same.
+_SAME = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,11 +182,13 @@ def posterior(problem: BlockProblem, solved: Solved) -> Posterior:
 def reweighed(
     problem: BlockProblem, solved: Solved, selection: Selection, variances: Variances
 ) -> tuple[BlockProblem, Solved]:
-    """Return the problem with these standard deviations, and its solution.
+    """Return the problem with these standard deviations, and its solution; both as they are if nothing much changes.
 
     Where that does not converge, as with cameras that few points hardly determine, both stay as they are; `posterior`
     then counts how far the solution is from the best.
     """
+    if not variances.estimated and abs(variances.image - 1.0) < _SAME:
+        return problem, solved
     other = variances.applied(problem)
     try:
         return other, other.solve(solved.state, selection)
