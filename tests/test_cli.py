@@ -191,7 +191,7 @@ COMMANDS = [
     "doctor", "sensors", "models", "info a.tif", "fit a.tif --gcps b.csv", "compare a.tif --gcps b.csv",
     "rectify a.tif --height 5 -o out", "export a.tif -o out", "report a.json --plots out", "edge a.tif",
     "adjust a.tif b.tif --points c.csv -o out", "intersect a.tif b.tif --points c.csv", "run a.yaml",
-    "simulate ikonos -o out", "reproduce bilsat",
+    "simulate ikonos -o out", "reproduce bilsat", "register a.tif b.tif -o out",
 ]  # fmt: skip
 
 
