@@ -11,8 +11,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
+
+from ortho_pipeline.compiled import compiled, inlined
 
 NEAREST, BILINEAR, CUBIC, LANCZOS, AVERAGE = range(5)
 # Unsigned indices spare the compiled code a test for Python's negative ones in every access; they are made by way of
@@ -21,17 +22,14 @@ _ONE, _TWO = np.uint32(1), np.uint32(2)
 #: From this many output pixels per DEM sample on, pixels are taken together that lie between the same samples.
 _RUN = 6.0
 
-_jit = numba.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-_inline = numba.njit(nogil=True, cache=True, inline="always", boundscheck=False, error_model="numpy")
 
-
-@_inline
+@inlined
 def _between(first, second, share):
     # A node without weight may be NaN (outside of the model) and must not count.
     return first if share == 0.0 else first + (second - first) * share
 
 
-@_jit
+@compiled
 def block_coordinates(
     row: int,
     left: int,
@@ -86,7 +84,7 @@ def block_coordinates(
             cols[k], lines[k] = col, line
 
 
-@_inline
+@inlined
 def _quadratic(start, slope, middle, scale, tx, cols, lines):
     """Turn heights in `cols` into image coordinates by the quadratics of one row of a cell."""
     c0, c1, c2, r0, r1, r2 = start[0], start[2], start[4], start[1], start[3], start[5]
@@ -97,7 +95,7 @@ def _quadratic(start, slope, middle, scale, tx, cols, lines):
         lines[k] = ((r2 + dr2 * tx[k]) * t + (r1 + dr1 * tx[k])) * t + (r0 + dr0 * tx[k])
 
 
-@_inline
+@inlined
 def _row_heights(heights, u0, du, v0, dv, dem_left, dem_top, cubic_dem, spacing, tx, out):
     """Fill `out` with the heights at (u0 + du tx, v0 + dv tx), DEM coordinates that are linear along a row of a cell.
 
@@ -133,7 +131,7 @@ def _row_heights(heights, u0, du, v0, dv, dem_left, dem_top, cubic_dem, spacing,
         k = end
 
 
-@_jit
+@compiled
 def heights_at(uv: Any, heights: Any, dem_left: int, dem_top: int, cubic_dem: bool, out: Any) -> None:
     """Fill `out` ``(n, m)`` with the heights at DEM coordinates `uv` ``(n, m, 2)``; NaN outside of the window."""
     for j in range(out.shape[0]):
@@ -141,7 +139,7 @@ def heights_at(uv: Any, heights: Any, dem_left: int, dem_top: int, cubic_dem: bo
             out[j, i] = _dem_height_at(heights, uv[j, i, 0], uv[j, i, 1], dem_left, dem_top, cubic_dem)
 
 
-@_jit
+@compiled
 def _dem_height_at(heights, u, v, dem_left, dem_top, cubic_dem):
     """Interpolate the DEM at sample coordinates (u, v); NaN outside of its window."""
     rows, columns = heights.shape
@@ -152,7 +150,7 @@ def _dem_height_at(heights, u, v, dem_left, dem_top, cubic_dem):
     return _dem_height(heights, i - dem_left, j - dem_top, u - i, v - j, cubic_dem)
 
 
-@_inline
+@inlined
 def _dem_height(heights, i, j, fu, fv, cubic_dem):
     """Interpolate the DEM at (i + fu, j + fv); NaN where a sample with weight is void."""
     # A sample of weight zero must not spoil the result: 0 * NaN is NaN.
@@ -178,7 +176,7 @@ def _dem_height(heights, i, j, fu, fv, cubic_dem):
     return total if total == total else bilinear
 
 
-@_inline
+@inlined
 def cubic_weights(f):
     """Weights of Keys' cubic convolution (a = -0.5) of samples -1, 0, 1, 2 for a point at f between 0 and 1."""
     f2 = f * f
@@ -191,7 +189,7 @@ def cubic_weights(f):
     )
 
 
-@_inline
+@inlined
 def _bilinear(source, x, y, left, top, full_width, full_height):
     """Value at (x, y), which count from the centre of the source's first pixel; beyond the edge, the edge."""
     i, j = int(np.floor(x)), int(np.floor(y))
@@ -204,7 +202,7 @@ def _bilinear(source, x, y, left, top, full_width, full_height):
     return upper * (1.0 - fy) + lower * fy
 
 
-@_inline
+@inlined
 def _bilinear_valid(source, valid, x, y, left, top, full_width, full_height):
     """As `_bilinear`, of the valid pixels only, with weights that sum to one; NaN if none is."""
     i, j = int(np.floor(x)), int(np.floor(y))
@@ -223,7 +221,7 @@ def _bilinear_valid(source, valid, x, y, left, top, full_width, full_height):
     return total / weights if weights > 1e-5 else np.nan
 
 
-@_inline
+@inlined
 def _cubic(source, x, y, left, top):
     """Value at (x, y) by cubic convolution; the 4 x 4 neighbours have to be there."""
     i, j = int(np.floor(x)), int(np.floor(y))
@@ -237,7 +235,7 @@ def _cubic(source, x, y, left, top):
     return b0 * line0 + b1 * line1 + b2 * line2 + b3 * line3
 
 
-@_inline
+@inlined
 def _all_valid(valid, i, j, size):
     for b in range(size):
         for a in range(size):
@@ -246,7 +244,7 @@ def _all_valid(valid, i, j, size):
     return True
 
 
-@_jit
+@compiled
 def warp_block(
     kernel: int,
     source: Any,
@@ -345,7 +343,7 @@ def warp_block(
     return short
 
 
-@_jit
+@compiled
 def _span(columns, rows, low_col, high_col, low_row, high_row):
     """Return where the part of a row begins and ends in which no neighbour is missing; the rest is done with care."""
     begin, end = 0, columns.size
@@ -359,7 +357,7 @@ def _span(columns, rows, low_col, high_col, low_row, high_row):
     return (begin, end) if inside else (0, 0)
 
 
-@_inline
+@inlined
 def _row_inside(kernel, source, columns, rows, left, top, low, high, integer, box, out):
     if kernel == NEAREST:
         _row_nearest(source, columns, rows, left, top, out)
@@ -373,13 +371,13 @@ def _row_inside(kernel, source, columns, rows, left, top, low, high, integer, bo
         _row_average(source, columns, rows, left, top, box, integer, out)
 
 
-@_inline
+@inlined
 def _row_nearest(source, columns, rows, left, top, out):
     for k in range(columns.size):
         out[k] = source[np.uint32(np.int32(rows[k] - top)), np.uint32(np.int32(columns[k] - left))]
 
 
-@_inline
+@inlined
 def _row_bilinear(source, columns, rows, left, top, integer, out):
     x0, y0 = left + 0.5, top + 0.5
     rounding = 0.5 if integer else 0.0
@@ -394,7 +392,7 @@ def _row_bilinear(source, columns, rows, left, top, integer, out):
         out[k] = np.floor(value) if integer else value
 
 
-@_inline
+@inlined
 def _row_cubic(source, columns, rows, left, top, low, high, integer, out):
     x0, y0 = left + 0.5, top + 0.5
     for k in range(columns.size):
@@ -412,19 +410,19 @@ def _row_cubic(source, columns, rows, left, top, low, high, integer, out):
         out[k] = min(max(np.floor(value + 0.5), low), high) if integer else value
 
 
-@_inline
+@inlined
 def _cubic_line(line, i, a0, a1, a2, a3):
     return a0 * line[i - _ONE] + a1 * line[i] + a2 * line[i + _ONE] + a3 * line[i + _TWO]
 
 
-@_inline
+@inlined
 def _row_lanczos(source, columns, rows, left, top, low, high, integer, out):
     for k in range(columns.size):
         value = _lanczos(source, columns[k] - left - 0.5, rows[k] - top - 0.5)
         out[k] = min(max(np.floor(value + 0.5), low), high) if integer else value
 
 
-@_inline
+@inlined
 def _lanczos_weights(f):
     """Weights of the Lanczos kernel (a = 3) of samples -2 … 3 for a point at f between 0 and 1; their sum is one."""
     if f < 1e-9:
@@ -446,7 +444,7 @@ def _lanczos_weights(f):
     return w0 * scale, w1 * scale, w2 * scale, w3 * scale, w4 * scale, w5 * scale
 
 
-@_inline
+@inlined
 def _lanczos(source, x, y):
     """Value at (x, y), counted from the centre of the window's first pixel; the 6 x 6 neighbours have to be there."""
     across, down = np.int32(x), np.int32(y)
@@ -467,7 +465,7 @@ def _lanczos(source, x, y):
     return total
 
 
-@_inline
+@inlined
 def _lanczos_valid(source, valid, masked, x, y, left, top, full_width, full_height):
     """As `_lanczos`, of the valid pixels of the source only, with weights that sum to one; NaN if they cancel."""
     across, down = int(np.floor(x)), int(np.floor(y))
@@ -484,7 +482,7 @@ def _lanczos_valid(source, valid, masked, x, y, left, top, full_width, full_heig
     return total / weights if weights > 1e-6 else np.nan
 
 
-@_inline
+@inlined
 def _row_average(source, columns, rows, left, top, box, integer, out):
     everywhere = np.ones((1, 1), dtype=np.bool_)
     for k in range(columns.size):
@@ -492,7 +490,7 @@ def _row_average(source, columns, rows, left, top, box, integer, out):
         out[k] = np.floor(value + 0.5) if integer else value
 
 
-@_inline
+@inlined
 def _average_valid(source, valid, masked, col, row, box):
     """Mean of the valid pixels in a box about (col, row), each weighted by the area that lies in the box."""
     height, width = source.shape
@@ -509,7 +507,7 @@ def _average_valid(source, valid, masked, col, row, box):
     return total / area if area > 0.0 else np.nan
 
 
-@_inline
+@inlined
 def _edge_value(kernel, source, valid, masked, col, row, left, top, full_width, full_height, box):
     """Value at image point (col, row) where neighbours may be missing; its own pixel is valid.
 
@@ -536,7 +534,7 @@ def _edge_value(kernel, source, valid, masked, col, row, left, top, full_width, 
     return _bilinear(source, x, y, left, top, full_width, full_height)
 
 
-@_jit
+@compiled
 def _row_with_edges(
     kernel: int,
     source: Any,

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
-_jit = numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False)
-_inline = numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False, inline="always")
+from ortho_pipeline.compiled import compiled, inlined
 
 #: A cell counts as visible if it comes as close to the image as this (px), or as half of its own size.
 _NEAR = 4.0
@@ -21,7 +19,7 @@ _NEAR = 4.0
 _TRUST = 3.0
 
 
-@_jit
+@compiled
 def visible(image: Any, width: float, height: float, unknown: Any, cells: Any, area: Any) -> None:
     """Mark the cells that may show some of the image, and find the rectangle of cells around them.
 
@@ -42,7 +40,7 @@ def visible(image: Any, width: float, height: float, unknown: Any, cells: Any, a
         area[b, 2], area[b, 3] = (first if found else 0), last
 
 
-@_inline
+@inlined
 def _may_show(image, j, i, width, height, unknown):
     low_col, high_col, low_row, high_row = np.inf, -np.inf, np.inf, -np.inf
     whole = True
@@ -57,7 +55,7 @@ def _may_show(image, j, i, width, height, unknown):
     return near if whole else unknown
 
 
-@_jit
+@compiled
 def bounds(
     image: Any, coefficients: Any, dem: Any, cells: Any, spacing: int, points: Any, exact: Any, exact_dem: Any,
     error: Any, step: Any,
@@ -90,13 +88,13 @@ def bounds(
             error[b] = np.inf
 
 
-@_inline
+@inlined
 def _worse(first, second):
     """Return the larger; infinity where the second is not a number."""
     return max(first, second) if second <= np.inf else np.inf
 
 
-@_inline
+@inlined
 def _mark(cells, along, across):
     """Mark the nodes whose second differences count for visible cells, those of the next cell on included."""
     count, any_cell = cells.shape[0], False
@@ -112,7 +110,7 @@ def _mark(cells, along, across):
     return any_cell
 
 
-@_inline
+@inlined
 def _reach(image, cells):
     """Return how far the heights move a node, and how far apart nodes are, at most in visible cells (source px)."""
     count, parallax, step = cells.shape[0], 0.0, 0.0
@@ -129,12 +127,12 @@ def _reach(image, cells):
     return parallax, step
 
 
-@_inline
+@inlined
 def _distance(one, other):
     return np.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2)
 
 
-@_inline
+@inlined
 def _bent(nodes, along, across):
     """Return how far bilinear interpolation between nodes ``(n, n, 2)`` is off, as their second differences tell.
 
@@ -160,14 +158,14 @@ def _bent(nodes, along, across):
     return worst
 
 
-@_inline
+@inlined
 def _second(nodes, j, i, down, right):
     first = nodes[j - down, i - right, 0] - 2.0 * nodes[j, i, 0] + nodes[j + down, i + right, 0]
     second = nodes[j - down, i - right, 1] - 2.0 * nodes[j, i, 1] + nodes[j + down, i + right, 1]
     return first, second
 
 
-@_inline
+@inlined
 def _unexplained(coefficients, dem, cells, spacing, point, exact, exact_dem, parallax):
     """Return how far a check point is off beyond what the second differences foretell there (source px).
 
@@ -187,7 +185,7 @@ def _unexplained(coefficients, dem, cells, spacing, point, exact, exact_dem, par
     return np.sqrt(miss) + parallax * shift
 
 
-@_inline
+@inlined
 def _bowed(nodes, j, i, fx, fy):
     """Interpolate nodes ``(n, n)`` with the bow that their second differences foretell."""
     last = nodes.shape[0] - 2

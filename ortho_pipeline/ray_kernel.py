@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-_jit = numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False)
-_inline = numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False, inline="always")
+from ortho_pipeline.compiled import compiled, inlined
 
 
-@_inline
+@inlined
 def _clearance(u, v, t, heights, left, top, middle, half):
     """Height of the ray above the terrain at the normalised height t; NaN off the DEM and beside a void.
 
@@ -27,7 +25,7 @@ def _clearance(u, v, t, heights, left, top, middle, half):
     return middle + half * t - (upper + (lower - upper) * fy)
 
 
-@_jit
+@compiled
 def march(image, nodes, origin, spacing, heights, left, top, middle, half, tolerance, found):
     """Fill `found` ``(N,)`` with the heights at which rays first meet the terrain, from above; NaN where they do not.
 

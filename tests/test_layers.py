@@ -17,7 +17,7 @@ PACKAGE = ROOT / "ortho_pipeline"
 LAYERS = """
 errors options
 locations
-files crs geometry notebook
+files crs geometry notebook compiled
 point_table datum
 point_csv point_geojson point_lists point_ground
 point_files
@@ -52,7 +52,7 @@ cli
 LINE = {name: number for number, line in enumerate(LAYERS.split("\n")) for name in line.split()}
 GDAL_MODULES = {"locations", "raster", "raster_output", "raster_writer", "dem", "mosaic", "plugins"}
 GDAL_MODULES |= {"rpc", "stack", "gcp_export", "gdal_engine"}
-NUMBA_MODULES = {"kernels", "lattice_kernel", "ray_kernel", "models"}
+NUMBA_MODULES = {"compiled"}
 MAX_LINES, MAX_FUNCTION = 600, 50
 
 FILES = sorted(PACKAGE.rglob("*.py"))

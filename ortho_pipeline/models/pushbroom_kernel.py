@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-_jit = numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False)
-_inline = numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False, inline="always")
+from ortho_pipeline.compiled import compiled, inlined
 
 
-@_inline
+@inlined
 def _horner(pieces, i, k, d):
     """Value and slope of component k of piece i at d after its origin."""
     value, slope = 0.0, 0.0
@@ -24,7 +22,7 @@ def _horner(pieces, i, k, d):
     return value, slope
 
 
-@_inline
+@inlined
 def _series(terms, xi):
     """Value and slope of a polynomial at xi."""
     value, slope = 0.0, 0.0
@@ -34,7 +32,7 @@ def _series(terms, xi):
     return value, slope
 
 
-@_inline
+@inlined
 def _in_camera(px, py, pz, t, ends, origins, pieces, mount, lever):
     """Vector from camera to point in camera axes at time t and its rate; (px, py, pz) is in orbital axes."""
     i, above = 0, ends.shape[0]
@@ -74,7 +72,7 @@ def _in_camera(px, py, pz, t, ends, origins, pieces, mount, lever):
     )
 
 
-@_jit
+@compiled
 def project(ground, orbit, centre, ends, origins, pieces, mount, lever, camera, dx, dy, limits, image):
     """Fill `image` ``(N, 2)`` with the projections of `ground` ``(N, 3)`` (lon, lat in degrees, ellipsoidal height).
 

@@ -6,14 +6,12 @@ over the points does it all without temporary arrays.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-_jit = numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False)
-_inline = numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False, inline="always")
+from ortho_pipeline.compiled import compiled, inlined
 
 
-@_inline
+@inlined
 def _polynomial(a, x, y, z):
     """Value of an RPC00B polynomial with coefficients a at (L, P, H) = (x, y, z)."""
     return (
@@ -24,7 +22,7 @@ def _polynomial(a, x, y, z):
     )
 
 
-@_inline
+@inlined
 def _with_slopes(a, x, y, z):
     """Value and its derivatives by L and P."""
     by_x = (
@@ -42,7 +40,7 @@ def _with_slopes(a, x, y, z):
     return _polynomial(a, x, y, z), by_x, by_y
 
 
-@_jit
+@compiled
 def project(ground, offsets, scales, coefficients, limit, image):
     """Fill `image` ``(N, 2)`` with the projections of `ground` ``(N, 3)`` (lon, lat, h).
 
@@ -65,7 +63,7 @@ def project(ground, offsets, scales, coefficients, limit, image):
         image[k, 1] = row if good else np.nan
 
 
-@_jit
+@compiled
 def intersect(image, heights, offsets, scales, coefficients, start, limit, tolerance, verified, steps, ground):
     """Fill `ground` ``(N, 3)`` with the points at ellipsoidal `heights` ``(N,)`` whose projections are `image`.
 
