@@ -395,6 +395,33 @@ def register(
     print_result(bands.register(images, folder, reference=reference, transform=transform, scene=scene), as_json)
 
 
+@cli.command("dem-check")
+@click.argument("dem", type=click.Path())
+@click.option("--points", required=True, metavar="FILE", help="Check heights: CSV or GeoJSON with x, y, h.")
+@click.option("--points-crs", "crs", metavar="CRS", help="CRS of the points, where their file has none.")
+@click.option("--points-vertical", "vertical", metavar="DATUM", help="Their height datum: ellipsoid, egm96, EPSG:n ...")
+@click.option("--dem-vertical", metavar="DATUM", help="Height datum of the DEM, where it does not say it.")
+@click.option("--override-dem-vertical", is_flag=True, help="Believe --dem-vertical where the DEM says otherwise.")
+@click.option("--allow-network", is_flag=True, help="Open URLs and /vsi paths too.")
+@json_option
+def dem_check(
+    dem: str,
+    points: str,
+    crs: str | None,
+    vertical: str | None,
+    dem_vertical: str | None,
+    override_dem_vertical: bool,
+    allow_network: bool,
+    as_json: bool,
+) -> None:
+    """Compare a DEM with check heights: bias, RMSE, NMAD and LE90, also by the slope of the terrain."""
+    from ortho_pipeline import pipeline
+
+    surface = SurfaceOptions(vertical=dem_vertical, override_vertical=override_dem_vertical)
+    scene = SceneOptions(allow_network=allow_network)
+    print_result(pipeline.dem_check(dem, points, crs=crs, vertical=vertical, surface=surface, scene=scene), as_json)
+
+
 @cli.command()
 @json_option
 def doctor(as_json: bool) -> None:

@@ -206,7 +206,7 @@ class Surface:
         self._set_affine((x + 0.5 * (a + b), a, b, y + 0.5 * (c + d), c, d))
         scale, offset = band.GetScale(), band.GetOffset()
         self._scale, self._offset = (1.0 if scale is None else scale), (0.0 if offset is None else offset)
-        self._spacing = int(np.clip(UNDULATION_SPACING / self._sample_metres(), 1, 64))
+        self._spacing = int(np.clip(UNDULATION_SPACING / self.sample_size, 1, 64))
         return crs
 
     def _set_affine(self, crs_from_pixel: tuple[float, float, float, float, float, float]) -> None:
@@ -218,7 +218,9 @@ class Surface:
             float(shift[1]), float(inverse[1, 0]), float(inverse[1, 1]),
         )  # fmt: skip
 
-    def _sample_metres(self) -> float:
+    @property
+    def sample_size(self) -> float:
+        """Larger side of a sample, in metres (on the equator where the DEM is in degrees)."""
         _, a, b, _, c, d = self._crs_from_pixel
         unit = 111320.0 if self.crs.is_geographic else self.crs.axis_info[0].unit_conversion_factor
         return unit * max(math.hypot(a, c), math.hypot(b, d))

@@ -21,7 +21,7 @@ import pyproj
 
 from ortho_pipeline import comparison as comparing
 from ortho_pipeline import crs as crs_module
-from ortho_pipeline import dem, footprint, gcp_export, inputs, plugins, raster, report, resolution, rpc
+from ortho_pipeline import dem, dem_accuracy, footprint, gcp_export, inputs, plugins, raster, report, resolution, rpc
 from ortho_pipeline import stac as stac_items
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import Fit
@@ -412,6 +412,45 @@ def edge(
         write_text(files["json"], json.dumps(document, indent=1, allow_nan=False) + "\n")
         write_text(files["svg"], resolution.plot(resolution.typical(found)).svg(alone=True) + "\n")
     return Result(files, document, resolution.text(document))
+
+
+def dem_check(
+    dem_file: str | os.PathLike[str],
+    points: str | os.PathLike[str],
+    *,
+    crs: str | None = None,
+    vertical: str | None = None,
+    surface: SurfaceOptions = SurfaceOptions(),
+    scene: SceneOptions = SceneOptions(),
+) -> Result:
+    """Compare a DEM with check heights, by the slope of the terrain.
+
+    Parameters
+    ----------
+    points : path
+        CSV or GeoJSON with x, y and h.
+    crs, vertical : str, optional
+        What they are in, where the file does not say it.
+    surface : SurfaceOptions
+        How the heights of the DEM are to be understood.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be used, or no check point lies on the DEM.
+    """
+    heights = open_surface(replace(surface, dem=dem_file), scene)
+    ground, plane, ids = dem_accuracy.read_check_heights(points, crs, vertical)
+    found = dem_accuracy.check_dem(heights, ground, plane, ids)
+    if not found.overall.count:
+        raise InputError(
+            f"none of the {len(ids)} check points has a height in this DEM", file=dem_file, field="--points",
+            remedy="check the CRS of the points, and whether they lie on the DEM",
+        )  # fmt: skip
+    document = {
+        "dem": str(dem_file), "check_points": str(points), "surface": dict(heights.provenance), **found.to_json()
+    }  # fmt: skip
+    return Result({}, document, dem_accuracy.summary(document))
 
 
 def doctor() -> dict[str, Any]:

@@ -48,7 +48,7 @@ def read_table(
 
 
 def read_block_table(path: str | os.PathLike[str], layout: Layout = OF_BLOCK) -> Table:
-    """Read the rays of a block, or with `OF_GROUND` ground alone: CSV, GeoJSON, and rays as ODM list or ASP file.
+    """Read the rays of a block, or ground alone (`OF_GROUND`, `OF_HEIGHTS`): CSV, GeoJSON; rays as ODM or ASP too.
 
     Raises
     ------

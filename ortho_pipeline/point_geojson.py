@@ -13,7 +13,6 @@ from typing import Any
 from ortho_pipeline.errors import CrsError, InputError
 from ortho_pipeline.point_table import (
     OF_BLOCK,
-    OF_GROUND,
     OF_IMAGE,
     Layout,
     Row,
@@ -91,7 +90,7 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, layout: Lay
         sigma_xy=sigma("sigma_xy", True),
         sigma_h=sigma("sigma_h", True),
     )
-    if layout is OF_GROUND:
+    if "col" not in layout.needed:
         return [row]
     return [replace(row, image=at, image_name=image) for image, at in _measured(path, where, properties, layout)]
 

@@ -36,9 +36,10 @@ class Layout(NamedTuple):
     role: str
 
 
-#: Points of one image; rays of a block, whose ground may be known; ground alone.
+#: Points of one image; rays of a block, whose ground may be known; ground whose heights count; ground alone.
 OF_IMAGE = Layout((*CSV_COLUMNS, CSV_IMAGE), CSV_COLUMNS[1:5], "control")
 OF_BLOCK = Layout(("id", CSV_IMAGE, *CSV_COLUMNS[1:]), ("id", CSV_IMAGE, "col", "row"), "")
+OF_HEIGHTS = Layout((*CSV_COLUMNS, CSV_IMAGE), CSV_COLUMNS[3:6], "check")
 OF_GROUND = Layout(("id", *CSV_COLUMNS[3:7], *CSV_COLUMNS[8:]), ("id", "x", "y"), "")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 

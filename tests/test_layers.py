@@ -36,7 +36,7 @@ raster_output
 raster_writer
 rpc dem preview edge outline crop stack
 plugins rays gdal_engine resolution
-footprint lattice simulate inputs testing
+footprint lattice simulate inputs testing dem_accuracy
 gcp_export scene_fit warp mosaic
 scene_layout
 report experiments stac block_images results

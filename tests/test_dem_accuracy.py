@@ -1,0 +1,140 @@
+"""A DEM against check heights: what was put into a DEM is found, by slope, in any CRS and height datum."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from osgeo import gdal, osr
+
+from ortho_pipeline.cli import cli
+from ortho_pipeline.crs import Vertical, ground_transform, parse_crs
+from ortho_pipeline.dem import Surface
+from ortho_pipeline.dem_accuracy import check_dem, read_check_heights, slopes_at
+from ortho_pipeline.errors import InputError
+
+UTM = "EPSG:32634"
+WEST, NORTH, STEP, SIDE = 500_000.0, 4_000_000.0, 10.0, 300
+#: Slopes (degrees) of the three strips of the terrain, each a third of its width.
+STRIPS = (2.0, 15.0, 35.0)
+
+
+def terrain(x):
+    """Return heights over x: three planes, one after the other, that rise eastwards."""
+    along = x - WEST
+    third = SIDE * STEP / 3
+    return 100.0 + sum(
+        np.tan(np.radians(slope)) * np.clip(along - k * third, 0, third) for k, slope in enumerate(STRIPS)
+    )
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A DEM 1.5 m too high that lies 4 m too far east, above EGM96, and 600 check points with 0.1 m of noise."""
+    folder = tmp_path_factory.mktemp("dem")
+    random = np.random.default_rng(5)
+    x = WEST + STEP * (np.arange(SIDE) + 0.5)
+    heights = np.tile(terrain(x - 4.0) + 1.5, (SIDE, 1)).astype(np.float32)
+    dataset = gdal.GetDriverByName("GTiff").Create(str(folder / "dem.tif"), SIDE, SIDE, 1, gdal.GDT_Float32)
+    dataset.SetGeoTransform((WEST, STEP, 0, NORTH, 0, -STEP))
+    system = osr.SpatialReference()
+    system.ImportFromEPSG(32634)
+    dataset.SetSpatialRef(system)
+    dataset.WriteArray(heights)
+    dataset = None
+    east = random.uniform(WEST + 100, WEST + SIDE * STEP - 100, 600)
+    north = random.uniform(NORTH - SIDE * STEP + 100, NORTH - 100, 600)
+    measured = terrain(east) + random.normal(0, 0.1, 600)
+    lines = ["#vertical: egm96", f"#CRS: {UTM}", "id,x,y,h"]
+    lines += [f"c{k},{a:.3f},{b:.3f},{h:.3f}" for k, (a, b, h) in enumerate(zip(east, north, measured, strict=True))]
+    (folder / "heights.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def opened(made, **options):
+    return Surface.open(made / "dem.tif", Vertical.parse("egm96"), **options)
+
+
+def test_the_error_of_each_class_of_slope_is_found(made):
+    """A shift of 4 m in plan is 4 m times the tangent of the slope in height, beside the bias of 1.5 m."""
+    ground, crs, ids = read_check_heights(made / "heights.csv")
+    found = check_dem(opened(made), ground, crs, ids)
+    assert found.overall.count == 600
+    expected = {(0.0, 5.0): 2.0, (10.0, 20.0): 15.0, (30.0, None): 35.0}
+    seen = {(low, high): errors for low, high, errors in found.by_slope() if errors.count > 20}
+    assert set(seen) == set(expected)
+    for limits, slope in expected.items():
+        errors, bias = seen[limits], 1.5 - 4.0 * np.tan(np.radians(slope))
+        # 200 points of 0.1 m: the median is known to 0.01 m; the geoid of both is the same within a millimetre.
+        assert errors.median == pytest.approx(bias, abs=0.03)
+        assert errors.nmad == pytest.approx(0.1, rel=0.25)
+        assert errors.le90 == pytest.approx(abs(bias) + 1.2816 * 0.1, abs=0.05)
+
+
+def test_slopes_are_those_of_the_terrain(made):
+    surface = opened(made)
+    lonlat, _, _ = read_check_heights(made / "heights.csv")
+    degrees = slopes_at(surface, ground_transform(parse_crs(UTM), "EPSG:4979")(lonlat)[:, :2])
+    third = SIDE * STEP / 3
+    for k, slope in enumerate(STRIPS):
+        inside = np.abs(lonlat[:, 0] - WEST - (k + 0.5) * third) < third / 2 - 3 * STEP
+        np.testing.assert_allclose(degrees[inside], slope, atol=0.05)
+
+
+def test_another_datum_of_the_points_is_undone(made, tmp_path):
+    text = (made / "heights.csv").read_text().splitlines()
+    ground, _, _ = read_check_heights(made / "heights.csv")
+    rows = [line.rsplit(",", 1)[0] + f",{h:.3f}" for line, h in zip(text[3:], ground[:, 2], strict=True)]
+    path = tmp_path / "ellipsoidal.csv"
+    path.write_text("\n".join(["#vertical: ellipsoid", *text[1:3], *rows]))
+    again, crs, ids = read_check_heights(path)
+    one, other = check_dem(opened(made), ground, crs, ids), check_dem(opened(made), again, crs, ids)
+    np.testing.assert_allclose(one.differences, other.differences, atol=2e-3)
+
+
+def test_gross_errors_and_points_off_the_dem_are_told(made, tmp_path):
+    path = tmp_path / "points.csv"
+    more = [f"wild,{WEST + 500},{NORTH - 500},999", f"away,{WEST - 9000},{NORTH - 500},100"]
+    head = (made / "heights.csv").read_text().splitlines()[:60]
+    path.write_text("\n".join([*head, *more]) + "\n")
+    done = CliRunner().invoke(
+        cli, ["dem-check", str(made / "dem.tif"), "--points", str(path), "--dem-vertical", "egm96", "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    assert document["gross"] == ["wild"]
+    assert document["without_height"] == 1
+    assert document["overall"]["count"] == 58
+    text = CliRunner().invoke(
+        cli, ["dem-check", str(made / "dem.tif"), "--points", str(path), "--dem-vertical", "egm96"]
+    )
+    assert "far from all others (they count all the same): wild" in text.stdout
+
+
+def test_gcps_of_an_image_are_check_heights_too(tiny):
+    done = CliRunner().invoke(cli, ["dem-check", str(tiny.dem), "--points", str(tiny.gcps), "--points-crs", "EPSG:4979",
+                                    "--points-vertical", "ellipsoid", "--dem-vertical", "ellipsoid", "--json"])  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["overall"]["count"] == 12
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ("id,x,y\na,1,2\n", "no column h"),
+        ("id,x,y,h\na,500100,3999900,\n", "not a number"),
+    ],
+)
+def test_points_without_heights_are_refused(tmp_path, rows, said):
+    path = tmp_path / "p.csv"
+    path.write_text(rows)
+    with pytest.raises(InputError, match=said):
+        read_check_heights(path, UTM, "ellipsoid")
+
+
+def test_a_datum_is_never_guessed(made):
+    done = CliRunner().invoke(cli, ["dem-check", str(made / "dem.tif"), "--points", str(made / "heights.csv")])
+    assert done.exit_code == 2
+    assert "--dem-vertical" in done.output + done.stderr
