@@ -114,8 +114,8 @@ def test_gross_errors_and_points_off_the_dem_are_told(made, tmp_path):
 
 
 def test_gcps_of_an_image_are_check_heights_too(tiny):
-    done = CliRunner().invoke(cli, ["dem-check", str(tiny.dem), "--points", str(tiny.gcps), "--points-crs", "EPSG:4979",
-                                    "--points-vertical", "ellipsoid", "--dem-vertical", "ellipsoid", "--json"])  # fmt: skip
+    datums = ["--points-crs", "EPSG:4979", "--points-vertical", "ellipsoid", "--dem-vertical", "ellipsoid"]
+    done = CliRunner().invoke(cli, ["dem-check", str(tiny.dem), "--points", str(tiny.gcps), *datums, "--json"])
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["overall"]["count"] == 12
 
