@@ -136,6 +136,7 @@ class RasterWriter:
         self.path, self.grid, self.profile, self.driver = Path(path), grid, profile, driver
         self.options = checked_options(driver, dict(creation_options or {}), threads)
         self._lock = threading.Lock()
+        self._written = 0
         self._open = contextlib.ExitStack()
 
     def __enter__(self) -> RasterWriter:
@@ -162,6 +163,7 @@ class RasterWriter:
     def write(self, left: int, top: int, pixels: NDArray[Any], valid: NDArray[np.bool_] | None) -> None:
         """Write a window ``(count, h, w)``; `valid` ``(h, w)`` goes to the mask, if the profile has one."""
         with self._lock, gdal_errors(self.path):
+            self._written += pixels.shape[1] * pixels.shape[2]
             self._dataset.WriteArray(pixels, left, top)
             if self.profile.validity == "mask" and valid is not None:
                 mask = valid.view(np.uint8) * np.uint8(255)
@@ -199,7 +201,9 @@ class RasterWriter:
                 source = gdal.OpenEx(str(self._work), gdal.OF_RASTER, allowed_drivers=["GTiff"])
                 options = [f"{k}={v}" for k, v in self.options.items()]
                 close(gdal.GetDriverByName("COG").CreateCopy(str(self._temporary), source, options=options))
-        sparse = self.options.get("SPARSE_OK", "NO").upper() in ("YES", "TRUE", "ON")
+        # GDAL leaves out blocks of a file beyond 4 GB into which nothing was written.
+        partly = self._written < self.grid.width * self.grid.height
+        sparse = partly or self.options.get("SPARSE_OK", "NO").upper() in ("YES", "TRUE", "ON")
         check_written(self._temporary, self.path, size=(self.grid.width, self.grid.height), sparse=sparse)
 
     def scratch(self, name: str) -> Path:
