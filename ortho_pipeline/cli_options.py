@@ -341,7 +341,7 @@ output_options = _grouped(
         type=click.Choice(["ortho", "gdal"]),
         default="ortho",
         show_default=True,
-        help="Our warper, or GDAL's exact one (slow; for comparison).",
+        help="Our warper, or GDAL's with its own transformers, exactly (slow; for comparison).",
     ),
     click.option(
         "--memory",

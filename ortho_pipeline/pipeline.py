@@ -547,11 +547,7 @@ def _warp(
         )  # fmt: skip
     if output.engine != "gdal":
         raise InputError(f"no engine is called {output.engine!r}", field="--engine", remedy="ortho or gdal")
-    if exported is None:
-        raise InputError("GDAL's warper needs an RPC, and none stands for this model", field="--engine", remedy="ortho")
-    return warp.rectify_gdal(
-        rpc.rpc_metadata(exported.rpc), source, surface, grid, path, rpc_error=exported.max_error_px, **common
-    )
+    return warp.rectify_gdal(model, exported, source, surface, grid, path, **common)
 
 
 def _write_models(

@@ -116,7 +116,8 @@ def summary_text(report: Mapping[str, Any]) -> str:
         steps = " x ".join(short(step) for step in ortho["resolution"])
         rows.append(("ortho", f"{size_text(ortho['size'])} px of {steps} {ortho['unit']}, {ortho['crs']}"))
     if warp := report["warp"]:
-        rows.append(("warp", f"{px(warp['max_error_px'])} at worst from the exact model"))
+        by = f" (GDAL's {name} transformer)" if (name := warp.get("transformer")) else ""
+        rows.append(("warp", f"{px(warp['max_error_px'])} at worst from the exact model{by}"))
     # The headline and the rows above have said these already.
     said = " ".join(value for _, value in rows).lower()
     known = ("left out", "no redundancy", "check points: fewer")

@@ -27,6 +27,7 @@ from ortho_pipeline.lattice import BLOCK, Block, Lattices, Terrain, block_cells
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster import Grid, RasterSource, limit_cache
 from ortho_pipeline.raster_writer import Profile, RasterWriter, as_written
+from ortho_pipeline.rpc import RpcExport
 
 #: Side of a tile, the piece of work of a thread.
 TILE = 4 * BLOCK
@@ -48,7 +49,8 @@ class WarpResult:
 
     `max_error_px` is a bound on the difference (source pixels) between the geometry used and the exact model at every
     output pixel; `finest_spacing` the smallest lattice spacing that a block needed, 1 where every pixel was projected;
-    `valid_pixels` how many output pixels have a value.
+    `valid_pixels` how many output pixels have a value. `transformer` names the one of GDAL's that stood for the model,
+    where GDAL's warper made the pixels: then the error is what was measured through it.
     """
 
     max_error_px: float
@@ -59,6 +61,7 @@ class WarpResult:
     pixels: int
     valid_pixels: int
     seconds: float
+    transformer: str | None = None
 
 
 def rectify(
@@ -126,13 +129,13 @@ def rectify(
 
 
 def rectify_gdal(
-    rpc: Mapping[str, str],
+    model: SensorModel,
+    exported: RpcExport | None,
     source: RasterSource,
     surface: Surface,
     grid: Grid,
     path: str | os.PathLike[str],
     *,
-    rpc_error: float = 0.0,
     resampling: str = "bilinear",
     memory: int = 512_000_000,
     threads: int | None = None,
@@ -141,32 +144,37 @@ def rectify_gdal(
     profile: Profile | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> WarpResult:
-    """Write the orthoimage by GDAL's own warper with its exact RPC transformer: a cross-check of `rectify`.
+    """Write the orthoimage by GDAL's own warper with one of its exact transformers: a cross-check of `rectify`.
 
     Parameters
     ----------
-    rpc : mapping
-        GDAL's ``RPC`` metadata of the model (`rpc.rpc_metadata`).
-    rpc_error : float
-        How far (px) that RPC is off the model which it stands for: GDAL's transformer adds nothing to it.
+    exported : RpcExport or None
+        The RPC that stands for the model (`rpc.export_rpc`), where there is one; GDAL's polynomials, homography and
+        geolocation arrays stand for others (`gdal_engine`).
+
+    Raises
+    ------
+    InputError
+        As `rectify`; for an image in several files; if no transformer of GDAL stands for the model within 0.1 px.
     """
     begin = time.monotonic()
     _check(source, resampling, "bilinear", 1.0)
     surface = _seamless(surface, grid)
-    valid = warp_with_gdal(
-        source, rpc, _heights_under(surface, grid), grid, path, resampling=resampling, driver=driver,
+    transformer, valid = warp_with_gdal(
+        model, exported, source, surface, grid, path, resampling=resampling, driver=driver,
         creation_options=creation_options, memory=memory, threads=threads or os.cpu_count() or 1, profile=profile,
         progress=progress,
     )  # fmt: skip
     return WarpResult(
-        max_error_px=rpc_error,
-        tolerance_px=rpc_error,
+        max_error_px=transformer.max_error_px,
+        tolerance_px=transformer.limit,
         finest_spacing=1,
         refined_blocks=0,
         blocks=0,
         pixels=grid.width * grid.height,
         valid_pixels=valid,
         seconds=time.monotonic() - begin,
+        transformer=transformer.method,
     )
 
 
@@ -176,29 +184,6 @@ def _seamless(surface: Surface, grid: Grid) -> Surface:
         return surface
     x, y = grid.xy(np.array([grid.width / 2]), np.array([grid.height / 2]))
     return surface.around(float(GroundTransform(grid.crs, "EPSG:4979")([[x[0], y[0], 0.0]])[0, 0]))
-
-
-def _heights_under(surface: Surface, grid: Grid) -> tuple[Array, tuple[float, ...], Any] | float:
-    """Return the ellipsoidal heights under a grid with their geotransform and CRS, for GDAL."""
-    if surface.constant_height is not None:
-        return surface.constant_height
-    columns, rows = np.meshgrid(np.linspace(0, grid.width, 65), np.linspace(0, grid.height, 65))
-    x, y = grid.xy(columns.ravel(), rows.ravel())
-    plan = GroundTransform(grid.crs, surface.crs)(np.stack([x, y, np.zeros(x.size)], axis=1))
-    if surface.crs.is_geographic and np.ptp(plan[:, 0]) > 180:
-        raise InputError(
-            "GDAL's warper loses the pixels on one side of the antimeridian with a DEM in longitude and latitude",
-            field="--engine", remedy="take our own engine (--engine ortho), or a DEM in a projected CRS",
-        )  # fmt: skip
-    samples = surface.samples_at(plan[:, :2])
-    low = np.floor(np.nanmin(samples, axis=0)).astype(int) - 3
-    size = np.ceil(np.nanmax(samples, axis=0)).astype(int) + 4 - low
-    heights = surface.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]))
-    u, a, b, v, c, d = surface.pixel_from_crs
-    inverse = np.linalg.inv([[a, b], [c, d]])
-    # GDAL's geotransform starts at the corner of the first sample.
-    corner = inverse @ (low - 0.5 - np.array([u, v]))
-    return heights, (corner[0], inverse[0, 0], inverse[0, 1], corner[1], inverse[1, 0], inverse[1, 1]), surface.crs
 
 
 def _check(source: RasterSource, resampling: str, dem_interpolation: str, tolerance: float) -> None:

@@ -22,7 +22,7 @@ from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models import RPC, SensorModel
 from ortho_pipeline.raster import Grid, RasterSource
-from ortho_pipeline.rpc import rpc_metadata
+from ortho_pipeline.rpc import export_rpc, rpc_metadata
 from ortho_pipeline.warp import rectify, rectify_gdal
 
 UTM = pyproj.CRS.from_epsg(32735)
@@ -183,7 +183,14 @@ def test_values_are_those_of_exact_gdalwarp(scene, tmp_path, kernel):
     source, surface, grid = RasterSource(scene.write(texture())), scene.surface(), grid_of()
     rectify(scene.model, source, surface, grid, tmp_path / "ours.tif", resampling=kernel, driver="GTiff")
     rectify_gdal(
-        rpc_metadata(scene.model), source, surface, grid, tmp_path / "gdal.tif", resampling=kernel, driver="GTiff"
+        scene.model,
+        export_rpc(scene.model),
+        source,
+        surface,
+        grid,
+        tmp_path / "gdal.tif",
+        resampling=kernel,
+        driver="GTiff",
     )
     (ours, valid), (theirs, their_valid) = read(tmp_path / "ours.tif"), read(tmp_path / "gdal.tif")
     use = inner(exact_image(scene.model, tmp_path / "dem.tif", grid), 4) & valid & their_valid
@@ -203,7 +210,14 @@ def test_lanczos_is_that_of_gdalwarp_at_edges_and_beside_nodata(scene, tmp_path,
     source, surface, grid = RasterSource(scene.write(pixels, nodata=nodata)), scene.surface(), grid_of()
     rectify(scene.model, source, surface, grid, tmp_path / "ours.tif", resampling="lanczos", driver="GTiff")
     rectify_gdal(
-        rpc_metadata(scene.model), source, surface, grid, tmp_path / "gdal.tif", resampling="lanczos", driver="GTiff"
+        scene.model,
+        export_rpc(scene.model),
+        source,
+        surface,
+        grid,
+        tmp_path / "gdal.tif",
+        resampling="lanczos",
+        driver="GTiff",
     )
     (ours, valid), (theirs, their_valid) = read(tmp_path / "ours.tif"), read(tmp_path / "gdal.tif")
     difference = np.abs(ours.astype(int) - theirs)[0][valid & their_valid]
@@ -726,7 +740,7 @@ def test_names_with_brackets_leave_nothing_behind(scene, tmp_path):
 def test_gdals_warper_refuses_several_files(scene, tmp_path):
     source = RasterSource(scene.write(texture(), "a.tif"), scene.write(texture(), "b.tif"))
     with pytest.raises(InputError, match="one file"):
-        rectify_gdal(rpc_metadata(scene.model), source, Surface.constant(700.0), grid_of(50.0), tmp_path / "o.tif")
+        rectify_gdal(scene.model, None, source, Surface.constant(700.0), grid_of(50.0), tmp_path / "o.tif")
 
 
 def vrt(path: Path, source: str) -> Path:
