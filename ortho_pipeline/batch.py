@@ -161,7 +161,7 @@ def _check_versions(job: Job) -> None:
 
 def _still_good(record: Record | None, job: Job, listing: str, verify: bool) -> Record | None:
     """Return the record with the present dates if inputs, settings and outputs have the content recorded."""
-    if record is None or record.status != "done":
+    if record is None or record.status != "done" or not isinstance(record.facts.get("lean_m_per_m"), int | float):
         return None
     if not verify:
         _digests.learn(record.inputs)

@@ -10,14 +10,14 @@ import difflib
 import os
 import re
 from collections.abc import Hashable, Mapping
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pydantic
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.files import read_bounded
 
 _MAX_BYTES = 5_000_000
 _MAX_DEPTH, _MAX_EVENTS = 20, 300_000
@@ -197,6 +197,7 @@ def merged(*layers: Settings) -> Settings:
 # -- reading ---------------------------------------------------------------------------------------------------------
 
 
+@reads("see docs/run.md for the form of the file")
 def read_config(path: str | os.PathLike[str]) -> Config:
     """Read a pipeline file.
 
@@ -205,12 +206,9 @@ def read_config(path: str | os.PathLike[str]) -> Config:
     InputError
         For anything that is not as the schema has it: the message names line, field and remedy.
     """
-    try:
-        if Path(path).stat().st_size > _MAX_BYTES:
-            raise InputError("a pipeline file of more than 5 MB is not read", file=path, remedy="use patterns")
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path, remedy="check the path") from error
+    content = read_bounded(path, _MAX_BYTES, remedy="check the path")
+    if len(content) > _MAX_BYTES:
+        raise InputError("a pipeline file of more than 5 MB is not read", file=path, remedy="use patterns")
     document, lines = _parse(content, path)
     try:
         return Config.model_validate(document)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import hashlib
 import json
 import os
@@ -19,11 +20,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pydantic
+
 from ortho_pipeline import files
 from ortho_pipeline.errors import InputError
 
 SCHEMA_VERSION = 1
 DOCUMENT = "ortho-pipeline scene record"
+_MAX_BYTES = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -46,14 +50,21 @@ class FileState:
         """Tell whether size and time of change are those recorded; `folder` is that of a relative path."""
         try:
             stat = os.stat(folder / self.path if folder else self.path)
-        except OSError:
+        except (OSError, ValueError):
             return False
         return (stat.st_size, stat.st_mtime_ns) == (self.bytes, self.mtime_ns)
 
     def same(self, folder: Path) -> bool:
         """Tell whether the file in `folder` has the content recorded."""
-        path = folder / self.path
-        return self.untouched(folder) or (path.is_file() and files.sha256(path) == self.sha256)
+        return self.untouched(folder) or self.identical(folder)
+
+    def identical(self, folder: Path) -> bool:
+        """Tell whether the file in `folder` has the content recorded, whatever its dates say."""
+        try:
+            return (folder / self.path).is_file() and files.sha256(folder / self.path) == self.sha256
+        except (OSError, ValueError):
+            # A name that no file can have, or a file that cannot be read.
+            return False
 
 
 @dataclass(frozen=True)
@@ -100,12 +111,11 @@ class Record:
     def read(cls, path: Path) -> Record | None:
         """Return the record, or None where there is none of this version that can be understood."""
         try:
-            document = json.loads(path.read_text(encoding="utf-8"))
+            document = files.read_json(path, _MAX_BYTES, "run again")
             if (document.pop("document"), document.pop("schema_version")) != (DOCUMENT, SCHEMA_VERSION):
                 return None
-            inputs, outputs = (tuple(FileState(**one) for one in document.pop(name)) for name in ("inputs", "outputs"))
-            record = cls(**document, inputs=inputs, outputs=outputs)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            record = _checked().validate_python(document)
+        except (InputError, ValueError, KeyError, TypeError, AttributeError):
             return None
         # What is outside of the scene's folder is not ours to judge, or to remove.
         return record if all(Path(one.path).name == one.path for one in record.outputs) else None
@@ -113,9 +123,14 @@ class Record:
     def intact(self, folder: Path, verify: bool = False) -> bool:
         """Tell whether all outputs are as they were written; with `verify` by content whatever their dates say."""
         if verify:
-            return all((folder / one.path).is_file() and files.sha256(folder / one.path) == one.sha256
-                       for one in self.outputs)  # fmt: skip
+            return all(one.identical(folder) for one in self.outputs)
         return all(one.same(folder) for one in self.outputs)
+
+
+@functools.cache
+def _checked() -> pydantic.TypeAdapter[Record]:
+    """Return what makes a record of a document whose values are of the types that its fields say."""
+    return pydantic.TypeAdapter(Record)
 
 
 def key_of(inputs: Sequence[FileState], configuration: Mapping[str, Any], versions: Mapping[str, Any]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import glob
+import itertools
 import os
 import re
 import unicodedata
@@ -18,7 +19,7 @@ import pyproj
 
 from ortho_pipeline import plugins, raster
 from ortho_pipeline.batch_config import Config, Entry, MosaicSettings, Settings, merged, read_config
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.inputs import OWN_POINTS
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 
@@ -28,6 +29,7 @@ STATE = ".run"
 RUN_FILES = {"log": "run.jsonl", "summary": "run.json", "catalog": "catalog.json", "seams": "mosaic.json"}
 _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _NAME_BYTES = 150
+_WALKS, _PATTERN_BYTES = 2, 1000
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,7 @@ class Plan:
         return jobs[part - 1 :: parts]
 
 
+@reads("see docs/run.md for the form of the file")
 def plan(path: str | os.PathLike[str]) -> Plan:
     """Read a pipeline file and work out its scenes.
 
@@ -158,9 +161,10 @@ class _Planner:
         if entry.image is not None:
             return [self._inside(entry.image, f"scenes[{number}].image")]
         found: dict[Path, None] = {}
-        excluded = {image for pattern in _listed(entry.exclude) for image in self._matches(pattern)}
+        excluded = {image for pattern in _listed(entry.exclude)
+                    for image in self._matches(pattern, f"scenes[{number}].exclude")}  # fmt: skip
         for pattern in _listed(entry.images):
-            matches = [image for image in self._matches(pattern) if image not in excluded]
+            matches = [image for image in self._matches(pattern, f"scenes[{number}].images") if image not in excluded]
             if not matches:
                 raise InputError(
                     f"nothing matches {pattern!r}", file=self.path, field=f"scenes[{number}].images",
@@ -170,7 +174,16 @@ class _Planner:
                 found[self._inside(str(image), f"scenes[{number}].images")] = None
         return list(found)
 
-    def _matches(self, pattern: str) -> list[Path]:
+    def _matches(self, pattern: str, field: str) -> list[Path]:
+        parts = pattern.split("/")
+        # Every ** walks all folders below each that the one before it found.
+        if parts.count("**") > _WALKS or len(os.fsencode(pattern)) > _PATTERN_BYTES:
+            raise InputError(
+                f"{pattern[:60]!r} is too long a search", file=self.path, field=field,
+                remedy=f"at most {_WALKS} times ** and {_PATTERN_BYTES} bytes in a pattern",
+            )  # fmt: skip
+        # Nothing outside of the root is searched either.
+        self._inside("/".join(itertools.takewhile(lambda part: not glob.has_magic(part), parts)) or ".", field)
         names = glob.glob(os.path.join(glob.escape(str(self.base)), pattern), recursive=True)
         paths = [Path(os.path.abspath(name)) for name in sorted(names) if os.path.isfile(name)]
         # A pattern with ** would take the orthos of the last run for scenes.
@@ -230,7 +243,15 @@ class _Planner:
         if "\0" in text or "://" in text or text.startswith("/vsi"):
             raise InputError(f"{text!r} is no path of a file", file=self.path, field=field, remedy="give a file")
         path = Path(os.path.abspath(self.base / text))
-        if not path.resolve().is_relative_to(self.root):
+        try:
+            resolved = path.resolve()
+            path.is_file()
+        except (OSError, RuntimeError, ValueError) as error:
+            # Names longer than the file system's, links in a circle, surrogates.
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"{text[:60]!r} is no path of a file ({reason})", file=self.path, field=field,
+                             remedy="check the name, and the links on its way") from error  # fmt: skip
+        if not resolved.is_relative_to(self.root):
             raise InputError(
                 f"{text} lies outside of the root {self.root}", file=self.path, field=field,
                 remedy="move it there, or widen 'root:' in the file",
@@ -244,9 +265,9 @@ class _Planner:
         """Return the path of a value that names a file, any other value as it is."""
         text = self._filled(text, image, field)
         looks = os.sep in text and not text.startswith("+")
-        if looks or (self.base / text).is_file():
+        if looks or _is_file(self.base / text):
             return str(self._inside(text, field))
-        if Path(text).is_file():
+        if _is_file(Path(text)):
             raise InputError(
                 f"{text!r} is a file of the current folder, but paths are relative to the pipeline file",
                 file=self.path, field=field, remedy=f"give its path relative to {self.base}",
@@ -304,6 +325,14 @@ class _Planner:
 def for_run(jobs: Sequence[Job], run: str, memory: int, threads: int | None) -> list[Job]:
     """Return the jobs of a run, with the bytes and threads that each may use."""
     return [replace(job, run=run, ortho=replace(job.ortho, memory=memory, threads=threads)) for job in jobs]
+
+
+def _is_file(path: Path) -> bool:
+    """Tell whether there is a file of this name; a text that can be no name is none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def _listed(patterns: str | Sequence[str] | None) -> list[str]:

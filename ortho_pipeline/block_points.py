@@ -17,7 +17,7 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.crs import Vertical, ground_transform, horizontal, same_crs
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.point_files import read_block_table
 from ortho_pipeline.point_ground import ground_of
@@ -246,6 +246,7 @@ def _agree(
 # -- reading ---------------------------------------------------------------------------------------------------------
 
 
+@reads("see docs/formats.md for what stands in a file of points")
 def read_block_points(
     path: str | os.PathLike[str],
     *,

@@ -183,7 +183,10 @@ class Surface:
         if reference is None or transform is None:
             missing = "CRS" if reference is None else "geotransform"
             raise CrsError(
-                f"this DEM has no {missing}", file=self._path, remedy="set it with gdal_edit.py -a_srs / -a_ullr"
+                f"this DEM has no {missing}",
+                file=self._path,
+                field=missing,
+                remedy="set it with gdal_edit.py -a_srs / -a_ullr",
             )
         try:
             crs = pyproj.CRS.from_wkt(reference.ExportToWkt(["FORMAT=WKT2_2018"]))
@@ -193,15 +196,20 @@ class Surface:
             raise CrsError(
                 f"the CRS of this DEM cannot be used ({getattr(error, 'message', error)})",
                 file=self._path,
+                field="CRS",
                 remedy="set a CRS of known datum with gdal_edit.py -a_srs",
             ) from error
         x, a, b, y, c, d = transform
         if not np.isfinite(transform).all() or abs(a * d - b * c) <= 1e-14 * (abs(a) + abs(b)) * (abs(c) + abs(d)):
-            raise CrsError(f"the geotransform {transform} of this DEM is degenerate", file=self._path)
+            raise CrsError(
+                f"the geotransform {transform} of this DEM is degenerate", file=self._path, field="geotransform",
+                remedy="set it with gdal_edit.py -a_ullr",
+            )  # fmt: skip
         self.shape = dataset.RasterYSize, dataset.RasterXSize
         band = dataset.GetRasterBand(1)
         if gdal.DataTypeIsComplex(band.DataType):
-            raise InputError("complex numbers are not heights", file=self._path)
+            raise InputError("complex numbers are not heights", file=self._path, field="band 1",
+                             remedy="choose one part of them with gdal_calc.py")  # fmt: skip
         # GDAL counts from the corner of the first pixel; heights belong to the centres.
         self._set_affine((x + 0.5 * (a + b), a, b, y + 0.5 * (c + d), c, d))
         scale, offset = band.GetScale(), band.GetOffset()
@@ -407,7 +415,9 @@ class Surface:
             if band.GetMaskFlags() & gdal.GMF_PER_DATASET:
                 mask = band.GetMaskBand().ReadAsArray(left, top, width, height)
         except RuntimeError as error:
-            raise InputError(f"the heights cannot be read ({error})", file=self._path) from error
+            raise InputError(
+                f"the heights cannot be read ({error})", file=self._path, remedy="copy the DEM again: it is damaged"
+            ) from error
         heights = raw.astype(float) * (self._scale * self._metres_per_unit) + self._offset * self._metres_per_unit
         with np.errstate(invalid="ignore"):
             void = ~((heights >= SANE_HEIGHTS[0]) & (heights <= SANE_HEIGHTS[1]))

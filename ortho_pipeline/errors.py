@@ -18,7 +18,14 @@ A bad point is NaN; a bad request is one of these.
 
 from __future__ import annotations
 
-from os import PathLike
+import contextlib
+import functools
+from collections.abc import Callable, Iterator
+from os import PathLike, fspath
+from typing import ParamSpec, TypeVar
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 
 class OrthoError(Exception):
@@ -58,6 +65,36 @@ class OrthoError(Exception):
     def __reduce__(self):
         # Keyword-only arguments do not survive the default pickling, and errors cross process borders in batch runs.
         return _rebuild, (type(self), self.message, self.file, self.field, self.remedy)
+
+
+@contextlib.contextmanager
+def completed(file: object = None, *, field: str | None = None, remedy: str | None = None) -> Iterator[None]:
+    """Give a refusal that comes from within what it does not say itself: file, field and remedy.
+
+    A reader knows its file and what a sound one looks like; the line that finds a fault in it need not.
+    """
+    try:
+        yield
+    except OrthoError as error:
+        if error.file is None and isinstance(file, str | PathLike):
+            error.file = str(fspath(file))
+        error.field = error.field or field
+        error.remedy = error.remedy or remedy
+        raise
+
+
+def reads(remedy: str, field: str | None = None) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
+    """Decorate a function whose first argument is the file that it reads: its refusals are `completed`."""
+
+    def decorate(function: Callable[_P, _R]) -> Callable[_P, _R]:
+        @functools.wraps(function)
+        def reading(*args: _P.args, **named: _P.kwargs) -> _R:
+            with completed(args[0] if args else None, field=field, remedy=remedy):
+                return function(*args, **named)
+
+        return reading
+
+    return decorate
 
 
 def _rebuild(kind, message, file, field, remedy):

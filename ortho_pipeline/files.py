@@ -11,6 +11,7 @@ import contextlib
 import fcntl
 import hashlib
 import json
+import math
 import os
 import secrets
 import stat
@@ -19,12 +20,15 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import CancelledError
 from contextvars import ContextVar
 from pathlib import Path
+from typing import Any
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.locations import VsiPath
 
 #: Bytes that are read at once for a checksum.
 _CHUNK = 1 << 20
+#: Digits that a whole number in a JSON document may have.
+_DIGITS = 40
 #: What a temporary name has between its random part and its suffix.
 _PART = ".part"
 
@@ -361,6 +365,62 @@ def decoded(data: bytes) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("latin-1")
+
+
+def parse_json(data: str | bytes, file: object, remedy: str, *, unique: bool = False) -> Any:
+    """Return a JSON document whose numbers are all finite.
+
+    Parameters
+    ----------
+    file : path
+        For messages.
+    unique : bool
+        Refuse fields that stand twice in an object.
+
+    Raises
+    ------
+    InputError
+        Names the line, for what is no JSON in UTF-8, ``NaN``, ``Infinity`` and numbers beyond those of a computer.
+    """
+    try:
+        text = data.decode("utf-8-sig") if isinstance(data, bytes) else data
+        return json.loads(
+            text, parse_constant=_finite, parse_float=_finite, parse_int=_whole,
+            object_pairs_hook=_unique if unique else None,
+        )  # fmt: skip
+    except (ValueError, RecursionError) as error:
+        line = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else None
+        reason = str(error)[:120]
+        raise InputError(f"this is no JSON ({reason})", file=str(file), field=line, remedy=remedy) from error
+
+
+def read_json(path: str | os.PathLike[str], limit: int, remedy: str, *, unique: bool = False) -> Any:
+    """Return the JSON document in a file of at most `limit` bytes, as `parse_json` does."""
+    data = read_bounded(path, limit, remedy=remedy)
+    if len(data) > limit:
+        raise InputError(f"a file of more than {limit // 1_000_000} MB is not read here", file=path, remedy=remedy)
+    return parse_json(data, path, remedy, unique=unique)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:40]} is not a finite number")
+    return value
+
+
+def _whole(text: str) -> int:
+    # Longer ones are no numbers of anything here, and overflow where they become floats.
+    if len(text) > _DIGITS:
+        raise ValueError(f"{text[:20]}... is too large for a number")
+    return int(text)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ValueError("a field stands twice")
+    return found
 
 
 def sha256(path: str | os.PathLike[str], stop: threading.Event | None = None) -> str:

@@ -9,14 +9,18 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from typing import Any
 
-from ortho_pipeline.errors import InputError, PluginError
-from ortho_pipeline.files import read_bounded, write_text
-from ortho_pipeline.models import model_from_dict
+from ortho_pipeline.errors import InputError, PluginError, reads
+from ortho_pipeline.files import read_json, write_text
+from ortho_pipeline.models import model_from_dict, require_view
 from ortho_pipeline.models.base import SensorModel
 
 SCHEMA_VERSION = 1
 DOCUMENT = "ortho-pipeline model"
 _MAX_BYTES = 50_000_000
+
+
+#: What is done about a damaged file.
+_REMEDY = "give a <stem>_model.json as it was written, or write it again"
 
 
 @dataclass(frozen=True)
@@ -82,15 +86,17 @@ def write_model_file(saved: SavedModel, path: str | os.PathLike[str]) -> None:
     write_text(path, json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
+@reads(_REMEDY)
 def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
     """Read a model file.
 
     Raises
     ------
     InputError
-        If it is no model file, of a later schema, or its model does not fit its kind.
+        If it is no model file, of a later schema, its model does not fit its kind, or maps no ground.
     """
-    document = _document(path)
+    found = read_json(path, _MAX_BYTES, _REMEDY)
+    document: dict[str, Any] = found if isinstance(found, dict) else {}
     version = document.get("schema_version")
     if document.get("document") != DOCUMENT or not isinstance(document.get("model"), dict):
         raise InputError(
@@ -112,10 +118,10 @@ def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
         raise InputError(f"{size!r} is no image size", file=path, field="size", remedy="two positive integers, or null")
     try:
         model = model_from_dict(document["model"])
+        require_view(model)
     except InputError as error:
-        raise InputError(
-            error.message, file=path, field=".".join(filter(None, ("model", error.field))), remedy=error.remedy
-        ) from error
+        error.field = "model" if error.field in (None, "model") else f"model.{error.field}"
+        raise
     provenance = document.get("provenance")
     return SavedModel(
         model=model,
@@ -149,18 +155,3 @@ def load_model(path: str | os.PathLike[str]) -> SensorModel:
         As for `read_model_file`.
     """
     return read_model_file(path).model
-
-
-def _document(path: str | os.PathLike[str]) -> dict[str, Any]:
-    try:
-        data = read_bounded(path, _MAX_BYTES, remedy="check the path")
-        if len(data) > _MAX_BYTES:
-            raise InputError("a model file of more than 50 MB is not read", file=path)
-        document = json.loads(data.decode("utf-8-sig"), parse_constant=_no_constant)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"this is no JSON ({error})", file=path, remedy="give a <stem>_model.json") from error
-    return document if isinstance(document, dict) else {}
-
-
-def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a number that a model may hold")

@@ -23,7 +23,7 @@ from ortho_pipeline import comparison as comparing
 from ortho_pipeline import crs as crs_module
 from ortho_pipeline import dem, dem_accuracy, footprint, gcp_export, inputs, plugins, raster, report, resolution, rpc
 from ortho_pipeline import stac as stac_items
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.estimation import Fit
 from ortho_pipeline.files import retire, sha256, staged, states, together, write_text
 from ortho_pipeline.ground_error import viewing
@@ -371,10 +371,11 @@ def write_plots(report_file: str | os.PathLike[str], folder: str | os.PathLike[s
     InputError
         If it is no report, or PNG is asked for and matplotlib is not installed.
     """
-    document = report.read_report_json(report_file)
-    stem = Path(report_file).stem
-    files = report.write_plots(document, Path(folder), stem, kind)
-    return Result(files, {}, f"{len(files)} plots of {document['scene']['name']}")
+    with completed(report_file, remedy="give a <stem>_report.json as it was written, or make it again"):
+        document = report.read_report_json(report_file)
+        stem = Path(report_file).stem
+        files = report.write_plots(document, Path(folder), stem, kind)
+    return Result(files, {}, f"{len(files)} plots of {Path(report_file).name.removesuffix(_ENDINGS['report'])}")
 
 
 @_outputs_together

@@ -22,7 +22,7 @@ import pluggy
 from ortho_pipeline import hookspecs
 from ortho_pipeline.contract import described, scene_faults, sensor_faults
 from ortho_pipeline.crop import placed
-from ortho_pipeline.errors import InputError, OrthoError, PluginError
+from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed
 from ortho_pipeline.hookspecs import PROJECT_NAME, Scene, Sensor
 from ortho_pipeline.models import KINDS, SensorModel
 from ortho_pipeline.raster import open_dataset
@@ -34,6 +34,7 @@ _RETURNS: dict[str, tuple[type, type, str]] = {
     "ortho_sensors": (Iterable, list, "yield the Sensor, or return [Sensor(...)]"),
     "ortho_models": (Mapping, dict, "return {kind: class}"),
 }
+_COPY_IT = "correct what the file says there, or copy it again from the delivery"
 _TEST_IT = "its author: run ortho_pipeline.testing.check_sensor on this file"
 log = logging.getLogger(__name__)
 
@@ -195,18 +196,17 @@ class Host:
                     remedy="see `ortho sensors`, or choose another sensor with --sensor NAME",
                 )
         try:
-            scene = chosen.open_scene(dataset, **options)
-            size = dataset.RasterXSize, dataset.RasterYSize
-            fault = next(scene_faults(chosen, scene, size, {*KINDS, *self.models}), None)
-        except OrthoError as error:
-            if error.file is None:
-                error.file = str(path)
+            with completed(path, remedy=_COPY_IT):
+                scene = chosen.open_scene(dataset, **options)
+                size = dataset.RasterXSize, dataset.RasterYSize
+                fault = next(scene_faults(chosen, scene, size, {*KINDS, *self.models}), None)
+        except OrthoError:
             raise
         except Exception as error:
             text = described(error, chosen.open_scene)
             raise PluginError(f"{self._name(chosen)} failed to open it ({text})", file=path) from error
         if fault:
-            raise PluginError(f"{self._name(chosen)}: {fault}", file=path, remedy=_TEST_IT)
+            raise PluginError(f"{self._name(chosen)}: {fault}", file=path, field="models", remedy=_TEST_IT)
         log.info("%s: sensor %s, models %s from %s", path, chosen.name, ", ".join(scene.models), scene.model_source)
         return placed(scene, dataset, crop_offset)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.point_csv import is_header, read_csv
 from ortho_pipeline.point_geojson import read_geojson
 from ortho_pipeline.point_lists import LINK_TABLE, odm_crs, read_asp, read_envi, read_links, read_odm, read_qgis
@@ -85,12 +85,8 @@ _WANTED: dict[Callable[..., Table], str] = {
 
 def _read(reader: Callable[..., Table], path: str | os.PathLike[str], text: str, *layout: Layout) -> Table:
     """Read a file; an error without a remedy gets that of the format."""
-    try:
+    with completed(path, remedy=_WANTED[reader]):
         return reader(path, text, *layout)
-    except InputError as error:
-        if error.remedy is not None:
-            raise
-        raise type(error)(error.message, file=error.file, field=error.field, remedy=_WANTED[reader]) from error
 
 
 def _reader(path: str | os.PathLike[str], text: str) -> Callable[[str | os.PathLike[str], str], Table]:
@@ -111,11 +107,12 @@ def _reader(path: str | os.PathLike[str], text: str) -> Callable[[str | os.PathL
     if re.search(r"\d", first) and re.fullmatch(r"[-+.,;\deE\s]+", first):
         raise InputError(
             f"numbers without names: it is not said what the columns are; the first line is {short(first)}", file=path,
+            field="line 1",
             remedy="put a line with their names above them, such as ID P L X Y Z (PCI), or 'link table' (ArcGIS: "
             "from-x from-y to-x to-y)",
         )  # fmt: skip
     raise InputError(
-        f"the format of this point file is not known; its first line is {short(first)}", file=path,
+        f"the format of this point file is not known; its first line is {short(first)}", file=path, field="line 1",
         remedy=f"give one of: {_FORMATS}",
     )  # fmt: skip
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
@@ -11,6 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from ortho_pipeline.errors import CrsError, InputError
+from ortho_pipeline.files import parse_json
 from ortho_pipeline.point_table import (
     OF_BLOCK,
     OF_IMAGE,
@@ -31,14 +31,7 @@ def read_geojson(path: str | os.PathLike[str], text: str, layout: Layout = OF_IM
     Heights are ellipsoidal, as the format says. In a block ``ji`` may be a mapping of images to [column, row], and the
     geometry of a tie point is null; where only ground is wanted, ``ji`` is ignored.
     """
-
-    def refuse(constant: str) -> float:
-        raise InputError(f"{constant} is not a finite number", file=path)
-
-    try:
-        document = json.loads(text, parse_constant=refuse)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"this is not well-formed JSON ({str(error)[:80]})", file=path) from error
+    document = parse_json(text, path, "write a FeatureCollection of Points")
     features = document.get("features") if isinstance(document, dict) else None
     if not isinstance(features, list):
         raise InputError("this is not a GeoJSON FeatureCollection", file=path, field="features")

@@ -26,7 +26,7 @@ from ortho_pipeline.crs import (
     horizontal,
     parse_crs,
 )
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import write_text
 from ortho_pipeline.point_files import read_table
 from ortho_pipeline.point_ground import ground_of
@@ -179,6 +179,7 @@ class Points:
 # -- reading ---------------------------------------------------------------------------------------------------------
 
 
+@reads("see docs/formats.md for what stands in a file of points")
 def read_points(
     path: str | os.PathLike[str],
     *,

@@ -20,7 +20,7 @@ import pyproj
 from numpy.typing import NDArray
 from osgeo import gdal
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.locations import VsiPath, archive_of, in_local_archive, located, members, within
 from ortho_pipeline.options import PIXEL_TYPES
 
@@ -40,6 +40,7 @@ MAX_BLOCK = 1 << 30
 _MAX_VRT = 5_000_000
 
 
+@reads("give a whole raster of a format that GDAL reads ('ortho doctor' lists the allowed ones); copy it again")
 def open_dataset(
     path: str | os.PathLike[str],
     *,
@@ -80,7 +81,8 @@ def open_dataset(
     options: dict[str, Any] = {} if siblings else {"sibling_files": [name.rpartition("/")[2]]}
     try:
         dataset = gdal.OpenEx(name, gdal.OF_RASTER | gdal.OF_READONLY, allowed_drivers=drivers, **options)
-    except RuntimeError as error:
+    except (RuntimeError, UnicodeDecodeError) as error:
+        # What GDAL quotes of a damaged file need not be UTF-8.
         raise InputError(
             f"GDAL cannot open this as a raster ({first_line(error)})",
             file=name,

@@ -26,7 +26,7 @@ from ortho_pipeline.delivered import accuracy_before
 from ortho_pipeline.drawing import round_down, style_sheet
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.estimation import Fit, root_mean_square
-from ortho_pipeline.files import whole_or_nothing, write_text
+from ortho_pipeline.files import read_json, whole_or_nothing, write_text
 from ortho_pipeline.ground_error import along_view, in_metres, rmse_metres, viewing
 from ortho_pipeline.map_scale import map_scale
 from ortho_pipeline.preview import preview_png
@@ -284,14 +284,7 @@ def read_report_json(path: str | PathLike[str]) -> dict[str, Any]:
     InputError
         If the file is no report of this version.
     """
-    try:
-        if Path(path).stat().st_size > _MAX_BYTES:
-            raise InputError("a report of more than 50 MB is not read", file=path)
-        document = json.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path, remedy="check the path") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"this is no JSON ({error})", file=path, remedy="give a <stem>_report.json") from error
+    document = read_json(path, _MAX_BYTES, "give a <stem>_report.json")
     if not isinstance(document, dict) or document.get("document") != DOCUMENT:
         raise InputError("this is no report of ortho-pipeline", file=path, remedy="give a <stem>_report.json")
     if document.get("schema_version") != SCHEMA_VERSION:
@@ -312,8 +305,12 @@ def write_plots(report: Mapping[str, Any], folder: Path, stem: str, kind: str = 
     """
     try:
         drawings = plots(report)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"the report is damaged ({error})", remedy="make the report again") from error
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        # What a report holds is the business of report.schema.json; here it is used as it was written.
+        raise InputError(
+            f"the report is damaged ({type(error).__name__}: {str(error)[:120]})", field="plots",
+            remedy="make the report again",
+        ) from error  # fmt: skip
     files = {}
     for name, drawing in drawings.items():
         files[name] = folder / f"{stem}_{name}.{kind}"

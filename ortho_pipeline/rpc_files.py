@@ -22,7 +22,7 @@ from collections.abc import Mapping
 from os import PathLike
 
 from ortho_pipeline import files
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, completed, reads
 from ortho_pipeline.models.rational import RPC
 
 #: Files of more bytes are refused unread: XML, and the other formats, of which 20 kB are usual.
@@ -72,11 +72,13 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
 # Bounded, so that no hostile file makes it slow.
 _RPB_ITEM = re.compile(r"(\w{1,40})[ \t]*=[ \t]*(?:\(([^()]{0,8000})\)|\"([^\"\n]{0,200})\"|([^;\n(\"]{0,200}))\s*;")
 _CENTRE = 0.5
+_REMEDY = "give the RPC file as the vendor delivers it, or another one (--rpc FILE)"
 
 
 # -- reading ---------------------------------------------------------------------------------------------------------
 
 
+@reads(_REMEDY)
 def read_rpc_text(path: str | PathLike[str]) -> RPC:
     """Read an RPC from any of the text formats of this module.
 
@@ -118,6 +120,11 @@ def rpc_of_fields(fields: Mapping[str, str], file: str | PathLike[str] | None = 
     InputError
         If a field is missing or wrong.
     """
+    with completed(file, remedy=_REMEDY):
+        return _rpc(fields, file, origin)
+
+
+def _rpc(fields: Mapping[str, str], file: str | PathLike[str] | None, origin: float) -> RPC:
     if not any(key in fields or f"{key}_1" in fields for key in (*SCALARS, *COEFFICIENTS)):
         raise InputError(
             "there is no RPC in this file", file=file, remedy="give an RPC text, .RPB, DIMAP RPC XML or OTB .geom file"

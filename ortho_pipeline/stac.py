@@ -71,13 +71,14 @@ def acquisition_time(facts: Mapping[str, Any], given: str | None = None) -> date
         )  # fmt: skip
     try:
         time = datetime.fromisoformat(str(text).strip())
-    except ValueError as error:
+        return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
+    except (ValueError, OverflowError) as error:
+        # Overflow: the last hours of the last year, in a zone in which they are the next year in UTC.
         raise InputError(
             f"{str(text)[:40]!r} is no time of acquisition",
             field="--acquired",
             remedy="for example 2005-08-03T08:12:31Z",
         ) from error
-    return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
 
 
 def write_item(

@@ -209,8 +209,8 @@ def _check(source: RasterSource, resampling: str, dem_interpolation: str, tolera
             field="resampling",
             remedy="use --resampling nearest, or expand the palette first (gdal_translate -expand rgb)",
         )
-    if not tolerance > 0:
-        raise InputError("the tolerance is positive", field="tolerance")
+    if not 0 < tolerance < math.inf:
+        raise InputError("the tolerance is positive and finite", field="tolerance", remedy="0.01 px is the default")
 
 
 def _tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
@@ -38,8 +40,30 @@ def model_from_dict(data: dict[str, Any]) -> SensorModel:
         )
     try:
         return KINDS[kind].from_dict(data)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"this is no model of kind {kind!r} ({error})") from error
+    except (TypeError, ValueError, AttributeError, ArithmeticError, LookupError, RecursionError) as error:
+        # Constructors check what numbers mean; that a value is a number or a list at all is found out by using it.
+        raise InputError(
+            f"this is no model of kind {kind!r} ({str(error)[:200]})", field=kind,
+            remedy="leave what was written as it is, or write the model again",
+        ) from error  # fmt: skip
+
+
+def require_view(model: SensorModel) -> None:
+    """Refuse a model whose numbers are each possible, but which maps nothing of the ground that it is meant for.
+
+    Raises
+    ------
+    InputError
+        If its domain is not finite, or of 125 points of it none has a finite place in the image.
+    """
+    centre, half = model.domain
+    if not (np.isfinite(centre).all() and np.isfinite(half).all()):
+        raise InputError("the ground that this model is meant for has no finite bounds", field="model")
+    parts = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 3), axis=-1).reshape(-1, 3)
+    with np.errstate(all="ignore"):
+        image = model.ground_to_image(centre + parts * half)
+    if np.isinf(image).any() or not np.isfinite(image).all(axis=1).any():
+        raise InputError("this model maps none of the ground that it is meant for into an image", field="model")
 
 
 __all__ = [
@@ -57,5 +81,6 @@ __all__ = [
     "family_of",
     "model_crs",
     "model_from_dict",
+    "require_view",
     "start_model",
 ]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import write_text
 from ortho_pipeline.models.lens import Interior
 
@@ -45,6 +45,7 @@ class Survey:
     attitude_sigma: float | None = None
 
 
+@reads("write the survey as docs/formats/bilsat.md has it")
 def read_survey(path: str | PathLike[str]) -> Survey:
     """Read an imaging survey.
 

@@ -16,11 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import decoded, read_bounded
 from ortho_pipeline.models.base import Array
 
 MAX_BYTES = 1_000_000
+_REMEDY = "copy the _MET.TXT again from the delivery"
 MISSING = frozenset({"", "-NA-", "NA", "N/A", "-", "NULL"})
 #: Along-track tilts of the two cameras, degrees: Willneff et al., table 1.
 TILTS_DEG = {"fore": 26.0, "aft": -5.0}
@@ -55,7 +56,9 @@ class Metadata:
         for key in keys:
             values = {value for value in self.fields.get(key.lower(), ()) if value.upper() not in MISSING}
             if len(values) > 1:
-                raise InputError("this key stands there twice, with two values", file=self.path, field=key)
+                raise InputError(
+                    "this key stands there twice, with two values", file=self.path, field=key, remedy=_REMEDY
+                )
             if values:
                 return values.pop()
         return None
@@ -73,9 +76,9 @@ class Metadata:
             return None
         token = str(self.text(key)).split()[0]
         if not _NUMBER.fullmatch(token):
-            raise InputError(f"{token[:60]!r} is no number", file=self.path, field=key)
+            raise InputError(f"{token[:60]!r} is no number", file=self.path, field=key, remedy=_REMEDY)
         value = float(token)
-        if not low <= value <= high:
+        if not low <= value <= high or not math.isfinite(value):
             raise InputError(f"{token[:60]} is not possible", file=self.path, field=key, remedy=f"{low:g} to {high:g}")
         return value
 
@@ -131,7 +134,7 @@ class Metadata:
                 missing = next(
                     f"{prefix}{name}" for name, corner in zip(CORNERS, corners, strict=True) if None in corner
                 )
-                raise InputError("this corner is not whole", file=self.path, field=missing)
+                raise InputError("this corner is not whole", file=self.path, field=missing, remedy=_REMEDY)
         return None
 
     @property
@@ -151,6 +154,7 @@ class Metadata:
         return text[:60]
 
 
+@reads(_REMEDY)
 def read_metadata(path: str | PathLike[str]) -> Metadata:
     """Read a `_MET.TXT`.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from dataclasses import dataclass
 from os import PathLike
@@ -13,7 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.files import read_json
 from ortho_pipeline.geometry import angles_of_rotation
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.lens import Interior
@@ -65,6 +65,7 @@ class Shot:
 # -- the camera ------------------------------------------------------------------------------------------------------
 
 
+@reads("write the camera as docs/formats/frame.md has it")
 def read_camera(path: str | PathLike[str], width: int, height: int, name: str | None = None) -> Interior:
     """Read the interior orientation for an image of `width` x `height` pixels.
 
@@ -96,7 +97,12 @@ def _own(path: str | PathLike[str], document: Any) -> Interior:
         raise InputError("a camera file is a JSON object", file=path, remedy="see docs/formats/frame.md")
     unknown = sorted(set(document) - CAMERA_KEYS)
     if unknown:
-        raise InputError("there is no such field", file=path, field=unknown[0], remedy=f"one of {sorted(CAMERA_KEYS)}")
+        raise InputError(
+            "there is no such field",
+            file=path,
+            field=unknown[0] or repr(unknown[0]),
+            remedy=f"one of {sorted(CAMERA_KEYS)}",
+        )
     width, height = (_number(path, key, document.get(key)) for key in ("width", "height"))
     focal = _number(path, "focal_length_mm", document.get("focal_length_mm")) * 1e-3
     if ("sensor_mm" in document) == ("pixel_pitch_um" in document):
@@ -186,6 +192,7 @@ def _number(path: str | PathLike[str], field: str, value: Any) -> float:
 # -- exterior orientations -------------------------------------------------------------------------------------------
 
 
+@reads("write one row per image, as docs/formats/frame.md has it")
 def read_exterior(path: str | PathLike[str], image: str | PathLike[str]) -> Pose | Shot:
     """Return the row of a table of exterior orientations, or the shot of a reconstruction, of an image by its name.
 
@@ -293,18 +300,13 @@ def _columns(path: str | PathLike[str], header: list[str]) -> tuple[bool, list[t
 
 
 def _json(path: str | PathLike[str]) -> Any:
-    try:
-        return json.loads(
-            _text(path, MAX_JSON_BYTES), object_pairs_hook=_unique, parse_constant=_refuse_constant
-        )  # fmt: skip
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"this is no JSON ({error})", file=path, remedy="see docs/formats/frame.md") from error
+    return read_json(path, MAX_JSON_BYTES, "see docs/formats/frame.md", unique=True)
 
 
-def _text(path: str | PathLike[str], limit: int = MAX_BYTES) -> str:
+def _text(path: str | PathLike[str]) -> str:
     try:
-        if Path(path).stat().st_size > limit:
-            raise InputError(f"a file of more than {limit // 1_000_000} MB is not read here", file=path)
+        if Path(path).stat().st_size > MAX_BYTES:
+            raise InputError(f"a file of more than {MAX_BYTES // 1_000_000} MB is not read here", file=path)
         text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", file=path, remedy="check the path") from error
@@ -313,14 +315,3 @@ def _text(path: str | PathLike[str], limit: int = MAX_BYTES) -> str:
     if "\0" in text:
         raise InputError("this is no text", file=path)
     return text
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
-        raise ValueError("a field stands twice")
-    return found
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a number")

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import decoded, read_bounded
 
 MAX_BYTES = 2_000_000
@@ -215,6 +215,7 @@ class Delivery:
         return found[0]
 
 
+@reads("copy the _metadata.txt again from the delivery")
 def read_metadata(path: str | PathLike[str]) -> Delivery:
     """Read the metadata file of an order.
 
@@ -257,6 +258,7 @@ def read_metadata(path: str | PathLike[str]) -> Delivery:
     )
 
 
+@reads("copy the _hdr.txt again from the delivery")
 def read_header(path: str | PathLike[str]) -> Placement:
     """Read how an image lies on the map from its ``_hdr.txt``; its keys are those of a component.
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from os import PathLike
 from typing import NamedTuple
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import decoded, read_bounded
 
 #: Real labels have 6 kB and three levels of groups.
@@ -127,6 +127,7 @@ class Group:
         return value
 
 
+@reads("copy the .pvl again from the delivery")
 def read_label(path: str | PathLike[str]) -> Group:
     """Read a label.
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ortho_orbview3.label import Group, read_label
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.rational import RPC, rpc_terms
 from ortho_pipeline.rpc import read_rpc
@@ -103,6 +103,7 @@ def _beside(image: Path, end: str) -> Path | None:
         return None
 
 
+@reads("copy the .pvl again from the delivery")
 def read_product(path: str | PathLike[str]) -> Product:
     """Read a label.
 

@@ -32,7 +32,8 @@ from numpy.polynomial import Polynomial
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.models import require_view
 from ortho_pipeline.models.line_camera import LineCamera
 from ortho_pipeline.models.pushbroom import Pushbroom
 from ortho_pipeline.models.pushbroom_start import pushbroom_of_tables, rotations_of_quaternions
@@ -66,6 +67,7 @@ def has_dimap_pushbroom(path: str | PathLike[str]) -> bool:
     return len(data) <= MAX_SIZE and b"Dimap_Document" in data[:2000] and any(name in data for name in models)
 
 
+@reads("copy the metadata again from the delivery, or use the RPC")
 def read_dimap_pushbroom(
     source: str | PathLike[str] | DimapFile, *, image: str | None = None, heights: tuple[float, float] | None = None
 ) -> Pushbroom:
@@ -106,7 +108,7 @@ def read_dimap_pushbroom(
             heights=_heights(file) or heights or HEIGHTS,
             segments=(None, scan.pieces),
         )
-        _ = model.domain  # damaged numbers may well make a camera that looks into the sky
+        require_view(model)  # damaged numbers may well make a camera that looks into the sky
     except InputError as error:
         raise InputError(error.message, file=file.path, field=error.field, remedy=error.remedy) from error
     return model
