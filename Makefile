@@ -4,6 +4,7 @@
 #   make test     set up, run the tests (under ten minutes on two cores)
 #   make test-all the same with those marked slow
 #   make check    formatting, lint, types, tests
+#   make fuzz     read damaged files with every reader (N=100000 of each, READER=name for one)
 #   make bench    speed and memory against gdalwarp, speed of adjustments and of many scenes
 #   make docs     the documentation as a site in out/site, links checked
 #   make images   draw the pictures of README.md again
@@ -20,12 +21,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
 WORKERS ?= 2
+N ?= 100000
+READER ?=
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check bench docs images clean
+.PHONY: help setup demo test test-all check fuzz bench docs images clean
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
@@ -55,6 +58,9 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow"
+
+fuzz: setup
+	@$(BIN)/python tests/attack/fuzz.py -n $(N) -j $(WORKERS) $(addprefix --reader ,$(READER))
 
 bench: setup
 	@$(BIN)/python benchmarks/warp.py

@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner
 from ortho_rpc.dimap import has_dimap_pushbroom, read_dimap_pushbroom
 from osgeo import gdal
+from seeds import dimap_text
 
 from ortho_pipeline.cli import cli
 from ortho_pipeline.errors import InputError
@@ -230,52 +231,10 @@ def test_info_says_which_rigorous_model_is_not_read_and_why(real: Path, pleiades
 # -- made metadata ---------------------------------------------------------------------------------------------------
 
 
-def made_text(*, listed: bool = False) -> str:
-    """Return metadata of version 2: a flight northwards over the equator at noon, 300 x 400 pixels."""
-    points, quaternions = "", ""
-    for seconds in range(-120, 121, 30):
-        angle = 1.06e-3 * seconds
-        place = f"{7.07e6 * math.cos(angle)!r} 0.0 {7.07e6 * math.sin(angle)!r}"
-        total = 12 * 3600 + seconds
-        moment = f"2020-06-01T{total // 3600:02d}:{total % 3600 // 60:02d}:{total % 60:02d}.000000Z"
-        points += f"<Point><LOCATION_XYZ>{place}</LOCATION_XYZ><TIME>{moment}</TIME></Point>"
-    for k in range(12):
-        quaternions += f"<Quaternion><Q0>{0.70710678 + 1e-6 * (k - 5) * 0.01!r}</Q0><Q1>0.0</Q1><Q2>-0.70710678</Q2>"
-        quaternions += f"<Q3>0.0</Q3><TIME>2020-06-01T12:00:00.{k:02d}0000Z</TIME></Quaternion>"
-    parts = "".join(
-        f"<Q{k}><DEGREE>1</DEGREE><COEFFICIENTS>{terms}</COEFFICIENTS></Q{k}>"
-        for k, terms in enumerate(("0.70710678 1e-6", "0.0 0.0", "-0.70710678 0.0", "0.0 0.0"))
-    )
-    polynomials = f"<Polynomial_Quaternions><OFFSET>43200.05</OFFSET><SCALE>1.0</SCALE>{parts}</Polynomial_Quaternions>"
-    attitude = f"<Quaternion_List>{quaternions}</Quaternion_List>" if listed else polynomials
-    look = "<XLOS_0>-0.0001</XLOS_0><XLOS_1>7e-07</XLOS_1><YLOS_0>8e-05</YLOS_0>"
-    swath = "<Swath_Range><FIRST_COL>1</FIRST_COL><LAST_COL>300</LAST_COL></Swath_Range>"
-    calibration = f"{swath}<Polynomial_Look_Angles>{look}</Polynomial_Look_Angles>"
-    if listed:
-        calibration = (
-            f"<Band_Calibration_List><Band_Calibration>{calibration}</Band_Calibration></Band_Calibration_List>"
-        )
-    return f"""<?xml version="1.0" encoding="UTF-8"?>
-<Dimap_Document>
-  <Metadata_Identification><METADATA_FORMAT version="2.0">DIMAP</METADATA_FORMAT>
-    <METADATA_PROFILE>{"S6_SENSOR" if listed else "PHR_SENSOR"}</METADATA_PROFILE></Metadata_Identification>
-  <Raster_Data><Raster_Dimensions><NROWS>400</NROWS><NCOLS>300</NCOLS></Raster_Dimensions></Raster_Data>
-  <Geometric_Data><Refined_Model>
-    <Time><Time_Range><START>2020-06-01T12:00:00.0000000Z</START><END>2020-06-01T12:00:00.0279300Z</END></Time_Range>
-      <Time_Stamp><LINE_PERIOD>0.07</LINE_PERIOD></Time_Stamp></Time>
-    <Ephemeris><Point_List>{points}</Point_List></Ephemeris>
-    <Attitudes>{attitude}</Attitudes>
-    <Geometric_Calibration><Instrument_Calibration>{calibration}
-      <Instrument_Biases><YAW>0.0</YAW></Instrument_Biases></Instrument_Calibration></Geometric_Calibration>
-  </Refined_Model></Geometric_Data>
-</Dimap_Document>
-"""
-
-
 @pytest.fixture(params=[False, True], ids=["polynomials", "list"])
 def made(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     path = tmp_path / "DIM_SIMULATED.XML"
-    path.write_text(made_text(listed=request.param))
+    path.write_text(dimap_text(listed=request.param))
     return path
 
 
@@ -323,7 +282,7 @@ def test_directions_and_times_of_a_simple_flight(made: Path) -> None:
     ],
 )
 def test_damaged_metadata(tmp_path: Path, old: str, new: str, field: str | None) -> None:
-    path, text = tmp_path / "DIM_X.XML", made_text()
+    path, text = tmp_path / "DIM_X.XML", dimap_text()
     assert old in text
     path.write_text(text.replace(old, new))
     with pytest.raises(InputError) as caught:
@@ -333,7 +292,7 @@ def test_damaged_metadata(tmp_path: Path, old: str, new: str, field: str | None)
 
 
 def test_shortened_lists_and_bands_of_their_own_are_refused(tmp_path: Path) -> None:
-    path, text = tmp_path / "DIM_X.XML", made_text(listed=True)
+    path, text = tmp_path / "DIM_X.XML", dimap_text(listed=True)
     path.write_text(re.sub(r"<Quaternion>.*?</Quaternion>", "", text))
     with pytest.raises(InputError, match="neither a polynomial nor a list"):
         read_dimap_pushbroom(path)
@@ -373,7 +332,7 @@ UNTILED = "<Raster_Dimensions><NROWS>400</NROWS><NCOLS>300</NCOLS></Raster_Dimen
     ],
 )
 def test_damaged_tiles(tmp_path: Path, old: str, new: str) -> None:
-    path, text = tmp_path / "DIM_X.XML", made_text().replace(UNTILED, TILED)
+    path, text = tmp_path / "DIM_X.XML", dimap_text().replace(UNTILED, TILED)
     path.write_text(text)
     assert read_dimap_pushbroom(path, image="A_R1C2.tif").camera.width == 100
     path.write_text(text.replace(old, new))
@@ -385,12 +344,12 @@ def test_damaged_tiles(tmp_path: Path, old: str, new: str) -> None:
 def test_metadata_that_name_another_image_are_not_taken(tmp_path: Path) -> None:
     """Both images of a stereo pair have the same size: the names decide."""
     path = tmp_path / "DIM_A.XML"
-    path.write_text(made_text())
+    path.write_text(dimap_text())
     model = read_dimap_pushbroom(path)
     image, other = _image(tmp_path / "b.tif", model), tmp_path / "a.tif"
     assert list(open_scene(image).models) == ["rpc", "pushbroom"]
     files = '<Data_Access><Data_Files><Data_File><DATA_FILE_PATH href="A.TIF"/></Data_File></Data_Files></Data_Access>'
-    path.write_text(made_text().replace("</Raster_Data>", f"{files}</Raster_Data>"))
+    path.write_text(dimap_text().replace("</Raster_Data>", f"{files}</Raster_Data>"))
     _image(other, model)
     assert list(open_scene(image).models) == ["rpc"]
     assert list(open_scene(other).models) == ["rpc", "pushbroom"]
@@ -398,7 +357,7 @@ def test_metadata_that_name_another_image_are_not_taken(tmp_path: Path) -> None:
 
 def test_a_model_far_off_the_rpc_is_of_another_image(tmp_path: Path) -> None:
     path = tmp_path / "DIM_A.XML"
-    path.write_text(made_text())
+    path.write_text(dimap_text())
     scene = open_scene(_image(tmp_path / "a.tif", read_dimap_pushbroom(path), apart=150.0))
     assert list(scene.models) == ["rpc"]
     assert any("150 px off the RPC" in warning for warning in scene.warnings)

@@ -1,0 +1,368 @@
+"""Every reader of files of strangers: a valid file, how it is read, and what of the result has to be finite."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import seeds
+from ortho_bilsat.survey import read_survey
+from ortho_cartosat.metadata import read_metadata as read_cartosat
+from ortho_ikonos.metadata import read_header, read_metadata
+from ortho_orbview3.product import read_product
+from ortho_rpc.dimap import read_dimap_pushbroom
+
+from ortho_pipeline import batch_plan, pipeline, report
+from ortho_pipeline.batch_manifest import FileState, Record
+from ortho_pipeline.block_points import read_block_points
+from ortho_pipeline.crs import Vertical, ground_transform, parse_crs
+from ortho_pipeline.dem import Surface
+from ortho_pipeline.inputs import open_scene
+from ortho_pipeline.model_file import read_model_file, save_model
+from ortho_pipeline.models import ImageCorrection, SensorModel
+from ortho_pipeline.options import PointOptions, SceneOptions
+from ortho_pipeline.points import read_points
+from ortho_pipeline.raster import RasterSource, open_dataset
+from ortho_pipeline.rpc import rpc_of_dataset
+from ortho_pipeline.rpc_files import read_rpc_text, write_rpb
+from ortho_pipeline.stac import acquisition_time
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One reader.
+
+    Parameters
+    ----------
+    kind : str
+        A key of `mutate.KINDS`.
+    file : str
+        Name that the file has to have.
+    seed : callable(folder) -> bytes
+        Makes a valid file; may put others beside it into the folder.
+    read : callable(path) -> any
+        Reads it and returns all that has to be finite (`numbers`).
+    unknown : bool
+        Whether NaN may stand for what the file does not say (heights of points, voids).
+    """
+
+    name: str
+    kind: str
+    file: str
+    seed: Callable[[Path], bytes]
+    read: Callable[[Path], Any]
+    unknown: bool = False
+    of_files: bool = True
+
+
+def numbers(value: Any) -> Iterable[float]:
+    """Yield every number that a result holds."""
+    if isinstance(value, SensorModel):
+        yield from numbers(value.to_dict())
+        yield from numbers(value.domain)
+        centre, half = value.domain
+        parts = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 3), axis=-1).reshape(-1, 3)
+        image = value.ground_to_image(centre + parts * half)
+        # NaN is a point outside of the image; a model that sees none is damaged.
+        yield from image[np.isfinite(image).all(axis=1)][:1].ravel().tolist() or [math.nan]
+        yield from image[np.isinf(image)].tolist()
+    elif isinstance(value, np.ndarray):
+        yield from value.ravel().tolist() if value.dtype.kind == "f" else ()
+    elif isinstance(value, bool | str | bytes | None):
+        return
+    elif isinstance(value, int | float):
+        yield float(value)
+    elif isinstance(value, Mapping):
+        for one in value.values():
+            yield from numbers(one)
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            yield from numbers(getattr(value, field.name))
+    elif isinstance(value, Iterable):
+        for one in value:
+            yield from numbers(one)
+
+
+# -- how each is read ------------------------------------------------------------------------------------------------
+
+
+def _sample(*parts: str) -> Callable[[Path], bytes]:
+    return lambda folder: seeds.SAMPLE.joinpath(*parts).read_bytes()
+
+
+def _text(text: str) -> Callable[[Path], bytes]:
+    return lambda folder: text.encode()
+
+
+def _written(write: Callable[[Path], Any]) -> Callable[[Path], bytes]:
+    def seed(folder: Path) -> bytes:
+        path = folder / "seed"
+        write(path)
+        data = path.read_bytes()
+        path.unlink()
+        return data
+
+    return seed
+
+
+def _points(crs: str | None = None, vertical: str | None = None) -> Callable[[Path], Any]:
+    def read(path: Path) -> Any:
+        points = read_points(path, crs=crs, vertical=vertical, image_name="one.tif")
+        return [points.image, points.ground, points.sigma_image, points.sigma_ground]
+
+    return read
+
+
+def _block(path: Path) -> Any:
+    points = read_block_points(path)
+    return [getattr(points, field.name) for field in dataclasses.fields(points)]
+
+
+def _tagged(path: Path) -> Any:
+    return rpc_of_dataset(open_dataset(path))[0]
+
+
+def _image(path: Path) -> Any:
+    dataset = open_dataset(path)
+    source = RasterSource(path)
+    window = source.read(0, 0, min(64, dataset.RasterXSize), min(64, dataset.RasterYSize))
+    return [0.0, float(window.size)]
+
+
+def _scene(**options: Any) -> Callable[[Path], Any]:
+    def read(path: Path) -> Any:
+        given = {key: str(path) if value is None else value for key, value in options.items()}
+        scene = open_scene(path.parent / "one.tif", SceneOptions(**given))
+        return [*scene.models.values(), scene.facts]
+
+    return read
+
+
+def _frame(camera: str, exterior: str, **more: str) -> Callable[[Path], Any]:
+    def read(path: Path) -> Any:
+        files = {"camera": str(path.with_name(camera)), "exterior": str(path.with_name(exterior))}
+        scene = open_scene(
+            path.with_name("one.tif"),
+            SceneOptions(sensor="frame", sensor_options={**files, "vertical": "ellipsoid", **more}),
+        )
+        return [*scene.models.values(), scene.facts]
+
+    return read
+
+
+def _frame_seed(text: str) -> Callable[[Path], bytes]:
+    def seed(folder: Path) -> bytes:
+        seeds.image(folder / "one.tif", tag=False)
+        (folder / "camera.json").write_text(seeds.CAMERA)
+        (folder / "exterior.csv").write_text(seeds.FRAME_TABLE)
+        return text.encode()
+
+    return seed
+
+
+def _beside(image: str, *source: str) -> Callable[[Path], bytes]:
+    """Return a seed that lies beside the image of a sample product, whose other files are there too."""
+
+    def seed(folder: Path) -> bytes:
+        product = seeds.SAMPLE / source[0]
+        for path in product.iterdir():
+            if path.name.startswith(image.rpartition(".")[0][:12]) or path.suffix == ".tif":
+                shutil.copy(path, folder / path.name)
+        return seeds.SAMPLE.joinpath(*source).read_bytes()
+
+    return seed
+
+
+def _product(image: str) -> Callable[[Path], Any]:
+    def read(path: Path) -> Any:
+        scene = open_scene(path.with_name(image))
+        return [*scene.models.values(), scene.facts]
+
+    return read
+
+
+def _survey(path: Path) -> Any:
+    scene = open_scene(
+        path.with_name("bilsat.tif"), SceneOptions(sensor="bilsat", sensor_options={"survey": str(path)})
+    )
+    return [read_survey(path), *scene.models.values(), scene.facts]
+
+
+def _dem(path: Path) -> Any:
+    surface = Surface.open(path, "ellipsoid")
+    rows, columns = surface.shape
+    part = surface.window(0, 0, min(columns, 40), min(rows, 40))
+    return [part[np.isfinite(part)], np.isinf(part).any() * math.inf if np.isinf(part).any() else 0.0]
+
+
+def _grid(path: Path) -> Any:
+    found = Vertical.parse(str(path)).undulation(np.array([33.0, 34.5]), np.array([36.0, 37.5]))
+    return np.where(np.isnan(found), 0.0, found)
+
+
+def _system(path: Path) -> Any:
+    crs = parse_crs(path.read_bytes().decode("utf-8", "replace"))
+    found = ground_transform(crs, "EPSG:4979")(np.array([[500000.0, 4100000.0, 100.0]]))
+    return np.where(np.isnan(found), 0.0, found)
+
+
+def _model(path: Path) -> Any:
+    return read_model_file(path).model
+
+
+def _report_seed(folder: Path) -> bytes:
+    fitted = pipeline.fit(seeds.SAMPLE / "scene.tif", PointOptions(gcps=seeds.SAMPLE / "gcps.geojson", check="every:4"))
+    return json.dumps(report.build_report(scene=fitted.scene, fit=fitted.fit)).encode()
+
+
+def _report(path: Path) -> Any:
+    pipeline.write_plots(path, path.with_name("plots"))
+    return []
+
+
+def _yaml_seed(folder: Path) -> bytes:
+    for name in ("one.tif", "two.tif", "dem.tif"):
+        (folder / name).write_bytes(b"")
+    deep = folder / "a" / "b" / "c"
+    deep.mkdir(parents=True, exist_ok=True)
+    (deep / "three.tif").write_bytes(b"")
+    return seeds.PIPELINE.encode()
+
+
+def _yaml(path: Path) -> Any:
+    planned = batch_plan.plan(path)
+    return [job.configuration for job in planned.jobs]
+
+
+def _record_seed(folder: Path) -> bytes:
+    state = FileState.of("ortho", seeds.SAMPLE / "gcps.csv", name="gcps.csv")
+    facts = {"rmse_px": {"control": 0.5}, "lean_m_per_m": 0.1}
+    record = Record("one", "0" * 64, "done", (state,), (state,), "0" * 64, 1.5, facts, None, "run")
+    record.write(folder / "record.json")
+    return (folder / "record.json").read_bytes()
+
+
+def _record(path: Path) -> Any:
+    record = Record.read(path)
+    if record is None:
+        return []
+    # What `ortho run` does with it.
+    record.intact(path.parent)
+    [one.untouched() for one in record.inputs]
+    sorted((one.role, one.path, one.sha256) for one in record.inputs)
+    {(one.path, one.bytes, one.mtime_ns): one.sha256 for one in (*record.inputs, *record.outputs)}
+    record.write(path.with_name("again.json"))
+    return [record.seconds, record.facts, record.key == "", record.status in ("done",), {record.run, record.name}]
+
+
+def _time(path: Path) -> Any:
+    acquisition_time({"acquired": path.read_bytes().decode("utf-8", "replace")})
+    return []
+
+
+def _correction(folder: Path) -> bytes:
+    coefficients = np.array([3.0, 1e-5, 0.0, -2.0, 0.0, 1e-5])
+    save_model(ImageCorrection(seeds.rpc(), "affine", (20.0, 15.0), coefficients), folder / "m")
+    return (folder / "m").read_bytes()
+
+
+def _pushbroom(folder: Path) -> bytes:
+    (folder / "DIM.XML").write_text(seeds.dimap_text())
+    save_model(read_dimap_pushbroom(folder / "DIM.XML"), folder / "m")
+    return (folder / "m").read_bytes()
+
+
+def _frame_model(folder: Path) -> bytes:
+    _frame_seed("")(folder)
+    model = _frame("camera.json", "exterior.csv", crs="EPSG:32636")(folder / "exterior.csv")[0]
+    save_model(model, folder / "m")
+    return (folder / "m").read_bytes()
+
+
+def _cartosat(path: Path) -> Any:
+    metadata = read_cartosat(path)
+    return [metadata.view and 0.0, metadata.size, metadata.altitude, metadata.corners, *_product("BANDA.tif")(path)]
+
+
+def _ikonos_header(folder: Path) -> bytes:
+    text = (seeds.SAMPLE / "ikonos" / "po_39001_metadata.txt").read_text()
+    return text[text.index("Component ID") :].encode()
+
+
+def _with_image(text: Callable[[Path], str | bytes]) -> Callable[[Path], bytes]:
+    def seed(folder: Path) -> bytes:
+        seeds.image(folder / "one.tif", tag=False)
+        found = text(folder)
+        return found.encode() if isinstance(found, str) else found
+
+    return seed
+
+
+def _tiff(write: Callable[[Path], Path]) -> Callable[[Path], bytes]:
+    return lambda folder: write(folder / "seed.tif").read_bytes()
+
+
+_WKT = 'PROJCS["a",GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],' \
+    'UNIT["degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],PARAMETER["latitude_of_origin",0],' \
+    'PARAMETER["central_meridian",33],PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],' \
+    'PARAMETER["false_northing",0],UNIT["metre",1]]'  # fmt: skip
+_PO = "po_39001_metadata.txt"
+_UTM = "+proj=utm +zone=36 +datum=WGS84 +units=m +no_defs"
+_ORB = f"{seeds.ORBVIEW3}.pvl"
+
+READERS = (
+    Reader("rpc-text", "text", "one_RPC.TXT", _sample("scene_RPC.TXT"), read_rpc_text),
+    Reader("rpb", "text", "one.RPB", _written(lambda path: write_rpb(seeds.rpc(), path)), read_rpc_text),
+    Reader("dimap-rpc", "xml", "RPC_X.XML", lambda folder: seeds.rpc_xml(seeds.rpc()).encode(), read_rpc_text),
+    Reader("otb-geom", "text", "one.geom", lambda folder: seeds.rpc_geom(seeds.rpc()).encode(), read_rpc_text),
+    Reader("rpc-option", "text", "given.txt", _with_image(_sample("scene_RPC.TXT")), _scene(rpc=None)),
+    Reader("rpc-tag", "tiff", "one.tif", _tiff(seeds.image), _tagged),
+    Reader("dimap-polynomials", "xml", "DIM_X.XML", _text(seeds.dimap_text()), read_dimap_pushbroom),
+    Reader("dimap-lists", "xml", "DIM_X.XML", _text(seeds.dimap_text(listed=True)), read_dimap_pushbroom),
+    Reader("ikonos-metadata", "text", _PO, _sample("ikonos", _PO), read_metadata),
+    Reader("ikonos-header", "text", "po_39001_hdr.txt", _ikonos_header, read_header),
+    Reader("orbview3-label", "text", _ORB, _sample("orbview3", _ORB), read_product),
+    Reader("cartosat-met", "text", "BANDA_MET.TXT", _beside("BANDA.tif", "cartosat", "BANDA_MET.TXT"), _cartosat),
+    Reader("bilsat-survey", "text", "bilsat_survey.txt", _beside("bilsat.tif", "bilsat", "bilsat_survey.txt"), _survey),
+    Reader(
+        "frame-table", "text", "exterior.csv", _frame_seed(seeds.FRAME_TABLE),
+        _frame("camera.json", "exterior.csv", crs="EPSG:32636"),
+    ),
+    Reader(
+        "frame-camera", "json", "camera.json", _frame_seed(seeds.CAMERA),
+        _frame("camera.json", "exterior.csv", crs="EPSG:32636"),
+    ),
+    Reader("opensfm", "json", "reconstruction.json", _frame_seed(seeds.OPENSFM),
+           _frame("reconstruction.json", "reconstruction.json")),
+    Reader("points-csv", "text", "p.csv", _sample("gcps.csv"), _points(), unknown=True),
+    Reader("points-geojson", "json", "p.geojson", _sample("gcps.geojson"), _points(), unknown=True),
+    Reader("points-qgis", "text", "p.points", _text(seeds.QGIS), _points(), unknown=True),
+    Reader("points-odm", "text", "gcp_list.txt", _text(seeds.ODM), _points(None, "ellipsoid"), unknown=True),
+    Reader("points-envi", "text", "p.pts", _text(seeds.ENVI), _points(None, "ellipsoid"), unknown=True),
+    Reader("points-asp", "text", "p.gcp", _text(seeds.ASP), _points(None, "ellipsoid"), unknown=True),
+    Reader("points-pci", "text", "p.txt", _text(seeds.PCI), _points(), unknown=True),
+    Reader("points-links", "text", "links.txt", _text(seeds.LINKS), _points("EPSG:32636", None), unknown=True),
+    Reader("block-csv", "text", "rays.csv", _text(seeds.RAYS), _block, unknown=True),
+    Reader("block-geojson", "json", "rays.geojson", _text(seeds.RAYS_JSON), _block, unknown=True),
+    Reader("model-rpc", "json", "m_model.json", _correction, _model),
+    Reader("model-pushbroom", "json", "m_model.json", _pushbroom, _model),
+    Reader("model-frame", "json", "m_model.json", _frame_model, _model),
+    Reader("report", "json", "one_report.json", _report_seed, _report),
+    Reader("pipeline-file", "json", "pipeline.yaml", _yaml_seed, _yaml),
+    Reader("run-record", "json", "one.json", _record_seed, _record, of_files=False),
+    Reader("acquired", "text", "time.txt", _text("2005-08-03T08:12:31Z"), _time, of_files=False),
+    Reader("crs-wkt", "text", "crs.txt", _text(_WKT), _system, of_files=False),
+    Reader("crs-proj", "text", "crs.txt", _text(_UTM), _system, of_files=False),
+    Reader("dem", "tiff", "dem.tif", _tiff(seeds.dem), _dem),
+    Reader("image", "tiff", "one.tif", _tiff(seeds.image), _image),
+    Reader("vrt", "xml", "one.vrt", _with_image(seeds.vrt), _image),
+    Reader("geoid-grid", "binary", "geoid.gtx", lambda folder: seeds.geoid_gtx(), _grid, of_files=False),
+)  # fmt: skip
+BY_NAME = {reader.name: reader for reader in READERS}

@@ -1,0 +1,167 @@
+"""Damaged files of every format are read soundly or refused with file, field and remedy (docs/reliability.md)."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fuzz import Attack, Tally
+from mutate import mutant
+from readers import BY_NAME, READERS
+
+from ortho_pipeline import batch_plan
+from ortho_pipeline.batch_manifest import FileState, Record
+from ortho_pipeline.errors import InputError, completed, reads
+from ortho_pipeline.files import parse_json
+from ortho_pipeline.model_file import read_model_file
+from ortho_pipeline.stac import acquisition_time
+
+#: Mutants of each reader: hundreds, but as many as take about a second where a file takes milliseconds.
+FEW, MANY = 150, 5000
+DEAR = {"cartosat-met": 25, "dimap-lists": 60, "dimap-polynomials": 60, "bilsat-survey": 60, "points-geojson": 100}
+
+
+def attacked(name: str, folder: Path, count: int, first: int = 0) -> Tally:
+    """Return what became of the mutants of a reader."""
+    one = Attack(BY_NAME[name], folder)
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        one.check_seed()
+        for number in range(first, first + count):
+            one.judge(number)
+    return one.tally
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_damaged_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
+    tally = attacked(name, tmp_path, DEAR.get(name, FEW))
+    assert tally.sound, tally.faults
+    assert tally.accepted + tally.refused == tally.mutants
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BY_NAME)
+def test_thousands_of_damaged_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
+    tally = attacked(name, tmp_path, MANY, first=FEW)
+    assert tally.sound, tally.faults
+
+
+def test_mutants_are_the_same_on_every_machine() -> None:
+    import random
+
+    data = b"key = 1.5\nother = 2\n"
+    assert [mutant(data, "text", random.Random(7)) for _ in range(3)] == [mutant(data, "text", random.Random(7))] * 3
+    assert len({mutant(data, "text", random.Random(seed)) for seed in range(50)}) > 30
+    assert len(READERS) == len(BY_NAME)
+
+
+# -- what the attack found -------------------------------------------------------------------------------------------
+
+
+def test_a_refusal_gets_what_it_does_not_say_itself() -> None:
+    @reads("copy it again", field="header")
+    def read(path: str, error: InputError) -> None:
+        raise error
+
+    with pytest.raises(InputError) as caught:
+        read("a.txt", InputError("wrong"))
+    assert (caught.value.file, caught.value.field, caught.value.remedy) == ("a.txt", "header", "copy it again")
+    with pytest.raises(InputError) as caught:
+        read("a.txt", InputError("wrong", file="b.txt", field="line 3", remedy="other"))
+    assert (caught.value.file, caught.value.field, caught.value.remedy) == ("b.txt", "line 3", "other")
+    with pytest.raises(InputError) as caught, completed(remedy="this"):
+        raise InputError("wrong")
+    assert (caught.value.file, caught.value.remedy) == (None, "this")
+
+
+@pytest.mark.parametrize("text", ["1e400", "-1e999", "NaN", "Infinity", "9" * 400, "[" * 5000, '{"a": 1, "a": 2}', '"'])
+def test_json_has_finite_numbers(text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_json(text, "a.json", "write it again", unique=True)
+    assert (caught.value.file, caught.value.remedy) == ("a.json", "write it again")
+
+
+def test_line_of_broken_json() -> None:
+    with pytest.raises(InputError) as caught:
+        parse_json(b'{\n"a": 1,\n]', "a.json", "write it again")
+    assert caught.value.field == "line 3"
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("width", 10**300), ("focal_length", 1e308), ("pitch_x", "x"), ("k1", [1]), ("x0", None)],
+)
+def test_a_camera_that_is_none(tmp_path: Path, field: str, value: object) -> None:
+    document = json.loads(BY_NAME["model-frame"].seed(tmp_path))
+    document["model"]["interior"][field] = value
+    path = tmp_path / "m_model.json"
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError) as caught:
+        read_model_file(path)
+    assert caught.value.file == str(path)
+    assert caught.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("outputs", 0, "path"), 5), (("outputs", 0, "path"), "a" * 300), (("outputs", 0, "path"), "\0"),
+        (("outputs", 0, "mtime_ns"), "soon"), (("inputs", 0), None), (("facts",), [1]), (("outputs",), {}),
+        (("seconds",), [[]]), (("key",), None),
+    ],
+)  # fmt: skip
+def test_a_damaged_record_is_none_and_stops_nothing(tmp_path: Path, place: tuple, value: object) -> None:
+    document = json.loads(BY_NAME["run-record"].seed(tmp_path))
+    node = document
+    for key in place[:-1]:
+        node = node[key]
+    node[place[-1]] = value
+    path = tmp_path / "one.json"
+    path.write_text(json.dumps(document))
+    record = Record.read(path)
+    assert record is None or not record.intact(tmp_path, verify=True)
+
+
+def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("1")
+    state = FileState.of("ortho", tmp_path / "a", name="a")
+    record = Record("one", "k", "done", (state,), (state,), "s", 1.5, {"lean_m_per_m": 0.5}, None, "run")
+    record.write(tmp_path / "one.json")
+    assert Record.read(tmp_path / "one.json") == record
+
+
+@pytest.mark.parametrize(
+    ("images", "said"),
+    [
+        ("/".join(["**"] * 8) + "/*.tif", "too long a search"),
+        ("../../**/*.tif", "outside of the root"),
+        ("/**/*.tif", "outside of the root"),
+        ("a" * 300 + "/*.tif", "no path"),
+        ("b" * 5000, "too long a search"),
+    ],
+)
+def test_patterns_that_would_not_end_are_refused(tmp_path: Path, images: str, said: str) -> None:
+    (tmp_path / "one.tif").touch()
+    file = tmp_path / "run.yaml"
+    file.write_text(json.dumps({"scenes": [{"images": images}]}))
+    with pytest.raises(InputError, match=said) as caught:
+        batch_plan.plan(file)
+    assert caught.value.field == "scenes[0].images"
+
+
+@pytest.mark.parametrize("field", ["rpc", "model"])
+def test_a_name_longer_than_a_file_system_takes(tmp_path: Path, field: str) -> None:
+    (tmp_path / "one.tif").touch()
+    file = tmp_path / "run.yaml"
+    file.write_text(json.dumps({"scenes": [{"image": "one.tif", "scene": {field: "a" * 300}}]}))
+    with pytest.raises(InputError, match="no path of a file") as caught:
+        batch_plan.plan(file)
+    assert caught.value.remedy
+
+
+def test_the_end_of_time_is_no_time_of_acquisition() -> None:
+    with pytest.raises(InputError, match="no time of acquisition"):
+        acquisition_time({}, "9999-12-31T23:59:59-14:00")
