@@ -183,7 +183,8 @@ class _Planner:
                 remedy=f"at most {_WALKS} times ** and {_PATTERN_BYTES} bytes in a pattern",
             )  # fmt: skip
         # Nothing outside of the root is searched either.
-        self._inside("/".join(itertools.takewhile(lambda part: not glob.has_magic(part), parts)) or ".", field)
+        fixed = "/".join(itertools.takewhile(lambda part: not glob.has_magic(part), parts))
+        self._inside(fixed or ("/" if pattern.startswith("/") else "."), field)
         names = glob.glob(os.path.join(glob.escape(str(self.base)), pattern), recursive=True)
         paths = [Path(os.path.abspath(name)) for name in sorted(names) if os.path.isfile(name)]
         # A pattern with ** would take the orthos of the last run for scenes.
