@@ -318,7 +318,18 @@ def _refuse_duplicates(
 _ONE_MARK = 0.01
 
 
-def one_mark(points: Points) -> list[tuple[str, str]]:
+class HasGround(Protocol):
+    """A table of points with ground: of one image, or of a block."""
+
+    @property
+    def ids(self) -> tuple[str, ...]: ...
+    @property
+    def ground(self) -> Array: ...
+    @property
+    def crs(self) -> pyproj.CRS: ...
+
+
+def one_mark(points: HasGround) -> list[tuple[str, str]]:
     """Return pairs of ids of points that are within a centimetre on the ground: one mark that was measured twice.
 
     Of a crowd each point stands in one pair, with its nearest neighbour.
@@ -338,6 +349,18 @@ def one_mark(points: Points) -> list[tuple[str, str]]:
     near = np.flatnonzero(np.isfinite(distance).all(axis=1))
     pairs = {(min(index[k], index[other[k]]), max(index[k], index[other[k]])) for k in near}
     return [(points.ids[one], points.ids[two]) for one, two in sorted(pairs)]
+
+
+def marks_warning(control: HasGround) -> list[str]:
+    """Return a warning of control points that are one mark: they add no knowledge of its place."""
+    pairs = one_mark(control)
+    if not pairs:
+        return []
+    shown = ", ".join(f"{one} and {two}" for one, two in pairs[:5]) + (" ..." if len(pairs) > 5 else "")
+    return [
+        f"control points within a centimetre of each other ({shown}): one mark that was measured twice counts as two, "
+        "and redundancy and sigmas are too good by that; keep one of them"
+    ]
 
 
 # -- roles -----------------------------------------------------------------------------------------------------------

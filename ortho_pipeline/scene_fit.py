@@ -20,7 +20,7 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.model_choice import OWN, Removed, fit_family, fit_own, prune, restricted, ridge_of
 from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
 from ortho_pipeline.options import PointOptions, SceneOptions
-from ortho_pipeline.points import Points, one_mark
+from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.swaps import refuse_swapped
 
 #: A delivered model that is so many image sizes off belongs to another place, or reads its metadata wrongly.
@@ -72,7 +72,7 @@ class Adjusted:
             found += surface.provenance.get("warnings", [])
         found += [f"point {name} was left out: {reason}" for name, reason in adjusted.rejected]
         found += [f"{one.role} point {one.id} contradicts the others: {one.reason}" for one in adjusted.outlying]
-        found += _twice(points.select(adjusted.used & points.control))
+        found += marks_warning(points.select(adjusted.used & points.control))
         inside = ((points.image >= 0) & (points.image <= (scene.width, scene.height))).all(axis=1)
         if not inside.all():
             outside = ", ".join(np.array(points.ids)[~inside])
@@ -102,18 +102,6 @@ class Adjusted:
             f"the model as delivered is {sizes:.3g} image sizes away from the points: points or metadata of another "
             "scene, longitude and latitude exchanged, or an angle of another sign or unit"
         ]
-
-
-def _twice(control: Points) -> list[str]:
-    """Return a warning of control points that are one mark: they add no knowledge of its place."""
-    pairs = one_mark(control)
-    if not pairs:
-        return []
-    shown = ", ".join(f"{one} and {two}" for one, two in pairs[:5]) + (" ..." if len(pairs) > 5 else "")
-    return [
-        f"control points within a centimetre of each other ({shown}): one mark that was measured twice counts as two, "
-        "and redundancy and sigmas are too good by that; keep one of them"
-    ]
 
 
 def open_adjustable(image: Any, scene: SceneOptions, points: PointOptions) -> Scene:
