@@ -23,13 +23,14 @@ from ortho_pipeline.block_points import BlockPoints
 from ortho_pipeline.block_solver import BlockProblem, Pseudo, Selection, Solved, State
 from ortho_pipeline.block_variance import Posterior, Variances, estimate, posterior, reweighed
 from ortho_pipeline.crs import ground_transform
-from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
+from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
 from ortho_pipeline.estimation import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING, root_mean_square
 from ortho_pipeline.ground_frame import GEODETIC
 from ortho_pipeline.intersection import frame_of, meet, models_of, predict, sigmas_of
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.notebook import block_html
 from ortho_pipeline.point_table import ROLES
+from ortho_pipeline.points import marks_warning
 from ortho_pipeline.problem import CONDITION_LIMIT, Prior
 from ortho_pipeline.report_text import count
 
@@ -249,8 +250,7 @@ def adjust(
     _enough(problem, selection)
     if problem.unstated.any():
         problem = _started(problem, state, selection)
-    solved = problem.solve(state, selection)
-    _determined(problem, solved)
+    solved = _solved(problem, state, selection)
     if problem.unstated.any():
         problem, solved = reweighed(problem, solved, selection, estimate(problem, solved))
     rejected: tuple[Rejected, ...] = ()
@@ -263,11 +263,11 @@ def adjust(
         if rejected:
             gauge = gauge.replace(_by_control(problem, selection), _by_control(problem, blunders.kept))
             selection = blunders.kept
-            solved = problem.solve(solved.state, selection)
-            _determined(problem, solved)
+            solved = _solved(problem, solved.state, selection)
     problem, solved, found = _weighed(problem, solved, selection)
     notes += found.variances.notes()
-    notes += _uncertain(problem, solved, held=any(one.held for one in problem.pseudo))
+    notes += marks_warning(points.select(problem.active(selection) & selection.ground))
+    notes += _uncertain(problem, solved)
     return _result(problem, solved, found, selection, points, chosen, gauge, rejected, notes)
 
 
@@ -304,6 +304,7 @@ def _prepared(
             notes.append(
                 f"{len(names)} {role} points take no part (fewer rays than needed, rays that do not meet or are "
                 f"parallel, or outside of the models): {some}"
+                + ("; whether their known ground is right is not tested" if role == "check" else "")
             )
     return problem, State(models, local), selection, notes
 
@@ -438,6 +439,19 @@ def _weighed(problem: BlockProblem, solved: Solved, selection: Selection) -> tup
     return problem, solved, found
 
 
+def _solved(problem: BlockProblem, state: State, selection: Selection) -> Solved:
+    """Return the solution; refuse a block whose points leave parameters open, also where that is why none is found."""
+    solved = problem.attempt(state, selection)
+    _determined(problem, solved)
+    if not solved.converged:
+        _uncertain(problem, solved)
+        raise NotConverged(
+            "the adjustment did not converge", file=problem.points.source or None,
+            remedy="give more control points, spread in plan and height, or a simpler model or correction",
+        )  # fmt: skip
+    return solved
+
+
 # -- after -----------------------------------------------------------------------------------------------------------
 
 
@@ -467,9 +481,9 @@ def _weakest(problem: BlockProblem, solved: Solved) -> str:
     return f"{shown}; and those of {len(parts) - 4} more images" if len(parts) > 4 else shown
 
 
-def _uncertain(problem: BlockProblem, solved: Solved, *, held: bool) -> list[str]:
+def _uncertain(problem: BlockProblem, solved: Solved) -> list[str]:
     """Refuse images that are far less certain where their own points are than these, and warn of uncertain corners."""
-    found = []
+    found, held = [], any(one.held for one in problem.pseudo)
     for image, model in enumerate(solved.state.models):
         columns = problem.columns_of(image)
         used = solved.linear.layout.rays_of_image[image]

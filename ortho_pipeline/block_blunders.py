@@ -180,11 +180,11 @@ def find_blunders(problem: BlockProblem, solved: Solved, selection: Selection) -
     tests = tests_of(problem, robust)
     suspects = _suspects(problem, tests, variances, _SUSPECT)
     worst = _worst(problem, tests, variances)
-    trusted = _trusted(problem, robust, selection, suspects)
+    trusted = _trusted(problem, (robust, solved), selection, suspects)
     if trusted is None:
         # Weights of few points fall at random, and may leave too few: then only what all others contradict is doubted.
         suspects = significant
-        trusted = _trusted(problem, solved, selection, suspects)
+        trusted = _trusted(problem, (solved,), selection, suspects)
     kept, rejected = selection, dict[int, Rejected]()
     for _ in range(_TEST_ROUNDS):
         if trusted is None:
@@ -207,7 +207,7 @@ def find_blunders(problem: BlockProblem, solved: Solved, selection: Selection) -
         if (more == suspects).all() or not more.any():
             break
         suspects = more
-        trusted = _trusted(trusted.problem, trusted.solved, selection, suspects)
+        trusted = _trusted(trusted.problem, (trusted.solved,), selection, suspects)
     return Found(kept, tuple(rejected[number] for number in sorted(rejected)))
 
 
@@ -220,14 +220,20 @@ class _Trusted:
     variances: Variances
 
 
-def _trusted(problem: BlockProblem, start: Solved, selection: Selection, suspects: Mask) -> _Trusted | None:
-    """Return the solution without the suspects; None if that leaves no control to judge them by, or is undetermined."""
+def _trusted(
+    problem: BlockProblem, starts: tuple[Solved, ...], selection: Selection, suspects: Mask
+) -> _Trusted | None:
+    """Return the solution without the suspects; None if that leaves no control to judge them by, or is undetermined.
+
+    It is sought from the best of some starts: steps with robust weights can lead far away where few points keep theirs.
+    """
     of_others = ~suspects[problem.points.point]
     others = Selection.of(selection.rays & of_others, selection.ground & ~suspects)
     if selection.ground.any() and not (problem.active(others) & others.ground).any():
         return None
-    solved = problem.solve(start.state, others)
-    if solved.condition > CONDITION_LIMIT:
+    start = min((one.state for one in starts), key=lambda state: problem.square(state, others))
+    solved = problem.attempt(start, others)
+    if solved.condition > CONDITION_LIMIT or not solved.converged:
         return None
     found = estimate(problem, solved)
     found = replace(found, image=max(found.image, _SCALE_FLOOR))

@@ -24,6 +24,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ortho_pipeline.block_points import BlockPoints, Index
+from ortho_pipeline.block_steps import Steps
 from ortho_pipeline.block_system import NormalSystem, OrthogonalSystem, solve_triangular
 from ortho_pipeline.errors import InputError, NotConverged
 from ortho_pipeline.ground_frame import GroundFrame
@@ -171,13 +172,17 @@ class Eliminated:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The observation equations at a minimum (or after one step), factored, with the cofactors of the parameters."""
+    """The observation equations at a minimum (or after one step), factored, with the cofactors of the parameters.
+
+    Not `converged`: at the place where the iteration ended without one.
+    """
 
     linear: Linear
     eliminated: tuple[Eliminated, ...]
     cofactors: Array
     condition: float
     iterations: int = 0
+    converged: bool = True
 
     @property
     def state(self) -> State:
@@ -467,15 +472,28 @@ class BlockProblem:
     # -- iteration ---------------------------------------------------------------------------------------------------
 
     def solve(self, start: State, selection: Selection) -> Solved:
-        """Minimise the squared misfits by Gauss-Newton, damped where that does not descend.
+        """Minimise the squared misfits.
 
         Raises
         ------
         NotConverged
-            If no descent is found.
+            If no minimum is found.
+        """
+        found = self.attempt(start, selection)
+        if not found.converged:
+            raise NotConverged("the adjustment did not converge", remedy="give more control points or a simpler model")
+        return found
+
+    def attempt(self, start: State, selection: Selection) -> Solved:
+        """Minimise the squared misfits by Gauss-Newton, damped where that does not descend; see `Solved.converged`.
+
+        Raises
+        ------
+        NotConverged
+            If nothing can be computed at the start.
         """
         layout = self.layout(selection)
-        state, damping, before = start, 0.0, math.inf
+        state, damping, steps = start, 0.0, Steps()
         square = self._square(state, layout, selection)
         if not math.isfinite(square):
             raise NotConverged("the start values put points outside of the models", remedy="give better start values")
@@ -486,31 +504,40 @@ class BlockProblem:
             if not finite or (iteration == 1 and solution.condition > CONDITION_LIMIT):
                 # In a valley without a bottom the iteration would only wander: the caller says what is undetermined.
                 return Solved(linear, eliminated, solution.cofactors, max(solution.condition, CONDITION_LIMIT * 1.01))
-            promised = self._promised(linear, solution.values, shift)
+            change = self._change(linear, solution.values, shift)
+            promised, before = float(np.linalg.norm(change)), steps.length
             length = math.sqrt(square) + math.sqrt(layout.observations)
             # Close to the minimum steps are rounding: they do not get shorter any more, or do not descend.
             small = promised <= 1e-8 * length or (promised <= 1e-6 * length and promised > before / 4)
             if small and not damping:
                 return Solved(linear, eliminated, solution.cofactors, solution.condition, iteration)
-            before = promised
-            ahead, after = self._descent(state, solution.values, shift, square, layout, selection)
+            whole = np.concatenate([solution.values, shift.ravel()])
+            further = None if damping else steps.extrapolated(change, whole)
+            ahead, after, move = self._descent(state, whole, further, square, layout, selection)
             if ahead is not None:
+                if damping:
+                    steps = Steps()
+                else:
+                    steps.made(change, whole, move)
                 state, square = ahead, after
                 damping = damping / 10 if damping > 1e-6 else 0.0
                 continue
+            steps = Steps()
             if damping:
                 solution, shift, eliminated = self.step(linear)
-                promised = self._promised(linear, solution.values, shift)
+                promised = float(np.linalg.norm(self._change(linear, solution.values, shift)))
             if promised <= 1e-4 * length:
                 # Rounding of the ground hides what so small a step would gain.
                 return Solved(linear, eliminated, solution.cofactors, solution.condition, iteration)
             damping = max(10 * damping, 1e-3)
             if damping > 1e8:
                 break
-        raise NotConverged("the adjustment did not converge", remedy="give more control points or a simpler model")
+        solution, _, eliminated = self.step(linear)
+        return Solved(linear, eliminated, solution.cofactors, solution.condition, iteration, converged=False)
 
-    def _promised(self, linear: Linear, step: Array, shift: Array) -> float:
-        return math.sqrt(sum(float((part**2).sum()) for part in self.changes(linear, step, shift)))
+    def _change(self, linear: Linear, step: Array, shift: Array) -> Array:
+        """Return what a step changes to first order, in sigmas, as one vector."""
+        return np.concatenate([part.ravel() for part in self.changes(linear, step, shift)])
 
     def once(self, state: State, selection: Selection) -> tuple[Solved, State]:
         """Return one step's solution, with the misfits that it leaves to first order, and the state after it."""
@@ -524,20 +551,25 @@ class BlockProblem:
         return Solved(left, eliminated, solution.cofactors, solution.condition), state.moved(solution.values, shift)
 
     def _descent(
-        self, state: State, step: Array, shift: Array, square: float, layout: Layout, selection: Selection
-    ) -> tuple[State | None, float]:
-        factor = 1.0
-        while factor > 1e-3:
+        self, state: State, whole: Array, further: Array | None, square: float, layout: Layout, selection: Selection
+    ) -> tuple[State | None, float, Array]:
+        """Return the state after a move that descends: further than the step, the step, or a part of it."""
+        moves = [] if further is None else [further]
+        for move in (*moves, *(whole / 2.0**k for k in range(10))):
             try:
-                ahead = state.moved(factor * step, factor * shift)
+                ahead = state.moved(move[: self.size], move[self.size :].reshape(-1, 3))
                 after = self._square(ahead, layout, selection)
             except InputError:  # a correction that cannot be inverted
                 after = math.nan
             # Coordinates are rounded to a billionth of a metre: what is added to a square by that is no ascent.
             if math.isfinite(after) and after <= square * (1 + 1e-8):
-                return ahead, after
-            factor /= 2
-        return None, square
+                return ahead, after, move
+        return None, square, whole
+
+    def square(self, state: State, selection: Selection) -> float:
+        """Return the sum of the squared misfits at a state; infinite where something cannot be computed."""
+        found = self._square(state, self.layout(selection), selection)
+        return found if math.isfinite(found) else math.inf
 
     def _square(self, state: State, layout: Layout, selection: Selection) -> float:
         return float(sum((part**2).sum() for part in self.misfits(state, layout, selection)))

@@ -8,11 +8,14 @@ import numpy as np
 import pyproj
 import pytest
 
+from ortho_pipeline import block_solver
 from ortho_pipeline.adjustment import BlockFit, adjust
 from ortho_pipeline.block_points import BlockPoints
+from ortho_pipeline.block_steps import Steps
 from ortho_pipeline.crs import ground_transform
-from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
+from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
 from ortho_pipeline.estimation import fit
+from ortho_pipeline.experiments.cartosat_scene import StereoPair
 from ortho_pipeline.geometry import geocentric
 from ortho_pipeline.ground_frame import GroundFrame
 from ortho_pipeline.intersection import intersect
@@ -22,6 +25,7 @@ from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom_start import pushbroom_of_metadata
 from ortho_pipeline.problem import Prior
 from ortho_pipeline.rpc import export_rpc
+from ortho_pipeline.selection import select_control
 from ortho_pipeline.simulate import LineScanner
 
 LON, LAT = 33.35, 37.25
@@ -582,6 +586,56 @@ def test_a_wrong_check_point_is_named_and_kept(rpcs: dict[str, RPC], axis: int, 
     assert found.to_json()["outlying"][0]["point"] == "p20"
 
 
+def test_control_of_little_weight_that_is_off_is_named(rpcs: dict[str, RPC]) -> None:
+    """A sketch map's point, stated as 20 m, is 120 m off: it moves nothing, and no residual of another point tells."""
+    truth = biased(rpcs)
+    points = measured(truth, places(40), roles_of(9, 31), noise=0.3, sigma_ground=0.3)
+    sigma = points.sigma_ground.copy()
+    sigma[3] = 20.0
+    frame = GroundFrame.about(points.ground)
+    local, turn = frame.of_geodetic(points.ground), frame.horizons(points.ground)[3]
+    local[3] += turn[0] * 120.0
+    weak = replace(points, sigma_ground=sigma, ground=frame.geodetic(local))
+    kept = adjust(starts(truth), weak, robust=False)
+    assert [(one.point, one.role, one.what) for one in kept.outlying] == [("p3", "control", "ground")]
+    assert kept.outlying[0].metres == pytest.approx(120.0, abs=3.0)
+    assert any("control point p3" in text for text in kept.warnings)
+    good = adjust(starts(truth), points, robust=False)
+    assert (np.abs(kept.values - good.values) < good.sigmas).all()
+    # The search for gross errors finds it as well, and then it is no longer there to be named.
+    found = adjust(starts(truth), weak)
+    assert [one.point for one in found.rejected] == ["p3"]
+    assert found.outlying == ()
+
+
+def test_a_check_point_in_one_image_is_said_to_be_untested(rpcs: dict[str, RPC]) -> None:
+    truth = biased(rpcs)
+    points = measured(truth, places(20), roles_of(8, 12), noise=0.3, sigma_ground=0.3)
+    alone = (points.point != 15) | (points.image == 0)
+    points = replace(
+        points, point=points.point[alone], image=points.image[alone], measured=points.measured[alone],
+        sigma_image=points.sigma_image[alone],
+    )  # fmt: skip
+    ground = points.ground.copy()
+    ground[15, 2] += 500.0
+    found = adjust(starts(truth), replace(points, ground=ground))
+    assert [text for text in found.warnings if "p15" in text and "not tested" in text]
+    assert found.outlying == ()
+
+
+def test_a_mark_that_was_measured_twice_is_told(rpcs: dict[str, RPC]) -> None:
+    truth = biased(rpcs)
+    ground = places(20)
+    ground[5] = ground[4] + (0.0, 0.002 / 111_000, 0.0)
+    points = measured(truth, ground, roles_of(8, 12), noise=0.3, sigma_ground=0.0)
+    points = points.with_ground_sigma(0.1)
+    told = [text for text in adjust(starts(truth), points).warnings if "measured twice" in text]
+    assert len(told) == 1
+    assert "p4 and p5" in told[0]
+    # A point that takes no part, or that only checks, adds no redundancy.
+    assert not any("measured twice" in text for text in adjust(starts(truth), points, exclude=["p5"]).warnings)
+
+
 # -- rank defects ----------------------------------------------------------------------------------------------------
 
 
@@ -625,6 +679,56 @@ def test_points_with_one_ray_or_parallel_rays_are_left_out_and_named(rpcs: dict[
     assert any("check points take no part" in text and "p10" in text for text in found.warnings)
     crossed = intersect({"left": rpcs["left"], "twin": rpcs["left"]}, points)
     assert np.isnan(crossed.ground).all()
+
+
+# -- convergence -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("crs", ["utm", "geocentric"])
+def test_an_affine_pair_with_misfits_as_large_as_its_relief_converges(crs: str) -> None:
+    """Pixels of 150 m over a relief of few of them: products of parameters and heights bend the model most."""
+    tables = StereoPair.make(size=200, seed=3).measure(3)
+    roles = select_control(tables["fore"], "even:9").roles
+    tables = {name: table.with_roles(roles) for name, table in tables.items()}
+    start = {name: start_model("affine3d", tables[name], crs=crs, size=(200, 200)) for name in tables}
+    found = adjust(start, BlockPoints.of(tables))
+    assert found.rejected == ()
+    assert found.sigma0 == pytest.approx(1.0, abs=0.35)
+    # Plain steps take 18, each half as long as the one before.
+    assert found.iterations <= 10
+
+
+def test_what_does_not_converge_because_it_is_not_determined_says_so(
+    rpcs: dict[str, RPC], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A valley with hardly any slope: the iteration ends before its bottom, and the reason is the points."""
+    truth = biased({name: rpcs[name] for name in ("left", "right")}, "affine")
+    ground = places(30)
+    # Three control points within 3 m say nothing of the slopes of a correction.
+    ground[:3] = ground[0] + np.array([(0, 0, 0), (3e-5, 0, 0), (0, 3e-5, 0)])
+    points = measured(truth, ground, roles_of(3, 0, 27), noise=0.3, sigma_ground=0.3)
+    with pytest.raises(DegeneratePoints, match="do not determine"):
+        adjust(starts(truth), points)
+    monkeypatch.setattr(block_solver, "_STEPS", 1)
+    with pytest.raises(DegeneratePoints, match="do not determine the image") as caught:
+        adjust(starts(truth), points)
+    assert "control points" in str(caught.value.remedy)
+    enough = measured(truth, places(30), roles_of(9, 0, 21), noise=0.3, sigma_ground=0.3)
+    with pytest.raises(NotConverged, match="did not converge"):
+        adjust(starts(truth), enough)
+
+
+def test_steps_that_creep_or_overshoot_are_extrapolated() -> None:
+    """Errors of a fixed-point iteration that shrink by 0.9 and turn back by -1.6 and -0.5: plain steps diverge."""
+    slope = np.diag(1.0 - np.array([0.9, -1.6, -0.5, 0.0]))
+    place, steps = np.array([3.0, -2.0, 5.0, 1.0]), Steps()
+    for _ in range(12):
+        change = -slope @ place
+        further = steps.extrapolated(change, change)
+        move = change if further is None else further
+        steps.made(change, change, move)
+        place = place + move
+    assert np.abs(place).max() < 1e-9
 
 
 # -- intersection ----------------------------------------------------------------------------------------------------

@@ -24,7 +24,7 @@ point_files
 points
 models least_squares statistics
 problem block_points ground_frame
-ridge block_system intersection
+ridge block_steps block_system intersection
 blunders block_solver report_text
 block_variance
 registration estimation hookspecs swaps model_file kernels lattice_kernel ray_kernel landscape rpc_files
