@@ -248,7 +248,7 @@ class _RasterFile:
         self.dtype = np.result_type(*(_numpy_type(band.DataType) for band in bands))
         self.nodata = tuple(_nodata(band, self.dtype) for band in bands)
         self.palette = any(band.GetColorTable() is not None for band in bands)
-        flags = bands[0].GetMaskFlags()
+        flags = self._io(bands[0].GetMaskFlags)
         # GDAL's own order: a mask of the dataset stands beside nodata.
         self._masked = bool(flags & gdal.GMF_PER_DATASET and not flags & (gdal.GMF_NODATA | gdal.GMF_ALPHA))
         if any(value is not None for value in self.nodata):

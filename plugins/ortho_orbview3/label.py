@@ -180,7 +180,7 @@ class _Reader:
         return token
 
     def wrong(self, message: str, field: str) -> InputError:
-        return InputError(f"{message} (line {self.line})", file=self.file, field=field)
+        return InputError(f"{message} (line {self.line})", file=self.file, field=field or f"line {self.line}")
 
     def read(self) -> Group:
         found = self.group("", 0)

@@ -35,7 +35,7 @@ from readers import BY_NAME, READERS, Reader, numbers
 from ortho_pipeline.errors import OrthoError
 
 #: Seconds of processor time that a file may take, and seconds without a sign of life after which a reader hangs.
-SLOWEST, SILENCE = 5.0, 60.0
+SLOWEST, SILENCE = 5.0, 600.0
 #: What is wrong with a file as a whole, and so with no field of it.
 WHOLE = re.compile(
     r"cannot be read|not read|no text|binary|UTF-16|not UTF-8|well-formed|no RPC|no points|more than .* (MB|bytes)"

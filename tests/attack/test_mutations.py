@@ -84,6 +84,11 @@ def test_json_has_finite_numbers(text: str) -> None:
     assert (caught.value.file, caught.value.remedy) == ("a.json", "write it again")
 
 
+@pytest.mark.parametrize(("name", "number"), [("image", 1026), ("image", 1046), ("orbview3-label", 1001)])
+def test_what_was_found_stays_mended(name: str, number: int, tmp_path: Path) -> None:
+    assert attacked(name, tmp_path, 1, first=number).sound
+
+
 def test_line_of_broken_json() -> None:
     with pytest.raises(InputError) as caught:
         parse_json(b'{\n"a": 1,\n]', "a.json", "write it again")
