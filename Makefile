@@ -3,6 +3,7 @@
 #   make demo     set up, orthorectify the sample scene, say where the ortho and the report are
 #   make test     set up, run the tests (under ten minutes on two cores)
 #   make test-all the same with those marked slow
+#   make faults   commands limited, killed, cut off: no broken or mixed outputs (N=400 write limits, 3/4 as many kills)
 #   make check    formatting, lint, types, tests
 #   make fuzz     read damaged files with every reader (N=100000 of each, READER=name for one)
 #   make bench    speed and memory against gdalwarp, speed of adjustments and of many scenes
@@ -28,7 +29,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check fuzz bench docs images clean
+.PHONY: help setup demo test test-all faults check fuzz bench docs images clean
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
@@ -52,6 +53,11 @@ test: setup
 
 test-all: setup
 	@$(BIN)/python -m pytest -q -n $(WORKERS)
+
+N ?= 400
+
+faults: setup
+	@$(BIN)/python tests/attack/faults.py --limits $(N) --kills $$(( $(N) * 3 / 4 ))
 
 check: setup
 	@$(BIN)/ruff format --check .

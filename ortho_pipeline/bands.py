@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shutil
@@ -12,7 +11,7 @@ from typing import Any
 
 from ortho_pipeline import inputs, plugins
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import whole_or_nothing, write_text
+from ortho_pipeline.files import states, together, whole_or_nothing, write_text
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.model_file import SavedModel, write_model_file
 from ortho_pipeline.options import SceneOptions
@@ -74,18 +73,20 @@ def register(
             raise InputError(
                 "this path would be read and written", file=path, field="-o", remedy="choose another folder"
             )
-    with contextlib.ExitStack() as together:
-        # What goes beside the image is complete before the image appears.
+    begun = states([*paths, opened.model_source])
+    with together(folder, files["image"].stem):
         if beside is not None:
-            shutil.copyfile(opened.model_source, together.enter_context(whole_or_nothing(beside)))
+            with whole_or_nothing(beside, side_cars=False) as temporary:
+                shutil.copyfile(opened.model_source, temporary)
         done = stack_bands(
             dict(zip(names, paths, strict=True)), files["image"], reference=chosen.stem, transform=transform
         )
-    if "model" in files:
-        size = opened.width, opened.height
-        write_model_file(SavedModel(opened.model, opened.sensor, opened.model_source, size), files["model"])
-    document = _document(opened, chosen, names, done, inputs.hashed(dict.fromkeys(paths, "band")))
-    write_text(files["table"], json.dumps(document, indent=1, allow_nan=False) + "\n")
+        if "model" in files:
+            size = opened.width, opened.height
+            write_model_file(SavedModel(opened.model, opened.sensor, opened.model_source, size), files["model"])
+        document = _document(opened, chosen, names, done, inputs.hashed(dict.fromkeys(paths, "band")))
+        write_text(files["table"], json.dumps(document, indent=1, allow_nan=False) + "\n")
+        inputs.refuse_changed(begun)
     return Result(files, document, _text(chosen, done))
 
 

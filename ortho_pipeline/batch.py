@@ -7,7 +7,6 @@ goes on where it stood, and ends with the same bytes as a run that nothing inter
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import time
@@ -24,7 +23,7 @@ from ortho_pipeline.batch_manifest import Digests, FileState, Record, key_of, lo
 from ortho_pipeline.batch_plan import RUN_FILES, STATE, Job, Plan, for_run, plan, versions
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.executors import Processes, Sequential, completed, dask_executor
-from ortho_pipeline.files import clear_up, write_text
+from ortho_pipeline.files import append_line, clear_up, confined, retire, together, write_text
 from ortho_pipeline.stac import write_catalog
 
 SCHEMA_VERSION = 1
@@ -103,7 +102,7 @@ def make_scene(job: Job, verify: bool = False) -> Outcome:
     """
     begin = time.monotonic()
     try:
-        with locked(job.lock, wait=True):
+        with confined(job.output), locked(job.lock, wait=True):
             return _make_locked(job, verify, begin)
     except OrthoError as error:
         return Outcome(job.name, "failed", time.monotonic() - begin, error=error_document(error))
@@ -286,6 +285,7 @@ def run(
     jobs, part = planned.chosen(only, shard), bool(only) or shard is not None
     lock = planned.output / STATE / "run.lock"
     with (
+        confined(planned.output),
         locked(lock, shared=part, owner=f"'ortho run {planned.path.name}'"),
         _crew(executor, workers, threads, scheduler, len(jobs)) as (crew, budget),
     ):
@@ -403,9 +403,7 @@ class _Run:
     def log(self, event: str, **fields: Any) -> None:
         """Append a line to the log; several runs of parts may do so at once."""
         line = {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event, **fields}
-        with self.log_path.open("a", encoding="utf-8") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            file.write(json.dumps(line, allow_nan=False, default=str) + "\n")
+        append_line(self.log_path, json.dumps(line, allow_nan=False, default=str))
 
 
 class _Mosaic:
@@ -438,16 +436,17 @@ class _Mosaic:
             return {**json.loads(self.report.read_text(encoding="utf-8")), "status": "unchanged"}
         self.record.unlink(missing_ok=True)
         layout = mosaic.lay_out(self.orthos, self.settings.order)
-        if self.settings.format == "VRT":
-            mosaic.write_vrt(layout, self.path)
-        else:
-            mosaic.write_cog(layout, self.path)
-        document = {"file": str(self.path), **mosaic.summary(layout, self._seams(layout, crew))}
-        write_text(self.report, json.dumps(document, indent=1, allow_nan=False) + "\n")
+        with together(self.output, "mosaic"):
+            if self.settings.format == "VRT":
+                mosaic.write_vrt(layout, self.path)
+            else:
+                mosaic.write_cog(layout, self.path)
+            document = {"file": str(self.path), **mosaic.summary(layout, self._seams(layout, crew))}
+            write_text(self.report, json.dumps(document, indent=1, allow_nan=False) + "\n")
+            if record is not None:
+                retire({self.output / one.path for one in record.outputs} - {self.path, self.report})
         made = tuple(FileState.of(role, path, name=path.name) for role, path in
                      (("mosaic", self.path), ("seams", self.report)))  # fmt: skip
-        if record is not None:
-            _remove(self.output, {one.path for one in record.outputs} - {one.path for one in made})
         Record("mosaic", self.key, "done", self.inputs, made).write(self.record)
         return {**document, "status": "done"}
 

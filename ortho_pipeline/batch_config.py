@@ -167,7 +167,8 @@ class Config(_Strict):
     output: str = Field(default="out", description="Output folder, relative to this file.")
     root: str | None = Field(
         default=None,
-        description="Folder that every path has to lie in, relative to this file. Default: the file's own.",
+        description="Folder that every path has to lie in, relative to this file; within the file's own, or that of "
+        "--root. Default: that one.",
     )
     defaults: Settings = Field(default=Settings(), description="What holds for all scenes.")
     mosaic: MosaicSettings | None = None

@@ -193,9 +193,10 @@ def locked(path: Path, *, shared: bool = False, wait: bool = False, owner: str =
     InputError
         If the lock is held, or the folder cannot be written or locked.
     """
+    files.allowed(path.parent)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     except OSError as error:
         raise InputError(
             f"cannot write here ({error.strerror})", file=path.parent, remedy="choose a folder that you may write to"

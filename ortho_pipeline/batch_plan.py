@@ -112,15 +112,21 @@ class Plan:
 
 
 @reads("see docs/run.md for the form of the file")
-def plan(path: str | os.PathLike[str]) -> Plan:
+def plan(path: str | os.PathLike[str], root: str | os.PathLike[str] | None = None) -> Plan:
     """Read a pipeline file and work out its scenes.
+
+    Parameters
+    ----------
+    root : path, optional
+        Folder that every path has to lie in; that of the file without. The file's own ``root`` can only narrow it: who
+        wrote the file is not who says what it may read.
 
     Raises
     ------
     InputError
         For a wrong file, a path outside of the root, a pattern without a match, or two scenes of one name.
     """
-    return _Planner(Path(path), read_config(path)).plan()
+    return _Planner(Path(path), read_config(path), root).plan()
 
 
 @functools.cache
@@ -136,10 +142,12 @@ def versions() -> dict[str, Any]:
 
 
 class _Planner:
-    def __init__(self, path: Path, config: Config) -> None:
+    def __init__(self, path: Path, config: Config, root: str | os.PathLike[str] | None) -> None:
         self.path, self.config = path, config
         self.base = Path(os.path.abspath(path)).parent
-        self.root = Path(os.path.abspath(self.base / (config.root or "."))).resolve()
+        self.root = self.base.resolve() if root is None else Path(root).resolve()
+        if config.root is not None:
+            self.root = self._inside(config.root, "root")
         self.output = self._inside(config.output, "output")
 
     def plan(self) -> Plan:
@@ -255,9 +263,12 @@ class _Planner:
         if not resolved.is_relative_to(self.root):
             raise InputError(
                 f"{text} lies outside of the root {self.root}", file=self.path, field=field,
-                remedy="move it there, or widen 'root:' in the file",
+                remedy=f"move it there, or allow a folder that holds both with --root {self._common(path.resolve())}",
             )  # fmt: skip
         return path
+
+    def _common(self, place: Path) -> str:
+        return os.path.commonpath([self.base.resolve(), place if place.is_dir() else place.parent])
 
     def _file(self, text: str | None, image: Path, field: str) -> str | None:
         return None if text is None else str(self._inside(self._filled(text, image, field), field))

@@ -38,7 +38,7 @@ from ortho_pipeline.cli_text import (
     progress,
     view_text,
 )
-from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.errors import InputError, OrthoError, Terminated
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 
 FAILED, CORRECTABLE, INTERRUPTED = 1, 2, 130
@@ -49,7 +49,11 @@ class _Commands(Group):
 
     def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> click.Context:
         command = shlex.join([info_name or "ortho", *args])
-        ctx = super().make_context(info_name, args, *more, **extra)
+        try:
+            ctx = super().make_context(info_name, args, *more, **extra)
+        except click.UsageError as error:
+            _print_usage_error(command, error)
+            raise
         ctx.meta["command"] = command
         return ctx
 
@@ -65,9 +69,17 @@ class _Commands(Group):
             # Every command loads GDAL when it begins its work.
             missing = _without_gdal()
             return self._fail(ctx, missing or _fault(error), CORRECTABLE if missing else FAILED)
-        except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
+        except MemoryError as error:
+            short = OrthoError("there is not enough memory", remedy="give less work at once (--memory MB, --threads 1)")
+            short.__cause__ = error
+            return self._fail(ctx, short, FAILED)
+        except click.UsageError as error:
+            _print_usage_error(ctx.meta["command"], error)
             raise
-        except Exception as error:
+        except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError, Terminated):
+            raise
+        except (Exception, SystemExit) as error:
+            # A library or a plugin that exits by itself would say that all is well.
             return self._fail(ctx, _fault(error), FAILED)
 
     def _fail(self, ctx: click.Context, error: OrthoError, code: int) -> None:
@@ -80,7 +92,17 @@ class _Commands(Group):
         ctx.exit(code)
 
 
-def _fault(error: Exception) -> OrthoError:
+def _print_usage_error(command: str, error: click.UsageError) -> None:
+    """Print the document of an error in the command line itself, of which only the words are known."""
+    if "--json" in shlex.split(command):
+        parameter = getattr(error, "param", None)
+        field = parameter.opts[0] if parameter is not None else getattr(error, "option_name", None)
+        remedy = f"see '{error.ctx.command_path} --help'" if error.ctx is not None else "see 'ortho --help'"
+        told = {"kind": "UsageError", "message": error.format_message(), "file": None, "field": field, "remedy": remedy}
+        print_json({"schema_version": 1, "error": told})
+
+
+def _fault(error: BaseException) -> OrthoError:
     """Return an error that nobody foresaw as one that people can report."""
     fault = OrthoError(
         f"{type(error).__name__}: {error}" if str(error) else type(error).__name__,
@@ -126,7 +148,7 @@ def main() -> None:
 
 def _end(number: int, _: Any) -> None:
     """End as after an exception, so that temporary files go and locks are released."""
-    raise SystemExit(128 + number)
+    raise Terminated(128 + number)
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})

@@ -15,6 +15,7 @@ from ortho_pipeline.cli_text import count, print_json, progress
 
 if TYPE_CHECKING:
     from ortho_pipeline.batch import BatchResult, Outcome
+    from ortho_pipeline.batch_plan import Plan
 
 FAILED, PARTLY_DONE = 1, 3
 #: More scenes than this are only counted, except for those that failed.
@@ -49,6 +50,12 @@ class _Shard(click.ParamType):
 @click.option("--scheduler", metavar="URL", help="Of dask, such as tcp://host:8786.")
 @click.option("--only", multiple=True, metavar="NAME", help="Only this scene; may be repeated.")
 @click.option("--shard", type=_Shard(), metavar="K/N", help="Only the K-th of N parts, for arrays of jobs.")
+@click.option(
+    "--root",
+    type=click.Path(file_okay=False),
+    metavar="DIR",
+    help="Folder that every path of the file has to lie in  [default: that of the file]",
+)
 @click.option("--verify", is_flag=True, help="Judge all files by their content, whatever their dates say.")
 @click.option("--list", "as_list", is_flag=True, help="List the scenes and their state, and do nothing.")
 @click.option("--check", "as_check", is_flag=True, help="Open images, points and DEM, look for gaps, and make nothing.")
@@ -57,6 +64,7 @@ class _Shard(click.ParamType):
 def run(
     pipeline_file: str | None,
     memory: int,
+    root: str | None,
     as_list: bool,
     as_check: bool,
     as_schema: bool,
@@ -77,18 +85,19 @@ def run(
         raise click.UsageError("Missing argument 'PIPELINE.yaml'.")
     from ortho_pipeline import batch
 
+    planned = batch.plan(pipeline_file, root)
     if as_list:
-        listed = batch.list_scenes(pipeline_file)
+        listed = batch.list_scenes(planned)
         if as_json:
             return print_json({"schema_version": batch.SCHEMA_VERSION, "scenes": listed})
         for scene in listed:
             click.echo(f"{scene['name']}\t{scene['state']}\t{scene['image']}")
         return None
     if as_check:
-        return _check(pipeline_file, options["only"], options["shard"], as_json)
+        return _check(planned, options["only"], options["shard"], as_json)
     try:
         with progress("Orthorectifying scenes") as advance:
-            result = batch.run(pipeline_file, memory=memory, progress=advance, **options)
+            result = batch.run(planned, memory=memory, progress=advance, **options)
     except KeyboardInterrupt:
         click.echo("What is done is kept: run it again to go on.", err=True)
         raise
@@ -101,11 +110,11 @@ def run(
     return None
 
 
-def _check(pipeline_file: str, only: Sequence[str], shard: tuple[int, int] | None, as_json: bool) -> None:
+def _check(planned: Plan, only: Sequence[str], shard: tuple[int, int] | None, as_json: bool) -> None:
     """Print what stands in the way of each scene; exit as a run would if that were all."""
     from ortho_pipeline import batch
 
-    checked = batch.check_scenes(pipeline_file, only, shard)
+    checked = batch.check_scenes(planned, only, shard)
     failed = [one for one in checked if "error" in one]
     if as_json:
         print_json({"schema_version": batch.SCHEMA_VERSION, "scenes": checked})

@@ -214,6 +214,40 @@ class Outputs:
 _under_way: ContextVar[Outputs | None] = ContextVar("_under_way", default=None)
 
 
+#: The folder that all outputs have to lie in, in this context.
+_confined: ContextVar[Path | None] = ContextVar("_confined", default=None)
+
+
+@contextlib.contextmanager
+def confined(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Let nothing be written outside of `folder` within the block, wherever symbolic links in it lead."""
+    token = _confined.set(Path(folder).resolve())
+    try:
+        yield
+    finally:
+        _confined.reset(token)
+
+
+def allowed(path: Path) -> Path:
+    """Return a path that may be written.
+
+    Raises
+    ------
+    InputError
+        If it lies outside of the folder that outputs are `confined` to, or its links lead nowhere.
+    """
+    folder = _confined.get()
+    try:
+        if folder is None or path.resolve().is_relative_to(folder):
+            return path
+    except (OSError, RuntimeError) as error:
+        raise InputError("this path leads nowhere", file=path, remedy="check its links") from error
+    raise InputError(
+        f"a symbolic link leads outside of the output folder {folder}", file=path,
+        remedy="remove the link, or choose an output folder without links",
+    )  # fmt: skip
+
+
 @contextlib.contextmanager
 def together(folder: str | os.PathLike[str], name: str) -> Iterator[Outputs]:
     """Let all files that are written into `folder` within the block appear at once, when it ends well.
@@ -236,7 +270,7 @@ def together(folder: str | os.PathLike[str], name: str) -> Iterator[Outputs]:
     if outer is not None and outer.folder == place:
         yield outer
         return
-    outputs = Outputs(place, name)
+    outputs = Outputs(allowed(place), name)
     outputs.begin()
     token, failed = _under_way.set(outputs), True
     try:
@@ -306,7 +340,7 @@ def _place(path: str | os.PathLike[str]) -> Path:
     final = Path(path)
     try:
         # A rename onto a symbolic link would replace the link, not what it points to.
-        return final.resolve() if final.is_symlink() else final.parent.resolve() / final.name
+        return allowed(final.resolve() if final.is_symlink() else final.parent.resolve() / final.name)
     except (OSError, RuntimeError) as error:
         # Links that point at each other are a RuntimeError before Python 3.13.
         raise InputError(
@@ -327,6 +361,33 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write `text` as UTF-8 to `path`, whole or not at all."""
     with whole_or_nothing(path, side_cars=False) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def append_line(path: str | os.PathLike[str], line: str) -> None:
+    """Append a line to a file to which several processes may do so at once; on a full disk nothing of it is left.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    allowed(Path(path))
+    data = (line + "\n").encode("utf-8", errors="backslashreplace")
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            size = os.fstat(descriptor).st_size
+            try:
+                while data:
+                    data = data[os.write(descriptor, data) :]
+            except OSError:
+                os.ftruncate(descriptor, size)
+                raise
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise _unwritable(Path(path), error) from error
 
 
 def clear_up(path: str | os.PathLike[str]) -> None:
@@ -352,6 +413,7 @@ def read_bounded(path: str | os.PathLike[str], limit: int, **told: str) -> bytes
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         with open(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                told.setdefault("remedy", "give a plain file")
                 raise InputError("this is not a file but a folder, a pipe or a device", file=path, **told)
             return file.read(limit + 1)
     except (OSError, ValueError) as error:

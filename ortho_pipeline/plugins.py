@@ -22,7 +22,7 @@ import pluggy
 from ortho_pipeline import hookspecs
 from ortho_pipeline.contract import described, scene_faults, sensor_faults
 from ortho_pipeline.crop import placed
-from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed
+from ortho_pipeline.errors import InputError, OrthoError, PluginError, Terminated, completed
 from ortho_pipeline.hookspecs import PROJECT_NAME, Scene, Sensor
 from ortho_pipeline.models import KINDS, SensorModel
 from ortho_pipeline.raster import open_dataset
@@ -35,6 +35,7 @@ _RETURNS: dict[str, tuple[type, type, str]] = {
     "ortho_models": (Mapping, dict, "return {kind: class}"),
 }
 _COPY_IT = "correct what the file says there, or copy it again from the delivery"
+_COPY_AGAIN = "copy the metadata again from the delivery, or give a sound model (--rpc FILE, --model FILE)"
 _TEST_IT = "its author: run ortho_pipeline.testing.check_sensor on this file"
 log = logging.getLogger(__name__)
 
@@ -202,9 +203,14 @@ class Host:
                 fault = next(scene_faults(chosen, scene, size, {*KINDS, *self.models}), None)
         except OrthoError:
             raise
-        except Exception as error:
+        except Terminated:
+            raise
+        except (Exception, SystemExit) as error:
             text = described(error, chosen.open_scene)
             raise PluginError(f"{self._name(chosen)} failed to open it ({text})", file=path) from error
+        if fault and _normalised(self.provenance(chosen.name).distribution) == BUNDLED:
+            # The plugins that come along keep the contract with sound files: it is the file that is damaged.
+            raise InputError(f"this is no possible {fault}", file=scene.model_source, field="model", remedy=_COPY_AGAIN)
         if fault:
             raise PluginError(f"{self._name(chosen)}: {fault}", file=path, field="models", remedy=_TEST_IT)
         log.info("%s: sensor %s, models %s from %s", path, chosen.name, ", ".join(scene.models), scene.model_source)
@@ -217,7 +223,9 @@ class Host:
                 self._reserved.add(entry.name)
             try:
                 plugin = entry.load()
-            except Exception as error:
+            except Terminated:
+                raise
+            except (Exception, SystemExit) as error:
                 # A plugin is somebody else's code: whatever its import does wrong, the others go on.
                 self._leave_out(Broken(entry.name, distribution, version, described(error, entry.module)))
                 continue
@@ -270,7 +278,9 @@ class Host:
                 try:
                     offered = implementation.function()
                     returned = collect(offered) if isinstance(offered, wanted) else None
-                except Exception as error:
+                except Terminated:
+                    raise
+                except (Exception, SystemExit) as error:
                     text = described(error, implementation.function)
                     raise PluginError(f"plugin {plugin}: {hook} failed ({text})") from error
                 if returned is None:
@@ -328,7 +338,9 @@ class Host:
     def _recognises(self, sensor: Sensor, dataset: Any) -> bool:
         try:
             return bool(sensor.recognises(dataset))
-        except Exception as error:
+        except Terminated:
+            raise
+        except (Exception, SystemExit) as error:
             raise PluginError(
                 f"{self._name(sensor)} failed while looking at the dataset ({described(error, sensor.recognises)})",
                 file=dataset.GetDescription(),

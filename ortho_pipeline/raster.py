@@ -6,9 +6,11 @@ GDAL read any file of the machine. One `gdal.Dataset` is used by one thread only
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import os
+import stat
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -38,6 +40,9 @@ MAX_SIDE = 4_000_000
 #: GDAL reads whole blocks: one larger than this is refused before it is allocated (bytes).
 MAX_BLOCK = 1 << 30
 _MAX_VRT = 5_000_000
+#: Endings of files beside an image that GDAL's readers of metadata look for.
+_SIDE_CARS = (".xml", ".txt", ".imd", ".rpb", ".pvl", ".met", ".att", ".eph", ".tfw", ".wld", ".prj", ".hdr", ".ovr",
+              ".msk", ".rpc", ".dim")  # fmt: skip
 
 
 @reads("give a whole raster of a format that GDAL reads ('ortho doctor' lists the allowed ones); copy it again")
@@ -79,6 +84,8 @@ def open_dataset(
     else:
         drivers.remove("VRT")
     options: dict[str, Any] = {} if siblings else {"sibling_files": [name.rpartition("/")[2]]}
+    if siblings and not isinstance(place, VsiPath):
+        _refuse_pipes(Path(name))
     try:
         dataset = gdal.OpenEx(name, gdal.OF_RASTER | gdal.OF_READONLY, allowed_drivers=drivers, **options)
     except (RuntimeError, UnicodeDecodeError) as error:
@@ -91,6 +98,25 @@ def open_dataset(
     _check_size(dataset, name)
     log.info("%s: opened by %s", name, dataset.GetDriver().ShortName)
     return dataset
+
+
+def _refuse_pipes(path: Path) -> None:
+    """Refuse an image beside whose metadata or side-cars lies a pipe or a device: GDAL would wait for it for ever."""
+    folder = path if path.is_dir() else path.parent
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            related = path.stem in entry.name or Path(entry.name).suffix.lower() in _SIDE_CARS
+            if related and not entry.is_file() and not entry.is_dir() and entry.name != path.name:
+                try:
+                    kind = stat.S_IFMT(entry.stat().st_mode)
+                except OSError:
+                    # A link that leads nowhere: there is nothing to read.
+                    continue
+                if kind in (stat.S_IFIFO, stat.S_IFCHR, stat.S_IFBLK):
+                    raise InputError(
+                        "a pipe or a device lies beside this image where its metadata would be", file=path,
+                        field=entry.name, remedy="remove it",
+                    )  # fmt: skip
 
 
 def _check_size(dataset: gdal.Dataset, name: str) -> None:

@@ -61,15 +61,33 @@ def gdal_errors(path: str | os.PathLike[str]) -> Iterator[None]:
         gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", previous)
 
 
-def close(dataset: gdal.Dataset) -> None:
+def close(dataset: gdal.Dataset | None) -> None:
     """Close a dataset that was written; it cannot be used afterwards.
 
     Raises
     ------
     RuntimeError
-        If GDAL could not write the rest of it, which Python would ignore where a dataset is only deleted.
+        If GDAL could not write the rest of it, which Python would ignore where a dataset is only deleted; or could not
+        make it, which some of its drivers say by returning none.
     """
-    dataset.FlushCache()
+    if dataset is None:
+        raise RuntimeError(gdal.GetLastErrorMsg() or "GDAL could not make the file")
+    try:
+        dataset.FlushCache()
+    except RuntimeError:
+        abandon(dataset)
+        raise
+    _destroy(dataset)
+
+
+def abandon(dataset: gdal.Dataset | None) -> None:
+    """Close a dataset whose file is thrown away: what GDAL cannot write any more is nothing to tell."""
+    if dataset is not None:
+        with contextlib.suppress(RuntimeError):
+            _destroy(dataset)
+
+
+def _destroy(dataset: gdal.Dataset) -> None:
     if hasattr(dataset, "Close"):  # GDAL 3.8
         dataset.Close()
     else:

@@ -18,7 +18,7 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.raster import Grid, RasterSource, holds, pixel_type
-from ortho_pipeline.raster_output import check_written, checked_options, close, gdal_errors
+from ortho_pipeline.raster_output import abandon, check_written, checked_options, close, gdal_errors
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ class RasterWriter:
         # What is written last is left first: the pixels are complete before the file gets its name.
         with self._open:
             if error is not None:
-                self._dataset = None
+                abandon(self._dataset)
                 raise error
             self._finish()
 

@@ -268,9 +268,48 @@ def test_paths_stay_inside_of_the_root(block, change):
         batch_plan.plan(block.file)
 
 
-def test_an_explicit_root_widens(block):
-    block.write("root: ..\n" + FILE.replace("dem: dem.tif", "dem: ../tiny/dem.tif"))
-    assert batch_plan.plan(block.file).jobs[0].surface.dem == str(block.tiny.dem)
+def test_the_user_widens_the_root_and_the_file_only_narrows_it(block):
+    """Who wrote the file is not who says what it may read."""
+    widened = FILE.replace("dem: dem.tif", "dem: ../tiny/dem.tif")
+    for root in ("", "root: ..\n", "root: /\n"):
+        block.write(root + widened)
+        with pytest.raises(InputError, match="outside of the root") as caught:
+            batch_plan.plan(block.file)
+        assert "--root" in (caught.value.remedy or "")
+    block.write("root: /\n" + widened)
+    with pytest.raises(InputError, match="outside of the root"):
+        batch_plan.plan(block.file, block.folder.parent)
+    for root in ("", "root: ..\n"):
+        block.write(root + widened)
+        assert batch_plan.plan(block.file, block.folder.parent).jobs[0].surface.dem == str(block.tiny.dem)
+    block.write("root: raw\n" + FILE)
+    with pytest.raises(InputError, match="outside of the root"):
+        batch_plan.plan(block.file)
+
+
+@pytest.mark.parametrize("where", ["s0", "s0/s0_ortho.tif", "s0/s0_report.json", ".run", ".run/s0.json", "run.jsonl",
+                                   "run.json"])  # fmt: skip
+def test_a_run_writes_through_no_link_out_of_its_output_folder(block, where):
+    elsewhere = block.folder.parent / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / ".0123456789ab.x.part").write_text("somebody else's")
+    target = elsewhere / "precious"
+    if "." in where[1:]:
+        target.write_text("precious")
+    else:
+        target.mkdir()
+    path = block.folder / "out" / where
+    path.parent.mkdir(parents=True)
+    path.symlink_to(target)
+    before = {path: path.read_bytes() for path in elsewhere.rglob("*") if path.is_file()}
+    try:
+        outcome = batch.run(block.file, executor="sequential").scenes[0].error
+        said = "" if outcome is None else outcome["message"]
+    except InputError as error:
+        said = error.message
+    assert "a symbolic link leads outside of the output folder" in said
+    assert {path: path.read_bytes() for path in elsewhere.rglob("*") if path.is_file()} == before
+    assert target.is_file() or not list(target.iterdir())
 
 
 def test_a_file_of_the_current_folder_is_not_meant(block, tmp_path, monkeypatch):

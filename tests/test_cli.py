@@ -238,3 +238,24 @@ def test_verbose_says_what_is_done(tiny):
     assert "GTiff" not in quiet
     assert "tiny.tif: opened by GTiff" in loud
     assert "sensor rpc" in loud
+
+
+@pytest.mark.parametrize(
+    ("words", "field"),
+    [
+        (("rectify", "a.tif", "--json"), "--output"),
+        (("info", "a.tif", "--nope", "--json"), "--nope"),
+        (("info", "--json"), "image"),
+        (("--nope", "info", "--json"), "--nope"),
+        (("fly", "--json"), None),
+        (("rectify", "a.tif", "-o", "out", "-wm", "much", "--json"), "--memory"),
+    ],
+)
+def test_usage_errors_are_documents_too(words, field):
+    done = run(*words)
+    assert done.exit_code == 2
+    document = json.loads(done.stdout)
+    assert document["error"]["kind"] == "UsageError"
+    assert document["error"]["field"] == field
+    assert document["error"]["remedy"]
+    assert document["error"]["message"] in done.stderr

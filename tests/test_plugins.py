@@ -10,7 +10,7 @@ import pytest
 from osgeo import gdal
 
 from ortho_pipeline import pipeline
-from ortho_pipeline.errors import InputError, PluginError
+from ortho_pipeline.errors import InputError, PluginError, Terminated
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models import RPC, SensorModel
 from ortho_pipeline.plugins import Host
@@ -101,7 +101,8 @@ def test_installed_plugin_is_found_with_distribution_and_version(install):
     assert any(origin.distribution == "third-party" for origin in host.plugins())
 
 
-@pytest.mark.parametrize("source", ["import no_such_module_here", "def broken(:", "raise KeyError('x')", "1 / 0"])
+@pytest.mark.parametrize("source", ["import no_such_module_here", "def broken(:", "raise KeyError('x')", "1 / 0",
+                                    "import sys; sys.exit(0)"])  # fmt: skip
 def test_plugin_that_fails_to_import_is_left_out_with_a_warning(install, caplog, source):
     install("third-party", "third_party_plugin", source)
     host = Host(installed=True)
@@ -268,6 +269,33 @@ def test_recogniser_and_opener_that_raise_name_their_plugin(tmp_path):
     # What the user can correct is said of the file, where the plugin names none.
     with pytest.raises(InputError, match=r"a\.tif: the band is missing"):
         Host([make_plugin(make_sensor(open_scene=bad_product))]).open_scene(image)
+
+
+def test_a_plugin_cannot_end_the_process_but_a_signal_can(tmp_path):
+    def leave(dataset):
+        sys.exit(0)
+
+    def ended(dataset):
+        raise Terminated(143)
+
+    image = make_image(tmp_path / "a.tif")
+    with pytest.raises(PluginError, match="failed while looking"):
+        Host([make_plugin(make_sensor(recognises=leave))]).open_scene(image)
+    with pytest.raises(PluginError, match="failed to open"):
+        Host([make_plugin(make_sensor(open_scene=leave))]).open_scene(image)
+    with pytest.raises(Terminated):
+        Host([make_plugin(make_sensor(open_scene=ended))]).open_scene(image)
+
+
+def test_a_damaged_rpc_is_blamed_on_its_file_and_not_on_the_author_of_the_plugin(tmp_path):
+    image = make_image(tmp_path / "a.tif")
+    side_car = tmp_path / "a_RPC.TXT"
+    write_rpc_txt(make_rpc(lat_scale=1e5), side_car)
+    with pytest.raises(InputError, match="not in degrees") as caught:
+        Host.discover().open_scene(image)
+    assert caught.value.file == str(side_car)
+    assert caught.value.field
+    assert "author" not in (caught.value.remedy or "author")
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from osgeo import gdal
 
 from ortho_bilsat.survey import MARK, Survey, read_survey
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import read_bounded
 from ortho_pipeline.geometry import geodetic, orbital_from_ecef
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models.frame import FrameCamera, camera_from_platform, exterior_sigmas
@@ -37,9 +38,8 @@ def recognises(dataset: gdal.Dataset) -> bool:
     """Tell whether an imaging survey lies beside the image."""
     try:
         # A dataset in memory has no name: ValueError.
-        with open(survey_of(dataset.GetDescription()), "rb") as file:
-            return file.read(len(MARK)) == MARK.encode()
-    except (OSError, ValueError):
+        return read_bounded(survey_of(dataset.GetDescription()), len(MARK)).startswith(MARK.encode())
+    except (InputError, ValueError):
         return False
 
 

@@ -7,10 +7,9 @@ import math
 import re
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
 
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files import write_text
+from ortho_pipeline.files import read_bounded, write_text
 from ortho_pipeline.models.lens import Interior
 
 MARK = "BILSAT-1 IMAGING SURVEY 1"
@@ -131,13 +130,10 @@ def _fields(path: str | PathLike[str]) -> dict[str, str]:
 
 def _text(path: str | PathLike[str]) -> str:
     try:
-        if Path(path).stat().st_size > MAX_BYTES:
+        data = read_bounded(path, MAX_BYTES, field="survey", remedy="give the option survey")
+        if len(data) > MAX_BYTES:
             raise InputError(f"a survey of more than {MAX_BYTES} bytes is not read", file=path)
-        return Path(path).read_text(encoding="ascii")
-    except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror})", file=path, field="survey", remedy="give the option survey"
-        ) from error
+        return data.decode("ascii")
     except ValueError as error:
         raise InputError("a survey is plain ASCII text", file=path) from error
 

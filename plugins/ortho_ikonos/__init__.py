@@ -18,6 +18,7 @@ from ortho_ikonos.metadata import Component, Delivery, SourceImage, read_metadat
 from ortho_ikonos.order import ImageFile, Position, bands_of, position_of, rpc_file
 from ortho_pipeline.crs import ground_transform
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import read_bounded
 from ortho_pipeline.hookspecs import Piece, Scene, Sensor, hookimpl
 from ortho_pipeline.models import MapPlane, SensorModel
 from ortho_pipeline.models.rational import RPC
@@ -56,9 +57,8 @@ def recognises(dataset: gdal.Dataset) -> bool:
     if image is None:
         return False
     try:
-        with open(image.metadata, "rb") as file:
-            return b"IKONOS" in file.read(100_000)
-    except (OSError, ValueError):
+        return b"IKONOS" in read_bounded(image.metadata, 100_000)
+    except InputError:
         return False
 
 

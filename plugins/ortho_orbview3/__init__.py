@@ -12,6 +12,7 @@ from osgeo import gdal
 
 from ortho_orbview3.product import Product, choose_rpc, label_of, read_product, rpc_text_of
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import read_bounded
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models.rational import RPC
 
@@ -55,9 +56,8 @@ def recognises(dataset: gdal.Dataset) -> bool:
     if path is None:
         return False
     try:
-        with open(path, "rb") as file:
-            text = file.read(100_000)
-    except OSError:
+        text = read_bounded(path, 100_000)
+    except InputError:
         return False
     # A label that is cut off should say so, and not be passed over: the name of the satellite comes late in it.
     return b"OV-3" in text or (b"productInfo" in text and b"numScanLines" in text) or bool(_NAME.match(path.name))

@@ -33,6 +33,7 @@ from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.files import read_bounded
 from ortho_pipeline.models import require_view
 from ortho_pipeline.models.line_camera import LineCamera
 from ortho_pipeline.models.pushbroom import Pushbroom
@@ -59,9 +60,8 @@ _VENDOR_FROM_CAMERA = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.
 def has_dimap_pushbroom(path: str | PathLike[str]) -> bool:
     """Tell whether a file is DIMAP metadata with a rigorous model, from its text alone."""
     try:
-        with open(path, "rb") as file:
-            data = file.read(MAX_SIZE + 1)
-    except (OSError, ValueError):
+        data = read_bounded(path, MAX_SIZE)
+    except InputError:
         return False
     models = (b"<Sensor_Model_Characteristics", b"<Refined_Model")
     return len(data) <= MAX_SIZE and b"Dimap_Document" in data[:2000] and any(name in data for name in models)

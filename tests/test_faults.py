@@ -1,0 +1,33 @@
+"""The attack of `make faults`, reduced: write limits, kills, a full disk, little memory, changed inputs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FAULTS = Path(__file__).parent / "attack" / "faults.py"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--only", "export", "--limits", "16", "--kills", "10", "--disks", "2", "--memory", "0"),
+        ("--only", "rectify", "--limits", "3", "--kills", "3", "--disks", "1", "--memory", "0", "--changes", "2"),
+    ],
+)
+def test_no_fault_leaves_a_broken_or_mixed_set(words):
+    counts = [word for name in ("--workers", "--changes") if name not in words for word in (name, "0")]
+    done = subprocess.run(
+        [sys.executable, str(FAULTS), *words, *counts], check=False, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_no_fault_leaves_a_broken_or_mixed_set_of_any_command():
+    words = ("--limits", "40", "--kills", "40", "--workers", "6", "--disks", "20", "--memory", "0", "--changes", "8")
+    done = subprocess.run([sys.executable, str(FAULTS), *words], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -1,0 +1,63 @@
+"""Pipes and devices where files are expected: nobody waits for what never comes, and nothing endless is read."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BESIDE = ["{stem}_RPC.TXT", "{stem}_rpc.txt", "{stem}.RPB", "{stem}.IMD", "{stem}.pvl", "{stem}_metadata.txt",
+          "{stem}_survey.txt", "DIM_{stem}.XML", "RPC_{stem}.XML", "{stem}.tif.aux.xml", "{stem}.tif.ovr",
+          "{stem}.tif.msk", "{stem}.tfw", "{stem}_MET.TXT", "{stem}_RPC_ORG.TXT", "product_met.txt"]  # fmt: skip
+
+INFO = """
+import sys
+from pathlib import Path
+from click.testing import CliRunner
+from ortho_pipeline.cli import cli
+for name in sys.argv[2:]:
+    pipe = Path(sys.argv[1]).with_name(name)
+    import os
+    os.mkfifo(pipe)
+    print(name, flush=True)
+    done = CliRunner().invoke(cli, ["info", sys.argv[1]])
+    assert done.exit_code in (0, 2), (name, done.output)
+    pipe.unlink()
+"""
+
+
+@pytest.mark.parametrize("stem", ["IMG_PHR1A_P_001", "po_39001_pan_0000000"])
+def test_pipes_beside_an_image_do_not_hang_anything(tiny, tmp_path, stem):
+    image = tmp_path / f"{stem}.tif"
+    image.write_bytes(tiny.image.read_bytes())
+    names = [name.format(stem=stem.removeprefix("IMG_") if name.startswith(("DIM_", "RPC_")) else stem)
+             for name in BESIDE]  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", INFO, str(image), *names], check=False, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--gcps", "/dev/zero"),
+        ("--gcps", "{pipe}"),
+        ("--rpc", "{pipe}"),
+        ("--dem", "{pipe}"),
+    ],
+)
+def test_endless_files_are_refused(tiny, tmp_path, words):
+    pipe = tmp_path / "pipe.csv"
+    os.mkfifo(pipe)
+    words = [word.format(pipe=pipe) for word in words]
+    if "--dem" not in words:
+        words += ["--height", "500"]
+    command = [sys.executable, "-m", "ortho_pipeline", "rectify", str(tiny.image), "-o", str(tmp_path / "out"), *words]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2, done.stderr
+    assert "Remedy:" in done.stderr
+    assert not Path(tmp_path / "out").exists()
