@@ -3,19 +3,17 @@
 A model that cannot be fitted is a row with its reason. Gross errors are found once and left out for all, because a
 model that may throw out what it cannot follow would win.
 
-The recommendation follows the one-standard-error rule, on the mean squared errors at all points that took no part:
-check points, and control points each left out in turn.
+The recommendation compares the root mean squares at all points that took no part: check points, and control points each
+left out in turn.
 
 1. A model that is unstable, uncertain at a corner of the scene or unsuited is never recommended.
-2. A simpler model is as good as the best if its mean squared error is within one standard error of the best one's, and,
-   should its RMSE be more than 5 % larger, not significantly so at the same points (paired differences, one standard
-   error). Paired differences alone would prefer one of two nested near-twins with the better part of its parameters
-   for nothing: they hardly differ, but do so everywhere.
-3. Where the scene has a model of its own, one of its corrections is taken, unless another model is significantly
-   better: beyond the standard error, and at 5 % in paired differences.
-4. Of those as good as the best, the one with the fewest parameters.
+2. Where the scene has a model of its own, one of its corrections is taken, unless another model is better by more than
+   5 %, and significantly so: at 5 % in paired differences of the squared errors at the same points.
+3. Of the models within 5 % of the smallest error, the one with the fewest parameters.
 
-Source: Breiman et al. 1984, Classification and Regression Trees, section 3.4.3.
+The model with the smallest error there is the best guess at that elsewhere, so what a simpler one may cost is bounded.
+The one-standard-error rule (Breiman et al. 1984, Classification and Regression Trees, section 3.4.3) bounds it by how
+little is known, with twelve points by a quarter of the error and more; docs/accuracy.md has both on simulated scenes.
 """
 
 from __future__ import annotations
@@ -39,11 +37,9 @@ from ortho_pipeline.statistics import student_of
 
 #: What is adjusted over a scene's own model.
 CORRECTIONS = ("none", "shift", "shift-drift", "affine")
-#: Chance of calling a model worse, in paired differences, that is as good: one standard error, one-sided.
-WORSE = 0.16
-#: The same for taking another model than a correction of the scene's own.
-SIGNIFICANTLY_WORSE = 0.05
-#: Smaller differences of the RMSE, as a factor, are not worth a parameter.
+#: Chance of calling the corrections of the scene's own model worse than another one that is as good, one-sided.
+_SIGNIFICANTLY_WORSE = 0.05
+#: Smaller differences of the RMSE, as a factor, are not worth a parameter, nor another model than the scene's own.
 _WORTH = 1.05
 #: Models whose median error is within this factor of the smallest one have a vote on gross errors.
 _CLEAR_SIGHTED = 2.0
@@ -329,8 +325,8 @@ def recommend(
         reason += f"; {best} has {shown[best]}, not significantly less than a correction of the scene's own model"
     else:
         reason += (
-            f"; {best} has {shown[best]} with {by_name[best].parameters} parameters, a difference within the standard "
-            "error, so the model with fewer parameters is preferred"
+            f"; {best} has {shown[best]} with {by_name[best].parameters} parameters, less by 5 % at most, so the model "
+            "with fewer parameters is preferred"
         )
     if doubts[smallest]:
         reason += f" ({smallest} has {shown[smallest]} and is {doubts[smallest]})"
@@ -377,27 +373,26 @@ def _best(squares: _Squares, rows: Mapping[str, Row]) -> str:
 
 
 def _choose(squares: _Squares, rows: Mapping[str, Row], preferred: Sequence[str]) -> tuple[str, str]:
-    """Return the model to take, and the one with the smallest error among those that it was chosen from."""
+    """Return the model to take, and the one with the smallest error of all."""
     best = _best(squares, rows)
+    candidates = squares
     if preferred:
         own = {name: squares[name] for name in preferred}
-        first = _best(own, rows)
-        if _as_good(own[first], squares[best], SIGNIFICANTLY_WORSE, either=True):
-            return _choose(own, rows, ())[0], best
-    close = [name for name in squares if _as_good(squares[name], squares[best], WORSE)]
+        if not _significantly_worse(own[_best(own, rows)], squares[best]):
+            candidates = own
+    limit = _WORTH**2 * squares[_best(candidates, rows)].mean()
+    close = [name for name, values in candidates.items() if values.mean() <= limit]
     return min(close, key=lambda name: (rows[name].parameters, squares[name].mean())), best
 
 
-def _as_good(squares: Array, best: Array, level: float, *, either: bool = False) -> bool:
-    """Say whether errors are within the standard error of the best ones, and (or) not significantly larger."""
+def _significantly_worse(squares: Array, best: Array) -> bool:
+    """Say whether errors are larger by more than is worth it, and by more than chance at the same points explains."""
+    if squares.mean() <= _WORTH**2 * best.mean():
+        return False
     difference = squares - best
-    if not difference.any():
-        return True
-    count = len(difference)
-    within = bool(squares.mean() <= best.mean() + best.std(ddof=1) / math.sqrt(count))
-    _, p = student_of(difference.mean()[None], np.array([[difference.var(ddof=1) / count]]), count - 1)
-    alike = not (squares.mean() > _WORTH**2 * best.mean() and p[0] / 2 < level)
-    return within or alike if either else within and alike
+    variance = difference.var(ddof=1) / len(difference)
+    _, p = student_of(difference.mean()[None], np.array([[variance]]), len(difference) - 1)
+    return bool(p[0] / 2 < _SIGNIFICANTLY_WORSE)
 
 
 def _what(checks: int, control: int) -> str:
