@@ -11,6 +11,7 @@ from typing import Any
 #: Public name -> module that holds it.
 _HOMES = {
     "BlockPoints": "block_points",
+    "Ellipse": "ellipse",
     "Fit": "estimation",
     "Grid": "raster",
     "ImageCorrection": "models",
@@ -32,6 +33,7 @@ _HOMES = {
     "compare": "comparison",
     "export_rpc": "rpc",
     "fit": "estimation",
+    "fit_ellipse": "ellipse",
     "hookimpl": "hookspecs",
     "load_model": "model_file",
     "intersect": "intersection",

@@ -6,6 +6,8 @@ from ortho_pipeline.block_points import read_block_points as read_block_points
 from ortho_pipeline.comparison import compare as compare
 from ortho_pipeline.crs import Vertical as Vertical
 from ortho_pipeline.dem import Surface as Surface
+from ortho_pipeline.ellipse import Ellipse as Ellipse
+from ortho_pipeline.ellipse import fit_ellipse as fit_ellipse
 from ortho_pipeline.errors import OrthoError as OrthoError
 from ortho_pipeline.estimation import Fit as Fit
 from ortho_pipeline.estimation import fit as fit

@@ -283,27 +283,23 @@ class _Fitted:
         return (self.a + self.b * top, top), (self.a + self.b * bottom, bottom)
 
 
-def edge_response(distance: Array, sigma: float, wide: float, tall: float) -> Array:
+def edge_response(distance: Array, sigma: float, wide: Array | float, tall: Array | float) -> Array:
     """Return what pixels at signed distances from an edge between 0 and 1 see through a Gaussian and a square pixel.
 
     Against the normal of the edge, the pixel is the convolution of two boxes, `wide` and `tall` (cosine and sine of the
-    angle): so this is the second difference of the second integral of the cumulative normal distribution.
+    angle, of one edge or of each pixel's): so this is the second difference of the second integral of the cumulative
+    normal distribution.
     """
     from scipy.special import ndtr
 
     sigma = max(sigma, 0.02)
 
-    def once(at: Array) -> Array:
-        z = at / sigma
-        return np.asarray(sigma * (z * ndtr(z) + np.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)))
-
     def twice(at: Array) -> Array:
         z = at / sigma
         return np.asarray(sigma**2 / 2 * ((z**2 + 1) * ndtr(z) + z * np.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)))
 
-    long, short = max(wide, tall), min(wide, tall)
-    if short < 1e-3:
-        return (once(distance + long / 2) - once(distance - long / 2)) / long
+    # A box of a thousandth of a pixel is none, and differences over it still have ten digits.
+    long, short = np.maximum(wide, tall), np.maximum(np.minimum(wide, tall), 1e-3)
     out, inner = (long + short) / 2, (long - short) / 2
     ends = twice(distance + out) + twice(distance - out) - twice(distance + inner) - twice(distance - inner)
     return np.asarray(ends / (long * short))

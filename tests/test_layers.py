@@ -35,7 +35,7 @@ raster
 raster_output
 raster_writer
 rpc dem preview edge outline crop stack
-plugins rays gdal_engine resolution
+plugins rays gdal_engine resolution ellipse
 footprint lattice simulate inputs testing dem_accuracy
 gcp_export scene_fit warp mosaic
 scene_layout
