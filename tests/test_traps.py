@@ -1,0 +1,42 @@
+"""Traps of the field (docs/reliability.md) that no test of a module holds."""
+
+from __future__ import annotations
+
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline import pipeline
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.raster_output import checked_options
+from ortho_pipeline.rpc import rpc_metadata
+
+
+@pytest.mark.parametrize("size", [(4_000_001, 1), (1, 4_000_001)])
+def test_headers_of_impossible_sizes_are_refused_before_anything_is_allocated(tmp_path, size):
+    path = tmp_path / "a.tif"
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), *size, 1, gdal.GDT_Byte, ["SPARSE_OK=YES"])
+    dataset = None
+    assert dataset is None
+    with pytest.raises(InputError, match="the header claims"):
+        open_dataset(path)
+
+
+@pytest.mark.parametrize("driver", ["COG", "GTiff"])
+def test_compression_is_lossless_unless_somebody_asks_for_another(driver):
+    assert checked_options(driver, {}, 1).get("COMPRESS", "NONE") in ("NONE", "DEFLATE")
+    assert checked_options(driver, {"COMPRESS": "JPEG"}, 1)["COMPRESS"] == "JPEG"
+
+
+def test_the_rpc_of_an_image_is_used_and_not_its_control_points(tiny):
+    dataset = gdal.Open(str(tiny.image), gdal.GA_Update)
+    dataset.SetMetadata(rpc_metadata(tiny.model), "RPC")
+    dataset.SetGCPs([gdal.GCP(10.0, 50.0, 0.0, 0.0, 0.0), gdal.GCP(11.0, 50.0, 0.0, 400.0, 0.0),
+                     gdal.GCP(10.0, 51.0, 0.0, 0.0, 300.0)], "")  # fmt: skip
+    dataset = None
+    assert dataset is None
+    found = pipeline.info(tiny.image)
+    assert next(iter(found["models"])) == "rpc"
+    lon, lat = found["corners_lon_lat"][0]
+    assert abs(lon - tiny.model.lon_off) < 0.1
+    assert abs(lat - tiny.model.lat_off) < 0.1
