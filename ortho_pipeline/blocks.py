@@ -254,9 +254,7 @@ def _record(
     read: dict[Path, str] = {}
     for image, scene, start in zip(images, scenes, starts.values(), strict=True):
         for given in (options.points, options.gcps):
-            for path, role in inputs.files_read(
-                image, scene, PointOptions(gcps=given), rasters=start.scene.rasters
-            ).items():
+            for path, role in inputs.files_read(image, scene, PointOptions(gcps=given), opened=start.scene).items():
                 read.setdefault(path, role)
     first = next(iter(starts.values())).scene
     whole = inputs.provenance(

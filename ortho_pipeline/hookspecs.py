@@ -19,6 +19,9 @@ into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole
         return Scene("tinysat", dataset.GetDescription(), dataset.RasterXSize, dataset.RasterYSize, {"rpc": rpc},
                      source, facts={"band": int(band)})
 
+Files beside an image are found from ``ortho_pipeline.locations.place(dataset.GetDescription())``, which has the methods
+of `pathlib.Path` for an image on disk and for one in an archive (docs/plugins.md).
+
 The host tries every scene at a few points before it works with it (`ortho_pipeline.contract`). Test more with
 `ortho_pipeline.testing.check_sensor`.
 """
@@ -33,6 +36,7 @@ from typing import Any
 
 import pluggy
 
+from ortho_pipeline.locations import place
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.problem import Prior
 
@@ -116,10 +120,10 @@ class Scene:
     adjusted: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "path", Path(self.path))
+        object.__setattr__(self, "path", place(self.path))
         if isinstance(self.model_source, PathLike):
             object.__setattr__(self, "model_source", str(self.model_source))
-        object.__setattr__(self, "rasters", tuple(map(Path, self.rasters)))
+        object.__setattr__(self, "rasters", tuple(map(place, self.rasters)))
 
     def __fspath__(self) -> str:
         """Stand for the image file where a path is wanted."""

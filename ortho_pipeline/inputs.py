@@ -108,8 +108,8 @@ def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_mo
     asked = isinstance(image, Scene) or bool(options.model or options.rpc or options.sensor or options.sensor_options)
     if needs_model or asked:
         return open_scene(image, options)
-    dataset = raster.open_dataset(image, **options.access)
     host = plugins.Host.discover()
+    dataset = host.open_image(image, **options.access)
     try:
         host.recognise(dataset)
     except InputError:
@@ -334,12 +334,11 @@ def files_read(
     scene: SceneOptions = SceneOptions(),
     points: PointOptions = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
-    rasters: Iterable[str | os.PathLike[str]] = (),
-    sources: Iterable[str | os.PathLike[str]] = (),
+    opened: Scene | None = None,
 ) -> dict[Path, str]:
     """Return every file that is read and its role, side-cars and sources of a VRT included.
 
-    `rasters` and `sources` are those of the `Scene`.
+    Of what lies in an archive that is the archive. `opened` knows what its sensor read.
     """
     read: dict[Path, str] = {}
 
@@ -351,10 +350,12 @@ def files_read(
 
     add("image", [image])
     add("image", _files_of(image, scene))
-    add("image", rasters)
-    add("metadata", sources)
     for role, path in scene.files.items():
         add(role, [path])
+    if opened is not None:
+        add("image", [opened.path, *opened.rasters])
+        add("image", _files_of(opened.path, scene) if opened.path != Path(image) else ())
+        add("metadata", [*opened.sources, opened.model_source])
     add("points", [point_file(points)])
     if surface.dem is not None:
         add("DEM", [surface.dem, *_files_of(surface.dem, scene)])

@@ -6,6 +6,8 @@ strangers says of other files is text, which nothing here opens.
 
 from __future__ import annotations
 
+import errno
+import fnmatch
 import io
 import os
 import re
@@ -21,6 +23,10 @@ SCHEMES = {"http": "/vsicurl/http://", "https": "/vsicurl/https://", "s3": "/vsi
 _ARCHIVES = ("/vsizip", "/vsitar", "/vsigzip", "/vsi7z", "/vsirar")
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
 _SHOWN = 5
+#: No more is read at once of a file in an archive or behind a URL: a zip of 1 kB may hold milliards of zeros.
+MAX_READ = 5_000_000
+#: No delivery has more files in a folder; a store behind a URL may.
+MAX_LISTED = 10_000
 
 
 class VsiPath:
@@ -76,6 +82,14 @@ class VsiPath:
             raise InputError(f"{name!r} is not the name of a file in this folder", file=self._name)
         return VsiPath(f"{self._name}/{name}")
 
+    def with_suffix(self, suffix: str) -> VsiPath:
+        """Return the file beside it whose name has another ending."""
+        return self.with_name(self.stem + suffix)
+
+    def absolute(self) -> VsiPath:
+        """Return the path itself."""
+        return self
+
     def resolve(self) -> VsiPath:
         """Return the path itself: there are no links."""
         return self
@@ -107,12 +121,28 @@ class VsiPath:
         return found is not None and bool(found.IsDirectory())
 
     def iterdir(self) -> Iterator[VsiPath]:
-        """Yield what lies in the folder."""
+        """Yield what lies in the folder, the first `MAX_LISTED`.
+
+        Raises
+        ------
+        FileNotFoundError
+            If it is none.
+        """
         from osgeo import gdal
 
-        for name in gdal.ReadDir(self._name) or []:
-            if name not in (".", "..") and "/" not in name:
+        try:
+            names = gdal.ReadDir(self._name, MAX_LISTED)
+        except RuntimeError:
+            names = None
+        if names is None:
+            raise FileNotFoundError(2, "there is no such folder", self._name)
+        for name in names:
+            if name not in (".", "..", "") and "/" not in name:
                 yield self / name
+
+    def glob(self, pattern: str) -> Iterator[VsiPath]:
+        """Yield what lies in the folder and has a name of this pattern."""
+        return (path for path in self.iterdir() if fnmatch.fnmatchcase(path.name, pattern))
 
     def read(self, limit: int) -> bytes:
         """Return the first bytes, at most `limit`.
@@ -136,16 +166,27 @@ class VsiPath:
             gdal.VSIFCloseL(file)
 
     def read_bytes(self) -> bytes:
-        """Return all bytes."""
-        return self.read(max(1, int(self.stat().st_size)))
+        """Return all bytes.
+
+        Raises
+        ------
+        OSError
+            If it cannot be read, or has more than `MAX_READ`, whatever size an archive states of it.
+        """
+        data = self.read(MAX_READ + 1)
+        if len(data) > MAX_READ:
+            raise OSError(errno.EFBIG, f"a file of more than {MAX_READ // 1_000_000} MB is not read whole", self._name)
+        return data
 
     def read_text(self, encoding: str = "utf-8") -> str:
         """Return all text."""
         return self.read_bytes().decode(encoding)
 
-    def open(self, mode: str = "rb") -> io.BytesIO:
+    def open(self, mode: str = "r", encoding: str = "utf-8") -> io.BytesIO | io.StringIO:
         """Return the content as a file that is open for reading."""
-        return io.BytesIO(self.read_bytes())
+        if "b" in mode:
+            return io.BytesIO(self.read_bytes())
+        return io.StringIO(self.read_text(encoding))
 
     def _stat(self) -> Any:
         from osgeo import gdal
@@ -213,7 +254,11 @@ def in_local_archive(name: str) -> bool:
 
 
 def place(name: AnyPath) -> Any:
-    """Return the path of a dataset that is open (``dataset.GetDescription()``): a `Path`, or a `VsiPath`."""
+    """Return the path of a dataset that is open (``dataset.GetDescription()``): a `Path`, or a `VsiPath`.
+
+    Both know names, siblings and content by the methods of `pathlib.Path`: what is written for a folder on disk works
+    in an archive as well. `files.read_bounded` reads either with a limit.
+    """
     text = os.fspath(name)
     return VsiPath(text) if text.startswith("/vsi") else Path(text)
 

@@ -56,9 +56,14 @@ class SceneOptions:
     @property
     def files(self) -> dict[str, str | os.PathLike[str]]:
         """Files besides the image that the scene is read from, by what they are."""
-        given = {name: value for name, value in self.sensor_options.items() if os.path.isfile(value)}
+        given = {name: value for name, value in self.sensor_options.items() if _is_file(value)}
         own = {"RPC": self.rpc, "model": self.model}
         return {**{role: path for role, path in own.items() if path is not None}, **given}
+
+
+def _is_file(value: object) -> bool:
+    """Tell whether a text names a file, on disk or as GDAL names those in an archive."""
+    return isinstance(value, str | os.PathLike) and (os.fspath(value).startswith("/vsi") or os.path.isfile(value))
 
 
 class PointTable(Protocol):

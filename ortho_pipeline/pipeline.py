@@ -194,7 +194,7 @@ def compare(
     if best.model in {family.name for family in families()}:
         opened = replace(opened, models={best.model: best.fit.model}, model_source="control points")
     adjusted = Adjusted(opened, best.fit)
-    hashed = inputs.hashed(inputs.files_read(image, scene, points, surface))
+    hashed = inputs.hashed(inputs.files_read(image, scene, points, surface, opened))
     record = inputs.provenance(opened, points, heights, hashed, command, {"scene": scene, "surface": surface})
     document = report.build_report(
         scene=opened, fit=best.fit, surface=heights, comparison=result.to_json(), near=points.near,
@@ -250,7 +250,7 @@ def rectify(
     opened = open_adjustable(image, scene, points)
     heights = open_surface(surface, scene)
     acquired = stac_items.acquisition_time(opened.facts, output.acquired) if output.stac else None
-    read = inputs.files_read(image, scene, points, surface, opened.rasters, opened.sources)
+    read = inputs.files_read(image, scene, points, surface, opened)
     begun = states(read) | begun
     with inputs.hashed_beside(read, digest) as hashing:
         adjusted, model, heights, found, grid = lay_out(opened, points, scene, heights, output)

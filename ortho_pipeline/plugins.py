@@ -10,10 +10,12 @@ import contextlib
 import difflib
 import functools
 import logging
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from os import PathLike
+from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any
 
@@ -138,6 +140,29 @@ class Host:
         """Return the provenance of every plugin that is registered."""
         return tuple(self._origin.values())
 
+    def open_image(
+        self,
+        path: str | PathLike[str],
+        sensor: str | None = None,
+        *,
+        allow_network: bool = False,
+        roots: Sequence[str | PathLike[str]] = (),
+    ) -> Any:
+        """Return the dataset of an image; of a link, beside which nothing of its product lies, that of its target."""
+        dataset = open_dataset(path, allow_network=allow_network, roots=roots)
+        if not Path(path).is_symlink():
+            return dataset
+        target = open_dataset(os.path.realpath(path), allow_network=allow_network, roots=roots)
+        # A sensor that knows the product goes before a fallback, at the link and at its target.
+        for fallback in (False, True):
+            asked = [
+                item for item in self.sensors.values() if sensor in (None, item.name) and item.fallback == fallback
+            ]
+            for found in (dataset, target):
+                if any(self._recognises(item, found) for item in asked):
+                    return found
+        return dataset
+
     def recognise(self, dataset: Any, sensor: str | None = None, options: Iterable[str] = ()) -> Sensor:
         """Return the sensor that `dataset` belongs to.
 
@@ -185,7 +210,7 @@ class Host:
     ) -> Scene:
         """Open a product with the sensor that recognises it; see `open_scene`."""
         options = dict(options or {})
-        dataset = open_dataset(path, allow_network=allow_network, roots=roots)
+        dataset = self.open_image(path, sensor, allow_network=allow_network, roots=roots)
         chosen = self.recognise(dataset, sensor, options)
         for name in options:
             if name not in chosen.options:

@@ -355,6 +355,18 @@ def test_metadata_that_name_another_image_are_not_taken(tmp_path: Path) -> None:
     assert list(open_scene(other).models) == ["rpc", "pushbroom"]
 
 
+def test_metadata_in_an_archive_are_those_on_disk(tmp_path: Path) -> None:
+    folder = tmp_path / "delivery"
+    folder.mkdir()
+    (folder / "DIM_A.XML").write_text(dimap_text())
+    image = _image(folder / "a.tif", read_dimap_pushbroom(folder / "DIM_A.XML"))
+    inside = f"/vsizip/{shutil.make_archive(str(tmp_path / 'order'), 'zip', folder)}"
+    here, there = open_scene(image), open_scene(f"{inside}/a.tif")
+    assert list(here.models) == list(there.models) == ["rpc", "pushbroom"]
+    assert here.models["pushbroom"].to_dict() == there.models["pushbroom"].to_dict()
+    assert list(map(str, there.sources)) == [f"{inside}/DIM_A.XML"]
+
+
 def test_a_model_far_off_the_rpc_is_of_another_image(tmp_path: Path) -> None:
     path = tmp_path / "DIM_A.XML"
     path.write_text(dimap_text())

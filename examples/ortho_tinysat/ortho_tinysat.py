@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geometry import geocentric
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.locations import place
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.problem import Prior
 
@@ -76,8 +76,8 @@ def recognises(dataset: Any) -> bool:
     return flight_file(dataset).is_file()
 
 
-def flight_file(dataset: Any) -> Path:
-    return Path(dataset.GetDescription().removesuffix(".tif") + ".tinysat.json")
+def flight_file(dataset: Any) -> Any:
+    return place(dataset.GetDescription().removesuffix(".tif") + ".tinysat.json")
 
 
 def open_scene(dataset: Any, *, mounting: str = "0") -> Scene:

@@ -14,6 +14,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.geometry import geodetic, orbital_from_ecef
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.locations import place
 from ortho_pipeline.models.frame import FrameCamera, camera_from_platform, exterior_sigmas
 from ortho_pipeline.problem import priors_at
 
@@ -45,14 +46,14 @@ def recognises(dataset: gdal.Dataset) -> bool:
 
 def survey_of(image: str) -> Path:
     """Return the path at which the survey of an image is looked for."""
-    path = Path(image)
+    path = place(image)
     return path.with_name(f"{path.stem}_survey.txt")
 
 
 def open_scene(dataset: gdal.Dataset, *, survey: str | None = None, attitude: str = "survey") -> Scene:
     """Open a BILSAT-1 image with its imaging survey."""
     name = dataset.GetDescription()
-    path = Path(survey) if survey else survey_of(name)
+    path = place(survey) if survey else survey_of(name)
     read = read_survey(path)
     if (dataset.RasterXSize, dataset.RasterYSize) != (read.interior.width, read.interior.height):
         raise InputError(

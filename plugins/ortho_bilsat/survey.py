@@ -129,10 +129,10 @@ def _fields(path: str | PathLike[str]) -> dict[str, str]:
 
 
 def _text(path: str | PathLike[str]) -> str:
+    data = read_bounded(path, MAX_BYTES, field="survey", remedy="give the option survey")
+    if len(data) > MAX_BYTES:
+        raise InputError(f"a survey of more than {MAX_BYTES} bytes is not read", file=path)
     try:
-        data = read_bounded(path, MAX_BYTES, field="survey", remedy="give the option survey")
-        if len(data) > MAX_BYTES:
-            raise InputError(f"a survey of more than {MAX_BYTES} bytes is not read", file=path)
         return data.decode("ascii")
     except ValueError as error:
         raise InputError("a survey is plain ASCII text", file=path) from error

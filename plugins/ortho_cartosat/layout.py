@@ -20,6 +20,7 @@ from pathlib import Path
 
 from ortho_cartosat.metadata import Metadata, read_metadata
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.locations import place
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.rpc_files import read_rpc_text
 
@@ -33,7 +34,7 @@ MAX_FOLDERS = 200
 
 def beside(image: str | PathLike[str], before: str, after: str) -> Path | None:
     """Return the file ``<before><stem><after>`` beside an image, in one of the usual cases; None without it."""
-    path = Path(image)
+    path = place(image)
     for stem in dict.fromkeys((path.stem, path.stem.upper(), path.stem.lower())):
         head, tail = before + stem, after.removesuffix("TXT")
         for name in (head + tail + "TXT", head + tail + "txt", f"{before.lower()}{stem}{tail.lower()}txt"):
@@ -88,7 +89,7 @@ def partner_of(image: str | PathLike[str], metadata: Metadata) -> Path | None:
 
     None without it, and where several folders have one: which of them is meant cannot be told.
     """
-    path = Path(image)
+    path = place(image)
     named = _SIDE.fullmatch(path.stem)
     name = (path.stem if named is None else named[1] + _OTHER[named[2]]) + path.suffix
     if named is not None and _is_partner(path.with_name(name), metadata):

@@ -18,6 +18,7 @@ import numpy as np
 
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import decoded, read_bounded
+from ortho_pipeline.locations import place
 from ortho_pipeline.models.base import Array
 
 MAX_BYTES = 1_000_000
@@ -163,7 +164,7 @@ def read_metadata(path: str | PathLike[str]) -> Metadata:
     InputError
         If the file cannot be read, is no text, or holds no assignment.
     """
-    path = Path(path)
+    path = place(path)
     data = read_bounded(path, MAX_BYTES)
     if len(data) > MAX_BYTES or b"\0" in data:
         raise InputError("this is no metadata: too large, or no text", file=path)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files import read_json
+from ortho_pipeline.files import read_bounded, read_json
 from ortho_pipeline.geometry import angles_of_rotation
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.lens import Interior
@@ -304,12 +304,11 @@ def _json(path: str | PathLike[str]) -> Any:
 
 
 def _text(path: str | PathLike[str]) -> str:
+    data = read_bounded(path, MAX_BYTES, remedy="check the path")
+    if len(data) > MAX_BYTES:
+        raise InputError(f"a file of more than {MAX_BYTES // 1_000_000} MB is not read here", file=path)
     try:
-        if Path(path).stat().st_size > MAX_BYTES:
-            raise InputError(f"a file of more than {MAX_BYTES // 1_000_000} MB is not read here", file=path)
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path, remedy="check the path") from error
+        text = data.decode("utf-8-sig")
     except ValueError as error:
         raise InputError("this is no text in UTF-8", file=path) from error
     if "\0" in text:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 
 import numpy as np
 from osgeo import gdal
@@ -20,6 +19,7 @@ from ortho_pipeline.crs import ground_transform
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.hookspecs import Piece, Scene, Sensor, hookimpl
+from ortho_pipeline.locations import place
 from ortho_pipeline.models import MapPlane, SensorModel
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.problem import Prior, priors_at
@@ -53,7 +53,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 def recognises(dataset: gdal.Dataset) -> bool:
     """Tell whether it is named like an image of an order whose metadata, which lie beside it, are of IKONOS."""
-    image = ImageFile.of(Path(dataset.GetDescription()))
+    image = ImageFile.of(place(dataset.GetDescription()))
     if image is None:
         return False
     try:
@@ -72,7 +72,7 @@ def open_scene(
     heights: str | None = None,
 ) -> Scene:
     """Open an image of an IKONOS order."""
-    path = Path(dataset.GetDescription())
+    path = place(dataset.GetDescription())
     image = ImageFile.of(path)
     if image is None and (metadata is None or bands != "one"):
         raise InputError(
@@ -121,7 +121,7 @@ def _rpc(dataset: gdal.Dataset, choice: str | None) -> tuple[RPC, str] | None:
     """Return the RPC and where it is from; GDAL does not attach a side-car to every format."""
     if choice is not None or has_rpc(dataset):
         return rpc_of_dataset(dataset, choice)
-    found = rpc_file(Path(dataset.GetDescription()))
+    found = rpc_file(place(dataset.GetDescription()))
     return None if found is None else (read_rpc(found), str(found))
 
 

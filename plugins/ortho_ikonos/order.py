@@ -14,6 +14,7 @@ from osgeo import gdal
 from ortho_ikonos.metadata import Component, Delivery, Placement, read_header
 from ortho_pipeline.crs import same_crs
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.locations import place
 
 _NAME = re.compile(
     r"(?P<order>po_[^/\\]+)_(?P<band>[a-z]{2,4})_(?P<component>\d{7})\.(?:tiff?|ntf|nitf)", re.IGNORECASE | re.ASCII
@@ -137,9 +138,9 @@ def position_of(dataset: gdal.Dataset, delivery: Delivery, component: Component)
     InputError
         If the image has not the size that is stated.
     """
-    path, size = Path(dataset.GetDescription()), (dataset.RasterXSize, dataset.RasterYSize)
+    path, size = place(dataset.GetDescription()), (dataset.RasterXSize, dataset.RasterYSize)
     header = beside(path, f"{path.stem}_hdr.txt")
-    stated, sources = component.placement, (Path(delivery.file),)
+    stated, sources = component.placement, (place(delivery.file),)
     if header.is_file():
         stated, sources = read_header(header).completed_by(stated), (*sources, header)
     if len(delivery.components) == 1:

@@ -14,6 +14,7 @@ from ortho_orbview3.product import Product, choose_rpc, label_of, read_product, 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.locations import place
 from ortho_pipeline.models.rational import RPC
 
 #: Names of the USGS: 3v, year, month, day, and p for panchromatic or m for multispectral.
@@ -66,7 +67,7 @@ def recognises(dataset: gdal.Dataset) -> bool:
 def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None, label: str | None = None) -> Scene:
     """Open an OrbView-3 image with its label and its RPC."""
     name = dataset.GetDescription()
-    path = Path(label) if label else label_of(name)
+    path = place(label) if label else label_of(name)
     if path is None:
         raise InputError("there is no label beside this image", file=name, field="label", remedy="give label=FILE")
     product = read_product(path)

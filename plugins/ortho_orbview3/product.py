@@ -12,6 +12,7 @@ import numpy as np
 
 from ortho_orbview3.label import Group, read_label
 from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.locations import place
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.rational import RPC, rpc_terms
 from ortho_pipeline.rpc import read_rpc
@@ -82,12 +83,12 @@ class Product:
 
 def label_of(image: str | PathLike[str]) -> Path | None:
     """Return the label beside an image, None if there is none."""
-    return _beside(Path(image), ".pvl")
+    return _beside(place(image), ".pvl")
 
 
 def rpc_text_of(image: str | PathLike[str]) -> Path | None:
     """Return the RPC text beside an image, None if there is none."""
-    return _beside(Path(image), "_rpc.txt")
+    return _beside(place(image), "_rpc.txt")
 
 
 def _beside(image: Path, end: str) -> Path | None:
@@ -149,7 +150,7 @@ def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple
     if choice == "label":
         return product.rpc, product.file, ()
     if choice not in (None, "text", "sidecar"):
-        return read_rpc(choice), choice, ()
+        return read_rpc(choice), str(choice), ()
     if text is None:
         if choice is not None:
             raise InputError("there is no RPC text beside the image", field="rpc", remedy="take --rpc label")

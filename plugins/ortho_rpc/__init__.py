@@ -7,12 +7,12 @@ same image lie beside it, the scene has the model ``pushbroom`` as well.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 from osgeo import gdal
 
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.locations import place
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.rpc import has_rpc, rpc_of_dataset
@@ -39,7 +39,7 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
     """Open an image with its RPC, or with the one given."""
     model, source = rpc_of_dataset(dataset, rpc)
     width, height = dataset.RasterXSize, dataset.RasterYSize
-    rigorous = rigorous_beside(Path(dataset.GetDescription()), (width, height), model)
+    rigorous = rigorous_beside(place(dataset.GetDescription()), (width, height), model)
     models: dict[str, SensorModel] = {"rpc": model}
     if rigorous.model is not None:
         models["pushbroom"] = rigorous.model

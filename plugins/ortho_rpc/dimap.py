@@ -24,7 +24,6 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -34,6 +33,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import read_bounded
+from ortho_pipeline.locations import place
 from ortho_pipeline.models import require_view
 from ortho_pipeline.models.line_camera import LineCamera
 from ortho_pipeline.models.pushbroom import Pushbroom
@@ -86,7 +86,7 @@ def read_dimap_pushbroom(
     InputError
         If the file is no such metadata, something is missing or impossible in it, or its conventions are not known.
     """
-    file = source if isinstance(source, DimapFile) else DimapFile(Path(source))
+    file = source if isinstance(source, DimapFile) else DimapFile(place(source))
     if file.has(FIRST):
         scan = _first_version(file)
     elif file.has(SECOND):
@@ -229,9 +229,9 @@ def _look_angles(file: DimapFile, columns: int) -> tuple[Array, Array]:
     bands = file.all(f"{base}/Band_Calibration_List/Band_Calibration", 100)
     places = [f"{base}/Band_Calibration_List/Band_Calibration[{k + 1}]" for k in range(len(bands))] or [base]
     found = []
-    for place in places:
-        _refuse_part_of_a_line(file, f"{place}/Swath_Range", columns)
-        found.append([_angle(file, f"{place}/Polynomial_Look_Angles", name) for name in ("XLOS", "YLOS")])
+    for one in places:
+        _refuse_part_of_a_line(file, f"{one}/Swath_Range", columns)
+        found.append([_angle(file, f"{one}/Polynomial_Look_Angles", name) for name in ("XLOS", "YLOS")])
     if any(not np.array_equal(*pair) for other in found for pair in zip(other, found[0], strict=True)):
         raise file.error("the bands have look angles of their own, an image has one model", "Band_Calibration_List")
     return found[0][0], found[0][1]
