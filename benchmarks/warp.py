@@ -30,7 +30,7 @@ from osgeo import gdal, osr
 
 from ortho_pipeline.dem import Surface
 from ortho_pipeline.models import RPC, SensorModel
-from ortho_pipeline.models.rational import RPC_TERMS
+from ortho_pipeline.models.rpc_box import RPC_TERMS
 from ortho_pipeline.raster import Grid, RasterSource
 from ortho_pipeline.rpc import rpc_metadata
 from ortho_pipeline.warp import rectify

@@ -26,6 +26,7 @@ from ortho_pipeline.locations import VsiPath, place
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.rational import RPC, rpc_terms
+from ortho_pipeline.models.rpc_box import has_pole
 from ortho_pipeline.raster import open_dataset
 from ortho_pipeline.raster_output import close, raster_output
 from ortho_pipeline.rpc_files import (
@@ -431,7 +432,7 @@ def _fit_ratio(terms: Array, values: Array) -> tuple[Array, Array]:
 
 
 def _iterate_ratio(terms: Array, values: Array, damping: float, iterations: int = 5) -> tuple[Array, Array] | None:
-    """Return the best of some iterations, None if the first of them has a pole."""
+    """Return the best of some iterations, None if the first of them has a pole in the box of the terms."""
     system = np.column_stack([terms, -values[:, None] * terms[:, 1:], values])
     penalty = np.sqrt(len(terms)) * np.repeat([TIKHONOV, damping], [20, 19])
     denominator = np.ones(len(terms))
@@ -444,7 +445,7 @@ def _iterate_ratio(terms: Array, values: Array, damping: float, iterations: int 
         solution: Array = vt.T @ (size / (size**2 + 1.0) * (u.T @ r[:39, 39])) / penalty
         num, den = solution[:20], np.concatenate([[1.0], solution[20:]])
         denominator = terms @ den
-        if denominator.min() < 1e-3:
+        if has_pole(den):
             break
         worst = float(np.abs(terms @ num / denominator - values).max())
         if best is None or worst < best[0]:

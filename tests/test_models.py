@@ -9,7 +9,8 @@ import pytest
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models import RPC, ImageCorrection, SensorModel, model_from_dict
-from ortho_pipeline.models.rational import COMPILED_FROM, RPC_TERMS, rpc_terms
+from ortho_pipeline.models.rational import COMPILED_FROM, rpc_terms
+from ortho_pipeline.models.rpc_box import RPC_TERMS
 from ortho_pipeline.testing import check_sensor_model
 
 
@@ -145,11 +146,26 @@ def test_degenerate_rpc_is_refused(changes, field):
 
 
 @pytest.mark.filterwarnings("error")
-def test_zero_denominator_inside_the_box_is_nan_without_a_warning():
-    model = make_rpc(lon_off=24.5, lon_scale=0.5, col_den=[1.0, -1.0, *[0.0] * 18])
-    image = model.ground_to_image([[25.0, -33.65, 700.0], [24.5, -33.65, 700.0]])
-    assert np.isnan(image[0]).all()
-    assert np.isfinite(image[1]).all()
+@pytest.mark.parametrize("count", [3, COMPILED_FROM])
+def test_a_pole_beyond_the_box_and_what_is_behind_it_are_nan_without_a_warning(count):
+    model = make_rpc(lon_off=24.5, lon_scale=0.5, col_den=[1.0, -0.8, *[0.0] * 18])
+    pole = np.array([[24.5 + scales * 0.5, -33.65, 700.0] for scales in (1.2, 1.25, 1.3)])
+    ground = np.repeat(pole, -(-count // 3), axis=0)
+    image = model.ground_to_image(ground)
+    np.testing.assert_array_equal(np.isfinite(image[:, 0]), ground[:, 0] < 25.125)
+
+
+def test_heights_are_gated_like_longitude_and_latitude():
+    model = make_rpc()
+    heights = model.h_off + model.h_scale * np.array([-4.0, -1.51, -1.49, 0.0, 1.49, 1.51, 4.0])
+    inside = np.abs(heights - model.h_off) < 1.5 * model.h_scale
+    for count in (1, -(-COMPILED_FROM // 7)):
+        height = np.repeat(heights, count)
+        ground = np.column_stack([np.full((height.size, 2), (model.lon_off, model.lat_off)), height])
+        image = np.full((height.size, 2), (model.col_off, model.row_off))
+        np.testing.assert_array_equal(np.isfinite(model.ground_to_image(ground)[:, 0]), np.repeat(inside, count))
+        np.testing.assert_array_equal(np.isfinite(model.image_to_ground(image, height)[:, 0]), np.repeat(inside, count))
+    assert model.height_limits == (model.h_off - 1.5 * model.h_scale, model.h_off + 1.5 * model.h_scale)
 
 
 def test_correction_is_the_stated_affine_transformation():

@@ -90,6 +90,11 @@ class SensorModel(ABC):
         return float(centre[2] - half[2]), float(centre[2] + half[2])
 
     @property
+    def height_limits(self) -> tuple[float, float]:
+        """Ellipsoidal heights (m) beyond which the model does not project: it would extrapolate."""
+        return -math.inf, math.inf
+
+    @property
     def reference_height(self) -> float:
         """Ellipsoidal height (m) in the middle of `height_range`."""
         return float(self.domain[0][2])

@@ -90,6 +90,10 @@ class ImageCorrection(SensorModel):
     def domain(self) -> tuple[Array, Array]:
         return self.model.domain
 
+    @property
+    def height_limits(self) -> tuple[float, float]:
+        return self.model.height_limits
+
     def with_heights(self, low: float, high: float) -> Self:
         return self._replace(model=self.model.with_heights(low, high))
 

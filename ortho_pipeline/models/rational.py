@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -34,36 +34,11 @@ from ortho_pipeline.models.base import (
     as_image,
 )
 from ortho_pipeline.models.families import Family, exponents, family_of, points_needed
-
-#: Exponents of (L, P, H) in the order of RPC00B: 1, L, P, H, LP, LH, PH, LL, PP, HH, PLH, LLL, LPP, LHH, LLP, PPP,
-#: PHH, LLH, PPH, HHH.
-RPC_TERMS = np.array(
-    [
-        (0, 0, 0),
-        (1, 0, 0),
-        (0, 1, 0),
-        (0, 0, 1),
-        (1, 1, 0),
-        (1, 0, 1),
-        (0, 1, 1),
-        (2, 0, 0),
-        (0, 2, 0),
-        (0, 0, 2),
-        (1, 1, 1),
-        (3, 0, 0),
-        (1, 2, 0),
-        (1, 0, 2),
-        (2, 1, 0),
-        (0, 3, 0),
-        (0, 1, 2),
-        (2, 0, 1),
-        (0, 2, 1),
-        (0, 0, 3),
-    ]
-)
+from ortho_pipeline.models.rpc_box import RPC_TERMS, check_numbers, sound_heights
 
 #: From this many points on the compiled kernels are used: loading them takes longer than few points do.
 COMPILED_FROM = 20_000
+_NUMBERS = tuple(f"{name}_{part}" for part in ("off", "scale") for name in ("col", "row", "lon", "lat", "h"))
 #: Beyond this many scales from its centre an RPC is extrapolation without meaning, and has false roots.
 DOMAIN_LIMIT = 1.5
 
@@ -112,12 +87,13 @@ class RPC(SensorModel):
 
     `col_off` and `row_off` are in this package's image convention, that is SAMP_OFF + 0.5 and LINE_OFF + 0.5.
     Coefficients are ``(20,)`` in the order of RPC00B. Longitudes are unwrapped about `lon_off`, so scenes across the
-    antimeridian work. Ground beyond 1.5 scales in longitude or latitude projects to NaN.
+    antimeridian work. Ground beyond 1.5 scales in longitude, latitude or height projects to NaN, and so does ground
+    beyond the heights at which the RPC has a pole or a fold (`rpc_box.sound_heights`), and beyond a pole.
 
     Raises
     ------
     InputError
-        For a number that is not finite, a scale of zero, or a denominator that is zero everywhere.
+        For numbers that no RPC of a scene on Earth can have: not finite, a scale of zero, a pole about its middle.
     """
 
     kind: ClassVar[str] = "rpc"
@@ -140,14 +116,10 @@ class RPC(SensorModel):
     err_rand: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("col", "row", "lon", "lat", "h"):
-            for part in ("off", "scale"):
-                value = float(getattr(self, f"{name}_{part}"))
-                if not np.isfinite(value):
-                    raise InputError("an RPC needs finite numbers", field=f"{name}_{part}")
-                if part == "scale" and value == 0.0:
-                    raise InputError("an RPC scale cannot be zero", field=f"{name}_{part}")
-                object.__setattr__(self, f"{name}_{part}", value)
+        numbers = {name: float(getattr(self, name)) for name in _NUMBERS}
+        check_numbers(numbers)
+        for name, value in numbers.items():
+            object.__setattr__(self, name, value)
         for name in ("col_num", "col_den", "row_num", "row_den"):
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.shape != (20,):
@@ -158,9 +130,15 @@ class RPC(SensorModel):
                 raise InputError("all coefficients of an RPC are zero here", field=name)
             values.setflags(write=False)
             object.__setattr__(self, name, values)
-        centre = self.ground_to_image(np.array([[self.lon_off, self.lat_off, self.h_off]]))
-        if not np.isfinite(centre).all():
-            raise InputError("the denominator of an RPC is zero at its centre", field="col_den, row_den")
+        _ = self._reach  # refuses what is unsound
+
+    @cached_property
+    def _reach(self) -> tuple[float, float]:
+        """Normalised heights up to which the model projects."""
+        numbers = {name: getattr(self, name) for name in _NUMBERS}
+        low, high = sound_heights(numbers, np.stack([self.col_num, self.col_den, self.row_num, self.row_den]))
+        # Sound up to the end of the box: beyond it as far as in plan.
+        return low if low > -1.0 else -DOMAIN_LIMIT, high if high < 1.0 else DOMAIN_LIMIT
 
     @property
     def crs(self) -> str:
@@ -168,10 +146,17 @@ class RPC(SensorModel):
 
     @property
     def domain(self) -> tuple[Array, Array]:
+        low, high = np.clip(self._reach, -1.0, 1.0)
+        middle, half = (low + high) / 2, (high - low) / 2
         return (
-            np.array([self.lon_off, self.lat_off, self.h_off]),
-            np.abs([self.lon_scale, self.lat_scale, self.h_scale]),
+            np.array([self.lon_off, self.lat_off, self.h_off + middle * self.h_scale]),
+            np.abs([self.lon_scale, self.lat_scale, half * self.h_scale]),
         )
+
+    @property
+    def height_limits(self) -> tuple[float, float]:
+        low, high = sorted(self.h_off + self.h_scale * reach for reach in self._reach)
+        return low, high
 
     def normalise(self, ground: ArrayLike) -> tuple[Array, Array, Array]:
         """Return normalised longitude, latitude, height, each ``(N,)``; NaN outside the domain."""
@@ -182,10 +167,12 @@ class RPC(SensorModel):
                 lon = np.remainder(lon + 180.0, 360.0) - 180.0
             lon = lon / self.lon_scale
             lat = (ground[:, 1] - self.lat_off) / self.lat_scale
+            h = (ground[:, 2] - self.h_off) / self.h_scale
             outside = (np.abs(lon) > DOMAIN_LIMIT) | (np.abs(lat) > DOMAIN_LIMIT)
+            outside |= (h < self._reach[0]) | (h > self._reach[1])
         if outside.any():
             lon[outside] = np.nan
-        return lon, lat, (ground[:, 2] - self.h_off) / self.h_scale
+        return lon, lat, h
 
     def ground_to_image(self, ground: ArrayLike) -> Array:
         ground = as_ground(ground)
@@ -194,7 +181,7 @@ class RPC(SensorModel):
         from ortho_pipeline.models import rpc_kernel
 
         image = np.empty((len(ground), 2))
-        rpc_kernel.project(ground, *self._tables(), DOMAIN_LIMIT, image)
+        rpc_kernel.project(ground, *self._tables(), np.array([DOMAIN_LIMIT, *self._reach]), image)
         return image
 
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
@@ -206,8 +193,8 @@ class RPC(SensorModel):
         ground = np.empty((len(image), 3))
         heights = np.ascontiguousarray(np.broadcast_to(np.asarray(height, dtype=np.float64), len(image)))
         rpc_kernel.intersect(
-            image, heights, *self._tables(), self._inverse_start(), DOMAIN_LIMIT, INVERSE_TOLERANCE, INVERSE_VERIFIED,
-            25, ground,
+            image, heights, *self._tables(), self._inverse_start(), np.array([DOMAIN_LIMIT, *self._reach]),
+            INVERSE_TOLERANCE, INVERSE_VERIFIED, 25, ground,
         )  # fmt: skip
         return ground
 
@@ -215,7 +202,9 @@ class RPC(SensorModel):
         """Return offsets and scales of lon, lat, h, column, row, and the coefficients, for the compiled kernels."""
         offsets = np.array([self.lon_off, self.lat_off, self.h_off, self.col_off, self.row_off])
         scales = np.array([self.lon_scale, self.lat_scale, self.h_scale, self.col_scale, self.row_scale])
-        return offsets, scales, np.stack([self.col_num, self.col_den, self.row_num, self.row_den])
+        coefficients = np.stack([self.col_num, self.col_den, self.row_num, self.row_den])
+        # With positive denominators at the centre: where one is not, there is a pole in between.
+        return offsets, scales, coefficients * np.repeat(np.sign(coefficients[1::2, :1]), 2, axis=0)
 
     def _inverse_start(self) -> Array:
         """Return first approximations ``(2, 6)`` of the inverse: see `rpc_kernel.intersect`."""
@@ -233,10 +222,12 @@ class RPC(SensorModel):
     def _project(self, ground: Array) -> Array:
         terms = rpc_terms(*self.normalise(ground))
         with np.errstate(divide="ignore", invalid="ignore"):
-            col = (self.col_num @ terms) / (self.col_den @ terms) * self.col_scale + self.col_off
-            row = (self.row_num @ terms) / (self.row_den @ terms) * self.row_scale + self.row_off
+            col_den, row_den = self.col_den @ terms, self.row_den @ terms
+            col = (self.col_num @ terms) / col_den * self.col_scale + self.col_off
+            row = (self.row_num @ terms) / row_den * self.row_scale + self.row_off
+            before_poles = (col_den * self.col_den[0] > 0) & (row_den * self.row_den[0] > 0)
         image = np.stack([col, row], axis=1)
-        image[~np.isfinite(image).all(axis=1)] = np.nan
+        image[~(np.isfinite(image).all(axis=1) & before_poles)] = np.nan
         return image
 
     def ground_partials(self, ground: ArrayLike) -> Array:

@@ -41,13 +41,15 @@ def _with_slopes(a, x, y, z):
 
 
 @compiled
-def project(ground, offsets, scales, coefficients, limit, image):
+def project(ground, offsets, scales, coefficients, limits, image):
     """Fill `image` ``(N, 2)`` with the projections of `ground` ``(N, 3)`` (lon, lat, h).
 
     `offsets` and `scales` are of lon, lat, h, column, row; `coefficients` ``(4, 20)`` column numerator and denominator,
-    row numerator and denominator; beyond `limit` scales in longitude or latitude the projection is NaN.
+    row numerator and denominator, the denominators positive at the centre. The projection is NaN beyond `limits` (of
+    normalised longitude and latitude, lowest and highest normalised height), and beyond a pole.
     """
     a, b, c, d = coefficients[0], coefficients[1], coefficients[2], coefficients[3]
+    limit, lowest, highest = limits[0], limits[1], limits[2]
     inverse = 1.0 / scales
     for k in range(ground.shape[0]):
         lon = ground[k, 0] - offsets[0]
@@ -56,15 +58,17 @@ def project(ground, offsets, scales, coefficients, limit, image):
         x = lon * inverse[0]
         y = (ground[k, 1] - offsets[1]) * inverse[1]
         z = (ground[k, 2] - offsets[2]) * inverse[2]
-        col = _polynomial(a, x, y, z) / _polynomial(b, x, y, z) * scales[3] + offsets[3]
-        row = _polynomial(c, x, y, z) / _polynomial(d, x, y, z) * scales[4] + offsets[4]
-        good = abs(x) <= limit and abs(y) <= limit and abs(col) < np.inf and abs(row) < np.inf
+        m, q = _polynomial(b, x, y, z), _polynomial(d, x, y, z)
+        col = _polynomial(a, x, y, z) / m * scales[3] + offsets[3]
+        row = _polynomial(c, x, y, z) / q * scales[4] + offsets[4]
+        good = abs(x) <= limit and abs(y) <= limit and lowest <= z <= highest and m > 0.0 and q > 0.0
+        good = good and abs(col) < np.inf and abs(row) < np.inf
         image[k, 0] = col if good else np.nan
         image[k, 1] = row if good else np.nan
 
 
 @compiled
-def intersect(image, heights, offsets, scales, coefficients, start, limit, tolerance, verified, steps, ground):
+def intersect(image, heights, offsets, scales, coefficients, start, limits, tolerance, verified, steps, ground):
     """Fill `ground` ``(N, 3)`` with the points at ellipsoidal `heights` ``(N,)`` whose projections are `image`.
 
     `start` ``(2, 6)`` gives first longitudes and latitudes (normalised) as polynomials 1, c, r, z, cz, rz of normalised
@@ -72,6 +76,7 @@ def intersect(image, heights, offsets, scales, coefficients, start, limit, toler
     shrink the misfit to a hundredth.
     """
     a, b, c, d = coefficients[0], coefficients[1], coefficients[2], coefficients[3]
+    limit, lowest, highest = limits[0], limits[1], limits[2]
     for k in range(image.shape[0]):
         col = (image[k, 0] - offsets[3]) / scales[3]
         row = (image[k, 1] - offsets[4]) / scales[4]
@@ -116,7 +121,8 @@ def intersect(image, heights, offsets, scales, coefficients, start, limit, toler
             # The step that was just made takes what is left to a hundredth, down to the rounding of degrees.
             if not miss > tolerance:
                 break
-        good = miss <= verified and abs(x) <= limit and abs(y) <= limit
+        good = miss <= verified and abs(x) <= limit and abs(y) <= limit and lowest <= z <= highest
+        good = good and _polynomial(b, x, y, z) > 0.0 and _polynomial(d, x, y, z) > 0.0
         ground[k, 0] = x * scales[0] + offsets[0] if good else np.nan
         ground[k, 1] = y * scales[1] + offsets[1] if good else np.nan
         ground[k, 2] = heights[k] if good else np.nan

@@ -14,7 +14,7 @@ from ortho_orbview3.label import Group, read_label
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.locations import place
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.models.rational import RPC, rpc_terms
+from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.rpc import read_rpc
 from ortho_pipeline.rpc_files import read_rpc_text, rpc_of_fields
 
@@ -155,7 +155,7 @@ def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple
         if choice is not None:
             raise InputError("there is no RPC text beside the image", field="rpc", remedy="take --rpc label")
         return product.rpc, product.file, ("there is no RPC text beside the label, whose own RPC is taken",)
-    rpc = _without_poles(read_rpc_text(text), str(text), "LINE_DEN_COEFF, SAMP_DEN_COEFF")
+    rpc = read_rpc_text(text)
     difference = _difference(product.rpc, rpc)
     if choice is not None or difference <= DIFFERENT:
         return rpc, str(text), ()
@@ -222,22 +222,10 @@ def _rpc(group: Group) -> RPC:
         fields[key] = " ".join(map(repr, group.numbers(name, 20)))
     fields |= {key: repr(group.number(name)) for key, name in ERROR_KEYS.items() if group.has(name)}
     try:
-        rpc = rpc_of_fields(fields, group.file)
+        return rpc_of_fields(fields, group.file)
     except InputError as error:
         names = SCALAR_KEYS | COEFFICIENT_KEYS | ERROR_KEYS
         keys = [names.get(key, key) for key in (error.field or "").split(", ")]
         raise InputError(
             error.message, file=group.file, field=", ".join(map(group.place, keys)), remedy=error.remedy
         ) from error
-    return _without_poles(rpc, group.file, group.path)
-
-
-def _without_poles(rpc: RPC, file: str, field: str) -> RPC:
-    """Return the RPC if none of its denominators changes its sign within its box."""
-    terms = rpc_terms(*rpc.normalise(_box(rpc)))
-    for name in ("row_den", "col_den"):
-        values = getattr(rpc, name) @ terms
-        if not (values.min() > 0 or values.max() < 0):
-            which = "line" if name == "row_den" else "pixel"
-            raise InputError(f"the {which} denominator is zero within the scene", file=file, field=field)
-    return rpc
