@@ -99,6 +99,26 @@ def horizontal(crs: str | pyproj.CRS) -> pyproj.CRS:
     return crs.to_2d() if len(crs.axis_info) > 2 else crs
 
 
+def map_crs(text: str | pyproj.CRS) -> pyproj.CRS:
+    """Return the CRS that `text` states for a map that is written to a GeoTIFF.
+
+    Raises
+    ------
+    CrsError
+        If it has no horizontal coordinates, or only PROJ knows it, so that no file could say it.
+    """
+    crs = parse_crs(text)
+    remedy = "give a geographic or a projected CRS, such as EPSG:n"
+    try:
+        plain = horizontal(crs)
+    except CrsError as error:
+        raise CrsError(error.message, field="--output-crs", remedy=remedy) from error
+    operation = plain.coordinate_operation
+    if "Derived" in plain.type_name or (operation is not None and operation.method_name.startswith("PROJ ")):
+        raise CrsError(f"a GeoTIFF cannot hold {plain.to_string()!r}", field="--output-crs", remedy=remedy)
+    return crs
+
+
 def utm_crs(lon: float, lat: float) -> pyproj.CRS:
     """Return the WGS84 UTM zone of a position in degrees; polar stereographic (UPS) beyond 84 N and 80 S."""
     if not (np.isfinite(lon) and np.isfinite(lat) and abs(lat) <= 90 and abs(lon) <= 540):

@@ -22,18 +22,20 @@ from pyproj.exceptions import CRSError
 
 from ortho_pipeline.crs import Vertical, declared_vertical, ground_transform, horizontal, parse_crs
 from ortho_pipeline.datum import dem_unit, dem_vertical, dem_vertical_remedy
-from ortho_pipeline.errors import CrsError, DatumError, InputError
-from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.errors import CoverageError, CrsError, DatumError, InputError
+from ortho_pipeline.raster import first_line, open_dataset
 from ortho_pipeline.raster_output import close, raster_output
 
 Array = NDArray[np.float64]
 
 #: Heights (m) outside of this are voids, declared or not.
 SANE_HEIGHTS = (-500.0, 9000.0)
-#: ``fill='nearest'`` looks this far (samples) for a valid height.
-NEAREST_REACH = 512
+#: ``fill='nearest'`` looks so far for a valid height: samples, and metres after which real terrain is another one.
+NEAREST_REACH, NEAREST_METRES = 512, 20_000.0
 #: The undulation is computed exactly on a lattice no wider than this (m) and interpolated between: within 2 mm.
 UNDULATION_SPACING = 500.0
+#: No DEM has samples that are nearer to each other (m); work along a ray is counted in samples.
+_FINEST = 1e-3
 _TILE = 256
 _CACHED_TILES = 64
 
@@ -214,6 +216,11 @@ class Surface:
         self._set_affine((x + 0.5 * (a + b), a, b, y + 0.5 * (c + d), c, d))
         scale, offset = band.GetScale(), band.GetOffset()
         self._scale, self._offset = (1.0 if scale is None else scale), (0.0 if offset is None else offset)
+        if self.sample_size < _FINEST:
+            raise CrsError(
+                f"the samples of this DEM would be {self.sample_size:.1g} m apart", file=self._path,
+                field="geotransform", remedy="set the true one with gdal_edit.py -a_ullr",
+            )  # fmt: skip
         self._spacing = int(np.clip(UNDULATION_SPACING / self.sample_size, 1, 64))
         return crs
 
@@ -319,7 +326,9 @@ class Surface:
         rows, columns = self.shape
         finite = np.isfinite(u) & np.isfinite(v)
         if filled and self.fill == "nearest":
-            u, v = np.clip(u, 0, columns - 1), np.clip(v, 0, rows - 1)
+            across, down, u, v = u, v, np.clip(u, 0, columns - 1), np.clip(v, 0, rows - 1)
+            with np.errstate(invalid="ignore"):
+                finite &= np.hypot(u - across, v - down) <= self.nearest_reach
         with np.errstate(invalid="ignore"):
             inside = finite & (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
         index = np.flatnonzero(inside)
@@ -371,8 +380,13 @@ class Surface:
             out[np.isnan(out)] = self.fill
         return out
 
+    @property
+    def nearest_reach(self) -> int:
+        """How far (samples) ``fill='nearest'`` looks for a height."""
+        return int(np.clip(NEAREST_METRES / self.sample_size, 1, NEAREST_REACH))
+
     def _nearest(self, u0: int, v0: int, nu: int, nv: int) -> Array:
-        """Fill voids by the nearest valid sample within `NEAREST_REACH`; outside of the DEM its edge goes on."""
+        """Fill voids by the nearest valid sample, if one is near enough; outside of the DEM its edge goes on so far."""
         rows, columns = self.shape
         u, v = np.clip(np.arange(u0, u0 + nu), 0, columns - 1), np.clip(np.arange(v0, v0 + nv), 0, rows - 1)
         left, top, right, bottom = int(u[0]), int(v[0]), int(u[-1]) + 1, int(v[-1]) + 1
@@ -380,15 +394,18 @@ class Surface:
         if np.isnan(heights).any():
             from scipy.ndimage import distance_transform_edt
 
-            west, north = max(0, left - NEAREST_REACH), max(0, top - NEAREST_REACH)
-            east, south = min(columns, right + NEAREST_REACH), min(rows, bottom + NEAREST_REACH)
+            reach = self.nearest_reach
+            west, north = max(0, left - reach), max(0, top - reach)
+            east, south = min(columns, right + reach), min(rows, bottom + reach)
             wide = self._read(west, north, east - west, south - north)
             void = np.isnan(wide)
             if not void.all():
                 distance, (near_v, near_u) = distance_transform_edt(void, return_indices=True)
-                wide = np.where(distance <= NEAREST_REACH, wide[near_v, near_u], np.nan)
+                wide = np.where(distance <= reach, wide[near_v, near_u], np.nan)
             heights = wide[top - north : bottom - north, left - west : right - west]
-        return heights[np.ix_(v - top, u - left)]
+        filled = heights[np.ix_(v - top, u - left)]
+        outside = np.hypot(*np.meshgrid(np.arange(u0, u0 + nu) - u, np.arange(v0, v0 + nv) - v))
+        return np.where(outside > self.nearest_reach, np.nan, filled)
 
     def _read(self, left: int, top: int, width: int, height: int) -> Array:
         """Return ellipsoidal heights of a window inside the DEM; NaN for voids."""
@@ -416,7 +433,9 @@ class Surface:
                 mask = band.GetMaskBand().ReadAsArray(left, top, width, height)
         except RuntimeError as error:
             raise InputError(
-                f"the heights cannot be read ({error})", file=self._path, remedy="copy the DEM again: it is damaged"
+                f"the heights cannot be read ({first_line(error)})",
+                file=self._path,
+                remedy="copy the DEM again: it is damaged",
             ) from error
         heights = raw.astype(float) * (self._scale * self._metres_per_unit) + self._offset * self._metres_per_unit
         with np.errstate(invalid="ignore"):
@@ -466,7 +485,7 @@ class Surface:
 
         Raises
         ------
-        InputError
+        CoverageError
             If there is no valid height in it.
         """
         if self.constant_height is not None:
@@ -480,7 +499,7 @@ class Surface:
                 if not np.isnan(heights).all():
                     low, high = min(low, float(np.nanmin(heights))), max(high, float(np.nanmax(heights)))
         if low > high:
-            raise InputError(
+            raise CoverageError(
                 "this DEM holds no valid height here", file=self._path, remedy="check its nodata value, unit and extent"
             )
         return low, high

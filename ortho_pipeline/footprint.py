@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.crs import GroundTransform, ground_transform, utm_crs
 from ortho_pipeline.dem import Surface
-from ortho_pipeline.errors import CoverageError, InputError, ModelError
+from ortho_pipeline.errors import CoverageError, InputError, ModelError, OrthoError
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster import Grid
 from ortho_pipeline.rays import intersect
@@ -85,6 +85,10 @@ class Footprint:
         Whether every ray met the surface at a height of its own; small voids between the rays may still be there.
     voids : int
         Samples of the DEM within the scene that have no height.
+    unmet : bool
+        Whether a ray that meets the ground somewhere met no height of the surface, not even a filled one.
+    beyond : str
+        Heights of the surface at which the model does not project, as a sentence; empty if there are none.
     """
 
     ring: Array
@@ -94,6 +98,8 @@ class Footprint:
     coverage: float = 1.0
     complete: bool = True
     voids: int = 0
+    unmet: bool = False
+    beyond: str = ""
 
     def require_coverage(self, surface: Surface) -> None:
         """Raise a `CoverageError` if the surface does not cover the scene and nothing was said about the rest.
@@ -103,21 +109,37 @@ class Footprint:
         CoverageError
             If a ray found no height and the surface has no fill rule.
         """
+        file, wanted = surface.provenance.get("path"), "say what the rest shall be: --dem-fill mask (no pixels there)"
+        if self.beyond and ((surface.fill == "error" and not self.complete) or not self.coverage):
+            raise CoverageError(
+                self.beyond, file=file, field="--dem",
+                remedy=f"check datum and unit of the DEM (--dem-vertical) and the place of the scene, or {wanted}",
+            )  # fmt: skip
         if not self.complete and surface.fill == "error":
             raise CoverageError(
-                f"the DEM covers {share(self.coverage)} of the scene",
-                file=surface.provenance.get("path"),
-                remedy="give a DEM that covers it all, or say what the rest shall be: --dem-fill mask (no pixels "
-                "there), nearest, or an ellipsoidal height in metres",
-            )
+                f"the DEM covers {share(self.coverage)} of the scene", file=file,
+                remedy=f"give a DEM that covers it all, or {wanted}, nearest, or an ellipsoidal height in metres",
+            )  # fmt: skip
+        if self.coverage == 0.0 and surface.fill == "mask":
+            raise CoverageError(
+                "the DEM covers nothing of the scene: the ortho would have no pixels", file=file, field="--dem",
+                remedy="give the DEM of this place",
+            )  # fmt: skip
+        if self.unmet and surface.fill == "nearest":
+            raise CoverageError(
+                f"parts of the scene are more than {surface.nearest_reach * surface.sample_size / 1000:.3g} km from "
+                "the next height of the DEM",
+                file=file, field="--dem-fill", remedy=f"give a DEM that reaches farther, or {wanted}",
+            )  # fmt: skip
 
     def notes(self, surface: Surface) -> list[str]:
         """Return what is to be said of a scene that the DEM does not cover as a whole."""
+        said = [f"{self.beyond}: such places have no pixels"] if self.beyond else []
         if self.coverage >= 1.0:
-            return []
+            return said
         what = "have no pixels in the ortho" if surface.fill in ("error", "mask") else "were filled"
         inside = f" ({count(self.voids, 'sample')} without a height within it)" if self.voids else ""
-        return [f"the DEM covers {share(self.coverage)} of the scene{inside}: the other places {what}"]
+        return [*said, f"the DEM covers {share(self.coverage)} of the scene{inside}: the other places {what}"]
 
     def fitted(self, model: SensorModel) -> SensorModel:
         """Return the model, meant for the heights here and a margin, where its own range is no more than a guess."""
@@ -150,7 +172,8 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
     reach = np.concatenate([closed, *ends])
     found = Footprint(_finite(closed), _finite(reach), heights, middle)
     if not len(found.reach):
-        raise ModelError("no border pixel meets the ground: the model does not belong to this image")
+        raise _nowhere(model, surface)
+    found = replace(found, beyond=_beyond(model, surface, found))
     if surface.constant_height is not None:
         return found
     projects = met[inner] | np.isfinite(model.image_to_ground(image[inner], middle)).all(axis=1)
@@ -159,7 +182,40 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
     # Whichever looks closer has the say; where a ray finds no height, the DEM does not cover all.
     fine = area > _COVERAGE_SIDE**2 and (sampled < 1.0 or own >= 1.0)
     covered = sampled if fine else min(own, sampled)
-    return replace(found, coverage=float(covered), complete=bool(own >= 1.0), voids=voids)
+    unmet = bool((projects & ~met[inner]).any())
+    return replace(found, coverage=float(covered), complete=bool(own >= 1.0), voids=voids, unmet=unmet)
+
+
+def _nowhere(model: SensorModel, surface: Surface) -> OrthoError:
+    """Return the error of a scene none of whose pixels meets the ground."""
+    if surface.constant_height is None:
+        return ModelError("no border pixel meets the ground: the model does not belong to this image")
+    low, high = model.height_range
+    return InputError(
+        f"the scene does not meet the ground at a height of {surface.constant_height:g} m", field="--height",
+        remedy=f"give an ellipsoidal height of the terrain; the model is meant for {low:.0f} to {high:.0f} m",
+    )  # fmt: skip
+
+
+def _beyond(model: SensorModel, surface: Surface, found: Footprint) -> str:
+    """Say that the surface has heights under a scene at which its model does not project; nothing if it has not."""
+    low, high = model.height_limits
+    if not (math.isfinite(low) or math.isfinite(high)):
+        return ""
+    lowest, highest = found.heights
+    if surface.constant_height is None:
+        samples = surface.samples_at(ground_transform(model.crs, surface.crs)(found.reach)[:, :2])
+        size = surface.shape[::-1]
+        first = np.clip(np.floor(np.nanmin(samples, axis=0)), 0, size).astype(int)
+        last = np.clip(np.ceil(np.nanmax(samples, axis=0)) + 1, 0, size).astype(int)
+        with contextlib.suppress(CoverageError):
+            lowest, highest = surface.range_within(*first.tolist(), *(last - first).tolist())
+    if low <= lowest and highest <= high:
+        return ""
+    return (
+        f"heights under the scene are {lowest:.0f} to {highest:.0f} m above the ellipsoid, its model is good for "
+        f"{low:.0f} to {high:.0f} m"
+    )
 
 
 def _finite(ground: Array) -> Array:
@@ -179,7 +235,7 @@ def _heights_under(
     # Peaks and hollows between the rays count too.
     samples = surface.samples_at(ground_transform(model.crs, surface.crs)(seen)[:, :2])
     first, last = np.floor(samples.min(axis=0)).astype(int), np.ceil(samples.max(axis=0)).astype(int) + 1
-    with contextlib.suppress(InputError):  # all of it filled
+    with contextlib.suppress(CoverageError):  # all of it filled
         lowest, highest = surface.range_within(*first.tolist(), *(last - first).tolist())
         low, high = min(low, lowest), max(high, highest)
     centre = _COVERAGE_SIDE**2 // 2
@@ -296,6 +352,31 @@ def choose_grid(
         )
     low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
     return Grid.of_extent(crs, (low[0], low[1], high[0], high[1]), step, align=True)
+
+
+def scene_pixels(model: SensorModel, found: Footprint, grid: Grid) -> float:
+    """Return how many pixels of a grid the scene covers, or a few more: those within the hull of what it may reach.
+
+    Raises
+    ------
+    InputError
+        If there are none: the extent lies beside the scene.
+    """
+    import shapely
+
+    ground = _continuous(GroundTransform(model.crs, grid.crs)(found.reach), grid.crs)
+    ground = ground[np.isfinite(ground).all(axis=1), :2]
+    xmin, ymin, xmax, ymax = grid.extent
+    if grid.crs.is_geographic and len(ground):
+        ground[:, 0] += 360.0 * round(((xmin + xmax) / 2 - (ground[:, 0].min() + ground[:, 0].max()) / 2) / 360.0)
+    hull = shapely.MultiPoint(ground).convex_hull
+    if not len(ground) or not hull.intersects(shapely.box(xmin, ymin, xmax, ymax)):
+        place = " ".join(f"{value:.10g}" for value in hull.bounds) if len(ground) else "outside of this CRS"
+        raise InputError(
+            f"the extent lies beside the scene, which reaches over {place}", field="--extent",
+            remedy="give xmin ymin xmax ymax in units of the output CRS, or leave --extent out",
+        )  # fmt: skip
+    return float(hull.intersection(shapely.box(xmin, ymin, xmax, ymax)).area) / (grid.dx * grid.dy)
 
 
 def _continuous(ground: Array, crs: pyproj.CRS) -> Array:

@@ -35,7 +35,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster import Grid, RasterSource, first_line
 from ortho_pipeline.raster_output import close, gdal_errors
-from ortho_pipeline.raster_writer import Profile, RasterWriter
+from ortho_pipeline.raster_writer import Profile, RasterWriter, refuse_empty
 from ortho_pipeline.rpc import REFUSE_ERROR, RpcExport, rpc_metadata
 
 #: GDAL's fit to points of a model expresses it if it repeats it this closely (px); another fit only resembles it.
@@ -194,7 +194,9 @@ def warp_with_gdal(
         transformer.georeference(ortho, grid)
         _warp_exactly(view, ortho, source, profile, transformer, resampling, memory, threads, progress)
         close(ortho)
-        return transformer, writer.copy(target)
+        valid = writer.copy(target)
+        refuse_empty(valid, path)
+        return transformer, valid
 
 
 # -- what stands for a model -------------------------------------------------------------------------------------------

@@ -42,7 +42,7 @@ import numpy as np
 from ortho_pipeline import kernels, lattice_kernel
 from ortho_pipeline.crs import GroundTransform
 from ortho_pipeline.dem import Surface
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import CoverageError
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster import Grid
 
@@ -395,7 +395,7 @@ class Terrain:
         if self._whole is None:
             try:
                 lowest, highest = self._surface.range_within(left, top, right - left, bottom - top)
-            except InputError:
+            except CoverageError:
                 return False
         else:
             heights, (first, above) = self._whole

@@ -253,7 +253,8 @@ def rectify(
     read = inputs.files_read(image, scene, points, surface, opened)
     begun = states(read) | begun
     with inputs.hashed_beside(read, digest) as hashing:
-        adjusted, model, heights, found, grid = lay_out(opened, points, scene, heights, output)
+        laid = lay_out(opened, points, scene, heights, output)
+        adjusted, model, heights, found, grid = laid
         opened = adjusted.scene
         exported, complaints = _as_rpc(model)
         source = source_of(opened, image, scene, output)
@@ -265,7 +266,7 @@ def rectify(
     document = report.build_report(
         scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
         warp=warped, near=points.near, provenance=record,
-        warnings=[*adjusted.warnings(heights), *found.notes(heights), *complaints],
+        warnings=[*adjusted.warnings(heights), *found.notes(heights), *laid.sparse(warped.valid_pixels), *complaints],
     )  # fmt: skip
     _write_report(document, adjusted.fit, files)
     if acquired is not None:

@@ -115,6 +115,22 @@ def as_written(pixels: NDArray[Any], valid: NDArray[np.bool_], dtype: np.dtype[A
     return written
 
 
+def refuse_empty(valid_pixels: int, path: str | os.PathLike[str]) -> None:
+    """Refuse an ortho none of whose pixels has a value.
+
+    Raises
+    ------
+    InputError
+        Inside of a `RasterWriter`, so that no file is left.
+    """
+    if not valid_pixels:
+        raise InputError(
+            "no pixel of this ortho has a value", file=path,
+            remedy="check the extent, the heights (--height, or the DEM's place, datum and unit), and the nodata value "
+            "and mask of the image",
+        )  # fmt: skip
+
+
 class RasterWriter:
     """A GeoTIFF or COG that is written in windows and appears at its path when it is complete.
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.crs import ground_transform, parse_crs
 from ortho_pipeline.dem import Surface
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import CoverageError
 from ortho_pipeline.models.base import SensorModel
 
 Array = NDArray[np.float64]
@@ -53,7 +53,10 @@ def intersect(model: SensorModel, image: ArrayLike, surface: Surface, *, toleran
     if reach is None:
         return np.full((len(image), 3), np.nan)
     window, (lowest, highest) = reach
-    low, high = lowest - 1.0, highest + 1.0
+    limits = model.height_limits
+    low, high = max(lowest - 1.0, limits[0]), min(highest + 1.0, limits[1])
+    if not low < high:
+        return np.full((len(image), 3), np.nan)
     # The window ends where the DEM does; a fill rule goes on beyond.
     many = len(image) >= MANY and surface.fill in ("error", "mask")
     height = _march_many(ray, window, low, high, tolerance) if many else None
@@ -94,9 +97,6 @@ class _Ray:
         The window follows from a range of heights and the range from a window: from the model's own range on, until
         the terrain lies within it. None if the rays miss the DEM.
         """
-        if self.any and self.surface.fill not in ("error", "mask"):
-            rows, columns = self.surface.shape
-            return (0, 0, columns, rows), self.surface.height_range
         low, high = self.model.height_range
         found = None
         for _ in range(4):
@@ -105,7 +105,7 @@ class _Ray:
                 return None
             try:
                 lowest, highest = self.surface.range_within(*window)
-            except InputError:
+            except CoverageError:
                 return None
             found = window, (lowest, highest)
             if low <= lowest and highest <= high:
@@ -123,8 +123,11 @@ class _Ray:
         uv = np.concatenate([self.samples(frame, np.full(len(frame), height)) for height in (low, high)])
         uv = uv[np.isfinite(uv).all(axis=1)]
         size = np.array(self.surface.shape[::-1])
-        first = np.clip(np.floor(uv.min(axis=0, initial=np.inf)) - 2, 0, size)
-        last = np.clip(np.ceil(uv.max(axis=0, initial=-np.inf)) + 3, 0, size)
+        filled = self.surface.fill not in ("error", "mask")
+        # A fill rule goes on beyond the DEM, and what it takes may come from there.
+        beyond = self.surface.nearest_reach if self.surface.fill == "nearest" else 0
+        first = np.clip(np.floor(uv.min(axis=0, initial=np.inf)) - 2 - beyond, 0, size - 2 if filled else size)
+        last = np.clip(np.ceil(uv.max(axis=0, initial=-np.inf)) + 3 + beyond, first + 2 if filled else 0, size)
         if (last - first < 2).any():
             return None
         return int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1])

@@ -13,7 +13,7 @@ import numpy as np
 from ortho_pipeline import inputs
 from ortho_pipeline.crs import ground_transform
 from ortho_pipeline.dem import Surface
-from ortho_pipeline.errors import InputError, ModelError
+from ortho_pipeline.errors import CoverageError, InputError, ModelError
 from ortho_pipeline.estimation import Fit, fit
 from ortho_pipeline.footprint import lay
 from ortho_pipeline.hookspecs import Scene
@@ -145,7 +145,7 @@ def on_surface(scene: Scene, surface: Surface | None) -> Scene:
         if model.with_heights(*model.height_range) is model:
             continue
         # A model that only starts an adjustment may look anywhere.
-        with contextlib.suppress(ModelError):
+        with contextlib.suppress(ModelError, InputError):
             models[name] = lay(model, surface, scene.width, scene.height).fitted(model)
     return dataclasses.replace(scene, models=models)
 
@@ -265,5 +265,5 @@ def heights_around(points: Points, surface: Surface | None) -> tuple[float, floa
     u1, v1 = (int(value) for value in np.clip(np.ceil(high + reach) + 1, 0, (columns, rows)))
     try:
         return surface.range_within(u0, v0, u1 - u0, v1 - v0)
-    except InputError:
+    except CoverageError:
         return None

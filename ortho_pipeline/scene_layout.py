@@ -6,13 +6,16 @@ import os
 from typing import Any, NamedTuple
 
 from ortho_pipeline import footprint
-from ortho_pipeline.crs import parse_crs
+from ortho_pipeline.crs import map_crs
 from ortho_pipeline.dem import Surface
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions
 from ortho_pipeline.raster import Grid, RasterSource
 from ortho_pipeline.scene_fit import Adjusted, adjust
+
+#: An ortho with a smaller part of what its scene covers is worth a warning.
+_SPARSE = 0.05
 
 
 class Layout(NamedTuple):
@@ -28,6 +31,16 @@ class Layout(NamedTuple):
     def scene(self) -> Scene:
         """The scene with the models that were adjusted."""
         return self.adjusted.scene
+
+    def sparse(self, valid_pixels: int) -> list[str]:
+        """Return a warning if hardly any of the pixels of the ortho that the scene covers has a value."""
+        part = valid_pixels / max(footprint.scene_pixels(self.model, self.lay, self.grid), 1.0)
+        if part >= _SPARSE:
+            return []
+        return [
+            f"only {part:.2%} of the pixels that the scene covers have a value: check the heights, and the nodata "
+            "value and the mask of the image"
+        ]
 
     def to_json(self) -> dict[str, Any]:
         """Return what is known before the first pixel as JSON values."""
@@ -63,10 +76,11 @@ def lay_out(
     lay = footprint.lay(model, surface, *size)
     lay.require_coverage(surface)
     model = lay.fitted(model)
-    crs = parse_crs(output.crs) if output.crs else None
+    crs = map_crs(output.crs) if output.crs else None
     grid = footprint.choose_grid(
         model, lay, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
     )
+    footprint.scene_pixels(model, lay, grid)
     return Layout(adjusted, model, surface, lay, grid)
 
 

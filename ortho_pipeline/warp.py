@@ -26,7 +26,7 @@ from ortho_pipeline.gdal_engine import warp_with_gdal
 from ortho_pipeline.lattice import BLOCK, Block, Lattices, Terrain, block_cells
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster import Grid, RasterSource, limit_cache
-from ortho_pipeline.raster_writer import Profile, RasterWriter, as_written
+from ortho_pipeline.raster_writer import Profile, RasterWriter, as_written, refuse_empty
 from ortho_pipeline.rpc import RpcExport
 
 #: Side of a tile, the piece of work of a thread.
@@ -116,6 +116,7 @@ def rectify(
         for done, _ in enumerate(_bounded(threads, lambda tile: job.make(writer, tile), tiles), start=1):
             if progress:
                 progress(done / len(tiles))
+        refuse_empty(job.valid_pixels, path)
     return WarpResult(
         max_error_px=job.lattices.worst,
         tolerance_px=tolerance,

@@ -285,7 +285,8 @@ def test_outside_is_nan_and_fill_rules_say_otherwise(tmp_path: Path) -> None:
     assert nearest.heights([far])[0] == heights[0, 0]
     assert nearest.window(9, 10, 2, 1)[0] == pytest.approx([heights[10, 9], heights[10, 9]])
     assert nearest.coverage([void, far]) == 0.0
-    assert nearest.window(500, 500, 2, 2) == pytest.approx(np.full((2, 2), heights[-1, -1]))
+    assert nearest.window(120, 120, 2, 2) == pytest.approx(np.full((2, 2), heights[-1, -1]))
+    assert np.isnan(nearest.window(600, 600, 2, 2)).all()
 
 
 @pytest.mark.parametrize("fill", ["nearest", "-3.5", "mask"])
