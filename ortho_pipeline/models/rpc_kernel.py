@@ -93,9 +93,8 @@ def intersect(image, heights, offsets, scales, coefficients, start, limits, tole
             + start[1, 2] * row
             + z * (start[1, 3] + start[1, 4] * col + start[1, 5] * row)
         )
-        stale, before = True, np.inf
+        stale, before, miss = True, np.inf, np.inf
         i00, i01, i10, i11 = 0.0, 0.0, 0.0, 0.0
-        miss = np.inf
         for _ in range(steps):
             if stale:
                 n, nx, ny = _with_slopes(a, x, y, z)
