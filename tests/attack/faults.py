@@ -189,6 +189,9 @@ def _command(words: Sequence[str], folder: Path, writer: int, prepare: Callable[
         os.dup2(writer, 1)
         os.dup2(writer, 2)
         os.close(writer)
+        # A shell lets what it starts in the background ignore these, and nohup the second.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
         sys.argv = ["ortho", *words]
         if prepare is not None:
             prepare()
