@@ -143,7 +143,12 @@ def main() -> None:
         # Under nohup a command is to survive the end of its terminal.
         if signal.getsignal(ending) == signal.SIG_DFL:
             signal.signal(ending, _end)
-    cli(prog_name="ortho")
+    try:
+        cli(prog_name="ortho")
+    except KeyboardInterrupt:
+        # Before a command has begun; later `_Commands` says so.
+        click.echo("Interrupted.", err=True)
+        raise SystemExit(INTERRUPTED) from None
 
 
 def _end(number: int, _: Any) -> None:

@@ -199,6 +199,9 @@ def _command(words: Sequence[str], folder: Path, writer: int, prepare: Callable[
         code = 0
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except KeyboardInterrupt:
+        # Between the fork and the command's own beginning.
+        code = 130
     except BaseException:
         os.write(2, traceback.format_exc().encode())
     finally:
