@@ -138,6 +138,10 @@ def _error_document(error: OrthoError) -> dict[str, str | None]:
 
 def main() -> None:
     """Run the command line."""
+    from ortho_pipeline.locations import close_network
+
+    # Before GDAL is loaded, which reads the environment; worker processes inherit it.
+    close_network()
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING, stream=sys.stderr)
     for ending in (signal.SIGTERM, signal.SIGHUP):
         # Under nohup a command is to survive the end of its terminal.

@@ -93,7 +93,7 @@ _SENSOR_OPTIONS = (
         multiple=True,
         type=click.Path(exists=True, file_okay=False),
         metavar="DIR",
-        help="A folder that a VRT may refer to, besides its own; may be repeated.",
+        help="A folder that files may lead to (a VRT), besides their own; may be repeated.",
     ),
 )
 scene_options = _grouped(

@@ -197,6 +197,38 @@ class VsiPath:
             return None
 
 
+#: What a closed process says to libcurl by way of GDAL: no file has this name, and nobody listens there.
+_CLOSED = {
+    "CPL_VSIL_CURL_ALLOWED_FILENAME": "none", "GDAL_HTTP_PROXY": "127.0.0.1:1", "GDAL_HTTPS_PROXY": "127.0.0.1:1",
+    "GDAL_HTTP_MAX_RETRY": "0", "GDAL_HTTP_CONNECTTIMEOUT": "1", "NO_PROXY": "", "no_proxy": "",
+}  # fmt: skip
+_closed_with: dict[str, str | None] = {}
+
+
+def close_network() -> None:
+    """Keep GDAL in this process and its children from the network until `located` is asked for a place there.
+
+    For a process of the command line: the environment is that of GDAL's host, which a library leaves alone.
+    """
+    for key, value in _CLOSED.items():
+        _closed_with.setdefault(key, os.environ.get(key))
+        os.environ[key] = value
+
+
+def network_is_closed() -> bool:
+    """Tell whether this process has been kept from the network, by itself or by its parent."""
+    return all(os.environ.get(key) == value for key, value in _CLOSED.items())
+
+
+def _open_network() -> None:
+    for key, value in _closed_with.items():
+        if value is None:
+            os.environ.pop(key, None)
+        else:
+            os.environ[key] = value
+    _closed_with.clear()
+
+
 #: What readers of metadata take.
 AnyPath = str | os.PathLike[str]
 
@@ -237,6 +269,8 @@ def located(path: AnyPath, *, allow_network: bool = False) -> AnyPath:
             file=os.fspath(path),
             remedy="allow them with --allow-network",
         )
+    if allow_network and not in_local_archive(name):
+        _open_network()
     return VsiPath(name)
 
 

@@ -1,7 +1,7 @@
 """Rasters that are read: what may be opened, grids, and windows of pixels.
 
-Files are opened by a list of drivers and never through what a file claims of itself: a VRT named ``.tif`` would let
-GDAL read any file of the machine. One `gdal.Dataset` is used by one thread only; `RasterSource` opens one per thread.
+Files are opened through the `gate`: by a list of drivers, and with every file that they lead to seen before. One
+`gdal.Dataset` is used by one thread only; `RasterSource` opens one per thread.
 """
 
 from __future__ import annotations
@@ -23,23 +23,17 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.locations import VsiPath, archive_of, in_local_archive, located, members, within
+from ortho_pipeline.gate import DRIVERS, open_seen
+from ortho_pipeline.locations import VsiPath, archive_of, in_local_archive, located, members
 from ortho_pipeline.options import PIXEL_TYPES
 
 gdal.UseExceptions()
 log = logging.getLogger(__name__)
 
-#: Raster drivers that only read pixels out of the file they are given (and its side-cars).
-DRIVERS = (
-    "GTiff", "COG", "NITF", "JP2OpenJPEG", "JP2KAK", "JPEG", "PNG", "HFA", "ENVI", "PCIDSK", "PCRaster", "DTED",
-    "SRTMHGT", "AAIGrid", "GTX", "NTv2", "DIMAP", "ERS", "EHdr", "BMP", "USGSDEM", "SGI", "ISIS3", "KEA", "BYN",
-    "VRT", "MEM",
-)  # fmt: skip
 #: A raster side beyond this is taken for a damaged header.
 MAX_SIDE = 4_000_000
 #: GDAL reads whole blocks: one larger than this is refused before it is allocated (bytes).
 MAX_BLOCK = 1 << 30
-_MAX_VRT = 5_000_000
 #: Endings of files beside an image that GDAL's readers of metadata look for.
 _SIDE_CARS = (".xml", ".txt", ".imd", ".rpb", ".pvl", ".met", ".att", ".eph", ".tfw", ".wld", ".prj", ".hdr", ".ovr",
               ".msk", ".rpc", ".dim")  # fmt: skip
@@ -60,14 +54,14 @@ def open_dataset(
     path : path
         A file, also in an archive; URLs and GDAL's network file systems only with `allow_network`.
     roots : sequence of path
-        Folders that sources of a VRT may lie in, besides its own.
+        Folders that the files may lie in that this one leads to, besides its own.
     siblings : bool
         Whether GDAL may look at side-car files. Without them RPC metadata are those of the file itself.
 
     Raises
     ------
     InputError
-        If the file is missing, of no allowed format, damaged, or a VRT that reaches outside of its own folder.
+        If the file is missing, of no allowed format, damaged, or leads outside of its own folder and `roots`.
     """
     place = located(path, allow_network=allow_network)
     name, drivers = os.fspath(place), list(DRIVERS)
@@ -77,17 +71,14 @@ def open_dataset(
             raise InputError("there is no such file in an archive", file=name, remedy=_in_archive(name))
     elif not Path(name).is_file() and not (Path(name).is_dir()):
         raise InputError("there is no such file", file=name, remedy="check the path")
-    elif Path(name).suffix.lower() == ".vrt":
-        _check_vrt(Path(name), roots)
     elif Path(name).suffix.lower() in (".zip", ".tar", ".tgz"):
         raise InputError("this is an archive, not an image", file=name, remedy=_in_archive(name))
-    else:
+    elif Path(name).suffix.lower() != ".vrt":
         drivers.remove("VRT")
-    options: dict[str, Any] = {} if siblings else {"sibling_files": [name.rpartition("/")[2]]}
     if siblings and not isinstance(place, VsiPath):
         _refuse_pipes(Path(name))
     try:
-        dataset = gdal.OpenEx(name, gdal.OF_RASTER | gdal.OF_READONLY, allowed_drivers=drivers, **options)
+        dataset = open_seen(place, roots, drivers, siblings)
     except (RuntimeError, UnicodeDecodeError) as error:
         # What GDAL quotes of a damaged file need not be UTF-8.
         raise InputError(
@@ -137,50 +128,6 @@ def _in_archive(name: str) -> str:
     archive = archive_of(name) if name.startswith("/vsi") else Path(name)
     found = members(archive) if archive is not None else []
     return f"name the image in it: {', '.join(found)}" if found else "name the image in it: /vsizip/FILE.zip/IMAGE"
-
-
-def _check_vrt(path: Path, roots: Sequence[str | os.PathLike[str]] = (), seen: frozenset[Path] = frozenset()) -> None:
-    """Refuse a VRT that is more than a view of files in its own folder or in `roots`, whatever names they have."""
-    from defusedxml import ElementTree
-    from defusedxml.common import DefusedXmlException
-
-    here = path.resolve()
-    if here in seen:
-        raise InputError("this VRT is a source of itself", file=path)
-    if path.stat().st_size > _MAX_VRT:
-        raise InputError("a VRT of more than 5 MB is not opened", file=path)
-    try:
-        root = ElementTree.fromstring(path.read_bytes())
-    except (ElementTree.ParseError, DefusedXmlException, ValueError) as error:
-        raise InputError(f"this VRT is no well-formed XML ({error})", file=path) from error
-    if root.get("subClass") not in (None, "VRTDataset") or next(root.iter("PixelFunctionType"), None) is not None:
-        raise InputError(
-            "only plain VRTs are opened", file=path, remedy="make a file of it first (gdal_translate in.vrt out.tif)"
-        )
-    for element in root.iter():
-        if element.tag in ("SourceFilename", "SourceDataset"):
-            name = element.text or ""
-            source = (here.parent / name if element.get("relativeToVRT") == "1" else Path(name)).resolve()
-            if not within(source, (here.parent, *roots)) or name.startswith("/vsi") or ":" in name.replace(":\\", ""):
-                raise InputError(
-                    f"this VRT reads {name!r}, which is outside of its own folder",
-                    file=path,
-                    field="SourceFilename",
-                    remedy=f"name a folder that holds both with --root {_common(source, here)}, put the VRT beside its "
-                    "sources, or make a file of it (gdal_translate in.vrt out.tif)",
-                )
-            if source.is_file() and _is_vrt(source):
-                _check_vrt(source, roots, seen | {here})
-
-
-def _common(*paths: Path) -> str:
-    return os.path.commonpath([path.parent for path in paths])
-
-
-def _is_vrt(path: Path) -> bool:
-    # GDAL goes by the content, so a VRT may have any name.
-    with path.open("rb") as file:
-        return path.suffix.lower() == ".vrt" or b"<VRTDataset" in file.read(10_000)
 
 
 def first_line(error: BaseException) -> str:

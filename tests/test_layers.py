@@ -31,6 +31,7 @@ registration estimation hookspecs swaps model_file kernels lattice_kernel ray_ke
 block_blunders
 model_choice block_checks selection ground_error drawing contract
 comparison report_plots adjustment covariance map_scale delivered
+gate
 raster
 raster_output
 raster_writer
@@ -50,7 +51,7 @@ cli_studies cli_blocks cli_batch
 cli
 """
 LINE = {name: number for number, line in enumerate(LAYERS.split("\n")) for name in line.split()}
-GDAL_MODULES = {"locations", "raster", "raster_output", "raster_writer", "dem", "mosaic", "plugins"}
+GDAL_MODULES = {"locations", "gate", "raster", "raster_output", "raster_writer", "dem", "mosaic", "plugins"}
 GDAL_MODULES |= {"rpc", "stack", "gcp_export", "gdal_engine"}
 NUMBA_MODULES = {"compiled"}
 MAX_LINES, MAX_FUNCTION = 600, 50
