@@ -22,7 +22,7 @@ from typing import Any
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.locations import AnyPath, VsiPath, network_is_closed, place, within
+from ortho_pipeline.locations import AnyPath, VsiPath, in_local_archive, network_is_closed, place, within
 
 gdal.UseExceptions()
 
@@ -265,7 +265,7 @@ class _Gate:
     def _names(self, folder: Any, image: str = "") -> list[str]:
         """Return the names of the files in a folder; behind a URL, those of the side-cars that are there."""
         key = str(folder)
-        if isinstance(folder, VsiPath) and not folder.is_dir():
+        if isinstance(folder, VsiPath) and not (in_local_archive(key) and folder.is_dir()):
             endings = (".ovr", ".msk", ".aux", ".aux.xml")
             return [image + ending for ending in endings if (folder / (image + ending)).exists()]
         if key not in self._folders:
