@@ -267,7 +267,7 @@ def adjust(
     problem, solved, found = _weighed(problem, solved, selection)
     notes += found.variances.notes()
     notes += marks_warning(points.select(problem.active(selection) & selection.ground))
-    notes += _uncertain(problem, solved)
+    notes += _uncertain(problem, solved, points)
     return _result(problem, solved, found, selection, points, chosen, gauge, rejected, notes)
 
 
@@ -444,7 +444,7 @@ def _solved(problem: BlockProblem, state: State, selection: Selection) -> Solved
     solved = problem.attempt(state, selection)
     _determined(problem, solved)
     if not solved.converged:
-        _uncertain(problem, solved)
+        _uncertain(problem, solved, problem.points)
         raise NotConverged(
             "the adjustment did not converge", file=problem.points.source or None,
             remedy="give more control points, spread in plan and height, or a simpler model or correction",
@@ -481,8 +481,12 @@ def _weakest(problem: BlockProblem, solved: Solved) -> str:
     return f"{shown}; and those of {len(parts) - 4} more images" if len(parts) > 4 else shown
 
 
-def _uncertain(problem: BlockProblem, solved: Solved) -> list[str]:
-    """Refuse images that are far less certain where their own points are than these, and warn of uncertain corners."""
+def _uncertain(problem: BlockProblem, solved: Solved, stated: BlockPoints) -> list[str]:
+    """Refuse images that are far less certain where their own points are than these, and warn of uncertain corners.
+
+    Points count as measured as they were `stated` even where they turned out better: constraints of the models are
+    stated too, and bound what is known of the images.
+    """
     found, held = [], any(one.held for one in problem.pseudo)
     for image, model in enumerate(solved.state.models):
         columns = problem.columns_of(image)
@@ -491,7 +495,10 @@ def _uncertain(problem: BlockProblem, solved: Solved) -> list[str]:
         if not len(columns) or not len(used):
             continue
         cofactors = solved.cofactors[np.ix_(columns, columns)]
-        inside = float(np.sqrt(np.median(((partials @ cofactors) * partials).sum(axis=2))))
+        of_image = problem.points.image == image
+        measured = float(np.median(problem.points.sigma_image[of_image]))
+        sigma = max(measured, float(np.median(stated.sigma_image[of_image])))
+        inside = float(np.sqrt(np.median(((partials @ cofactors) * partials).sum(axis=2)))) * measured / sigma
         name = problem.points.images[image]
         if inside > EXTRAPOLATION_LIMIT and not held:
             raise DegeneratePoints(
@@ -501,7 +508,6 @@ def _uncertain(problem: BlockProblem, solved: Solved) -> list[str]:
             )  # fmt: skip
         at_corners = model.param_partials(model.corners)
         at_corners = at_corners[np.isfinite(at_corners).all(axis=(1, 2))]
-        sigma = float(np.median(problem.points.sigma_image[problem.points.image == image]))
         spread = np.sqrt(((at_corners @ cofactors) * at_corners).sum(axis=2))
         factor = float(spread.max(initial=0.0)) / sigma
         if factor > EXTRAPOLATION_WARNING and not held:

@@ -284,11 +284,20 @@ class _Gate:
                     if target.exists():
                         self._see(target, path, named.field, frozenset())
         kind = dataset.GetDriver().ShortName
-        for name in dataset.GetFileList() or []:
+        for name in _listed(dataset):
             file = place(name)
             if str(file) == str(path):
                 continue
             self._must_be_inside(file, path, kind, name)
+
+
+def _listed(dataset: gdal.Dataset) -> list[str]:
+    """Return the files that GDAL knows of a dataset."""
+    try:
+        return list(dataset.GetFileList() or [])
+    except RuntimeError:
+        # Of a side-car that it cannot read GDAL complains once; who needs what stands in it is told by its reader.
+        return list(dataset.GetFileList() or [])
 
 
 def _is_below(path: VsiPath, folder: AnyPath) -> bool:
