@@ -118,7 +118,7 @@ def test_rectify_takes_the_names_of_gdalwarp(tiny, tmp_path):
     out = tmp_path / "out"
     done = run(
         "rectify", *fit_arguments(tiny), "--dem", tiny.dem, "--dem-vertical", "ellipsoid", "-t_srs", "EPSG:32734",
-        "-tr", "10", "-te", "403000", "6679000", "404000", "6680000", "-r", "cubic", "-of", "GTiff",
+        "-tr", "10", "-te", "403000", "6680100", "404000", "6681100", "-r", "cubic", "-of", "GTiff",
         "-co", "COMPRESS=LZW", "-o", out, "--json",
     )  # fmt: skip
     assert done.exit_code == 0, done.stderr
@@ -127,7 +127,7 @@ def test_rectify_takes_the_names_of_gdalwarp(tiny, tmp_path):
     from osgeo import gdal
 
     ortho = gdal.Open(document["files"]["ortho"])
-    assert ortho.GetGeoTransform() == (403000, 10, 0, 6680000, 0, -10)
+    assert ortho.GetGeoTransform() == (403000, 10, 0, 6681100, 0, -10)
     assert (ortho.RasterXSize, ortho.RasterYSize) == (100, 100)
     assert ortho.GetMetadataItem("COMPRESSION", "IMAGE_STRUCTURE") == "LZW"
 
@@ -191,7 +191,7 @@ COMMANDS = [
     "doctor", "sensors", "models", "info a.tif", "fit a.tif --gcps b.csv", "compare a.tif --gcps b.csv",
     "rectify a.tif --height 5 -o out", "export a.tif -o out", "report a.json --plots out", "edge a.tif",
     "adjust a.tif b.tif --points c.csv -o out", "intersect a.tif b.tif --points c.csv", "run a.yaml",
-    "simulate ikonos -o out", "reproduce bilsat", "register a.tif b.tif -o out",
+    "simulate ikonos -o out", "reproduce bilsat", "register a.tif b.tif -o out", "dem-check a.tif --points b.csv",
 ]  # fmt: skip
 
 

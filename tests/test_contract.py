@@ -115,7 +115,9 @@ def test_what_keeps_the_contract_opens_within_milliseconds(image):
     ],
 )
 def test_a_wrong_scene_is_named(image, fields, message):
-    with pytest.raises(PluginError, match=rf"a\.tif: sensor 'alpha' of plugin plugin: .*{message}(.|\n)*check_sensor"):
+    with pytest.raises(
+        PluginError, match=rf"a\.tif: scene: sensor 'alpha' of plugin plugin: .*{message}(.|\n)*check_sensor"
+    ):
         open_with(image, **fields)
 
 

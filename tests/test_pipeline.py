@@ -332,7 +332,7 @@ def test_points_without_heights_take_them_from_the_dem(tiny):
     lines += [f"{g[0]},{g[1]},{i[0]},{-i[1]},1,0,0,0" for g, i in zip(ground, image, strict=True)]
     path = tiny.folder / "gcps.points"
     path.write_text("\n".join(lines) + "\n")
-    with pytest.raises(InputError, match="no height"):
+    with pytest.raises(InputError, match="without a height"):
         pipeline.fit(tiny.image, PointOptions(gcps=path))
     result = pipeline.fit(tiny.image, PointOptions(gcps=path), surface=dem_of(tiny))
     np.testing.assert_allclose(result.fit.values, tiny.bias, atol=1e-3)
