@@ -218,6 +218,12 @@ class _RasterFile:
             raise InputError(
                 "complex pixels are not resampled", file=self.path, remedy="split them into real bands first"
             )
+        if any(band.GetMetadataItem("PIXELTYPE", "IMAGE_STRUCTURE") == "SIGNEDBYTE" for band in bands):
+            # GDAL before 3.7 gives bytes with a sign as bytes without one.
+            raise InputError(
+                "these pixels are bytes with a sign, which this GDAL reads as 0 to 255", file=self.path,
+                remedy="make 16 bit of them (gdal_calc.py, or gdal_translate -ot Int16 with GDAL 3.7)",
+            )  # fmt: skip
         self.dtype = np.result_type(*(_numpy_type(band.DataType) for band in bands))
         self.nodata = tuple(_nodata(band, self.dtype) for band in bands)
         self.palette = any(band.GetColorTable() is not None for band in bands)

@@ -10,8 +10,9 @@ import math
 import os
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -113,7 +114,8 @@ def rectify(
     limit_cache(memory // 4)
     with RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads) as writer:
         tiles = list(_tiles(grid, TILE))
-        for done, _ in enumerate(_bounded(threads, lambda tile: job.make(writer, tile), tiles), start=1):
+        for done, tile in enumerate(_in_order(threads, job.make, tiles), start=1):
+            writer.write(*tile)
             if progress:
                 progress(done / len(tiles))
         refuse_empty(job.valid_pixels, path)
@@ -220,19 +222,17 @@ def _tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
             yield top, left, min(side, grid.height - top), min(side, grid.width - left)
 
 
-def _bounded(threads: int, work: Callable[[Any], Any], items: list[Any]) -> Iterator[Any]:
-    """Yield results of `work` over `items` in any order, with no more than `threads` under way."""
+def _in_order(threads: int, work: Callable[[Any], Any], items: list[Any]) -> Iterator[Any]:
+    """Yield results of `work` over `items` in their order, so that equal orthos are equal files; few are ahead."""
     with ThreadPoolExecutor(threads, thread_name_prefix="warp") as pool:
-        pending: set[Any] = set()
+        pending: deque[Future[Any]] = deque()
         try:
             for item in items:
-                pending.add(pool.submit(work, item))
-                if len(pending) >= threads + 1:
-                    finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-                    for future in finished:
-                        yield future.result()
-            for future in pending:
-                yield future.result()
+                pending.append(pool.submit(work, item))
+                if len(pending) > threads + 1:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
         finally:
             for future in pending:
                 future.cancel()
@@ -268,8 +268,8 @@ class _Job:
 
     # -- a tile ------------------------------------------------------------------------------------------------------
 
-    def make(self, writer: RasterWriter, tile: tuple[int, int, int, int]) -> None:
-        """Compute one tile (top, left, height, width) and write it."""
+    def make(self, tile: tuple[int, int, int, int]) -> tuple[int, int, NDArray[Any], NDArray[np.bool_]]:
+        """Compute one tile (top, left, height, width), as `RasterWriter.write` takes it."""
         top, left, height, width = tile
         out = np.full((self.source.count, height, width), self.fill, dtype=self.source.dtype)
         valid = np.zeros(out.shape, dtype=bool)
@@ -290,7 +290,7 @@ class _Job:
         mask = np.asarray((np.any if self.any_band else np.all)(valid, axis=0))
         with self._lock:
             self.valid_pixels += int(np.count_nonzero(mask))
-        writer.write(left, top, out, mask)
+        return left, top, out, mask
 
     # -- pixels ------------------------------------------------------------------------------------------------------
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 from osgeo import gdal
 
@@ -40,3 +43,12 @@ def test_the_rpc_of_an_image_is_used_and_not_its_control_points(tiny):
     lon, lat = found["corners_lon_lat"][0]
     assert abs(lon - tiny.model.lon_off) < 0.1
     assert abs(lat - tiny.model.lat_off) < 0.1
+
+
+def test_every_trap_has_a_test_that_exists():
+    root = Path(__file__).resolve().parent
+    page = (root.parent / "docs" / "reliability.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d+) \| .* \| `([\w/.]+)::(\w+)` \|$", page, re.MULTILINE)
+    assert [int(number) for number, _, _ in rows] == list(range(1, 46))
+    for _, file, name in rows:
+        assert f"def {name}(" in (root / file).read_text(encoding="utf-8"), f"{file} has no {name}"

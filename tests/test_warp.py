@@ -20,6 +20,7 @@ from scipy.interpolate import RegularGridInterpolator
 from ortho_pipeline import warp
 from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import sha256
 from ortho_pipeline.models import RPC, SensorModel
 from ortho_pipeline.raster import Grid, RasterSource
 from ortho_pipeline.rpc import export_rpc, rpc_metadata
@@ -841,3 +842,25 @@ def test_a_crop_of_the_image_gives_a_crop_of_the_ortho(scene, tmp_path):
     assert use.mean() > 0.9
     # Values are the same but where the crop ends; positions differ in the last bit.
     assert np.quantile(np.abs(whole - part)[0][use], 0.99) < 1e-3
+
+
+@pytest.mark.parametrize("options", [{}, {"COMPRESS": "DEFLATE", "TILED": "NO"}])
+def test_equal_orthos_are_equal_files_whatever_the_number_of_threads(scene, tmp_path, options):
+    """Blocks used to be written in the order in which the threads came to an end."""
+    source, found = RasterSource(scene.write(texture())), set()
+    for threads in (1, 4, 4, 7):
+        out = tmp_path / "o.tif"
+        rectify(scene.model, source, Surface.constant(700.0), grid_of(step=0.1), out, driver="GTiff", threads=threads,
+                creation_options=options)  # fmt: skip
+        found.add(sha256(out))
+    assert len(found) == 1
+
+
+@pytest.mark.skipif(hasattr(gdal, "GDT_Int8"), reason="this GDAL has a type for bytes with a sign")
+def test_bytes_with_a_sign_are_not_taken_for_others(tmp_path):
+    path = tmp_path / "signed.tif"
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), 4, 4, 1, gdal.GDT_Byte, ["PIXELTYPE=SIGNEDBYTE"])
+    dataset = None
+    assert dataset is None
+    with pytest.raises(InputError, match="bytes with a sign"):
+        RasterSource(path)
