@@ -48,7 +48,7 @@ def delivery(real, tmp_path):
     corner = (UPPER_LEFT[0] - 0.5, UPPER_LEFT[1] + 0.5)
     image = sparse(tmp_path / "po_0000000_rgb_0010000.tif", (50, 50), corner)
     shutil.copyfile(data / "md_ge_metadata.txt", tmp_path / "po_0000000_metadata.txt")
-    (tmp_path / "po_0000000_rgb_0010000_rpc.txt").symlink_to(data / "md_ge_rgb_0010000_rpc.txt")
+    shutil.copyfile(data / "md_ge_rgb_0010000_rpc.txt", tmp_path / "po_0000000_rgb_0010000_rpc.txt")
     return image
 
 
