@@ -41,7 +41,9 @@ def test_a_file_that_is_cut_off_anywhere_is_refused(tmp_path, driver, options):
     check_written(path, path, size=(700, 600))
     whole = path.read_bytes()
     cut = tmp_path / "cut.tif"
-    for length in np.unique(np.linspace(0, len(whole) - 1, 60).astype(int)).tolist():
+    # In a COG, the last four bytes of a block may stand behind it once more: without them nothing is missing.
+    needed = len(whole) - (5 if driver == "COG" else 1)
+    for length in np.unique(np.linspace(0, needed, 60).astype(int)).tolist():
         cut.write_bytes(whole[:length])
         with pytest.raises(InputError, match=r"not written whole|cannot be read again"):
             check_written(cut, cut, size=(700, 600))
