@@ -161,7 +161,6 @@ class Outputs:
         if final.is_dir() or not final.name:
             raise InputError("a folder lies where this file would be written", file=final, remedy="remove or rename it")
         try:
-            os.pathconf(final.parent, "PC_NAME_MAX")
             if len(os.fsencode(final.name)) > os.pathconf(final.parent, "PC_NAME_MAX"):
                 raise InputError("this name is too long for the file system", file=final, remedy="rename the image")
             path = self.folder / f"{self.prefix}{secrets.token_hex(4)}{_PART}{suffix}"
