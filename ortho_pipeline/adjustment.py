@@ -23,7 +23,7 @@ from ortho_pipeline.block_points import BlockPoints
 from ortho_pipeline.block_solver import BlockProblem, Pseudo, Selection, Solved, State
 from ortho_pipeline.block_variance import Posterior, Variances, estimate, posterior, reweighed
 from ortho_pipeline.crs import ground_transform
-from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
+from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints, counted
 from ortho_pipeline.estimation import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING, root_mean_square
 from ortho_pipeline.ground_frame import GEODETIC
 from ortho_pipeline.intersection import frame_of, meet, models_of, predict, sigmas_of
@@ -32,7 +32,6 @@ from ortho_pipeline.notebook import block_html
 from ortho_pipeline.point_table import ROLES
 from ortho_pipeline.points import marks_warning
 from ortho_pipeline.problem import CONDITION_LIMIT, Prior
-from ortho_pipeline.report_text import count
 
 __all__ = ["BlockFit", "BlockPoints", "Rejected", "adjust"]
 
@@ -84,10 +83,12 @@ class BlockFit:
     def __repr__(self) -> str:
         found = self.object_rms()
         checks = (
-            f"; RMSE {found['plan']:.2f} m, height {found['h']:.2f} m at {found['n']} check points" if found else ""
+            f"; RMSE {found['plan']:.2f} m, height {found['h']:.2f} m at {counted(found['n'], 'check point')}"
+            if found
+            else ""
         )
         sigma0 = "unknown" if self.sigma0 is None else f"{self.sigma0:.3g}"
-        size = f"{count(len(self.models), 'image')}, {count(len(self.points), 'point')}"
+        size = f"{counted(len(self.models), 'image')}, {counted(len(self.points), 'point')}"
         return f"<block of {size}: sigma0 {sigma0}{checks}>"
 
     def _repr_html_(self) -> str:
@@ -302,7 +303,8 @@ def _prepared(
         if names:
             some = ", ".join(names[:10]) + (" ..." if len(names) > 10 else "")
             notes.append(
-                f"{len(names)} {role} points take no part (fewer rays than needed, rays that do not meet or are "
+                f"{counted(len(names), f'{role} point takes', f'{role} points take')} no part (fewer rays than "
+                "needed, rays that do not meet or are "
                 f"parallel, or outside of the models): {some}"
                 + ("; whether their known ground is right is not tested" if role == "check" else "")
             )
@@ -365,7 +367,7 @@ def _with_datum(
             return problem, "no control points: the datum is that of the priors and constraints of the models"
     sigma = HOLD if hold is None else hold
     held = _held(problem, state, selection, sigma)
-    why = f"{count(control, 'control point')} and" if control else "no control points:"
+    why = f"{counted(control, 'control point')} and" if control else "no control points:"
     right = "" if control else "; positions on the ground are as right as these values are"
     return problem.with_pseudo(held), (
         f"{why} the orientation is held at its start values with a sigma of {sigma:g} px of effect in the image for "
@@ -375,7 +377,7 @@ def _with_datum(
 
 def _by_control(problem: BlockProblem, selection: Selection) -> str:
     number = int((problem.active(selection) & selection.ground).sum())
-    return f"the datum is that of {count(number, 'control point')}"
+    return f"the datum is that of {counted(number, 'control point')}"
 
 
 def _held(problem: BlockProblem, state: State, selection: Selection, sigma: float) -> list[Pseudo]:
@@ -409,10 +411,10 @@ def _enough(problem: BlockProblem, selection: Selection) -> None:
         least = math.ceil((len(columns) - known) / 2)
         if 2 * measured + known < len(columns):
             raise TooFewPoints(
-                f"{count(measured, 'point')} in the image {points.images[image]!r} do not determine its "
-                f"{len(columns)} parameters",
+                f"{counted(measured, 'point')} in the image {points.images[image]!r} cannot determine its "
+                f"{counted(len(columns), 'parameter')}",
                 file=points.source or None,
-                remedy=f"measure at least {least} points in it, or take a simpler model",
+                remedy=f"measure at least {counted(least, 'point')} in it, or take a simpler model",
             )
 
 
@@ -478,7 +480,7 @@ def _weakest(problem: BlockProblem, solved: Solved) -> str:
         if mine:
             parts.append(f"{', '.join(mine)} of the image {name!r}")
     shown = "; ".join(parts[:4])
-    return f"{shown}; and those of {len(parts) - 4} more images" if len(parts) > 4 else shown
+    return f"{shown}; and those of {counted(len(parts) - 4, 'more image')}" if len(parts) > 4 else shown
 
 
 def _uncertain(problem: BlockProblem, solved: Solved, stated: BlockPoints) -> list[str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline import inputs, plugins
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.files import states, together, whole_or_nothing, write_text
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.model_file import SavedModel, write_model_file
@@ -113,9 +113,11 @@ def _document(
 def _text(reference: Path, done: tuple[Registration, ...]) -> str:
     rows = [one.row() for one in done]
     wide = max(len(row["band"]) for row in rows)
-    lines = [f"{len(rows) + 1} bands in the geometry of {reference.name}; residuals of tie points in pixels:"]
+    lines = [
+        f"{counted(len(rows) + 1, 'band')} in the geometry of {reference.name}; residuals of tie points in pixels:"
+    ]
     lines += [
-        f"{row['band']:<{wide}}  {row['transform']}, {row['used']} of {row['tie_points']} tie points, RMSE "
+        f"{row['band']:<{wide}}  {row['transform']}, {row['used']} of {counted(row['tie_points'], 'tie point')}, RMSE "
         f"{row['rmse']:.3f}, largest {row['largest']:.3f}"
         for row in rows
     ]

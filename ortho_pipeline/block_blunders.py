@@ -21,7 +21,7 @@ from ortho_pipeline.block_points import Index
 from ortho_pipeline.block_solver import BlockProblem, Eliminated, Mask, Selection, Solved
 from ortho_pipeline.block_variance import Variances, estimate, reweighed
 from ortho_pipeline.blunders import BLUNDER_RISK, REJECTED_LIMIT
-from ortho_pipeline.errors import DegeneratePoints
+from ortho_pipeline.errors import DegeneratePoints, counted
 from ortho_pipeline.intersection import PARALLEL
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.problem import CONDITION_LIMIT
@@ -498,12 +498,13 @@ def _refuse_many(problem: BlockProblem, selection: Selection, rejected: list[int
     """Refuse to clean up where so much contradicts that which part is wrong is a guess."""
     active = problem.active(selection)
     control = problem.points.control
-    for what, mask in (("control points", active & control), ("tie and check points", active & ~control)):
+    for what, mask in (("control point", active & control), ("tie and check point", active & ~control)):
         names = [problem.points.ids[i] for i in rejected if mask[i]]
         if len(names) > REJECTED_LIMIT * int(mask.sum()):
             some = ", ".join(names[:10]) + (" ..." if len(names) > 10 else "")
             raise DegeneratePoints(
-                f"{len(names)} of {int(mask.sum())} {what} contradict the others ({some}): which of them are wrong "
+                f"{len(names)} of {counted(int(mask.sum()), what)} contradict the others ({some}): which of "
+                "them are wrong "
                 "cannot be decided",
                 file=problem.points.source or None,
                 remedy="measure these points again, remove the wrong ones, or state sigmas as large as their errors "

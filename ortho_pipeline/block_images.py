@@ -12,7 +12,7 @@ import numpy as np
 
 from ortho_pipeline import inputs
 from ortho_pipeline.block_points import BlockPoints
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.model_choice import OWN, fit_family
 from ortho_pipeline.models import ImageCorrection, SensorModel, families, family_of, start_model
@@ -177,5 +177,8 @@ def _family_start(
         model = start_model(name, table, crs=options.model_crs, size=size, heights=heights)
     control = int(table.control.sum())
     return Start(
-        opened, model, getattr(model, "family", name), f"{control} control points of {Path(table.source).name}"
+        opened,
+        model,
+        getattr(model, "family", name),
+        f"{counted(control, 'control point')} of {Path(table.source).name}",
     )

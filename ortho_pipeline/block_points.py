@@ -17,7 +17,7 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.crs import Vertical, ground_transform, horizontal, same_crs
-from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.errors import InputError, counted, reads
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.point_files import read_block_table
 from ortho_pipeline.point_ground import ground_of
@@ -119,7 +119,10 @@ class BlockPoints:
 
     def __repr__(self) -> str:
         roles = ", ".join(f"{(self.roles == role).sum()} {role}" for role in ROLES if (self.roles == role).any())
-        return f"<{len(self)} points: {roles or 'none'}; {self.rays} rays in {len(self.images)} images; {self.source}>"
+        return (
+            f"<{counted(len(self), 'point')}: {roles or 'none'}; {counted(self.rays, 'ray')} in "
+            f"{counted(len(self.images), 'image')}; {self.source}>"
+        )
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -10,8 +10,9 @@ import numpy as np
 
 from ortho_pipeline.adjustment import BlockFit
 from ortho_pipeline.drawing import Drawing, round_down, style_sheet
+from ortho_pipeline.errors import counted
 from ortho_pipeline.report import page_environment
-from ortho_pipeline.report_text import ENOUGH_CHECK_POINTS, count, fixed, flat, metres, px
+from ortho_pipeline.report_text import ENOUGH_CHECK_POINTS, fixed, flat, metres, px
 
 if TYPE_CHECKING:
     from ortho_pipeline.block_images import Start
@@ -70,7 +71,7 @@ def headline(document: Mapping[str, Any]) -> dict[str, Any]:
             notes.append(
                 f"Fewer than {ENOUGH_CHECK_POINTS} check points: an indication, not a claim of accuracy (ASPRS 2023)."
             )
-        what = f"RMSE in plan and height at {count(check['n'], 'check point')} whose ground took no part"
+        what = f"RMSE in plan and height at {counted(check['n'], 'check point')} whose ground took no part"
         return {"figure": metres(check["plan"]), "height": metres(check["h"]), "what": what, "notes": notes}
     # The ground of control is held by its sigma: how well it fits is to be seen in the images.
     seen = {
@@ -78,7 +79,7 @@ def headline(document: Mapping[str, Any]) -> dict[str, Any]:
         for role in ("check", "control")
     }
     if check := seen["check"]:
-        what = f"RMSE of {count(check['n'], 'measurement')} of check points, whose ground took no part, in the images"
+        what = f"RMSE of {counted(check['n'], 'measurement')} of check points, whose ground took no part, in the images"
         return {"figure": px(check["total"]), "height": None, "what": what, "notes": notes}
     if control and seen["control"]:
         notes.append("No check points were kept apart.")
@@ -86,12 +87,13 @@ def headline(document: Mapping[str, Any]) -> dict[str, Any]:
             what = "nothing is left over to test the fit with"
             return {"figure": "Not tested", "height": None, "what": what, "notes": notes}
         what = (
-            f"RMSE of {count(seen['control']['n'], 'measurement')} of control points in the images: the fit, not a test"
+            f"RMSE of {counted(seen['control']['n'], 'measurement')} of control points in the images: the fit, "
+            "not a test"
         )
         return {"figure": px(seen["control"]["total"]), "height": None, "what": what, "notes": notes}
     sizes = [math.hypot(*ray["residual"]) for ray in adjustment["rays"] if ray["used"] and None not in ray["residual"]]
     figure = px(float(np.median(sizes))) if sizes else "Not tested"
-    what = f"median residual of {count(len(sizes), 'ray')}: how well the images agree, not how right they are"
+    what = f"median residual of {counted(len(sizes), 'ray')}: how well the images agree, not how right they are"
     return {"figure": figure, "height": None, "what": what, "notes": notes}
 
 
@@ -111,10 +113,12 @@ def summary_text(document: Mapping[str, Any]) -> str:
             low, high = rms["min"], rms["max"]
             axes = zip("ENh", (rms["x"], rms["y"], rms["h"]), low, high, strict=True)
             text = ", ".join(f"{axis} {value:.3f} ({a:+.2f} to {b:+.2f})" for axis, value, a, b in axes)
-            lines.append(f"{count(rms['n'], f'{role} point')}: RMSE {text} m")
+            lines.append(f"{counted(rms['n'], f'{role} point')}: RMSE {text} m")
     sigma0 = "unknown" if adjustment["sigma0"] is None else f"{adjustment['sigma0']:.3g}"
     lines += variance_lines(adjustment["variances"])
-    lines.append(f"Redundancy {adjustment['redundancy']}, sigma0 {sigma0}, {len(adjustment['rejected'])} gross errors")
+    lines.append(
+        f"Redundancy {adjustment['redundancy']}, sigma0 {sigma0}, {counted(len(adjustment['rejected']), 'gross error')}"
+    )
     height = f", height {head['height']}" if head["height"] else ""
     lines += [f"{head['figure']}{height}: {head['what']}", *head["notes"]]
     return "\n".join([*lines, *(f"Warning: {text}" for text in document["warnings"])])
@@ -126,7 +130,7 @@ def variance_lines(variances: Mapping[str, Any]) -> list[str]:
     number = max(part["points"] for part in ground.values())
     if not number:
         return []
-    who = count(number, "control point")
+    who = counted(number, "control point")
     if not variances["separable"]:
         return [f"Ground of {who} states no sigma; its errors count as errors of measurement"]
     found = [
@@ -197,7 +201,7 @@ def plot_rays(document: Mapping[str, Any], label: str) -> Drawing | None:
             vector = ray["residual"] if role == "tie" else ray["back_projected"]
             if None not in vector:
                 shown.append((ray["measured"], vector, role if ray["used"] else "out", f"{ray['id']} ({role})"))
-    title = f"Residuals of {len(shown)} rays over the frame of {label}"
+    title = f"Residuals of {counted(len(shown), 'ray')} over the frame of {label}"
     return _vectors(title, shown[:: max(1, len(shown) // _DRAWN_RAYS)], document["images"][label]["size"], "px")
 
 

@@ -27,9 +27,8 @@ import numpy as np
 
 from ortho_pipeline.block_points import Index
 from ortho_pipeline.block_solver import PERFECT_GROUND, BlockProblem, Selection, Solved
-from ortho_pipeline.errors import NotConverged
+from ortho_pipeline.errors import NotConverged, counted
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.report_text import count
 
 #: Errors of the ground below this part of what a point's own rays leave open change nothing that could be seen: the
 #: prior is even in log sigma above it, and even in sigma below.
@@ -125,7 +124,7 @@ class Variances:
         if not number:
             return []
         remedy = "state sigmas (sigma_xy, sigma_h, or --ground-sigma XY,H) if they are known"
-        who = f"{count(number, 'control point')} without a stated sigma"
+        who = f"{counted(number, 'control point')} without a stated sigma"
         if not self.separable:
             return [f"{who}: their errors cannot be told from errors of measurement here, and count as such; {remedy}"]
         found = []

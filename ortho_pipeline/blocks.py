@@ -19,7 +19,7 @@ from ortho_pipeline.adjustment import adjust as adjust_block
 from ortho_pipeline.block_images import Start, labels_of, points_of_images, start_of
 from ortho_pipeline.block_points import BlockPoints, read_block_points
 from ortho_pipeline.crs import Vertical, parse_crs
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.files import together, write_text
 from ortho_pipeline.ground_frame import GEODETIC, GroundFrame
 from ortho_pipeline.intersection import Intersection
@@ -31,7 +31,6 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import BlockOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.pipeline import Result
 from ortho_pipeline.points import assign_roles
-from ortho_pipeline.report_text import count
 
 #: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
 _ENOUGH_CHECKS = 30
@@ -210,7 +209,7 @@ def _own(scene: Any, name: str | None) -> SensorModel:
 def _check_models(images: Sequence[str | os.PathLike[str]], models: Sequence[str | os.PathLike[str]]) -> None:
     if models and len(models) != len(images):
         raise InputError(
-            f"{len(models)} models for {len(images)} images", field="--models",
+            f"{counted(len(models), 'model')} for {counted(len(images), 'image')}", field="--models",
             remedy="give one model file for each image, in their order",
         )  # fmt: skip
 
@@ -280,17 +279,21 @@ def _warnings(fit: BlockFit, starts: Mapping[str, Start]) -> list[str]:
         where = f" in {one.image}" if one.image else (" (its ground)" if one.what == "ground" else "")
         found.append(f"point {one.point}{where} was left out: {one.reason}")
     if len(fit.rejected) > 50:
-        found.append(f"and {len(fit.rejected) - 50} more gross errors, all of them in the report")
+        found.append(f"and {counted(len(fit.rejected) - 50, 'more gross error')}, all of them in the report")
     sizes = np.array([(start.scene.width, start.scene.height) for start in starts.values()])[points.image]
     outside = ((points.measured < 0) | (points.measured > sizes)).any(axis=1)
     if outside.any():
         names = ", ".join(dict.fromkeys(points.ids[i] for i in points.point[outside][:10]))
-        found.append(f"{int(outside.sum())} measurements outside of their images (used all the same): {names}")
+        found.append(
+            f"{counted(int(outside.sum()), 'measurement')} outside of their images (used all the same): {names}"
+        )
     if fit.parameters and fit.redundancy == 0:
         found.append("no redundancy: residuals are zero by construction and say nothing")
     checks = max((int(rms["n"]) for rms in _check_rms(fit) if rms), default=0)
     if points.control.any() and checks < _ENOUGH_CHECKS:
-        found.append(f"{checks} check points: fewer than the 30 that ASPRS 2023 asks for before accuracy is claimed")
+        found.append(
+            f"{counted(checks, 'check point')}: fewer than the 30 that ASPRS 2023 asks for before accuracy is claimed"
+        )
     return list(dict.fromkeys(found))
 
 
@@ -378,7 +381,7 @@ def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
     for row in rows:
         if row["ground"] is None or row["sigma"] is None:
             continue
-        note = f"{row['role']}, {count(row['rays'], 'ray')}"
+        note = f"{row['role']}, {counted(row['rays'], 'ray')}"
         sigma = max(row["sigma"][:2])
         writer.writerow([row["id"], *map(repr, (*row["ground"], sigma, row["sigma"][2])), note])
     return out.getvalue()
@@ -410,7 +413,8 @@ def _left_open(found: Intersection) -> list[str]:
         return []
     names = ", ".join(np.array(found.points.ids)[open_][:10])
     return [
-        f"{int(open_.sum())} points have no intersection (one ray, parallel rays, or outside of the models): {names}"
+        f"{counted(int(open_.sum()), 'point has', 'points have')} no intersection (one ray, parallel rays, or "
+        f"outside of the models): {names}"
     ]
 
 

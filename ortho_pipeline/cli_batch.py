@@ -11,7 +11,8 @@ import click
 
 from ortho_pipeline.cli_command import Command, Megabytes
 from ortho_pipeline.cli_options import json_option
-from ortho_pipeline.cli_text import count, print_json, progress
+from ortho_pipeline.cli_text import print_json, progress
+from ortho_pipeline.errors import counted
 
 if TYPE_CHECKING:
     from ortho_pipeline.batch import BatchResult, Outcome
@@ -121,7 +122,7 @@ def _check(planned: Plan, only: Sequence[str], shard: tuple[int, int] | None, as
     else:
         for one in checked:
             click.echo(_checked_text(one))
-        click.echo(f"{count(len(checked), 'scene')}: {len(checked) - len(failed)} ready, {len(failed)} not")
+        click.echo(f"{counted(len(checked), 'scene')}: {len(checked) - len(failed)} ready, {len(failed)} not")
     if failed:
         click.get_current_context().exit(FAILED if len(failed) == len(checked) else PARTLY_DONE)
 
@@ -132,7 +133,7 @@ def _checked_text(one: Mapping[str, Any]) -> str:
     points, grid = one["points"], one["grid"]
     parts = [
         f"{one['sensor']}, {one['model']}",
-        f"{count(points['control'], 'control point')}, {count(points['check'], 'check point')}",
+        f"{counted(points['control'], 'control point')}, {counted(points['check'], 'check point')}",
         f"DEM covers {100 * one['coverage']:.1f} %",
         f"{grid['size'][0]} x {grid['size'][1]} px of {grid['resolution'][0]:g} in {grid['crs']}",
     ]
@@ -159,7 +160,7 @@ def _print_summary(result: BatchResult) -> None:
         if scene.error:
             console.print(f"\n{scene.name}: {_error_text(scene.error)}", markup=False)
     counts = ", ".join(f"{result.count(status)} {status}" for status in ("done", "unchanged", "failed"))
-    console.print(f"\n{count(len(result.scenes), 'scene')}: {counts}  ({result.seconds:.1f} s)")
+    console.print(f"\n{counted(len(result.scenes), 'scene')}: {counts}  ({result.seconds:.1f} s)")
     if result.mosaic:
         console.print(_mosaic_text(result.mosaic), markup=False)
     for name, path in result.files.items():
@@ -178,7 +179,7 @@ def _mosaic_text(mosaic: Mapping[str, Any]) -> str:
     """Return what there is to say of a mosaic and its seams."""
     if mosaic.get("error"):
         return f"mosaic: {_error_text(mosaic['error'])}"
-    lines = [f"mosaic: {mosaic['size'][0]} x {mosaic['size'][1]} px of {len(mosaic['on_top_first'])} scenes"]
+    lines = [f"mosaic: {mosaic['size'][0]} x {mosaic['size'][1]} px of {counted(len(mosaic['on_top_first']), 'scene')}"]
     if mosaic["seams"]:
         text = f"seams: {mosaic['seams_measured']} of {len(mosaic['seams'])} measured"
         if mosaic["worst_seam"]:

@@ -11,13 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ortho_pipeline.errors import counted
+
 if TYPE_CHECKING:
     from ortho_pipeline.pipeline import CompareResult, FitResult, Result
-
-
-def count(number: int, what: str) -> str:
-    """Return a number and what it counts."""
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def print_json(document: Any) -> None:
@@ -59,11 +56,14 @@ def print_fit(result: FitResult) -> None:
     for which, label in (("control", "control"), ("check", "check"), ("loo", "leave-one-out")):
         rmse = document["rmse"][which]
         text = "no points" if rmse is None else (
-            f"column {rmse['col']:.3f}, row {rmse['row']:.3f}, both {rmse['total']:.3f}  ({rmse['n']} points)"
+            f"column {rmse['col']:.3f}, row {rmse['row']:.3f}, both {rmse['total']:.3f}  "
+            f"({counted(rmse['n'], 'point')})"
         )  # fmt: skip
         click.echo(f"RMSE {label:<14} {text}")
     if document["outlying"] and (rest := document["rmse_of_agreeing_checks"]):
-        click.echo(f"RMSE of the check points that are not outlying: {rest['total']:.3f}  ({rest['n']} points)")
+        click.echo(
+            f"RMSE of the check points that are not outlying: {rest['total']:.3f}  ({counted(rest['n'], 'point')})"
+        )
     if document["map_scale"]:
         click.echo(f"Map scale: {document['map_scale']['statement']}")
     for role, found in document["covariance"].items():
@@ -131,7 +131,9 @@ def print_comparison(result: CompareResult, units: str) -> None:
     rows, points = document["rows"], document["points"]
     wide = max([len(row["model"]) for row in rows] + [5])
     axes = ("column", "row") if units == "px" else ("x", "y")
-    click.echo(f"{count(points['control'], 'control point')}, {count(points['check'], 'check point')}; RMSE in {units}")
+    click.echo(
+        f"{counted(points['control'], 'control point')}, {counted(points['check'], 'check point')}; RMSE in {units}"
+    )
     click.echo(
         f"\n{'':<{wide}}  {'':>6} {'control (the fit)':^28}  {'check':^28}  {'left out':>8} {'condi-':>8}\n"
         f"{'model':<{wide}}  {'param.':>6} "

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.errors import InputError, OrthoError, counted
 from ortho_pipeline.estimation import SIGNIFICANCE, Fit, Prior, fit
 from ortho_pipeline.ground_error import rmse_metres
 from ortho_pipeline.model_choice import OWN, fit_family, fit_own
@@ -318,14 +318,15 @@ def recommend(
     chosen, best = _choose(sound, by_name, [name for name in preferred if name in sound])
     shown = {name: f"{math.sqrt(values.mean()):.3g} px" for name, values in squares.items()}
     reason = f"{chosen}: {shown[chosen]} at {_what(checks, count - checks)}, with "
-    reason += f"{by_name[chosen].parameters} parameters"
+    reason += f"{counted(by_name[chosen].parameters, 'parameter')}"
     if chosen == best:
         reason += "; the smallest error" + ("" if smallest == best else " of the models that can be relied on")
     elif best not in preferred and chosen in preferred:
         reason += f"; {best} has {shown[best]}, not significantly less than a correction of the scene's own model"
     else:
         reason += (
-            f"; {best} has {shown[best]} with {by_name[best].parameters} parameters, less by 5 % at most, so the model "
+            f"; {best} has {shown[best]} with {counted(by_name[best].parameters, 'parameter')}, less by 5 % at "
+            "most, so the model "
             "with fewer parameters is preferred"
         )
     if doubts[smallest]:
@@ -397,10 +398,10 @@ def _significantly_worse(squares: Array, best: Array) -> bool:
 
 def _what(checks: int, control: int) -> str:
     """Return in words what points tested the models."""
-    left_out = f"{control} control points, each left out in turn"
+    left_out = f"{counted(control, 'control point')}, each left out in turn"
     if not checks:
         return left_out
-    return f"{checks} check points" + (f" and {left_out}" if control else "")
+    return counted(checks, "check point") + (f" and {left_out}" if control else "")
 
 
 def _finite(value: float) -> float | None:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.crs import parse_crs
-from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.errors import OrthoError, counted
 from ortho_pipeline.geometry import units_per_metre
 from ortho_pipeline.hookspecs import Piece, Scene, Sensor
 from ortho_pipeline.models.base import Array, SensorModel
@@ -159,7 +159,10 @@ def _parameter_faults(model: SensorModel) -> Iterator[str]:
         yield f"param_names must be a tuple of texts, not {names!r}"
     fits = isinstance(values, np.ndarray) and values.shape == (len(names),) and values.dtype.kind in "fiu"
     if not fits or not np.isfinite(values).all():
-        yield f"params must be an array of {len(names)} finite numbers, one for each of param_names, not {values!r}"
+        yield (
+            f"params must be an array of {counted(len(names), 'finite number')}, one for each of param_names, "
+            f"not {values!r}"
+        )
     if len(names) and type(model).with_params is SensorModel.with_params:
         yield "param_names without with_params: write with_params(params), which returns the model with these values"
 
@@ -184,7 +187,7 @@ def _mapping_faults(model: SensorModel) -> Iterator[str]:
     tried = centre + _TRIED * half
     images = []
     for ground in (tried, tried[:1], tried[:0]):
-        what = f"ground_to_image of {len(ground)} point{'s' if len(ground) != 1 else ''}"
+        what = f"ground_to_image of {counted(len(ground), 'point')}"
         try:
             with np.errstate(all="ignore"):
                 images.append(model.ground_to_image(ground.copy()))

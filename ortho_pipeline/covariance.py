@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.crs import ground_transform
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.estimation import Fit
 from ortho_pipeline.geometry import horizon_from_geodetic
 from ortho_pipeline.ground_error import in_metres, metre_partials, with_reference_height
@@ -268,7 +268,7 @@ def _usable(xy: ArrayLike, residuals: ArrayLike, design: ArrayLike | None) -> tu
     mean = np.broadcast_to(np.eye(2), (len(values), 2, 2))
     partials = mean if design is None else np.asarray(design, dtype=np.float64)
     if partials.ndim != 3 or partials.shape[:2] != values.shape:
-        raise InputError(f"a design of {len(values)} points is (N, 2, P), not {partials.shape}")
+        raise InputError(f"a design of {counted(len(values), 'point')} is (N, 2, P), not {partials.shape}")
     whole = np.isfinite(where).all(axis=1) & np.isfinite(values).all(axis=1) & np.isfinite(partials).all(axis=(1, 2))
     rows = np.flatnonzero(whole)
     given = len(rows)
@@ -471,7 +471,7 @@ def _moran(values: Array, first: NDArray[Any], second: NDArray[Any]) -> Array:
 def _sentences(found: CovarianceAnalysis) -> list[str]:
     if found.moran is None or found.critical is None:
         return [
-            f"{found.n} point{'' if found.n == 1 else 's'}: too few to tell a systematic error from chance (it takes "
+            f"{counted(found.n, 'point')}: too few to tell a systematic error from chance (it takes "
             f"{FEWEST_POINTS} points, and {FEWEST_POINTS} observations more than parameters)."
         ]
     alike = "{:+.2f} in x and {:+.2f} in y".format(*found.moran)
@@ -484,7 +484,7 @@ def _sentences(found: CovarianceAnalysis) -> list[str]:
         numbers = "{:.2f} and {:.2f}".format(*found.relative), "{:.2f} and {:.2f}".format(*found.absolute)
         said.append(
             f"Points closer than {found.near:g} m are accurate to each other to {numbers[0]} {found.unit} "
-            f"({found.pairs_near} pair{'' if found.pairs_near == 1 else 's'}), all to {numbers[1]} {found.unit}."
+            f"({counted(found.pairs_near, 'pair')}), all to {numbers[1]} {found.unit}."
         )
     if found.mean_p and min(found.mean_p) < SIGNIFICANCE / 2:
         off = "{:+.2f} and {:+.2f}".format(*found.mean)

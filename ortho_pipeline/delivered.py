@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ortho_pipeline.errors import counted
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
-from ortho_pipeline.report_text import count, headline, px
+from ortho_pipeline.report_text import headline, px
 
 _UNTESTED = {"figure": "Not tested", "metres": None, "what": "there were no ground control points"}
 
@@ -34,7 +35,7 @@ def _of_scene(scene: Scene) -> dict[str, Any]:
     adjustment: Mapping[str, Any] = {"outlying": (), "rmse_of_agreeing_checks": None, **(scene.adjusted or {})}
     found = headline({"adjustment": adjustment, "rmse_m": dict.fromkeys(("control", "check", "loo"))})
     control = sum(1 for point in adjustment["points"] if point["used"])
-    name = f"{adjustment['model']}, {count(control, 'control point')}"
+    name = f"{adjustment['model']}, {counted(control, 'control point')}"
     return {
         **found,
         "what": f"{found['what']}, when the model was adjusted ({name})",
@@ -61,7 +62,7 @@ def _of_block(scene: Scene) -> dict[str, Any]:
     )
     for found, what in kinds:
         if found:
-            said = f"RMSE of {count(found['n'], 'measurement')} {what} in this image, when it was adjusted in a block"
+            said = f"RMSE of {counted(found['n'], 'measurement')} {what} in this image, when it was adjusted in a block"
             return {"figure": px(found["total"]), "metres": None, "what": said, "notes": notes}
     return {**_UNTESTED, "what": "the model was adjusted in a block without points in this image", "notes": notes}
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, counted
 
 Array = NDArray[np.float64]
 Segment = tuple[tuple[float, float], tuple[float, float]]
@@ -165,7 +165,7 @@ class _Area:
         rows = np.arange(max(0, math.ceil(y1 - 0.5)), min(height, math.floor(y2 - 0.5) + 1))
         if len(rows) < SHORTEST:
             raise InputError(
-                f"the edge crosses {len(rows)} lines of pixels; it takes {SHORTEST}",
+                f"the edge crosses {counted(len(rows), 'line')} of pixels; it takes {SHORTEST}",
                 field="--edge",
                 remedy="give a longer edge",
             )

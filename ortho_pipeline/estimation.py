@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.blunders import REJECTED_LIMIT, Outlying, find_blunders, outlying
-from ortho_pipeline.errors import DegeneratePoints, InputError
+from ortho_pipeline.errors import DegeneratePoints, InputError, counted
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.notebook import fit_html
 from ortho_pipeline.points import Points
@@ -170,7 +170,9 @@ class Fit:
     def __repr__(self) -> str:
         total = {role: found["total"] for role in ("control", "check", "loo") if (found := self.rmse(role))}
         said = ", ".join(f"{role} {value:.3f} px" for role, value in total.items())
-        return f"<fit of {self.model_name} to {int(self.used.sum())} control points: RMSE {said or 'unknown'}>"
+        return (
+            f"<fit of {self.model_name} to {counted(int(self.used.sum()), 'control point')}: RMSE {said or 'unknown'}>"
+        )
 
     def _repr_html_(self) -> str:
         return fit_html(self.to_json())
@@ -295,7 +297,8 @@ def _posed(
     projected = np.asarray(np.isfinite(raw).all(axis=1))
     if len(points) and not projected.any():
         raise InputError(
-            f"none of the {len(points)} points has an image by the model {model.kind!r}: no height, or outside of "
+            f"none of the {counted(len(points), 'point')} has an image by the model {model.kind!r}: no height, or "
+            "outside of "
             "where the model is defined",
             file=points.source or None,
             remedy="check the CRS and the heights of the points, and that they and the model belong to this scene",
@@ -386,7 +389,7 @@ def _refuse_many(points: Points, rejected: dict[int, str], count: int) -> None:
     if len(rejected) > REJECTED_LIMIT * count:
         names = ", ".join(points.ids[i] for i in sorted(rejected))
         raise DegeneratePoints(
-            f"{len(rejected)} of {count} control points contradict the others ({names}): "
+            f"{len(rejected)} of {counted(count, 'control point')} contradict the others ({names}): "
             "which of them are wrong cannot be decided",
             file=points.source,
             remedy="measure these points again, or remove the wrong ones",
@@ -435,7 +438,7 @@ def _unstable(solution: Solution, strength: float | None) -> list[str]:
         if solution.condition <= _UNSTABLE:
             return []
         return [
-            f"unstable: the points determine {solution.effective:.1f} of {len(names)} parameters (condition "
+            f"unstable: the points determine {solution.effective:.1f} of {counted(len(names), 'parameter')} (condition "
             f"{solution.condition:.0e}); regularisation ({strength:.1e}) decides the others: trust check points only"
         ]
     if solution.condition <= _UNSTABLE or len(names) < 2:
@@ -444,7 +447,8 @@ def _unstable(solution: Solution, strength: float | None) -> list[str]:
             return []
         first, second = np.unravel_index(int(np.argmax(pairs)), pairs.shape)
         return [
-            f"{int((pairs > _INSEPARABLE).sum())} pairs of parameters are correlated beyond {_INSEPARABLE} "
+            f"{counted(int((pairs > _INSEPARABLE).sum()), 'pair of parameters is', 'pairs of parameters are')} "
+            f"correlated beyond {_INSEPARABLE} "
             f"({names[first]} and {names[second]} the most): they cannot be told apart"
         ]
     return [f"unstable: the condition of the adjustment is {solution.condition:.0e}: a simpler model is safer"]

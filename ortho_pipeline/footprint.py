@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.crs import GroundTransform, ground_transform, utm_crs
 from ortho_pipeline.dem import Surface
-from ortho_pipeline.errors import CoverageError, InputError, ModelError, OrthoError
+from ortho_pipeline.errors import CoverageError, InputError, ModelError, OrthoError, counted
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster import Grid
 from ortho_pipeline.rays import intersect
-from ortho_pipeline.report_text import count, share
+from ortho_pipeline.report_text import share
 
 #: Points per side of the image at which the DEM is asked for.
 _COVERAGE_SIDE = 33
@@ -138,7 +138,7 @@ class Footprint:
         if self.coverage >= 1.0:
             return said
         what = "have no pixels in the ortho" if surface.fill in ("error", "mask") else "were filled"
-        inside = f" ({count(self.voids, 'sample')} without a height within it)" if self.voids else ""
+        inside = f" ({counted(self.voids, 'sample')} without a height within it)" if self.voids else ""
         return [*said, f"the DEM covers {share(self.coverage)} of the scene{inside}: the other places {what}"]
 
     def fitted(self, model: SensorModel) -> SensorModel:

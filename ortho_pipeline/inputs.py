@@ -17,7 +17,7 @@ import pyproj
 
 from ortho_pipeline import crop, dem, plugins, raster
 from ortho_pipeline.crs import Vertical, parse_crs
-from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.errors import InputError, OrthoError, counted
 from ortho_pipeline.files import sha256, states
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.locations import archive_of, located
@@ -235,7 +235,8 @@ def with_heights(points: Points, surface: dem.Surface | None) -> Points:
     if surface is None:
         names = ", ".join(np.array(points.ids)[missing][:5])
         raise InputError(
-            f"{int(missing.sum())} of {len(points)} points without a height ({names})", file=points.source, field="h",
+            f"{int(missing.sum())} of {counted(len(points), 'point')} without a height "
+            f"({names})", file=points.source, field="h",
             remedy="give heights in the file, or a DEM with --dem to take them from",
         )  # fmt: skip
     ground = points.ground.copy()

@@ -15,7 +15,7 @@ import numpy as np
 
 from ortho_pipeline.block_points import BlockPoints, Index
 from ortho_pipeline.crs import ground_transform
-from ortho_pipeline.errors import InputError, TooFewPoints
+from ortho_pipeline.errors import InputError, TooFewPoints, counted
 from ortho_pipeline.ground_frame import GEODETIC, GroundFrame
 from ortho_pipeline.models.base import Array, SensorModel
 
@@ -55,7 +55,10 @@ class Intersection:
     def __repr__(self) -> str:
         met = int(np.isfinite(self.ground).all(axis=1).sum())
         sigma0 = "unknown" if self.sigma0 is None else f"{self.sigma0:.3g}"
-        return f"<{met} of {len(self.points)} points intersected from {self.points.rays} rays: sigma0 {sigma0}>"
+        return (
+            f"<{met} of {counted(len(self.points), 'point')} intersected from "
+            f"{counted(self.points.rays, 'ray')}: sigma0 {sigma0}>"
+        )
 
     @property
     def sigmas(self) -> Array:

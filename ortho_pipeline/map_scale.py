@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from ortho_pipeline.errors import counted
 from ortho_pipeline.estimation import Fit
 from ortho_pipeline.ground_error import in_metres
 from ortho_pipeline.models.base import Array
@@ -61,9 +62,9 @@ class MapScale:
     def statement(self) -> str:
         """The verdicts in words, with what they rest on."""
         base = {
-            "check": f"{self.n} check points",
-            "delivered": f"{self.n} points of the model as delivered",
-            "loo": f"{self.n} control points left out in turn",
+            "check": counted(self.n, "check point"),
+            "delivered": f"{counted(self.n, 'point')} of the model as delivered",
+            "loo": f"{counted(self.n, 'control point')} left out in turn",
         }[self.evidence]
         by = "" if self.limited_by is None else f" (limited by the {self.limited_by})"
         said = f"{base}: {_scale(self.paper_scale)}{by} by 0.25 mm in the map; "

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, OrthoError
+from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, OrthoError, counted
 from ortho_pipeline.estimation import Fit, Prior, fit, gross_errors
 from ortho_pipeline.models import family_of, start_model
 from ortho_pipeline.models.base import Array, SensorModel
@@ -274,7 +274,7 @@ def k_fold(found: Fit, k: int = 10, seed: int = 0) -> Array:
     """
     rows = np.flatnonzero(found.used)
     if not 2 <= k <= len(rows):
-        raise InputError(f"{k} groups of {len(rows)} points cannot be made", field="k")
+        raise InputError(f"{counted(len(rows), 'point')} cannot be divided into {counted(k, 'group')}", field="k")
     problem = Problem.of(found.model, found.points, found.used, found.priors)
     if found.ridge is not None:
         problem, _ = regularised(problem, np.ones(len(rows), dtype=bool), found.ridge)

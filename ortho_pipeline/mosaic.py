@@ -18,7 +18,7 @@ import shapely
 from numpy.typing import NDArray
 from osgeo import gdal
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.outline import grid_of, valid_outline
 from ortho_pipeline.raster import Grid, RasterSource, limit_cache
 from ortho_pipeline.raster_output import close, raster_output
@@ -116,7 +116,7 @@ def _check_bands(orthos: Sequence[Ortho]) -> None:
     for ortho in orthos:
         source = RasterSource(ortho.path)
         nodata = tuple(None if value is None else str(value) for value in source.nodata)
-        kind = f"{source.count} bands of {source.dtype}", source.validity, nodata
+        kind = f"{counted(source.count, 'band')} of {source.dtype}", source.validity, nodata
         first = first or kind
         if kind != first:
             raise InputError(

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
+from ortho_pipeline.errors import counted
+
 #: In a notebook, pages of reports are this high (CSS pixels).
 _PAGE_HEIGHT = 640
 #: Images and gross errors of a block that are listed.
@@ -66,7 +68,7 @@ def block_html(document: Mapping[str, Any]) -> str:
     said = [document["gauge"], *document["warnings"]]
     said += [f"left out: point {one['point']} ({one['reason']})" for one in rejected[:_LISTED]]
     if len(rejected) > _LISTED:
-        said.append(f"and {len(rejected) - _LISTED} more gross errors")
+        said.append(f"and {counted(len(rejected) - _LISTED, 'more gross error')}")
     parts.append("<ul>" + "".join(f"<li>{escape(text)}</li>" for text in said) + "</ul>")
     return "".join(parts)
 

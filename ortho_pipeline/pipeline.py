@@ -23,7 +23,7 @@ from ortho_pipeline import comparison as comparing
 from ortho_pipeline import crs as crs_module
 from ortho_pipeline import dem, dem_accuracy, footprint, gcp_export, inputs, plugins, raster, report, resolution, rpc
 from ortho_pipeline import stac as stac_items
-from ortho_pipeline.errors import InputError, completed
+from ortho_pipeline.errors import InputError, completed, counted
 from ortho_pipeline.estimation import Fit
 from ortho_pipeline.files import retire, sha256, staged, states, together, write_text
 from ortho_pipeline.ground_error import viewing
@@ -376,7 +376,9 @@ def write_plots(report_file: str | os.PathLike[str], folder: str | os.PathLike[s
         document = report.read_report_json(report_file)
         stem = Path(report_file).stem
         files = report.write_plots(document, Path(folder), stem, kind)
-    return Result(files, {}, f"{len(files)} plots of {Path(report_file).name.removesuffix(_ENDINGS['report'])}")
+    return Result(
+        files, {}, f"{counted(len(files), 'plot')} of {Path(report_file).name.removesuffix(_ENDINGS['report'])}"
+    )
 
 
 @_outputs_together
@@ -446,7 +448,7 @@ def dem_check(
     found = dem_accuracy.check_dem(heights, ground, plane, ids)
     if not found.overall.count:
         raise InputError(
-            f"none of the {len(ids)} check points has a height in this DEM", file=dem_file, field="--points",
+            f"none of the {counted(len(ids), 'check point')} has a height in this DEM", file=dem_file, field="--points",
             remedy="check the CRS of the points, and whether they lie on the DEM",
         )  # fmt: skip
     document = {

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.point_table import (
     CSV_IMAGE,
     OF_IMAGE,
@@ -185,7 +185,8 @@ def _row(
         comma = header.delimiter == "," and len(cells) > len(header.names)
         remedy = "a decimal comma splits numbers: write decimal points, or ; between the columns" if comma else None
         raise InputError(
-            f"{len(cells)} cells under {len(header.names)} column names ({', '.join(header.names)[:120]})",
+            f"{counted(len(cells), 'cell')} under {counted(len(header.names), 'column name')} "
+            f"({', '.join(header.names)[:120]})",
             file=path, field=where, remedy=remedy,
         )  # fmt: skip
     if not header.names[-1] and cells[-1]:

@@ -6,7 +6,7 @@ import math
 import os
 import re
 
-from ortho_pipeline.errors import CrsError, InputError
+from ortho_pipeline.errors import CrsError, InputError, counted
 from ortho_pipeline.point_table import Line, Row, Table, cells_of, lines_of, number, short, sigma_of
 
 # -- QGIS ------------------------------------------------------------------------------------------------------------
@@ -46,7 +46,9 @@ _QGIS_NAMES = {"pixelx": "sourcex", "pixely": "sourcey"}
 def _qgis_row(path: str | os.PathLike[str], line: Line, names: list[str], cells: list[str]) -> Row | None:
     where = f"line {line.number}"
     if len(cells) != len(names):
-        raise InputError(f"{len(cells)} cells under {len(names)} column names", file=path, field=where)
+        raise InputError(
+            f"{counted(len(cells), 'cell')} under {counted(len(names), 'column name')}", file=path, field=where
+        )
     given = dict(zip(names, cells, strict=True))
     if given.get("enable", "1") not in ("0", "1"):
         raise InputError(f"{short(given['enable'])} is neither 0 nor 1", file=path, field=f"{where}, column enable")
@@ -84,7 +86,7 @@ def read_odm(path: str | os.PathLike[str], text: str) -> Table:
         cells = line.text.strip().split("\t") if "\t" in line.text.strip() else line.text.split()
         cells = [cell.strip() for cell in cells if cell.strip()]
         if len(cells) < 6:
-            raise InputError(f"{len(cells)} cells, not x y z column row image", file=path, field=where)
+            raise InputError(f"{counted(len(cells), 'cell')}, not x y z column row image", file=path, field=where)
         unknown_height = cells[2].lower() == "nan"
         x, y, column, row = (
             number(cells[k], path, f"{where}, column {name}")
@@ -136,7 +138,7 @@ def read_envi(path: str | os.PathLike[str], text: str) -> Table:
             )
         cells = plain.split()
         if len(cells) < len(layout):
-            raise InputError(f"{len(cells)} cells, not {', '.join(layout)}", file=path, field=where)
+            raise InputError(f"{counted(len(cells), 'cell')}, not {', '.join(layout)}", file=path, field=where)
         given = dict(zip(layout, cells, strict=False))
         image = given.pop("image file", None)
         if image is not None and image not in images:
@@ -193,7 +195,7 @@ def read_asp(path: str | os.PathLike[str], text: str) -> Table:
         cells = re.split(r"\s*,\s*|\s+", line.text.strip())
         if len(cells) < 12 or (len(cells) - 7) % 5:
             raise InputError(
-                f"{len(cells)} cells, not 7 of the point and 5 of each image", file=path, field=where,
+                f"{counted(len(cells), 'cell')}, not 7 of the point and 5 of each image", file=path, field=where,
                 remedy="id lat lon height sigma sigma sigma, then for each image: name column row sigma sigma",
             )  # fmt: skip
         lat, lon, height = (
@@ -226,7 +228,7 @@ def read_links(path: str | os.PathLike[str], text: str) -> Table:
     for line in lines:
         cells, where = line.text.split(), f"line {line.number}"
         if len(cells) not in (4, 5):
-            raise InputError(f"{len(cells)} cells, not [id] from-x from-y to-x to-y", file=path, field=where)
+            raise InputError(f"{counted(len(cells), 'cell')}, not [id] from-x from-y to-x to-y", file=path, field=where)
         x, minus_row, *to = (
             number(cell, path, f"{where}, {name}")
             for cell, name in zip(cells[-4:], ("from-x", "from-y", "to-x", "to-y"), strict=True)

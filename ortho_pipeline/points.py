@@ -26,7 +26,7 @@ from ortho_pipeline.crs import (
     horizontal,
     parse_crs,
 )
-from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.errors import InputError, counted, reads
 from ortho_pipeline.files import write_text
 from ortho_pipeline.point_files import read_table
 from ortho_pipeline.point_ground import ground_of
@@ -104,7 +104,7 @@ class Points:
 
     def __repr__(self) -> str:
         roles = ", ".join(f"{(self.roles == role).sum()} {role}" for role in ROLES if (self.roles == role).any())
-        return f"<{len(self.ids)} points: {roles or 'none'}; {self.crs.name}; {self.source}>"
+        return f"<{counted(len(self.ids), 'point')}: {roles or 'none'}; {self.crs.name}; {self.source}>"
 
     def __len__(self) -> int:
         return len(self.ids)

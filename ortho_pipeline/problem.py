@@ -24,7 +24,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
+from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints, counted
 from ortho_pipeline.geometry import units_per_metre
 from ortho_pipeline.least_squares import condition_of, minimise, solve_linear
 from ortho_pipeline.models.base import Array, SensorModel
@@ -180,9 +180,10 @@ class Problem:
         least = self.model.minimum_points if not known else math.ceil((count - known) / 2)
         if points < least:
             raise TooFewPoints(
-                f"{points} control points do not determine {count} parameters",
+                f"{counted(points, 'control point does', 'control points do')} not determine "
+                f"{counted(count, 'parameter')}",
                 file=self.source,
-                remedy=f"give at least {least} control points, or a simpler model",
+                remedy=f"give at least {counted(least, 'control point')}, or a simpler model",
             )
 
     def _determined(self, condition: float) -> None:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_pipeline.errors import InputError, TooFewPoints
+from ortho_pipeline.errors import InputError, TooFewPoints, counted
 from ortho_pipeline.models.base import Array, as_image
 
 #: Number of parameters by the name of the transformation.
@@ -75,7 +75,9 @@ class Transform:
             raise InputError(f"{kind!r} is no transformation", field="transform", remedy=", ".join(TRANSFORMS))
         source, target = as_image(reference), as_image(moving)
         if 2 * len(source) < TRANSFORMS[kind]:
-            raise TooFewPoints(f"{len(source)} tie points do not determine a {kind} transformation")
+            raise TooFewPoints(
+                f"{counted(len(source), 'tie point does', 'tie points do')} not determine a {kind} transformation"
+            )
         centre = source.mean(axis=0)
         scale = max(float(np.abs(source - centre).max()), 1.0)
         x, y = (source - centre) / scale, (target - centre) / scale
@@ -236,7 +238,8 @@ def _fit_robust(kind: str, reference: Array, moving: Array, name: str) -> tuple[
     for _ in range(10):
         if 2 * used.sum() < TRANSFORMS[kind] + 4 or used.sum() < 0.3 * len(used):
             raise TooFewPoints(
-                f"{int(used.sum())} of {len(used)} tie points of the band {name} agree: too few for a transformation",
+                f"{int(used.sum())} of {counted(len(used), 'tie point')} of the band {name}: too few agree for "
+                "a transformation",
                 field=name,
                 remedy="check that the bands are of one scene, or take larger patches",
             )

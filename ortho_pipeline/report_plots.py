@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.drawing import Axes, Drawing, number, round_down
+from ortho_pipeline.errors import counted
 
 #: Drawing area of the plot of vectors in CSS pixels, and the space around it.
 _PLOT_WIDTH, _PLOT_HEIGHT, _PAD = 452.0, 460.0, 19.0
@@ -71,7 +72,7 @@ def plot_residuals(report: Mapping[str, Any]) -> Drawing | None:
     lengths = [math.hypot(*point["residual"]) for point in points if kind_of(point) != "out"]
     longest = max(lengths, default=0.0)
     arrow = _LONGEST * min(_PLOT_WIDTH, max(tall - 2 * _PAD, wide / 2)) / longest if longest > 0 else 0.0
-    label = f"Residual vectors of {len(points)} points over the frame of the image"
+    label = f"Residual vectors of {counted(len(points), 'point')} over the frame of the image"
     drawing = Drawing(wide, float(tall) + 36, label, "residuals")
     x0, y0 = shift
     hull = report.get("control_hull") or {}
@@ -290,7 +291,10 @@ def _series(axes: Axes, found: Mapping[str, Any], key: str, role: str) -> None:
         for start, end in itertools.pairwise(at):
             drawing.line(line, *start, *end)
         for (x, y), one in zip(at, found["classes"], strict=True):
-            title = f"{'xy'[k]}: {one[key][k]:.2f}, {one['from_m']:.0f} to {one['to_m']:.0f} m, {one['pairs']} pairs"
+            title = (
+                f"{'xy'[k]}: {one[key][k]:.2f}, {one['from_m']:.0f} to {one['to_m']:.0f} m, "
+                f"{counted(one['pairs'], 'pair')}"
+            )
             with drawing.titled(title):
                 drawing.circle(mark, x, y, 3.4)
         left = 58 + 84 * k
@@ -330,7 +334,7 @@ def plot_comparison(report: Mapping[str, Any]) -> Drawing | None:
             drawing.rect("chosen", 0, y - step / 2, wide, step)
         drawing.text(room - 10, y + 4, row["model"], anchor="end")
         said = [f"{key} {row['rmse'][key]['total']:.3g} px" for key in kinds if row["rmse"][key]]
-        with drawing.titled(f"{row['model']}, {row['parameters']} parameters\n" + "\n".join(said)):
+        with drawing.titled(f"{row['model']}, {counted(row['parameters'], 'parameter')}\n" + "\n".join(said)):
             found = {key: across(row["rmse"][key]["total"]) for key in kinds if row["rmse"][key]}
             drawing.line("axis", min(found.values()), y, max(found.values()), y)
             for key, x in found.items():

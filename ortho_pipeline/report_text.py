@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from ortho_pipeline.errors import counted
+
 #: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
 ENOUGH_CHECK_POINTS = 30
 
@@ -43,20 +45,21 @@ def headline(
     notes = []
     if lost := len(adjustment["rejected"]):
         notes.append(
-            f"{count(lost, 'control point')} left out and not counted: good points that are left out are a sign of a "
+            f"{counted(lost, 'control point')} left out and not counted: good points that are left out are a sign of a "
             "model that does not suit the scene."
         )
     if control and parameters:
-        fitted = f"{px(control['total'])} RMSE at {count(control['n'], 'control point')}"
+        fitted = f"{px(control['total'])} RMSE at {counted(control['n'], 'control point')}"
         notes.append(
             f"The fit: {fitted}, redundancy {redundancy}."
             if redundancy
-            else f"No redundancy: {count(control['n'], 'control point')} for {parameters} parameters fit exactly, "
+            else f"No redundancy: {counted(control['n'], 'control point')} for "
+            f"{counted(parameters, 'parameter')} fit exactly, "
             "which says nothing about accuracy."
         )
     notes += _outlying_notes(adjustment)
     if check:
-        what = f"RMSE at {count(check['n'], 'check point')} that took no part in the adjustment"
+        what = f"RMSE at {counted(check['n'], 'check point')} that took no part in the adjustment"
         if check["n"] < ENOUGH_CHECK_POINTS:
             notes.append(
                 f"Fewer than {ENOUGH_CHECK_POINTS} check points: an indication, not a claim of accuracy (ASPRS 2023)."
@@ -64,14 +67,14 @@ def headline(
         return {**_figure(check, report["rmse_m"]["check"]), "what": what, "notes": notes}
     if control and not parameters:
         what = (
-            f"RMSE at {count(control['n'], 'point')} of the model as it was adjusted before: a test only if to others"
+            f"RMSE at {counted(control['n'], 'point')} of the model as it was adjusted before: a test only if to others"
             if adjusted
-            else f"RMSE at {count(control['n'], 'point')} of the model as delivered, none of which it was adjusted to"
+            else f"RMSE at {counted(control['n'], 'point')} of the model as delivered, none of which it was adjusted to"
         )
         return {**_figure(control, report["rmse_m"]["control"]), "what": what, "notes": notes}
     notes.append("No check points were kept apart.")
     if loo and redundancy:
-        what = f"RMSE when each of {count(loo['n'], 'control point')} is left out in turn"
+        what = f"RMSE when each of {counted(loo['n'], 'control point')} is left out in turn"
         return {**_figure(loo, report["rmse_m"]["loo"]), "what": what, "notes": notes}
     return {"figure": "Not tested", "metres": None, "what": "nothing is left over to test the fit with", "notes": notes}
 
@@ -83,7 +86,7 @@ def _outlying_notes(adjustment: Mapping[str, Any]) -> list[str]:
         return []
     said = f"Probably wrong, but counted: check point{'s' if len(names) > 1 else ''} {', '.join(names)}"
     rest = adjustment["rmse_of_agreeing_checks"]
-    return [f"{said}; without {px(rest['total'])} at {count(rest['n'], 'check point')}." if rest else f"{said}."]
+    return [f"{said}; without {px(rest['total'])} at {counted(rest['n'], 'check point')}." if rest else f"{said}."]
 
 
 def _figure(rmse: Mapping[str, Any], rmse_m: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -95,7 +98,7 @@ def summary_text(report: Mapping[str, Any]) -> str:
     adjustment, scene, head = report["adjustment"], report["scene"], report["headline"]
     rows = [("scene", f"{scene['name']}, {size_text(scene['size'])} px, {scene['sensor']} ({scene['model_source']})")]
     if raw := adjustment["raw_bias"]:
-        rows.append(("raw bias", f"{_bias(raw)} (measured minus delivered model, {count(raw['n'], 'point')})"))
+        rows.append(("raw bias", f"{_bias(raw)} (measured minus delivered model, {counted(raw['n'], 'point')})"))
     if adjustment["parameters"]:
         values = [f"{name} {_parameter(entry)}" for name, entry in adjustment["parameters"].items()]
         rows.append(("model", f"{adjustment['model']}: {', '.join(values)}"))
@@ -201,11 +204,6 @@ def share(value: float | None) -> str:
         return "–"
     # "100 %" is only said where it is so.
     return "100 %" if value >= 1 else f"{min(math.floor(value * 1000) / 10, 99.9):.1f} %"
-
-
-def count(number: int, what: str) -> str:
-    """Return a number and what it counts."""
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def size_text(size: Iterable[int]) -> str:

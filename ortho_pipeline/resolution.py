@@ -18,7 +18,7 @@ import numpy as np
 
 from ortho_pipeline.drawing import Axes, Drawing
 from ortho_pipeline.edge import HALF_WIDTH, Array, Edge, Segment, analyse_edge, said
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.raster import RasterSource
 
 SCHEMA_VERSION = 1
@@ -144,7 +144,7 @@ def measure(
     source = RasterSource(image, allow_network=allow_network)
     if not 1 <= band <= source.count:
         raise InputError(
-            f"the image has {source.count} band{'' if source.count == 1 else 's'}, not {band}",
+            f"the image has {counted(source.count, 'band')}, not {band}",
             file=source.path,
             field="--band",
             remedy=f"1 to {source.count}",
@@ -277,7 +277,7 @@ def text(result: dict[str, Any]) -> str:
         if group is None or (name != "all" and None in (median["along the row"], median["along the column"])):
             continue
         spread = "" if group["fwhm_spread_px"] is None else f" ± {group['fwhm_spread_px']:.2f}"
-        count = f"{group['n']} edge{'' if group['n'] == 1 else 's'}"
+        count = counted(group["n"], "edge")
         what = "" if name == "all" else f", profiles {name}"
         lines.append(
             f"Effective resolution {group['fwhm_px']:.2f}{spread} px (FWHM; {count}{what}), "

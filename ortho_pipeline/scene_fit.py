@@ -13,7 +13,7 @@ import numpy as np
 from ortho_pipeline import inputs
 from ortho_pipeline.crs import ground_transform
 from ortho_pipeline.dem import Surface
-from ortho_pipeline.errors import CoverageError, InputError, ModelError
+from ortho_pipeline.errors import CoverageError, InputError, ModelError, counted
 from ortho_pipeline.estimation import Fit, fit
 from ortho_pipeline.footprint import lay
 from ortho_pipeline.hookspecs import Scene
@@ -83,7 +83,8 @@ class Adjusted:
         checks = int(points.check.sum())
         if len(points) and checks < 30:
             found.append(
-                f"{checks} check points: fewer than the 30 that ASPRS 2023 asks for before accuracy is claimed"
+                f"{counted(checks, 'check point')}: fewer than the 30 that ASPRS 2023 asks for before accuracy "
+                "is claimed"
             )
         if self.removed:
             names = ", ".join(f"{one.name} (t {one.t:.1f})" for one in self.removed)
@@ -237,7 +238,7 @@ def _from_points(scene: Scene, options: PointOptions, points: Points, surface: S
         name, points, crs=options.model_crs, size=(scene.width, scene.height), heights=heights_around(points, surface),
         ridge=ridge_of(options.ridge), params=params_of(options),
     )  # fmt: skip
-    source = f"{int(adjusted.used.sum())} control points of {Path(points.source).name or scene.path}"
+    source = f"{counted(int(adjusted.used.sum()), 'control point')} of {Path(points.source).name or scene.path}"
     fitted = dataclasses.replace(scene, models={name: adjusted.model}, model_source=source)
     return Adjusted(fitted, adjusted)
 

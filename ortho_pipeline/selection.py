@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ortho_pipeline.errors import InputError, TooFewPoints
+from ortho_pipeline.errors import InputError, TooFewPoints, counted
 from ortho_pipeline.points import Array, Points
 
 _FORMS = "even:N, cluster:N[:K] (K 1-4: corners clockwise from the upper left, 5: middle), ids:a,b,c or random:N:seed"
@@ -36,7 +36,9 @@ def select_control(points: Points, spec: str) -> Points:
         count, other = _numbers(rest, spec)
         if count > len(rows):
             raise TooFewPoints(
-                f"{spec!r} asks for {count} of {len(rows)} control points", file=points.source or None, field="--select"
+                f"{spec!r} asks for {count} of {counted(len(rows), 'control point')}",
+                file=points.source or None,
+                field="--select",
             )
         places = points.image[rows]
         if kind == "even":

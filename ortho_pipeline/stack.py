@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from osgeo import gdal
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.raster import open_dataset
 from ortho_pipeline.raster_output import close, raster_output
 from ortho_pipeline.registration import Registration, register
@@ -55,7 +55,7 @@ def stack_bands(
 def _read(path: str | PathLike[str]) -> np.ndarray[Any, Any]:
     dataset = open_dataset(path)
     if dataset.RasterCount != 1:
-        raise InputError(f"this image has {dataset.RasterCount} bands, one is expected", file=path)
+        raise InputError(f"this image has {counted(dataset.RasterCount, 'band')}, one is expected", file=path)
     return np.asarray(dataset.ReadAsArray())
 
 

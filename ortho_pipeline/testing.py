@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.contract import described, model_faults, scene_faults, sensor_faults
+from ortho_pipeline.errors import counted
 from ortho_pipeline.hookspecs import Scene, Sensor
 from ortho_pipeline.models import KINDS, SensorModel, model_from_dict
 from ortho_pipeline.models.base import as_ground
@@ -169,7 +170,7 @@ def _check_mapping(model: SensorModel, ground: NDArray[np.float64]) -> NDArray[n
     image = model.ground_to_image(ground)
     n = len(ground)
     assert isinstance(image, np.ndarray), f"ground_to_image returns an array, not {type(image).__name__}"
-    assert image.shape == (n, 2), f"ground_to_image of {n} points returns ({n}, 2), not {image.shape}"
+    assert image.shape == (n, 2), f"ground_to_image of {counted(n, 'point')} returns ({n}, 2), not {image.shape}"
     assert image.dtype == np.float64, f"image points are float64, not {image.dtype}"
     assert np.isfinite(image).all(), f"{np.isnan(image).any(axis=1).sum()} of the points given do not project"
     singles = np.concatenate([model.ground_to_image(point[None]) for point in ground])
@@ -216,7 +217,9 @@ def _check_far(model: SensorModel) -> None:
 def _check_closure(model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64]) -> None:
     back = model.image_to_ground(image, ground[:, 2])
     assert back.shape == ground.shape, f"image_to_ground returns {ground.shape}, not {back.shape}"
-    assert np.isfinite(back).all(), f"{np.isnan(back).any(axis=1).sum()} points have no inverse"
+    assert np.isfinite(back).all(), (
+        f"{counted(np.isnan(back).any(axis=1).sum(), 'point has', 'points have')} no inverse"
+    )
     assert np.array_equal(back[:, 2], ground[:, 2]), "image_to_ground returns the height that it was given"
     worst = np.abs(model.ground_to_image(back) - image).max()
     assert worst < CLOSURE, f"ground to image to ground to image closes only to {worst:g} px, not {CLOSURE:g}"

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.errors import OrthoError, counted
 from ortho_pipeline.estimation import Fit, fit
 from ortho_pipeline.experiments.ikonos_scene import (
     BEND,
@@ -261,7 +261,7 @@ def _numbers() -> list[Number]:
 def _own_name(own: str, correction: str, count: int) -> tuple[str, str]:
     shown = {"geo": "geo, from metadata", "rpc": "RPC"}[own]
     added = {"none": "", "own": " + own parameters"}.get(correction, f" + {correction}")
-    return f"{shown}{added}", f"{count} point{'' if count == 1 else 's'}"
+    return f"{shown}{added}", counted(count, "point")
 
 
 def _evaluate(drawn: Realisation) -> _Values:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.drawing import Axes, Drawing, round_down, style_sheet
+from ortho_pipeline.errors import counted
 from ortho_pipeline.experiments.tables import VERDICTS, is_covered, is_missed
 from ortho_pipeline.models.base import Array
 
@@ -67,7 +68,8 @@ def verdict(document: Mapping[str, Any]) -> list[str]:
     said = []
     if predicted["rows"]:
         said += [
-            f"Of {predicted['rows']} numbers that no setting was fitted to, {_share(predicted, 'within', wide)} are "
+            f"Of {counted(predicted['rows'], 'number')} that no setting was fitted to, "
+            f"{_share(predicted, 'within', wide)} are "
             f"within a factor {wide} of the paper and {_share(predicted, 'within', tight)} within {tight}.",
             f"A naive guess without any simulation has {_share(predicted, 'naive', wide)} and "
             f"{_share(predicted, 'naive', tight)}: {document['naive_text']}",
@@ -78,7 +80,8 @@ def verdict(document: Mapping[str, Any]) -> list[str]:
         ]
     if fitted["rows"]:
         said.append(
-            f"Not counted: {fitted['rows']} numbers that settings were fitted to ({_share(fitted, 'within', wide)} "
+            f"Not counted: {counted(fitted['rows'], 'number')} that settings were fitted to "
+            f"({_share(fitted, 'within', wide)} "
             f"within {wide}, {_share(fitted, 'within', tight)} within {tight})."
         )
     if draws["rows"]:

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ortho_pipeline.crs import ground_transform, parse_crs
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.geometry import (
     SEMI_MAJOR,
     angles_of_rotation,
@@ -105,7 +105,7 @@ class FrameCamera(SensorModel):
         for name, count in (("origin", 3), ("heights", 2)):
             values = tuple(float(value) for value in getattr(self, name))
             if len(values) != count or not all(map(math.isfinite, values)):
-                raise InputError(f"{values} are not {count} finite numbers", field=name)
+                raise InputError(f"{values}: not {counted(count, 'finite number')}", field=name)
             object.__setattr__(self, name, values)
         if not self.heights[0] < self.heights[1]:
             raise InputError(f"heights from {self.heights[0]} to {self.heights[1]} are no range", field="heights")

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
+from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints, counted
 from ortho_pipeline.geometry import angles_of_rotation, rotation_between
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.frame import GEOGRAPHIC, MAP, TOPOCENTRIC, FrameCamera
@@ -62,7 +62,7 @@ def resect(
     needed = 4 if position is None else 3
     if len(control) < needed:
         raise TooFewPoints(
-            f"{len(control)} control points with heights do not orient a camera without start values",
+            f"{counted(len(control), 'control point')} with heights cannot orient a camera without start values",
             file=points.source or None,
             remedy=f"give at least {needed}",
         )

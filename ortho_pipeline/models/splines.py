@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.models.base import Array
 
 
@@ -69,7 +69,7 @@ class Spline:
         found, _, rank, _ = np.linalg.lstsq(empty.basis(times), values - middle, rcond=1e-10)
         if rank < count:
             raise InputError(
-                f"{len(values)} times do not determine {count} spline coefficients",
+                f"{counted(len(values), 'time does', 'times do')} not determine {counted(count, 'spline coefficient')}",
                 field="breaks",
                 remedy="use fewer knots, or a table that covers all of them",
             )

@@ -6,7 +6,7 @@ import numpy as np
 import pyproj
 
 from ortho_pipeline.crs import parse_crs, utm_crs
-from ortho_pipeline.errors import TooFewPoints
+from ortho_pipeline.errors import TooFewPoints, counted
 from ortho_pipeline.geometry import horizon_from_geodetic
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.families import Family, exponents, family_of
@@ -77,9 +77,10 @@ def start_model(
     usable = points.control & np.isfinite(ground).all(axis=1)
     if int(usable.sum()) < chosen.minimum_points:
         raise TooFewPoints(
-            f"{int(usable.sum())} control points do not determine the {chosen.parameters} parameters of {family}",
+            f"{counted(int(usable.sum()), 'control point does', 'control points do')} not determine the "
+            f"{counted(chosen.parameters, 'parameter')} of {family}",
             file=points.source or None,
-            remedy=f"give at least {chosen.minimum_points} control points, or take a simpler model",
+            remedy=f"give at least {counted(chosen.minimum_points, 'control point')}, or take a simpler model",
         )
     box = _box(ground, points.image, usable, size, heights, moved.crs)
     coordinates = ground[usable]

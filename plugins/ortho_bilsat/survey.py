@@ -8,7 +8,7 @@ import re
 from dataclasses import dataclass
 from os import PathLike
 
-from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.errors import InputError, counted, reads
 from ortho_pipeline.files import read_bounded, write_text
 from ortho_pipeline.models.lens import Interior
 
@@ -145,7 +145,7 @@ def _numbers(path: str | PathLike[str], key: str, text: str) -> tuple[float, ...
         raise InputError(f"{text[:60]!r} is not made of numbers", file=path, field=key)
     values = tuple(float(part) for part in parts)
     if len(values) != NUMBERS[key] or not all(abs(value) < 1e12 for value in values):
-        raise InputError(f"{text[:60]!r} are not {NUMBERS[key]} numbers in range", file=path, field=key)
+        raise InputError(f"{text[:60]!r}: not {counted(NUMBERS[key], 'number')} in range", file=path, field=key)
     return values
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.errors import InputError, counted, reads
 from ortho_pipeline.files import read_bounded, read_json
 from ortho_pipeline.geometry import angles_of_rotation
 from ortho_pipeline.models.base import Array
@@ -142,7 +142,10 @@ def _opensfm(path: str | PathLike[str], document: Any, name: str | None) -> Inte
     camera = next(iter(cameras.values()), None)
     if len(cameras) != 1 or not isinstance(camera, dict):
         raise InputError(
-            f"{len(cameras)} cameras are in this file", file=path, field="cameras", remedy="give a file with one camera"
+            f"{counted(len(cameras), 'camera is', 'cameras are')} in this file",
+            file=path,
+            field="cameras",
+            remedy="give a file with one camera",
         )
     kind = camera.get("projection_type")
     if kind not in ("brown", "perspective"):

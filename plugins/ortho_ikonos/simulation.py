@@ -13,7 +13,7 @@ import numpy as np
 from osgeo import gdal, osr
 
 from ortho_pipeline.dem import write_terrain
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.experiments import ikonos_scene as simulated
 from ortho_pipeline.experiments.ikonos_scene import GeoScene, VendorModel
 from ortho_pipeline.files import write_text
@@ -105,7 +105,7 @@ def write_product(
 def _check(size: int, pixel: float, seed: int, components: int, multispectral: bool) -> None:
     if not SMALLEST <= size <= LARGEST or seed < 0 or not 1 <= components <= MOST_COMPONENTS:
         raise InputError(
-            f"size {size}, seed {seed} and {components} components are not possible",
+            f"size {size}, seed {seed} and {counted(components, 'component')} are not possible",
             field="--size, --seed, --components",
             remedy=f"a size from {SMALLEST} to {LARGEST}, a seed from 0, and 1 to {MOST_COMPONENTS} components",
         )  # fmt: skip

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from os import PathLike
 from typing import NamedTuple
 
-from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.errors import InputError, counted, reads
 from ortho_pipeline.files import decoded, read_bounded
 
 #: Real labels have 6 kB and three levels of groups.
@@ -106,7 +106,11 @@ class Group:
         value = self._value(key)
         if not isinstance(value, tuple) or len(value) != count:
             found = f"a list of {len(value)}" if isinstance(value, tuple) else "no list"
-            raise InputError(f"here {count} numbers are expected, not {found}", file=self.file, field=self.place(key))
+            raise InputError(
+                f"here {counted(count, 'number is', 'numbers are')} expected, not {found}",
+                file=self.file,
+                field=self.place(key),
+            )
         return tuple(self._number(key, part) for part in value)
 
     def has(self, key: str) -> bool:

@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.models.line_camera import MOST_PIXELS
 
@@ -73,7 +73,8 @@ class DimapFile:
         """Return the finite numbers of a field, `count` of them."""
         tokens = self.text(field, parent).split(maxsplit=MOST_TERMS)
         if len(tokens) > MOST_TERMS or (count is not None and len(tokens) != count):
-            raise self.error(f"{count or 'a few'} numbers belong here", field)
+            wanted = counted(count, "number belongs", "numbers belong") if count else "a few numbers belong"
+            raise self.error(f"{wanted} here", field)
         values = []
         for token in tokens:
             if not _NUMBER.fullmatch(token[:60]):
