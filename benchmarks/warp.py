@@ -4,6 +4,7 @@
     python benchmarks/warp.py --scaling        time and memory from 1000² to 24000²
     python benchmarks/warp.py --kernels        by kernel, number of bands and sensor model
     python benchmarks/warp.py --accuracy       every output pixel of a ramp against an independent exact evaluation
+    python benchmarks/warp.py --against DIR    the warp alone and the whole job, in pairs with another checkout
 
 Every figure is of a whole process: wall time, CPU time, peak memory. Outputs are uncompressed tiled GeoTIFFs. What
 machines do at one moment differs from the next, so programs take turns and only ratios within a round count.
@@ -138,11 +139,11 @@ class Run:
     memory: float
 
 
-def measure(command: list[str]) -> Run:
+def measure(command: list[str], surroundings: dict[str, str] | None = None) -> Run:
     """Run a program; its own resource usage comes from the kernel when it ends."""
     begin = time.perf_counter()
     with tempfile.TemporaryFile() as log:
-        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=surroundings)
         _, status, usage = os.wait4(process.pid, 0)
         wall = time.perf_counter() - begin
         process.returncode = os.waitstatus_to_exitcode(status)
@@ -296,6 +297,57 @@ def alone(job: Job, model: SensorModel | None = None, kernel: str = "bilinear") 
     return result.seconds
 
 
+WARP_CPU = """
+import sys, time, pyproj
+from pathlib import Path
+from ortho_pipeline.dem import Surface
+from ortho_pipeline.raster import Grid, RasterSource, open_dataset
+from ortho_pipeline.rpc import rpc_of_dataset
+from ortho_pipeline.warp import rectify
+image, dem, out, step, *extent = sys.argv[1:]
+grid = Grid.of_extent(pyproj.CRS("EPSG:32735"), [float(value) for value in extent], (float(step), float(step)))
+model = rpc_of_dataset(open_dataset(image))[0]
+for name in ("warm", "counted"):
+    begin = time.process_time()
+    rectify(model, RasterSource(image), Surface.open(dem, "ellipsoid"), grid, out, driver="GTiff")
+    Path(out).unlink()
+print(time.process_time() - begin)
+"""
+
+
+def against(job: Job, other: Path, pairs: int) -> dict[str, list[tuple[float, float]]]:
+    """Alternate this checkout and another one: CPU seconds (here, there) of the warp alone and of the whole job."""
+    homes = (Path(__file__).resolve().parents[1], other.resolve())
+    places = [{**os.environ, "PYTHONPATH": os.pathsep.join((str(home), str(home / "plugins")))} for home in homes]
+
+    def warp(place: dict[str, str]) -> float:
+        command = [sys.executable, "-c", WARP_CPU, *api(job, job.folder / "warp.tif")[3:]]
+        return float(subprocess.run(command, env=place, cwd=job.folder, check=True, capture_output=True).stdout)
+
+    def whole(place: dict[str, str]) -> float:
+        return measure(ours(job, job.folder / "ours"), place).cpu
+
+    found: dict[str, list[tuple[float, float]]] = {}
+    for name, run in (("the warp alone", warp), ("the whole job", whole)):
+        for place in places:
+            run(place)
+        found[name] = []
+        for number in range(pairs):
+            order = (0, 1) if number % 2 else (1, 0)
+            seconds = {which: run(places[which]) for which in order}
+            found[name].append((seconds[0], seconds[1]))
+        ratios = sorted(here / there for here, there in found[name])
+        # Order statistics: this interval holds the median of such ratios in 95 of 100 cases.
+        rank = max(0, int((pairs - 1.96 * pairs**0.5) / 2))
+        here, there = (statistics.median(values) for values in zip(*found[name], strict=True))
+        print(
+            f"{name:15s} {here:6.2f} s of CPU here, {there:6.2f} s there; {pairs} pairs: "
+            f"{statistics.median(ratios):.3f} ({ratios[rank]:.3f}-{ratios[-1 - rank]:.3f})",
+            flush=True,
+        )
+    return found
+
+
 def scaling(folder: Path) -> dict[str, list[Run]]:
     """From 1000² to 24000² source pixels; the largest source is sparse."""
     runs: dict[str, list[Run]] = {}
@@ -408,6 +460,8 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=12000)
     parser.add_argument("--folder", type=Path, help="where scenes are kept between runs (default: a temporary one)")
     parser.add_argument("--json", type=Path, help="write all runs there")
+    parser.add_argument("--against", type=Path, metavar="DIR", help="another checkout of this project")
+    parser.add_argument("--pairs", type=int, default=20, help="of runs, with --against")
     for option in ("scaling", "kernels", "accuracy"):
         parser.add_argument(f"--{option}", action="store_true")
     arguments = parser.parse_args()
@@ -419,6 +473,8 @@ def main() -> None:
             document["scaling"] = {name: [asdict(run) for run in runs] for name, runs in scaling(folder).items()}
         elif arguments.kernels:
             document["kernels"] = {name: [asdict(run) for run in runs] for name, runs in kernels(folder).items()}
+        elif arguments.against:
+            document["against"] = against(Job(folder, arguments.side).make(), arguments.against, arguments.pairs)
         elif arguments.accuracy:
             document["accuracy"] = accuracy(folder, arguments.side)
         else:
