@@ -23,7 +23,7 @@ from pyproj.exceptions import CRSError
 from ortho_pipeline.crs import Vertical, declared_vertical, ground_transform, horizontal, parse_crs
 from ortho_pipeline.datum import dem_unit, dem_vertical, dem_vertical_remedy
 from ortho_pipeline.errors import CoverageError, CrsError, DatumError, InputError
-from ortho_pipeline.raster import first_line, open_dataset
+from ortho_pipeline.raster import first_line, open_pixels
 from ortho_pipeline.raster_output import close, raster_output
 
 Array = NDArray[np.float64]
@@ -57,6 +57,8 @@ class Surface:
         The height of a plane, None for a DEM.
     fill : 'error', 'mask', 'nearest' or float
         What stands for a void: NaN for the first two; a height with the others. `with_fill` changes it in a copy.
+    block : int
+        Bytes that GDAL decodes at once to read a sample.
     provenance : dict
         Path, declared and used height datum, warnings; JSON values.
     """
@@ -69,7 +71,7 @@ class Surface:
         self._fill: str | float = "error"
         self.provenance: dict[str, Any] = {"constant_height": constant_height}
         self.vertical = Vertical("ellipsoid")
-        self._path = ""
+        self._path, self.block = "", 0
         self._access: dict[str, Any] = {}
         self._metres_per_unit, self._scale, self._offset = 1.0, 1.0, 0.0
         self._crs_from_pixel = (0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -176,7 +178,7 @@ class Surface:
 
     def _dataset(self) -> gdal.Dataset:
         if not hasattr(self._local, "dataset"):
-            self._local.dataset = open_dataset(self._path, **self._access)
+            self._local.dataset, self.block = open_pixels(self._path, **self._access)
         return self._local.dataset
 
     def _place(self, dataset: gdal.Dataset) -> pyproj.CRS:

@@ -12,6 +12,7 @@ What GDAL alone can tell (`GetFileList`, overviews in metadata) is asked of the 
 from __future__ import annotations
 
 import functools
+import math
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -74,7 +75,9 @@ _VRT_CLASSES = frozenset({"vrtdataset", "vrtrasterband", "vrtsourcedrasterband",
 _PLAIN_VRT = "make a file of it first (gdal_translate in.vrt out.tif)"
 
 
-def open_seen(path: AnyPath, roots: Sequence[AnyPath], drivers: Sequence[str], siblings: bool) -> gdal.Dataset:
+def open_seen(
+    path: AnyPath, roots: Sequence[AnyPath], drivers: Sequence[str], siblings: bool
+) -> tuple[gdal.Dataset, Block]:
     """Open a raster for reading if all files that it leads to lie in its own folder or in `roots`.
 
     Parameters
@@ -86,6 +89,11 @@ def open_seen(path: AnyPath, roots: Sequence[AnyPath], drivers: Sequence[str], s
     siblings : bool
         Whether GDAL may look at side-car files.
 
+    Returns
+    -------
+    gdal.Dataset, Block
+        The raster, and the largest block of it and of all that it leads to.
+
     Raises
     ------
     InputError
@@ -94,7 +102,9 @@ def open_seen(path: AnyPath, roots: Sequence[AnyPath], drivers: Sequence[str], s
         If GDAL cannot open the file.
     """
     _without_fetching_drivers()
-    return _Gate(path, roots).open(path, drivers, siblings)
+    gate = _Gate(path, roots)
+    dataset = gate.open(path, drivers, siblings)
+    return dataset, gate.block
 
 
 @functools.cache
@@ -104,6 +114,14 @@ def _without_fetching_drivers() -> None:
             driver = gdal.GetDriverByName(name)
             if driver is not None:
                 driver.Deregister()
+
+
+@dataclass(frozen=True)
+class Block:
+    """What GDAL decodes at once to give one pixel: its `size` in bytes, and the `path` of the file that it is in."""
+
+    size: int
+    path: str
 
 
 @dataclass(frozen=True)
@@ -128,6 +146,7 @@ class _Gate:
             folders = [here, here.resolve()] if here.is_dir() else [here.parent, here.resolve().parent]
             self._roots = [folder.resolve() for folder in (*folders, *map(Path, roots))]
         self._seen: set[str] = set()
+        self.block = Block(0, os.fspath(path))
         self._folders: dict[str, list[str]] = {}
 
     def open(self, path: AnyPath, drivers: Sequence[str], siblings: bool = True) -> gdal.Dataset:
@@ -289,6 +308,37 @@ class _Gate:
             if str(file) == str(path):
                 continue
             self._must_be_inside(file, path, kind, name)
+        self.block = max(self.block, Block(_decoded_at_once(dataset), str(path)), key=lambda block: block.size)
+
+
+def _decoded_at_once(dataset: gdal.Dataset) -> int:
+    """Return the bytes of the largest block of a raster: all bands if they are interleaved, or its mask."""
+    if dataset.RasterCount == 0:
+        return 0
+    band = dataset.GetRasterBand(1)
+    together = dataset.RasterCount if dataset.GetMetadataItem("INTERLEAVE", "IMAGE_STRUCTURE") == "PIXEL" else 1
+    pixels = band.XSize * band.YSize if _is_sequential(dataset, band) else math.prod(band.GetBlockSize())
+    size = pixels * max(1, gdal.GetDataTypeSize(band.DataType) // 8) * together
+    try:
+        masked = band.GetMaskFlags() & gdal.GMF_PER_DATASET
+        return max(size, math.prod(band.GetMaskBand().GetBlockSize()) if masked else 0)
+    except RuntimeError:
+        # Who needs the mask is told by its reader.
+        return size
+
+
+def _is_sequential(dataset: gdal.Dataset, band: gdal.Band) -> bool:
+    """Tell whether a row is found by decoding all rows before it, whatever GDAL says of blocks.
+
+    So it is with PNG and JPEG, and with a compressed TIFF that is one strip, which GDAL gives row by row.
+    """
+    kind = dataset.GetDriver().ShortName
+    if kind != "GTiff":
+        return kind in ("PNG", "JPEG")
+    if band.GetBlockSize() != [band.XSize, 1] or dataset.GetMetadataItem("COMPRESSION", "IMAGE_STRUCTURE") is None:
+        return False
+    first, *others = (band.GetMetadataItem(f"BLOCK_OFFSET_0_{row}", "TIFF") for row in (0, 1, band.YSize - 1))
+    return first is not None and others == [None, None]
 
 
 def _listed(dataset: gdal.Dataset) -> list[str]:

@@ -152,9 +152,9 @@ def write_vrt(layout: Layout, path: Path) -> None:
 
 def write_cog(layout: Layout, path: Path, *, memory: int = 512_000_000, threads: int = 1) -> None:
     """Write the mosaic as a COG, window by window."""
-    sources = [RasterSource(layer.ortho.path) for layer in layout.layers]
+    sources = [RasterSource(layer.ortho.path, memory=memory) for layer in layout.layers]
     profile, grid = Profile.of(sources[0]), layout.grid
-    limit_cache(memory // 4)
+    limit_cache(memory, 1, max(source.block for source in sources))
     fill = profile.dtype.type(0 if profile.nodata is None else profile.nodata)
     with RasterWriter(path, grid, profile, threads=threads) as writer:
         for top in range(0, grid.height, _WINDOW):

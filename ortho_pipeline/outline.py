@@ -16,7 +16,7 @@ from shapely.geometry.base import BaseGeometry
 
 from ortho_pipeline.crs import ground_transform
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.raster import Grid, open_dataset
+from ortho_pipeline.raster import Grid, open_dataset, open_pixels
 
 #: Pixels per side at which the mask is looked at.
 _SIDE = 512
@@ -39,7 +39,7 @@ def valid_outline(path: str | PathLike[str], *, side: int = _SIDE) -> BaseGeomet
 
     The mask is looked at in at most `side` pixels per side, and the outline is true to one of these.
     """
-    dataset, grid = open_dataset(path), grid_of(path)
+    dataset, grid = open_pixels(path)[0], grid_of(path)
     columns, rows = min(side, grid.width), min(side, grid.height)
     mask = dataset.GetRasterBand(1).GetMaskBand().ReadAsArray(buf_xsize=columns, buf_ysize=rows) > 0
     edges = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.raster import open_pixels
 
 #: GDAL's number for averaging in a raster read.
 _AVERAGE = 5
@@ -21,7 +21,7 @@ def preview_png(path: str | PathLike[str], *, side: int = 800) -> bytes:
 
     Three bands or more give colours (the first three in their order), fewer give grey.
     """
-    dataset = open_dataset(path)
+    dataset = open_pixels(path)[0]
     shrink = min(1.0, side / max(dataset.RasterXSize, dataset.RasterYSize))
     size = max(1, round(dataset.RasterXSize * shrink)), max(1, round(dataset.RasterYSize * shrink))
     reading = {"buf_xsize": size[0], "buf_ysize": size[1]}

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.gate import DRIVERS, open_seen
+from ortho_pipeline.gate import DRIVERS, Block, open_seen
 from ortho_pipeline.locations import VsiPath, archive_of, in_local_archive, located, members
 from ortho_pipeline.options import PIXEL_TYPES
 
@@ -34,12 +34,18 @@ log = logging.getLogger(__name__)
 MAX_SIDE = 4_000_000
 #: GDAL reads whole blocks: one larger than this is refused before it is allocated (bytes).
 MAX_BLOCK = 1 << 30
+#: Bytes that reading and warping may take where nobody says how many.
+MEMORY = 512_000_000
+#: What GDAL's cache has to hold beside large blocks of an image (bytes).
+_OTHER_BLOCKS = 64_000_000
 #: Endings of files beside an image that GDAL's readers of metadata look for.
 _SIDE_CARS = (".xml", ".txt", ".imd", ".rpb", ".pvl", ".met", ".att", ".eph", ".tfw", ".wld", ".prj", ".hdr", ".ovr",
               ".msk", ".rpc", ".dim")  # fmt: skip
 
 
-@reads("give a whole raster of a format that GDAL reads ('ortho doctor' lists the allowed ones); copy it again")
+_WHOLE = "give a whole raster of a format that GDAL reads ('ortho doctor' lists the allowed ones); copy it again"
+
+
 def open_dataset(
     path: str | os.PathLike[str],
     *,
@@ -63,6 +69,43 @@ def open_dataset(
     InputError
         If the file is missing, of no allowed format, damaged, or leads outside of its own folder and `roots`.
     """
+    return _opened(path, allow_network, roots, siblings)[0]
+
+
+def open_pixels(
+    path: str | os.PathLike[str],
+    *,
+    allow_network: bool = False,
+    roots: Sequence[str | os.PathLike[str]] = (),
+    memory: int = MEMORY,
+) -> tuple[gdal.Dataset, int]:
+    """Open a raster whose pixels are going to be read; return it, and the bytes of its largest block.
+
+    GDAL decodes whole blocks (a strip, a tile), and again and again what its cache cannot hold: a megabyte that unpacks
+    to a strip of a gigabyte would keep it busy for minutes. So a block has to fit into `memory` (bytes), and the cache
+    is made to hold it.
+
+    Raises
+    ------
+    InputError
+        As for `open_dataset`; and if a block of it, of its mask or of a file that it leads to does not fit.
+    """
+    dataset, block = _opened(path, allow_network, roots, True)
+    if block.size > memory:
+        raise InputError(
+            f"one block of this raster is {block.size / 1e6:,.0f} MB when it is unpacked, which is beyond the "
+            f"{memory / 1e6:,.0f} MB of memory allowed",
+            file=block.path, field="block size",
+            remedy="tile it (gdal_translate -co TILED=YES in.tif out.tif), or for an image give a larger --memory MB",
+        )  # fmt: skip
+    keep_blocks(block.size)
+    return dataset, block.size
+
+
+@reads(_WHOLE)
+def _opened(
+    path: str | os.PathLike[str], allow_network: bool, roots: Sequence[str | os.PathLike[str]], siblings: bool
+) -> tuple[gdal.Dataset, Block]:
     place = located(path, allow_network=allow_network)
     name, drivers = os.fspath(place), list(DRIVERS)
     if isinstance(place, VsiPath):
@@ -78,7 +121,7 @@ def open_dataset(
     if siblings and not isinstance(place, VsiPath):
         _refuse_pipes(Path(name))
     try:
-        dataset = open_seen(place, roots, drivers, siblings)
+        dataset, block = open_seen(place, roots, drivers, siblings)
     except (RuntimeError, UnicodeDecodeError) as error:
         # What GDAL quotes of a damaged file need not be UTF-8.
         raise InputError(
@@ -88,7 +131,7 @@ def open_dataset(
         ) from error
     _check_size(dataset, name)
     log.info("%s: opened by %s", name, dataset.GetDriver().ShortName)
-    return dataset
+    return dataset, block
 
 
 def _refuse_pipes(path: Path) -> None:
@@ -243,7 +286,7 @@ class _RasterFile:
     def dataset(self) -> gdal.Dataset:
         """The GDAL dataset of the calling thread."""
         if not hasattr(self._local, "dataset"):
-            self._local.dataset = open_dataset(self.path, **self._access)
+            self._local.dataset, self.block = open_pixels(self.path, **self._access)
         return self._local.dataset
 
     @property
@@ -300,6 +343,8 @@ class RasterSource:
     dtype : str, optional
         GDAL's name of the type that an ortho shall have. Pixels of another type are read as floating point that
         holds both, so that interpolated values are rounded and clamped once, when they are written.
+    memory : int
+        Bytes that one of its blocks may take; see `open_pixels`.
 
     Attributes
     ----------
@@ -309,6 +354,8 @@ class RasterSource:
     nodata : tuple of float or None, per band
     validity : {'all', 'nodata', 'mask', 'alpha'}
         How the raster says which of its pixels are valid. NaN is never valid.
+    block : int
+        Bytes of the blocks that GDAL holds at once to read a pixel of all bands.
 
     Raises
     ------
@@ -324,8 +371,9 @@ class RasterSource:
         roots: Sequence[str | os.PathLike[str]] = (),
         bands: Sequence[int] | None = None,
         dtype: str | None = None,
+        memory: int = MEMORY,
     ) -> None:
-        access = {"allow_network": allow_network, "roots": roots}
+        access = {"allow_network": allow_network, "roots": roots, "memory": memory}
         self._files = [_RasterFile(name, access) for name in (path, *others)]
         first = self._files[0]
         self.paths = tuple(file.path for file in self._files)
@@ -343,6 +391,7 @@ class RasterSource:
         self.dtype = _read_as(np.result_type(*(file.dtype for file in self._files)), dtype)
         self.nodata = tuple(value for file in self._files for value in file.nodata)
         self.palette = any(file.palette for file in self._files)
+        self.block = sum(file.block for file in self._files)
         kinds = {file.validity for file in self._files}
         self.validity = kinds.pop() if len(kinds) == 1 else "mask"
 
@@ -446,6 +495,22 @@ def _read_as(own: np.dtype[Any], wanted: str | None) -> np.dtype[Any]:
     return np.promote_types(np.promote_types(own, pixel_type(wanted)), np.float32)
 
 
-def limit_cache(size: int) -> None:
-    """Limit GDAL's block cache to `size` bytes (at least 16 MB); its default is a share of the machine's memory."""
-    gdal.SetCacheMax(max(size, 16_000_000))
+def limit_cache(memory: int, threads: int, *blocks: int) -> int:
+    """Limit GDAL's block cache to a quarter of `memory` (at least 16 MB), or to what holds the blocks of each thread.
+
+    Returns
+    -------
+    int
+        How many threads that allows, at most `threads`: each decodes blocks (of `blocks` bytes) of its own.
+    """
+    held = sum(blocks)
+    threads = max(1, min(threads, memory // max(held, 1)))
+    gdal.SetCacheMax(max(memory // 4, 16_000_000))
+    keep_blocks(threads * held)
+    return threads
+
+
+def keep_blocks(size: int) -> None:
+    """Raise GDAL's block cache to what holds blocks of `size` bytes beside those of the output."""
+    if size > gdal.GetCacheMax() // 2:
+        gdal.SetCacheMax(max(gdal.GetCacheMax(), size + _OTHER_BLOCKS))

@@ -88,4 +88,6 @@ def source_of(
     scene: Scene, image: str | os.PathLike[str], options: SceneOptions, output: OutputOptions
 ) -> RasterSource:
     """Open the rasters of a scene with the bands and in the type that its ortho shall have."""
-    return RasterSource(*(scene.rasters or (image,)), **options.access, bands=output.bands, dtype=output.dtype)
+    return RasterSource(
+        *(scene.rasters or (image,)), **options.access, bands=output.bands, dtype=output.dtype, memory=output.memory
+    )

@@ -10,7 +10,7 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, counted
-from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.raster import open_pixels
 from ortho_pipeline.raster_output import close, raster_output
 from ortho_pipeline.registration import Registration, register
 
@@ -53,7 +53,7 @@ def stack_bands(
 
 
 def _read(path: str | PathLike[str]) -> np.ndarray[Any, Any]:
-    dataset = open_dataset(path)
+    dataset = open_pixels(path)[0]
     if dataset.RasterCount != 1:
         raise InputError(f"this image has {counted(dataset.RasterCount, 'band')}, one is expected", file=path)
     return np.asarray(dataset.ReadAsArray())

@@ -104,14 +104,13 @@ def rectify(
     """
     begin = time.monotonic()
     _check(source, resampling, dem_interpolation, tolerance)
-    threads = threads or os.cpu_count() or 1
+    threads = limit_cache(memory, threads or os.cpu_count() or 1, source.block, surface.block)
     surface = _seamless(surface, grid)
     profile = profile or Profile.of(source)
     job = _Job(
         model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, memory // (4 * threads),
         profile,
     )  # fmt: skip
-    limit_cache(memory // 4)
     with RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads) as writer:
         tiles = list(_tiles(grid, TILE))
         for done, tile in enumerate(_in_order(threads, job.make, tiles), start=1):
@@ -162,6 +161,8 @@ def rectify_gdal(
     """
     begin = time.monotonic()
     _check(source, resampling, "bilinear", 1.0)
+    # GDAL's warper reads in one of its threads.
+    limit_cache(memory, 1, source.block, surface.block)
     surface = _seamless(surface, grid)
     transformer, valid = warp_with_gdal(
         model, exported, source, surface, grid, path, resampling=resampling, driver=driver,
