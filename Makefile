@@ -5,7 +5,7 @@
 #   make test-all the same with those marked slow
 #   make faults   commands limited, killed, cut off: no broken or mixed outputs (N=400 write limits, 3/4 as many kills)
 #   make check    formatting, lint, types, tests
-#   make fuzz     read damaged files with every reader (N=100000 of each, READER=name for one)
+#   make fuzz     read damaged files with every reader (N=100000 of each, READER=name for one, KEEP=folder for results)
 #   make bench    speed and memory against gdalwarp, speed of adjustments and of many scenes
 #   make docs     the documentation as a site in out/site, links checked
 #   make images   draw the pictures of README.md again
@@ -66,7 +66,7 @@ check: setup
 	$(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow"
 
 fuzz: setup
-	@$(BIN)/python tests/attack/fuzz.py -n $(N) -j $(WORKERS) $(addprefix --reader ,$(READER))
+	@$(BIN)/python tests/attack/fuzz.py -n $(N) -j $(WORKERS) $(addprefix --reader ,$(READER)) $(addprefix --keep ,$(KEEP))
 
 bench: setup
 	@$(BIN)/python benchmarks/warp.py

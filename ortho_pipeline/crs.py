@@ -27,6 +27,7 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import AreaOfInterest, Transformer, TransformerGroup
 
 from ortho_pipeline.errors import CrsError, DatumError, OrthoError
+from ortho_pipeline.geoid_grid import header_fault
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -38,6 +39,12 @@ VERTICAL_NAMES = {"ellipsoid": "ellipsoid", "egm96": "EPSG:5773", "egm2008": "EP
 VERTICAL_FORMS = "ellipsoid, egm96, egm2008, EPSG:n of a vertical CRS, or a geoid grid file (.gtx, .tif)"
 _GRID_SUFFIXES = {".gtx", ".tif", ".tiff", ".byn", ".isg", ".gri"}
 _WGS84_SEMI_MAJOR = 6378137.0
+#: How WKT, PROJJSON and PROJ strings begin. PROJ seeks anything else by its name, for a quarter of a second.
+_STATED = re.compile(
+    r"\s*(?:\{|[A-Za-z]\w{0,40}\s*[\[(]|\+?\s*(?:proj|init|title)\s*=|\+?\w+\s*=.*\bproj\s*=)", re.DOTALL
+)
+#: Codes, URNs and names: the longest name in PROJ's database has 106 characters.
+_NAME = re.compile(r"\s*[\w ,.:/&@'()\[\]+–-]{1,200}( = \w+)?\s*")
 
 
 def add_system_grids() -> tuple[str, ...]:
@@ -73,6 +80,8 @@ def parse_crs(text: str | pyproj.CRS) -> pyproj.CRS:
     if isinstance(text, pyproj.CRS):
         return text
     try:
+        if isinstance(text, str) and not _STATED.match(text) and not _NAME.fullmatch(text):
+            raise ValueError("neither a name nor a form of a coordinate system")
         return pyproj.CRS.from_user_input(text)
     except (CRSError, ProjError, ValueError, TypeError, RecursionError) as error:
         shown = str(text) if len(str(text)) < 80 else f"{str(text)[:80]}..."
@@ -252,6 +261,8 @@ def _vertical_transformer(name: str) -> Transformer:
             return Transformer.from_crs(
                 _compound(name), "EPSG:4979", always_xy=True, only_best=True, allow_ballpark=False
             )
+        if fault := header_fault(Path(name)):
+            raise _grid_error(Vertical(name), fault)
         if set(name) & {",", '"'}:
             raise DatumError(
                 "PROJ cannot read a grid whose path holds a comma or a quotation mark", file=name, remedy="rename it"
@@ -267,7 +278,7 @@ def _vertical_transformer(name: str) -> Transformer:
 
 def _grid_error(vertical: Vertical, message: str) -> DatumError:
     if not vertical.name.startswith("EPSG:"):
-        exists = Path(vertical.name).is_file()
+        exists = Path(vertical.name).exists()
         return DatumError(
             "is not a geoid grid that PROJ reads" if exists else "this geoid grid does not exist",
             file=vertical.name,

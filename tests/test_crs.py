@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import shutil
+import struct
 import subprocess
 import sys
 import threading
@@ -12,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
+from pyproj.database import query_crs_info
 
 from ortho_pipeline import crs as module
 from ortho_pipeline.crs import GroundTransform, Vertical, declared_vertical, horizontal, parse_crs, utm_crs
@@ -91,6 +94,34 @@ def test_a_file_that_is_no_geoid(tmp_path: Path) -> None:
         Vertical.parse(str(path))
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        (b">ddddii", (30.0, 33.0, 1.0, 1.0, 2**29, 2**29)),
+        (b">ddddii", (30.0, 33.0, 1.0, 1.0, 8, 2**30)),
+        (b">ddddii", (30.0, 33.0, 1.0, 1.0, -8, -8)),
+        (b">ddddii", (30.0, 33.0, 0.0, 1.0, 8, 8)),
+        (b">ddddii", (30.0, float("nan"), 1.0, 1.0, 8, 8)),
+        (b">dddd", (30.0, 33.0, 1.0, 1.0)),
+    ],
+)
+def test_a_geoid_whose_header_lies(tmp_path: Path, change: tuple[bytes, tuple]) -> None:
+    # PROJ fills gigabytes with zeros for the first two.
+    path = tmp_path / "geoid.gtx"
+    path.write_bytes(struct.pack(change[0], *change[1]) + bytes(256))
+    with pytest.raises(DatumError, match="not a geoid grid"):
+        Vertical.parse(str(path))
+    path.write_bytes(struct.pack(">ddddii", 30.0, 33.0, 1.0, 1.0, 8, 8) + bytes(256))
+    assert Vertical.parse(str(path)).undulation([34.0], [33.0]) == 0
+
+
+@pytest.mark.parametrize("name", ["pipe.gtx", "pipe.tif"])
+def test_a_geoid_that_is_a_pipe(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(DatumError, match="not a geoid grid"):
+        Vertical.parse(str(tmp_path / name))
+
+
 @needs_egm96
 def test_undulation_goes_round_the_world() -> None:
     egm96 = Vertical.parse("egm96")
@@ -164,6 +195,26 @@ def test_parse_and_horizontal() -> None:
     for text in ("EPSG:4978", "EPSG:5773"):
         with pytest.raises(CrsError):
             horizontal(text)
+
+
+def test_only_what_can_be_a_name_is_sought_among_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    sought: list[str] = []
+    monkeypatch.setattr(pyproj.CRS, "from_user_input", sought.append)
+    names = [found.name for found in query_crs_info()]
+    stated = [
+        " EPSG:4326\n", "urn:ogc:def:crs:OGC:1.3:CRS84", "http://www.opengis.net/def/crs/EPSG/0/4326",
+        "ITRF2014@2020.5", "+zone=36 +proj=utm", "proj = utm zone=36", "+init=epsg:4326", "{}",
+        'GEOGCRS ["WGS 84",', "LOCAL_CS(1)",
+    ]  # fmt: skip
+    for text in (*names, *stated):
+        parse_crs(text)
+    assert sought == [*names, *stated]
+    assert len(names) > 5000
+    # PROJ takes a quarter of a second to find that these are none.
+    for text in ("x" * 5000, '\ufeffPROJCS["a",1]', 'PROJC,S["a"]', "b" * 5000 + '["a"]', "+prkj=utm", "\0EPSG:4326"):
+        with pytest.raises(CrsError):
+            parse_crs(text)
+    assert len(sought) == len(names) + len(stated)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,9 @@ PACKAGE = ROOT / "ortho_pipeline"
 LAYERS = """
 errors options
 locations
-files crs geometry notebook compiled
+files
+geoid_grid
+crs geometry notebook compiled
 point_table datum
 point_csv point_geojson point_lists point_ground
 point_files

@@ -1,17 +1,21 @@
-"""Read damaged files with every reader: `make fuzz [N=100000] [READER=name]`.
+"""Read damaged files with every reader: `make fuzz [N=100000] [READER=name] [KEEP=folder]`.
 
 A mutant is either read, and all numbers that come of it are finite, or refused by an `OrthoError` that names the file,
 the field where there is one, and a remedy; within 5 seconds of processor time. Each reader runs in a process of its
-own, two at a time, so that one that dies is seen as well.
+own, two at a time, so that one that dies is seen as well. With `--keep` the results lie in a folder while it runs, and
+the next run goes on behind them.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
+import json
 import logging
 import math
 import multiprocessing
+import os
 import random
 import re
 import signal
@@ -23,7 +27,7 @@ import traceback
 import warnings
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +40,8 @@ from ortho_pipeline.errors import OrthoError
 
 #: Seconds of processor time that a file may take, and seconds without a sign of life after which a reader hangs.
 SLOWEST, SILENCE = 5.0, 600.0
+#: Mutants between two tallies that a process hands over.
+_PART = 500
 #: What is wrong with a file as a whole, and so with no field of it.
 WHOLE = re.compile(
     r"cannot be read|not read|no text|binary|UTF-16|not UTF-8|well-formed|no RPC|no points|more than .* (MB|bytes)"
@@ -152,13 +158,10 @@ class Attack:
             self.tally.note("no remedy", f"{error.field}: {error.message}", number)
 
 
-def attack(name: str, first: int, count: int, quiet: bool = True) -> Tally:
-    """Read the mutants of one reader from the `first` on."""
-    with tempfile.TemporaryDirectory() as folder:
-        one = Attack(BY_NAME[name], Path(folder))
-        for number in range(first, first + count):
-            one.judge(number)
-        return one.tally
+def scratch() -> tempfile.TemporaryDirectory[str]:
+    """Return a temporary folder, in memory where there is such a file system."""
+    memory = Path("/dev/shm")
+    return tempfile.TemporaryDirectory(dir=memory if os.access(memory, os.W_OK) else None)
 
 
 # -- by hand ---------------------------------------------------------------------------------------------------------
@@ -175,20 +178,42 @@ def hush() -> None:
 
 def _work(name: str, first: int, count: int, alive: Any, pipe: Any) -> None:
     hush()
-    with tempfile.TemporaryDirectory() as folder:
+    with scratch() as folder:
         one = Attack(BY_NAME[name], Path(folder))
         for number in range(first, first + count):
             alive.value = number
             one.judge(number)
-            if number % 500 == 499:
+            if number % _PART == _PART - 1:
                 pipe.send(one.tally)
         pipe.send(one.tally)
         pipe.close()
 
 
-def run(name: str, first: int, count: int) -> Tally:
+class Kept:
+    """The results of one reader in a folder, so that a run that is stopped keeps what it did."""
+
+    def __init__(self, folder: Path | None, name: str, first: int) -> None:
+        self.path = folder and folder / f"{name}.json"
+        self.first, self.next, self.tally = first, first, Tally(name)
+        if self.path and self.path.exists():
+            found = json.loads(self.path.read_text())
+            if found["first"] != first:
+                sys.exit(f"{self.path} begins with mutant {found['first']}, not {first}")
+            self.next, self.tally = found["next"], Tally(**found["tally"])
+
+    def write(self, behind: int, tally: Tally) -> None:
+        """Keep what became of the mutants up to `behind`, which is not among them."""
+        if self.path:
+            document = {"first": self.first, "next": behind, "tally": asdict(tally)}
+            part = self.path.with_suffix(".part")
+            part.write_text(json.dumps(document, indent=1) + "\n")
+            part.replace(self.path)
+
+
+def run(name: str, first: int, count: int, folder: Path | None = None) -> Tally:
     """Attack one reader in a process of its own, and again behind the mutant at which that died or hung."""
-    total, at, end = Tally(name), first, first + count
+    kept = Kept(folder, name, first)
+    total, at, end = kept.tally, kept.next, first + count
     context = multiprocessing.get_context("fork")
     while at < end:
         alive, (ours, theirs) = context.Value("q", at), context.Pipe(duplex=False)
@@ -200,6 +225,7 @@ def run(name: str, first: int, count: int) -> Tally:
             try:
                 if ours.poll(1.0):
                     part = ours.recv()
+                    kept.write(at + part.mutants, _sum(total, part))
             except EOFError:
                 break
             if alive.value != seen:
@@ -208,24 +234,25 @@ def run(name: str, first: int, count: int) -> Tally:
                 worker.kill()
                 break
         worker.join()
-        _add(total, part)
+        total = _sum(total, part)
         if worker.exitcode == 0:
             break
         total.died += 1
         total.note("died", f"exit code {worker.exitcode}", alive.value)
         # The mutants since the last tally are not counted.
         at = alive.value + 1
+        kept.write(at, total)
     return total
 
 
-def run_all(names: list[str], first: int, count: int, processes: int) -> list[Tally]:
+def run_all(names: list[str], first: int, count: int, processes: int, folder: Path | None = None) -> list[Tally]:
     """Attack several readers, so many at a time."""
     left, done = list(reversed(names)), {}
 
     def work() -> None:
         while left:
             name = left.pop()
-            done[name] = run(name, first, count)
+            done[name] = run(name, first, count, folder)
             print(f"{name}: {done[name].mutants} mutants", file=sys.stderr)
 
     # No pool: what that does at the end of a process fails in one that was forked from its threads.
@@ -237,13 +264,14 @@ def run_all(names: list[str], first: int, count: int, processes: int) -> list[Ta
     return [done[name] for name in names]
 
 
-def _add(total: Tally, part: Tally) -> None:
+def _sum(first: Tally, second: Tally) -> Tally:
+    total = Tally(first.reader, slowest=max(first.slowest, second.slowest), faults=dict(first.faults))
     for name in ("mutants", "accepted", "refused", "untyped", "infinite", "unnamed", "unremedied", "slow", "died"):
-        setattr(total, name, getattr(total, name) + getattr(part, name))
-    total.slowest = max(total.slowest, part.slowest)
-    for key, (count, number, text) in part.faults.items():
+        setattr(total, name, getattr(first, name) + getattr(second, name))
+    for key, (count, number, text) in second.faults.items():
         before = total.faults.get(key, (0, number, text))
         total.faults[key] = (before[0] + count, *before[1:])
+    return total
 
 
 def table(tallies: list[Tally]) -> str:
@@ -253,10 +281,7 @@ def table(tallies: list[Tally]) -> str:
         "over 5 s | died | slowest, s |",
         "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
-    total = Tally("all")
-    for one in tallies:
-        _add(total, one)
-    for one in (*tallies, total):
+    for one in (*tallies, functools.reduce(_sum, tallies, Tally("all"))):
         rows.append(
             f"| {one.reader} | {one.mutants} | {one.accepted} | {one.refused} | {one.untyped} | {one.infinite} | "
             f"{one.unnamed} | {one.unremedied} | {one.slow} | {one.died} | {one.slowest:.2f} |"
@@ -271,14 +296,19 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first")
     parser.add_argument("--reader", action="append", choices=sorted(BY_NAME), help="only these")
     parser.add_argument("--show", type=int, help="write this mutant of the reader to standard output")
+    parser.add_argument(
+        "--keep", type=Path, help="folder for the results; what it holds is not run again (-n 0: shown)"
+    )
     parser.add_argument("-j", type=int, default=2, help="processes")
     chosen = parser.parse_args(arguments)
     names = chosen.reader or [reader.name for reader in READERS]
     if chosen.show is not None:
-        with tempfile.TemporaryDirectory() as folder:
+        with scratch() as folder:
             sys.stdout.buffer.write(Attack(BY_NAME[names[0]], Path(folder)).file(chosen.show))
         return 0
-    tallies = list(run_all(names, chosen.first, chosen.n, chosen.j))
+    if chosen.keep:
+        chosen.keep.mkdir(parents=True, exist_ok=True)
+    tallies = run_all(names, chosen.first, chosen.n, chosen.j, chosen.keep)
     print(table(tallies))
     for one in tallies:
         for key, (count, number, text) in sorted(one.faults.items(), key=lambda item: -item[1][0]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
 import shutil
@@ -202,8 +203,17 @@ def _dem(path: Path) -> Any:
     return [part[np.isfinite(part)], np.isinf(part).any() * math.inf if np.isinf(part).any() else 0.0]
 
 
+_COUNT = itertools.count()
+
+
 def _grid(path: Path) -> Any:
-    found = Vertical.parse(str(path)).undulation(np.array([33.0, 34.5]), np.array([36.0, 37.5]))
+    # A grid is read once under its name.
+    again = path.with_name(f"{next(_COUNT)}{path.suffix}")
+    again.hardlink_to(path)
+    try:
+        found = Vertical.parse(str(again)).undulation(np.array([33.0, 34.5]), np.array([36.0, 37.5]))
+    finally:
+        again.unlink()
     return np.where(np.isnan(found), 0.0, found)
 
 
