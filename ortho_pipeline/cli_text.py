@@ -166,6 +166,7 @@ def print_comparison(result: CompareResult, units: str) -> None:
     )
     for name, path in document["files"].items():
         click.echo(f"  {name:<10} {path}")
+    print_warnings(document["warnings"])
 
 
 def _errors(rmse: Mapping[str, Any] | None, units: str) -> str:

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from ortho_pipeline.control_hull import uncovered
 from ortho_pipeline.errors import InputError, OrthoError, counted
 from ortho_pipeline.estimation import SIGNIFICANCE, Fit, Prior, fit
 from ortho_pipeline.ground_error import rmse_metres
@@ -222,6 +223,7 @@ def compare(
     return Comparison(
         tuple(rows), tuple(blunders.items()), recommended, reason, criterion,
         control=int(kept.control.sum()), check=int(kept.check.sum()), model_crs=crs,
+        notes=uncovered(kept.image[kept.control], size),
     )  # fmt: skip
 
 

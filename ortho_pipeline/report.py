@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ortho_pipeline.control_hull import control_hull
 from ortho_pipeline.covariance import analyse_fit
 from ortho_pipeline.crs import Vertical, ground_transform
 from ortho_pipeline.delivered import accuracy_before
@@ -124,7 +125,7 @@ def build_report(
         "view_rmse": _view_rmse(fit, views),
         "covariance": {role: found and found.to_json() for role, found in analyse_fit(fit, near=near).items()},
         "map_scale": _map_scale(fit, seen),
-        "control_hull": _control_hull(fit, scene.width, scene.height),
+        "control_hull": control_hull(fit.points.image[fit.used], (scene.width, scene.height)),
         "comparison": None if comparison is None else _plain(comparison),
         "heights": heights,
         "surface": None if surface is None else {"coverage": coverage, **_plain(surface.provenance)},
@@ -152,18 +153,6 @@ def _view_rmse(fit: Fit, views: Array) -> dict[str, Any]:
         rmse = root_mean_square(rows[np.isfinite(rows).all(axis=1)])
         found[name] = rmse and {"along": rmse["col"], "across": rmse["row"], "n": rmse["n"]}
     return found
-
-
-def _control_hull(fit: Fit, width: int, height: int) -> dict[str, Any] | None:
-    """Return the convex hull of the used control points and its share of the image; None below three points."""
-    if fit.used.sum() < 3:
-        return None
-    import shapely
-
-    hull = shapely.MultiPoint(fit.points.image[fit.used]).convex_hull
-    inside = hull.intersection(shapely.box(0, 0, width, height))
-    outline = [[float(x), float(y)] for x, y in hull.exterior.coords[:-1]] if hull.geom_type == "Polygon" else []
-    return {"share": float(inside.area) / (width * height), "n": int(fit.used.sum()), "outline": outline}
 
 
 def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline import inputs
+from ortho_pipeline.control_hull import uncovered
 from ortho_pipeline.crs import ground_transform
 from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import CoverageError, InputError, ModelError, counted
@@ -78,6 +79,8 @@ class Adjusted:
             outside = ", ".join(np.array(points.ids)[~inside])
             found.append(f"points outside of the image (used all the same): {outside}")
         found += self._elsewhere()
+        if len(adjusted.param_names):
+            found += uncovered(points.image[adjusted.used], (self.scene.width, self.scene.height))
         if adjusted.used.any() and len(adjusted.param_names) and adjusted.redundancy == 0:
             found.append("no redundancy: the RMSE of the control points is zero by construction and says nothing")
         checks = int(points.check.sum())

@@ -31,7 +31,7 @@ blunders block_solver report_text
 block_variance
 registration estimation hookspecs swaps model_file kernels lattice_kernel ray_kernel landscape rpc_files
 block_blunders
-model_choice block_checks selection ground_error drawing contract
+model_choice block_checks selection ground_error drawing contract control_hull
 comparison report_plots adjustment covariance map_scale delivered
 gate
 raster
