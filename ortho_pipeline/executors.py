@@ -16,6 +16,7 @@ from multiprocessing import connection
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, TypeVar
 
+from ortho_pipeline.allowance import require_memory, startable_threads
 from ortho_pipeline.errors import InputError, OrthoError
 
 #: Jobs that are handed over before their turn, so that no worker waits for the next one.
@@ -84,6 +85,9 @@ class Processes:
         broken = True
         while broken:
             broken = False
+            # A pool whose own threads fail to begin is waited for without end.
+            require_memory()
+            startable_threads(2)
             self._pool = ProcessPoolExecutor(
                 min(self.workers, ahead), mp_context=_Spawning(self._spawned),
                 initializer=start_worker, initargs=(self.threads,),
@@ -127,6 +131,8 @@ def start_worker(threads: int) -> None:
         os.environ[name] = str(threads)
     # Ctrl-C goes to all processes of the terminal; what happens then is for the parent to decide.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    require_memory()
+    startable_threads(1)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()

@@ -16,6 +16,7 @@ import numpy as np
 import pyproj
 
 from ortho_pipeline import crop, dem, plugins, raster
+from ortho_pipeline.allowance import startable_threads
 from ortho_pipeline.crs import Vertical, parse_crs
 from ortho_pipeline.errors import InputError, OrthoError, counted
 from ortho_pipeline.files import sha256, states
@@ -390,6 +391,7 @@ def hashed_beside(
     The thread ends with the block, whatever happens, and never calls GDAL: the interpreter cannot exit while a thread
     is inside of a GDAL function (its binding's destructor takes the lock of the interpreter, and the process aborts).
     """
+    startable_threads(1)
     stop = threading.Event()
     with ThreadPoolExecutor(1, thread_name_prefix="checksums") as pool:
         future = pool.submit(hashed, read, digest, stop)

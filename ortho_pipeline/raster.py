@@ -22,6 +22,7 @@ import pyproj
 from numpy.typing import NDArray
 from osgeo import gdal
 
+from ortho_pipeline.allowance import require_memory
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.gate import DRIVERS, Block, open_seen
 from ortho_pipeline.locations import VsiPath, archive_of, in_local_archive, located, members
@@ -68,6 +69,8 @@ def open_dataset(
     ------
     InputError
         If the file is missing, of no allowed format, damaged, or leads outside of its own folder and `roots`.
+    OrthoError
+        If there is too little memory for any work.
     """
     return _opened(path, allow_network, roots, siblings)[0]
 
@@ -106,6 +109,7 @@ def open_pixels(
 def _opened(
     path: str | os.PathLike[str], allow_network: bool, roots: Sequence[str | os.PathLike[str]], siblings: bool
 ) -> tuple[gdal.Dataset, Block]:
+    require_memory()
     place = located(path, allow_network=allow_network)
     name, drivers = os.fspath(place), list(DRIVERS)
     if isinstance(place, VsiPath):

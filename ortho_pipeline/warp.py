@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline import kernels
+from ortho_pipeline.allowance import require_memory, startable_threads
 from ortho_pipeline.crs import GroundTransform
 from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import InputError
@@ -104,7 +105,7 @@ def rectify(
     """
     begin = time.monotonic()
     _check(source, resampling, dem_interpolation, tolerance)
-    threads = limit_cache(memory, threads or os.cpu_count() or 1, source.block, surface.block)
+    threads = limit_cache(memory, _threads(threads, memory), source.block, surface.block)
     surface = _seamless(surface, grid)
     profile = profile or Profile.of(source)
     job = _Job(
@@ -166,7 +167,7 @@ def rectify_gdal(
     surface = _seamless(surface, grid)
     transformer, valid = warp_with_gdal(
         model, exported, source, surface, grid, path, resampling=resampling, driver=driver,
-        creation_options=creation_options, memory=memory, threads=threads or os.cpu_count() or 1, profile=profile,
+        creation_options=creation_options, memory=memory, threads=_threads(threads, memory), profile=profile,
         progress=progress,
     )  # fmt: skip
     return WarpResult(
@@ -215,6 +216,13 @@ def _check(source: RasterSource, resampling: str, dem_interpolation: str, tolera
         )
     if not 0 < tolerance < math.inf:
         raise InputError("the tolerance is positive and finite", field="tolerance", remedy="0.01 px is the default")
+
+
+def _threads(wanted: int | None, memory: int) -> int:
+    """Return how many threads there are for tiles, with as many again for GDAL, which waits for missing ones."""
+    wanted = wanted or os.cpu_count() or 1
+    require_memory(memory, 2 * wanted)
+    return max(1, startable_threads(2 * wanted) // 2)
 
 
 def _tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:

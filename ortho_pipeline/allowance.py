@@ -1,0 +1,89 @@
+"""What the system lets this process have: address space and threads.
+
+Libraries do badly without: a thread of Python's that fails before its first line, and a pool of GDAL's that gets fewer
+threads than it asked for, are waited for without end; PROJ and GDAL end the process. So what a job needs is asked for
+before it begins.
+"""
+
+from __future__ import annotations
+
+import _thread
+import resource
+import threading
+from pathlib import Path
+
+from ortho_pipeline.errors import OrthoError
+
+#: Bytes of address space that any command needs beside its windows: libraries, compiled kernels, grids of PROJ.
+LEAST = 256 << 20
+#: Bytes of address space that a thread takes: its stack and its part of the heap.
+_PER_THREAD = 72 << 20
+#: Seconds in which a thread has begun, if it ever does.
+_PATIENCE = 10.0
+
+
+def require_memory(size: int = LEAST, threads: int = 0) -> None:
+    """Refuse to begin work for which the limit of this process's address space leaves no room.
+
+    Parameters
+    ----------
+    size : int
+        Bytes of the work.
+    threads : int
+        That are started for it.
+
+    Raises
+    ------
+    OrthoError
+        If the limit (``ulimit -v``) leaves less.
+    """
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit == resource.RLIM_INFINITY:
+        return
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    needed = size + threads * _PER_THREAD
+    if limit - used < needed:
+        raise OrthoError(
+            f"there is not enough memory: a limit on this process leaves {max(0, limit - used) >> 20} MB of address "
+            f"space, and the work takes {needed >> 20} MB",
+            field="ulimit -v",
+            remedy="raise the limit, or give less work at once (--memory MB, --threads 1)",
+        )
+
+
+def startable_threads(wanted: int) -> int:
+    """Return how many threads can run at once beside those that do, at most `wanted`; found by starting them.
+
+    Raises
+    ------
+    OrthoError
+        If there can be none.
+    """
+    begun, ended = threading.Semaphore(0), threading.Semaphore(0)
+    leave = threading.Event()
+
+    def wait() -> None:
+        begun.release()
+        leave.wait()
+        ended.release()
+
+    count = 0
+    try:
+        while count < wanted:
+            # Not `Thread.start`, which waits without end for a thread that fails before it has begun.
+            _thread.start_new_thread(wait, ())
+            if not begun.acquire(timeout=_PATIENCE):
+                break
+            count += 1
+    except (RuntimeError, MemoryError):
+        pass
+    finally:
+        leave.set()
+    for _ in range(count):
+        ended.acquire(timeout=_PATIENCE)
+    if not count:
+        raise OrthoError(
+            "no thread can be started",
+            remedy="raise the limits on processes and memory (ulimit -u, ulimit -v, pids and memory of the container)",
+        )
+    return count

@@ -1,0 +1,77 @@
+"""Little memory and few threads are an error at once, and never a command that waits without end."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from ortho_pipeline.allowance import require_memory, startable_threads
+from ortho_pipeline.errors import OrthoError
+
+SAMPLE = Path(__file__).resolve().parents[1] / "sample_data"
+EXTENT = ("530600", "4122000", "530800", "4122200")
+
+
+def limited(words: list[str], folder: Path, limits: str) -> subprocess.CompletedProcess[str]:
+    """Run a command under limits of the shell: those on stacks are those of threads in what the shell starts."""
+    line = f'{limits}; exec "$0" -m ortho_pipeline "$@"'
+    env = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    return subprocess.run(
+        ["bash", "-c", line, sys.executable, *words], check=False, capture_output=True, text=True, timeout=60,
+        cwd=folder, env=env,
+    )  # fmt: skip
+
+
+def rectify() -> list[str]:
+    names = [str(SAMPLE / name) for name in ("scene.tif", "gcps.geojson", "dem.tif")]
+    return ["rectify", names[0], "--gcps", names[1], "--dem", names[2], "-te", *EXTENT, "-o", "out"]
+
+
+def test_without_threads_a_command_ends_with_what_to_do(tmp_path):
+    # Every thread wants a stack of 64 GB, of 16 GB that there are; GDAL's pool waited for its threads without end.
+    ended = limited(rectify(), tmp_path, "ulimit -s $((64 << 20)) && ulimit -v $((16 << 20))")
+    assert ended.returncode == 1, ended.stderr
+    assert "no thread can be started" in ended.stderr
+    assert "Remedy: raise the limits" in ended.stderr
+    assert not [path for path in tmp_path.rglob("*") if path.is_file() and path.suffix == ".tif"]
+
+
+def test_less_memory_than_the_budget_is_said_before_the_work():
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + (400 << 20), hard))
+    try:
+        require_memory()
+        with pytest.raises(OrthoError, match="not enough memory") as raised:
+            require_memory(512_000_000, threads=2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+    assert "--memory" in str(raised.value.remedy)
+
+
+def test_threads_that_are_tried_are_gone_afterwards():
+    before = threading.active_count(), len(os.listdir("/proc/self/task"))
+    assert startable_threads(5) == 5
+    assert threading.active_count() == before[0]
+
+
+@pytest.mark.parametrize("megabytes", [90, 150, 170])
+def test_a_run_with_little_memory_ends_within_seconds(tmp_path, megabytes):
+    # Beside what is loaded already: GDAL and Python's threads waited for each other with 151 and 170 MB.
+    line = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import faults; faults.load(); from pathlib import Path; "
+        "ended = faults.run(sys.argv[4:], Path(sys.argv[2]), faults.limit_memory(int(sys.argv[3]) << 20)); "
+        "print(ended.code, ended.hung, ended.said)"
+    )
+    tools = str(Path(__file__).parent / "attack")
+    words = [sys.executable, "-c", line, tools, str(tmp_path), str(megabytes), *rectify()]
+    ended = subprocess.run(words, check=False, capture_output=True, text=True, timeout=60)
+    assert ended.stdout.startswith("1 False"), ended.stdout + ended.stderr
+    assert "there is not enough memory: a limit on this process leaves" in ended.stdout
