@@ -38,8 +38,9 @@ SLOW = ("rfm3", "rfm3-common", "poly5", "poly1")
 def arranged(points: Points, kind: str, count: int, size: tuple[int, int], random: np.random.Generator) -> Points:
     """Return so many of the points, laid out in one of `LAYOUTS`."""
     places = points.image / size
-    order = random.permutation(len(places))
-    if kind == "clusters":
+    if kind == "even":
+        order = random.permutation(len(places))
+    elif kind == "clusters":
         centres = places[random.choice(len(places), 3, replace=False)]
         order = np.argsort(np.hypot(*(places[:, None] - centres).transpose(2, 0, 1)).min(axis=1))
     elif kind == "strip":
@@ -48,8 +49,9 @@ def arranged(points: Points, kind: str, count: int, size: tuple[int, int], rando
         order = np.argsort(np.abs((places - 0.5 - random.uniform(-0.2, 0.2, 2)) @ across))
     elif kind == "corner":
         empty = ((places - 0.5) * random.choice([-1, 1], 2) > 0).all(axis=1)
+        order = random.permutation(len(places))
         order = order[~empty[order]]
-    elif kind == "flat":
+    else:
         heights = points.ground[:, 2]
         order = np.argsort(np.abs(heights - np.quantile(heights, random.uniform())))
     return points.select(np.sort(order[:count]))
