@@ -68,14 +68,19 @@ class OrthoError(Exception):
 
 
 @contextlib.contextmanager
-def completed(file: object = None, *, field: str | None = None, remedy: str | None = None) -> Iterator[None]:
+def completed(
+    file: object = None, *, field: str | None = None, remedy: str | None = None, of: str | None = None
+) -> Iterator[None]:
     """Give a refusal that comes from within what it does not say itself: file, field and remedy.
 
-    A reader knows its file and what a sound one looks like; the line that finds a fault in it need not.
+    A reader knows its file and what a sound one looks like; the line that finds a fault in it need not. With `of` only
+    what is refused because of that field is completed.
     """
     try:
         yield
     except OrthoError as error:
+        if of is not None and error.field != of:
+            raise
         if error.file is None and isinstance(file, str | PathLike):
             error.file = str(fspath(file))
         error.field = error.field or field

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.crs import GroundTransform, ground_transform, utm_crs
 from ortho_pipeline.dem import Surface
-from ortho_pipeline.errors import CoverageError, InputError, ModelError, OrthoError, counted
+from ortho_pipeline.errors import CoverageError, InputError, counted
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster import Grid
 from ortho_pipeline.rays import intersect
@@ -31,6 +31,10 @@ _BORDER_SIDE = 65
 _BLOCK = 1024
 #: A model is meant for the heights under its scene and this part of their range beyond, or so many metres.
 _MARGIN, _LEAST_MARGIN = 0.1, 10.0
+_SOUND = (
+    "give the metadata of this very image (--rpc FILE, --model FILE), and points that were measured in it; if they "
+    "are, its plugin reads them wrongly (docs/plugins.md)"
+)
 
 
 def image_grid(width: int, height: int, side: int) -> Array:
@@ -155,7 +159,7 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
 
     Raises
     ------
-    ModelError
+    InputError
         If no border pixel meets the ground.
     """
     surface = facing(model, surface, width, height)
@@ -186,11 +190,13 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
     return replace(found, coverage=float(covered), complete=bool(own >= 1.0), voids=voids, unmet=unmet)
 
 
-def _nowhere(model: SensorModel, surface: Surface) -> OrthoError:
+def _nowhere(model: SensorModel, surface: Surface) -> InputError:
     """Return the error of a scene none of whose pixels meets the ground."""
-    if surface.constant_height is None:
-        return ModelError("no border pixel meets the ground: the model does not belong to this image")
     low, high = model.height_range
+    if surface.constant_height is None or low <= surface.constant_height <= high:
+        return InputError(
+            "no border pixel meets the ground: the model does not belong to this image", field="model", remedy=_SOUND
+        )
     return InputError(
         f"the scene does not meet the ground at a height of {surface.constant_height:g} m", field="--height",
         remedy=f"give an ellipsoidal height of the terrain; the model is meant for {low:.0f} to {high:.0f} m",
@@ -298,7 +304,10 @@ def ground_sample_distance(
     across, down = ground[1, :2] - ground[0, :2], ground[3, :2] - ground[2, :2]
     area = abs(across[0] * down[1] - across[1] * down[0])
     if not (np.isfinite(area) and area > 0):
-        raise ModelError("the model has no ground sample distance in the middle of the image")
+        raise InputError(
+            "a pixel in the middle of the image has no size on the ground: this model is none of an image",
+            field="model", remedy=_SOUND,
+        )  # fmt: skip
     return math.sqrt(area)
 
 
@@ -390,9 +399,8 @@ def _continuous(ground: Array, crs: pyproj.CRS) -> Array:
 def _centre(model: SensorModel, width: int, height: int) -> Array:
     centre = model.image_to_ground(np.array([[width / 2, height / 2]]), model.reference_height)
     if not np.isfinite(centre).all():
-        raise ModelError(
-            "the middle of the image does not meet the ground: the model does not belong to this image",
-            remedy="give the metadata of this very image, and points that were measured in it; "
-            "if they are, its plugin reads them wrongly (docs/plugins.md)",
-        )
+        raise InputError(
+            "the middle of the image does not meet the ground: the model does not belong to this image", field="model",
+            remedy=_SOUND,
+        )  # fmt: skip
     return centre

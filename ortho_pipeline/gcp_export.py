@@ -179,14 +179,17 @@ def gcps_of_model(
 
     Raises
     ------
-    ModelError
+    InputError
         If fewer than four of them meet the ground.
     """
     image = image_grid(*size, side)
     gcps = np.column_stack([image, _lonlat(model, image, surface)])
     gcps = gcps[np.isfinite(gcps).all(axis=1)]
     if len(gcps) < 4:
-        raise ModelError("the rays of the image do not meet the ground: there is no grid of control points")
+        raise InputError(
+            "the rays of the image do not meet the ground: there is no grid of control points", field="model",
+            remedy="give the metadata of this very image, and a DEM or --height that lies under it",
+        )  # fmt: skip
     return gcps
 
 
@@ -265,7 +268,7 @@ def write_geolocation(
     ------
     InputError
         If the folder cannot be written.
-    ModelError
+    InputError
         If some rays of the image do not meet the surface.
     """
     path = Path(path)
@@ -275,9 +278,10 @@ def write_geolocation(
     image = np.stack(np.meshgrid(across, down), axis=-1)
     lonlat = _lonlat(model, image.reshape(-1, 2), surface)[:, :2].reshape(*image.shape[:2], 2)
     if not np.isfinite(lonlat).all():
-        raise ModelError(
-            "some rays of the image do not meet the surface: geolocation arrays would have holes", file=path,
-            remedy="give a DEM that covers the whole scene, or --height",
+        raise InputError(
+            "some rays of the image do not meet the ground: geolocation arrays would have holes",
+            field="model" if surface is None else "--dem",
+            remedy="give the metadata of this very image, and a DEM that covers the whole scene, or --height",
         )  # fmt: skip
     arrays = path.resolve().with_suffix(".tif")
     with raster_output(arrays) as temporary:

@@ -86,7 +86,9 @@ def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) 
     scene = open_scene(image, options)
     model = scene.model
     size = scene.width, scene.height
-    crs = footprint.output_crs(model, *size)
+    with completed(scene.model_source, of="model"):
+        crs = footprint.output_crs(model, *size)
+        gsd = footprint.ground_sample_distance(model, crs, *size)
     corners = np.array([[0.0, 0.0], [size[0], 0.0], [size[0], size[1]], [0.0, size[1]]])
     to_geographic = crs_module.ground_transform(model.crs, "EPSG:4979")
     ground = to_geographic(model.image_to_ground(corners, model.reference_height))
@@ -100,7 +102,7 @@ def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) 
         "height_range": list(model.height_range),
         "reference_height": model.reference_height,
         "utm": crs_text(crs),
-        "gsd_m": footprint.ground_sample_distance(model, crs, *size),
+        "gsd_m": gsd,
         "view": viewing(model, *size)["view"],
         "corners_lon_lat": [[_number(value) for value in row] for row in ground[:, :2]],
         "facts": dict(scene.facts),
@@ -344,15 +346,16 @@ def export(
     adjusted = adjust(opened, points, scene, heights)
     dataset = raster.open_dataset(image, **scene.access)
     size = opened.width, opened.height
-    if heights is not None:
-        heights = footprint.facing(adjusted.model, heights, *size)
     adjustment = adjusted.fit
-    job = gcp_export.Export(
-        dataset, adjusted.model, size, heights, adjustment.points.select(adjustment.used), adjustment.rejected,
-        force=force,
-    )  # fmt: skip
-    for name, path in files.items():
-        job.write(name, path)
+    with completed(adjusted.scene.model_source, of="model"):
+        if heights is not None:
+            heights = footprint.facing(adjusted.model, heights, *size)
+        job = gcp_export.Export(
+            dataset, adjusted.model, size, heights, adjustment.points.select(adjustment.used), adjustment.rejected,
+            force=force,
+        )  # fmt: skip
+        for name, path in files.items():
+            job.write(name, path)
     document = {**job.document, "model": adjustment.model_name, "model_source": adjusted.scene.model_source}
     return Result(files, document, job.summary(adjustment.model_name, adjusted.scene.model_source))
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from ortho_pipeline import footprint
 from ortho_pipeline.crs import map_crs
 from ortho_pipeline.dem import Surface
+from ortho_pipeline.errors import completed
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions
@@ -72,15 +73,16 @@ def lay_out(
     """
     adjusted = adjust(opened, points, scene, surface)
     model, size = adjusted.model, (opened.width, opened.height)
-    surface = footprint.facing(model, surface, *size)
-    lay = footprint.lay(model, surface, *size)
-    lay.require_coverage(surface)
-    model = lay.fitted(model)
-    crs = map_crs(output.crs) if output.crs else None
-    grid = footprint.choose_grid(
-        model, lay, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
-    )
-    footprint.scene_pixels(model, lay, grid)
+    with completed(adjusted.scene.model_source, of="model"):
+        surface = footprint.facing(model, surface, *size)
+        lay = footprint.lay(model, surface, *size)
+        lay.require_coverage(surface)
+        model = lay.fitted(model)
+        crs = map_crs(output.crs) if output.crs else None
+        grid = footprint.choose_grid(
+            model, lay, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
+        )
+        footprint.scene_pixels(model, lay, grid)
     return Layout(adjusted, model, surface, lay, grid)
 
 
