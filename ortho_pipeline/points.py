@@ -419,10 +419,17 @@ def assign_roles(points: AnyPoints, spec: str) -> AnyPoints:
 # -- writing ---------------------------------------------------------------------------------------------------------
 
 
-def write_points(points: Points, path: str | os.PathLike[str]) -> None:
+def write_points(
+    points: Points, path: str | os.PathLike[str], *, images: Sequence[str] | None = None
+) -> None:  # fmt: skip
     """Write points as ``.csv``/``.tsv``, ``.geojson`` (lon, lat, EPSG:4979) or QGIS ``.points``; whole or not at all.
 
     CSV and GeoJSON read back as they were; a QGIS file has no ids, heights, roles or sigmas.
+
+    Parameters
+    ----------
+    images : sequence of str, optional
+        Name of the file that each point was measured in, where they are several: CSV and TSV alone can say it.
 
     Raises
     ------
@@ -433,10 +440,12 @@ def write_points(points: Points, path: str | os.PathLike[str]) -> None:
     suffix = Path(path).suffix.lower()
     if suffix not in writers:
         raise InputError("points are not written in this format", file=path, remedy=f"one of {', '.join(writers)}")
-    write_text(path, writers[suffix](points, suffix))
+    if images is not None and writers[suffix] is not _csv_text:
+        raise InputError(f"{suffix} does not say in which file a point was measured", file=path, remedy="write .csv")
+    write_text(path, _csv_text(points, suffix, images) if images is not None else writers[suffix](points, suffix))
 
 
-def _csv_text(points: Points, suffix: str) -> str:
+def _csv_text(points: Points, suffix: str, images: Sequence[str] | None = None) -> str:
     out = io.StringIO()
     out.write(f"#CRS: {_crs_text(points.crs)}\n#vertical: ellipsoid\n")
     # An id that starts with '#' would read as a comment without quotation marks.
@@ -447,14 +456,15 @@ def _csv_text(points: Points, suffix: str) -> str:
         lineterminator="\n",
         quoting=csv.QUOTE_ALL if hidden else csv.QUOTE_MINIMAL,
     )
-    writer.writerow(CSV_COLUMNS)
+    writer.writerow(CSV_COLUMNS if images is None else (*CSV_COLUMNS, "image"))
     # One column holds both plan components: the larger one is the careful choice.
     sigma_xy = points.sigma_ground[:, :2].max(axis=1)
     numbers = np.column_stack([points.image, points.ground])
     sigmas = np.column_stack([points.sigma_image, sigma_xy, points.sigma_ground[:, 2]])
     for k, name in enumerate(points.ids):
         cells = ["" if math.isnan(value) else repr(value) for value in numbers[k].tolist()]
-        writer.writerow([name, *cells, str(points.roles[k]), *map(repr, sigmas[k].tolist())])
+        measured_in = [] if images is None else [images[k]]
+        writer.writerow([name, *cells, str(points.roles[k]), *map(repr, sigmas[k].tolist()), *measured_in])
     return out.getvalue()
 
 

@@ -10,6 +10,7 @@ from click.testing import CliRunner
 from ortho_ikonos.metadata import read_metadata
 from ortho_ikonos.simulation import ORDER, write_product
 
+from ortho_pipeline import pipeline
 from ortho_pipeline.cli import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.experiments.ikonos_scene import (
@@ -23,6 +24,7 @@ from ortho_pipeline.experiments.ikonos_scene import (
     to_map,
 )
 from ortho_pipeline.model_file import load_model
+from ortho_pipeline.options import PointOptions
 from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
 from ortho_pipeline.raster import open_dataset
@@ -196,3 +198,19 @@ def test_one_point_adjusts_the_metadata_model_beside_an_rpc(product, tmp_path):
     # (the simulated pixel has some of them), without it there are 10 to 25.
     assert said["model"] == "geo+model"
     assert said["rmse"]["check"]["total"] * PIXEL < 5
+
+
+def test_points_of_components_are_measured_in_the_component_that_they_lie_in(tmp_path):
+    whole = write_product(tmp_path / "whole", seed=2, size=128, pixel=20.0, rpc=False)
+    cut = write_product(tmp_path / "cut", seed=2, size=128, pixel=20.0, rpc=False, components=2)
+    images = [path for key, path in cut.items() if key.startswith("image")]
+    read = {path.name: read_points(cut["gcps"], image_name=path.name) for path in images}
+    # Points of the other component are not taken for those of the image at hand ...
+    assert all(0 < len(points) < 40 and points.image[:, 0].max() < 64.5 for points in read.values())
+    assert sum(map(len, read.values())) == 40
+    # ... and all of them adjust either component as they adjust the whole.
+    expected = pipeline.fit(whole["image"], PointOptions(gcps=whole["gcps"])).fit
+    for path in images:
+        found = pipeline.fit(path, PointOptions(gcps=cut["gcps"])).fit
+        assert len(found.points) == 40
+        np.testing.assert_allclose(found.rmse("check")["total"], expected.rmse("check")["total"], atol=1e-3)

@@ -18,7 +18,7 @@ from ortho_pipeline.experiments import ikonos_scene as simulated
 from ortho_pipeline.experiments.ikonos_scene import GeoScene, VendorModel
 from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.points import write_points
+from ortho_pipeline.points import Points, write_points
 from ortho_pipeline.raster_output import close, raster_output
 from ortho_pipeline.rpc import fit_rpc, write_rpc_txt
 
@@ -95,9 +95,7 @@ def write_product(
     files |= {"dem": out / "dem.tif", "gcps": out / "gcps.csv", "truth": out / "truth.json"}
     _write_heights(scene, dem_step, files["dem"])
     measured = scene.measure(seed)
-    write_points(
-        replace(measured, image=np.round(measured.image, 4), ground=np.round(measured.ground, 3)), files["gcps"]
-    )
+    _write_points(measured, cuts, files["gcps"])
     write_text(files["truth"], json.dumps(_truth(scene, seed, off_nadir_deg), indent=1) + "\n")
     return files
 
@@ -137,6 +135,16 @@ def _of_band(scene: GeoScene, band: str) -> GeoScene:
 
 
 # -- files -----------------------------------------------------------------------------------------------------------
+
+
+def _write_points(measured: Points, cuts: list[Component], path: Path) -> None:
+    """Write the points in the panchromatic component that each of them lies in, named where there are several."""
+    wide = cuts[0].scene.columns
+    of = np.clip(measured.image[:, 0] // wide, 0, len(cuts) - 1).astype(int)
+    image = np.round(measured.image - np.stack([of * wide, np.zeros(len(of))], axis=1), 4)
+    names = [f"po_{ORDER}_pan_{cuts[k].identifier}.tif" for k in of]
+    written = replace(measured, image=image, ground=np.round(measured.ground, 3))
+    write_points(written, path, images=names if len(cuts) > 1 else None)
 
 
 def _write_image(
