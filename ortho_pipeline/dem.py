@@ -25,6 +25,7 @@ from ortho_pipeline.datum import dem_unit, dem_vertical, dem_vertical_remedy
 from ortho_pipeline.errors import CoverageError, CrsError, DatumError, InputError
 from ortho_pipeline.raster import first_line, open_pixels
 from ortho_pipeline.raster_output import close, raster_output
+from ortho_pipeline.voids import nearest_heights
 
 Array = NDArray[np.float64]
 
@@ -371,7 +372,7 @@ class Surface:
         if self.constant_height is not None:
             return np.full((nv, nu), self.constant_height)
         if filled and self.fill == "nearest":
-            return self._nearest(u0, v0, nu, nv)
+            return nearest_heights(self._read, self.shape, (u0, v0, nu, nv), self.nearest_reach)
         rows, columns = self.shape
         left, top = max(u0, 0), max(v0, 0)
         right, bottom = min(u0 + nu, columns), min(v0 + nv, rows)
@@ -386,28 +387,6 @@ class Surface:
     def nearest_reach(self) -> int:
         """How far (samples) ``fill='nearest'`` looks for a height."""
         return int(np.clip(NEAREST_METRES / self.sample_size, 1, NEAREST_REACH))
-
-    def _nearest(self, u0: int, v0: int, nu: int, nv: int) -> Array:
-        """Fill voids by the nearest valid sample, if one is near enough; outside of the DEM its edge goes on so far."""
-        rows, columns = self.shape
-        u, v = np.clip(np.arange(u0, u0 + nu), 0, columns - 1), np.clip(np.arange(v0, v0 + nv), 0, rows - 1)
-        left, top, right, bottom = int(u[0]), int(v[0]), int(u[-1]) + 1, int(v[-1]) + 1
-        heights = self._read(left, top, right - left, bottom - top)
-        if np.isnan(heights).any():
-            from scipy.ndimage import distance_transform_edt
-
-            reach = self.nearest_reach
-            west, north = max(0, left - reach), max(0, top - reach)
-            east, south = min(columns, right + reach), min(rows, bottom + reach)
-            wide = self._read(west, north, east - west, south - north)
-            void = np.isnan(wide)
-            if not void.all():
-                distance, (near_v, near_u) = distance_transform_edt(void, return_indices=True)
-                wide = np.where(distance <= reach, wide[near_v, near_u], np.nan)
-            heights = wide[top - north : bottom - north, left - west : right - west]
-        filled = heights[np.ix_(v - top, u - left)]
-        outside = np.hypot(*np.meshgrid(np.arange(u0, u0 + nu) - u, np.arange(v0, v0 + nv) - v))
-        return np.where(outside > self.nearest_reach, np.nan, filled)
 
     def _read(self, left: int, top: int, width: int, height: int) -> Array:
         """Return ellipsoidal heights of a window inside the DEM; NaN for voids."""

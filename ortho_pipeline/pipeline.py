@@ -249,6 +249,8 @@ def rectify(
     inputs.check_paths(files, image, scene, points, surface, overwrite)
     inputs.require_heights(surface)
     begun = states(inputs.given_files(image, scene, points, surface))
+    # Before the DEM is read: left alone, GDAL keeps blocks in a share of the machine's memory.
+    raster.limit_cache(output.memory, 1)
     opened = open_adjustable(image, scene, points)
     heights = open_surface(surface, scene)
     acquired = stac_items.acquisition_time(opened.facts, output.acquired) if output.stac else None

@@ -19,7 +19,7 @@ errors options
 locations
 files
 geoid_grid
-crs geometry notebook compiled allowance
+crs geometry notebook compiled allowance voids
 point_table datum
 point_csv point_geojson point_lists point_ground
 point_files
