@@ -23,13 +23,15 @@ from ortho_pipeline.batch_manifest import Digests, FileState, Record, key_of, lo
 from ortho_pipeline.batch_plan import RUN_FILES, STATE, Job, Plan, for_run, plan, versions
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.executors import Processes, Sequential, completed, dask_executor
-from ortho_pipeline.files import append_line, clear_up, confined, retire, together, write_text
+from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_text
 from ortho_pipeline.stac import write_catalog
 
 SCHEMA_VERSION = 1
 EXECUTORS = ("sequential", "processes", "dask")
 #: Larger files beside an image are no metadata.
 _COMPANION_BYTES = 5_000_000
+#: A larger file is no report on a mosaic.
+_REPORT_BYTES = 50_000_000
 #: Seams from which on they are measured by several processes.
 _MANY_SEAMS = 64
 #: Checksums that this process has taken.
@@ -433,7 +435,11 @@ class _Mosaic:
     def make(self, crew: Executor | Processes) -> dict[str, Any]:
         record = Record.read(self.record)
         if record is not None and record.key == self.key and record.intact(self.output):
-            return {**json.loads(self.report.read_text(encoding="utf-8")), "status": "unchanged"}
+            # A record may lie: what it vouches for is read as any other file, and made again if it is no report.
+            with contextlib.suppress(InputError):
+                document = read_json(self.report, _REPORT_BYTES, "run again")
+                if isinstance(document, dict):
+                    return {**document, "status": "unchanged"}
         self.record.unlink(missing_ok=True)
         layout = mosaic.lay_out(self.orthos, self.settings.order)
         with together(self.output, "mosaic"):

@@ -269,7 +269,15 @@ class _Gate:
                 self._outside(name or str(path), by, field, None)
         elif not within(path, self._roots):
             self._outside(name or str(path), by, field, path.resolve())
-        if path.exists() and not path.is_file():
+        try:
+            plain = path.is_file() or not path.exists()
+        except OSError as error:
+            # Longer than a file system takes, or in a folder that may not be read.
+            raise InputError(
+                f"{(name or path.name)[:80]!r} cannot be a file here ({error.strerror})", file=by, field=field,
+                remedy="correct the name, or take it away",
+            ) from error  # fmt: skip
+        if not plain:
             raise InputError(
                 f"{name or path.name!r} is no file", file=by, field=field, remedy="put a file there, or take it away"
             )

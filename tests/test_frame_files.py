@@ -62,6 +62,18 @@ def test_a_shot_looks_where_opensfm_says(tmp_path):
     assert opened.facts["exterior_orientation"] == "shots.one.tif"
 
 
+def test_a_camera_that_looks_into_the_sky_says_so(tmp_path):
+    write(tmp_path)
+    opened = scene(tmp_path, heights="800,1000")
+    assert opened.model.sees_ground
+    assert (opened.facts["tilt_deg"], opened.warnings) == (pytest.approx(0.0, abs=1e-3), ())
+    write(tmp_path, shots={"one.tif": shot([30.0, -20.0, 150.0], Rotation.identity())})
+    opened = scene(tmp_path, heights="800,1000")
+    assert not opened.model.sees_ground
+    assert opened.facts["tilt_deg"] == pytest.approx(180.0, abs=1e-3)
+    assert "looks past the ground" in opened.warnings[0]
+
+
 def test_a_shot_has_its_own_camera_and_its_name_may_lack_a_suffix(tmp_path):
     write(tmp_path)
     assert scene(tmp_path, "two.tif").facts["focal_length_px"] == pytest.approx(96.0)

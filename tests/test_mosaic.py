@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
@@ -202,6 +203,13 @@ def test_a_run_ends_in_a_mosaic(block):
     again = batch.run(block / "p.yaml", executor="sequential")
     assert again.mosaic["status"] == "unchanged"
     assert (block / "out" / "mosaic.vrt").stat().st_mtime_ns == before
+    # A report that is none, of the size and the date that the record knows.
+    report = block / "out" / "mosaic.json"
+    state = report.stat()
+    report.write_bytes(b"{" * state.st_size)
+    os.utime(report, ns=(state.st_atime_ns, state.st_mtime_ns))
+    assert batch.run(block / "p.yaml", executor="sequential").mosaic["status"] == "done"
+    assert json.loads(report.read_text())["worst_seam"]["px"] > 2
     (block / "out" / "mosaic.vrt").unlink()
     assert batch.run(block / "p.yaml", executor="sequential").mosaic["status"] == "done"
     (block / "p.yaml").write_text(FILE.replace("FORMAT", "COG"))

@@ -59,6 +59,11 @@ GEOGRAPHIC = "EPSG:4979"
 REFRACTIVITY, SCALE_HEIGHT = 2.77e-4, 9200.0
 #: Rays flatter than this (cosine of the zenith angle) belong to no useful part of the scene.
 _FLATTEST = 0.17
+#: Warning for a camera whose `FrameCamera.sees_ground` is false.
+LOOKS_PAST = (
+    "by its exterior orientation the camera looks past the ground: the model only starts an adjustment to ground "
+    "control points"
+)
 _LIFT_STEPS = 12
 
 
@@ -202,16 +207,18 @@ class FrameCamera(SensorModel):
     @cached_property
     def domain(self) -> tuple[Array, Array]:
         """Centre and half-size of the box that the frame sees between `heights`, as far as rays are not too flat."""
-        fractions = np.stack(np.meshgrid(*[np.linspace(0, 1, 7)] * 2), axis=-1).reshape(-1, 2)
-        image = fractions * (self.interior.width, self.interior.height)
-        seen = np.concatenate([self.image_to_ground(image, height) for height in self.heights])
-        steep = self._steepness(seen) > _FLATTEST
+        seen, steep = self._seen()
         if not steep.any():
             # Start values may look anywhere; what they are meant for is then below the camera.
             seen, steep = self._below(), np.ones(4, dtype=bool)
         low, high = seen[steep].min(axis=0), seen[steep].max(axis=0)
         low[2], high[2] = self.heights
         return (low + high) / 2, (high - low) / 2
+
+    @property
+    def sees_ground(self) -> bool:
+        """Whether any of its rays meets the ground between `heights`; start values may look past it."""
+        return bool(self._seen()[1].any())
 
     @property
     def corners(self) -> Array:
@@ -372,6 +379,13 @@ class FrameCamera(SensorModel):
             return ground
         axes, zero = self._local
         return (geocentric(ground) - zero) @ axes.T
+
+    def _seen(self) -> tuple[Array, np.ndarray]:
+        """Return ground points ``(98, 3)`` of 7 x 7 pixels at both ends of `heights`, and which rays are steep."""
+        fractions = np.stack(np.meshgrid(*[np.linspace(0, 1, 7)] * 2), axis=-1).reshape(-1, 2)
+        image = fractions * (self.interior.width, self.interior.height)
+        seen = np.concatenate([self.image_to_ground(image, height) for height in self.heights])
+        return seen, self._steepness(seen) > _FLATTEST
 
     def _verticals(self, ground: Array) -> Array:
         """Return the upward directions at ground points in the working frame ``(N, 3)``."""

@@ -15,7 +15,7 @@ from ortho_pipeline.files import read_bounded
 from ortho_pipeline.geometry import geodetic, orbital_from_ecef
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.locations import place
-from ortho_pipeline.models.frame import FrameCamera, camera_from_platform, exterior_sigmas
+from ortho_pipeline.models.frame import LOOKS_PAST, FrameCamera, camera_from_platform, exterior_sigmas
 from ortho_pipeline.problem import priors_at
 
 
@@ -70,6 +70,8 @@ def open_scene(dataset: gdal.Dataset, *, survey: str | None = None, attitude: st
     known = read.attitude is not None and attitude == "survey"
     if not known:
         warnings.append("the attitude is not known: the model only starts an adjustment to ground control points")
+    elif not model.sees_ground:
+        warnings.append(LOOKS_PAST)
     return Scene(
         sensor="bilsat",
         path=name,
@@ -100,7 +102,7 @@ def _facts(survey: Survey, model: FrameCamera) -> dict[str, object]:
         "camera": survey.camera,
         "acquired": survey.acquired,
         "satellite_lon_lat_height": [round(lon, 7), round(lat, 7), round(height, 2)],
-        "off_nadir_deg": round(math.degrees(math.acos(min(1.0, abs(float(model.rotation[2, 2]))))), 3),
+        "off_nadir_deg": round(math.degrees(math.acos(max(-1.0, min(1.0, float(model.rotation[2, 2]))))), 3),
         "pixel_at_nadir_m": round(interior.pitch_x * height / interior.focal_length, 3),
         "position_sigma_m": survey.position_sigma,
     }

@@ -16,7 +16,7 @@ from ortho_pipeline.crs import Vertical, ground_transform
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.models.frame import TOPOCENTRIC, FrameCamera, exterior_sigmas
+from ortho_pipeline.models.frame import LOOKS_PAST, TOPOCENTRIC, FrameCamera, exterior_sigmas
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.problem import Prior, priors_at
 
@@ -84,6 +84,7 @@ def open_scene(
         models={"frame": model},
         model_source=exterior,
         facts=_facts(model, pose, heights),
+        warnings=() if model.sees_ground else (LOOKS_PAST,),
         priors=_priors(model, sigmas),
     )
 
@@ -174,7 +175,7 @@ def _pair(text: str) -> tuple[float, float]:
 
 def _facts(model: FrameCamera, pose: Pose | Shot, heights: str | None) -> dict[str, object]:
     centre: Array = model.perspective_centre
-    tilt = math.degrees(math.acos(min(1.0, abs(float(model.rotation[2, 2])))))
+    tilt = math.degrees(math.acos(max(-1.0, min(1.0, float(model.rotation[2, 2])))))
     unknown = {"ground_heights": "not stated, so a guess: a DEM gives them, or the option heights=low,high"}
     return {
         **({} if heights else unknown),

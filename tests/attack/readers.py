@@ -68,6 +68,9 @@ def numbers(value: Any) -> Iterable[float]:
     if isinstance(value, SensorModel):
         yield from numbers(value.to_dict())
         yield from numbers(value.domain)
+        if not getattr(value, "sees_ground", True):
+            # Start values of an adjustment; the scene has a warning.
+            return
         centre, half = value.domain
         parts = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 3), axis=-1).reshape(-1, 3)
         image = value.ground_to_image(centre + parts * half)

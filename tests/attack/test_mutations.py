@@ -84,7 +84,13 @@ def test_json_has_finite_numbers(text: str) -> None:
     assert (caught.value.file, caught.value.remedy) == ("a.json", "write it again")
 
 
-@pytest.mark.parametrize(("name", "number"), [("image", 1026), ("image", 1046), ("orbview3-label", 1001)])
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        ("image", 1026), ("image", 1046), ("orbview3-label", 1001), ("vrt", 2000781), ("opensfm", 2000063),
+        ("frame-table", 2000278), ("bilsat-survey", 2000041), ("cartosat-met", 2000539),
+    ],
+)  # fmt: skip
 def test_what_was_found_stays_mended(name: str, number: int, tmp_path: Path) -> None:
     assert attacked(name, tmp_path, 1, first=number).sound
 
