@@ -270,7 +270,8 @@ def rectify(
     document = report.build_report(
         scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
         warp=warped, near=points.near, provenance=record,
-        warnings=[*adjusted.warnings(heights), *found.notes(heights), *laid.sparse(warped.valid_pixels), *complaints],
+        warnings=[*adjusted.warnings(heights), *found.notes(heights), *laid.sparse(warped.valid_pixels), *complaints,
+                  *warped.notes(output.memory)],
     )  # fmt: skip
     _write_report(document, adjusted.fit, files)
     if acquired is not None:
@@ -542,6 +543,7 @@ def _warp(
 
     common: dict[str, Any] = {
         "resampling": output.resampling,
+        "dem_interpolation": output.dem_interpolation,
         "memory": output.memory,
         "threads": output.threads,
         "driver": output.format,
@@ -550,10 +552,7 @@ def _warp(
         "progress": progress,
     }
     if output.engine == "ortho":
-        return warp.rectify(
-            model, source, surface, grid, path, tolerance=output.tolerance,
-            dem_interpolation=output.dem_interpolation, **common,
-        )  # fmt: skip
+        return warp.rectify(model, source, surface, grid, path, tolerance=output.tolerance, **common)
     if output.engine != "gdal":
         raise InputError(f"no engine is called {output.engine!r}", field="--engine", remedy="ortho or gdal")
     return warp.rectify_gdal(model, exported, source, surface, grid, path, **common)

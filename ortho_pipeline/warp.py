@@ -43,6 +43,8 @@ RESAMPLING = {
 }
 #: Source pixels that a kernel reads around the one that holds the point ('average': plus half of its box).
 _REACH = {"nearest": 0, "bilinear": 1, "cubic": 2, "lanczos": 3, "average": 1}
+#: What GDAL's warper takes for each pixel of an ortho whose image points are geolocation arrays: 1.4 GB for 13.7 Mpx.
+_ARRAYS_BYTES = 100
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,16 @@ class WarpResult:
     valid_pixels: int
     seconds: float
     transformer: str | None = None
+
+    def notes(self, memory: int) -> list[str]:
+        """Return a notice if GDAL's geolocation arrays took more memory (bytes) than was allowed, which they may."""
+        took = self.pixels * _ARRAYS_BYTES
+        if self.transformer != "GEOLOC_ARRAY" or took <= memory:
+            return []
+        return [
+            f"GDAL's warper takes about {took / 1e6:.0f} MB for the arrays that stand for this model, beyond --memory "
+            f"{memory / 1e6:.0f}: make a smaller extent, or leave out --engine gdal"
+        ]
 
 
 def rectify(
@@ -140,6 +152,7 @@ def rectify_gdal(
     path: str | os.PathLike[str],
     *,
     resampling: str = "bilinear",
+    dem_interpolation: str = "bilinear",
     memory: int = 512_000_000,
     threads: int | None = None,
     driver: str = "COG",
@@ -158,10 +171,16 @@ def rectify_gdal(
     Raises
     ------
     InputError
-        As `rectify`; for an image in several files; if no transformer of GDAL stands for the model within 0.1 px.
+        As `rectify`; for an image in several files; for cubic heights, which GDAL's warper does not take from a DEM as
+        our engine does; if no transformer of GDAL stands for the model within 0.1 px.
     """
     begin = time.monotonic()
-    _check(source, resampling, "bilinear", 1.0)
+    _check(source, resampling, dem_interpolation, 1.0)
+    if dem_interpolation != "bilinear":
+        raise InputError(
+            "with GDAL's warper heights of the DEM are interpolated bilinearly", field="--dem-interpolation",
+            remedy="leave out --dem-interpolation or --engine gdal",
+        )  # fmt: skip
     # GDAL's warper reads in one of its threads.
     limit_cache(memory, 1, source.block, surface.block)
     surface = _seamless(surface, grid)

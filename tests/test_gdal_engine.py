@@ -6,6 +6,7 @@ coordinates that the engine used.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import pyproj
 import pytest
 from osgeo import gdal
 
+from ortho_pipeline import pipeline
 from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.gdal_engine import EXPRESSED, Exact, Transformer
@@ -21,6 +23,7 @@ from ortho_pipeline.models import FrameCamera, ImageCorrection, SensorModel
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.line_camera import LineCamera
 from ortho_pipeline.models.pushbroom_start import pushbroom_of_tables
+from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import Grid, RasterSource
 from ortho_pipeline.rpc import RpcExport, export_rpc
@@ -215,3 +218,14 @@ def test_where_nothing_stands_for_the_model_the_remedy_is_our_engine(tmp_path, m
         both(frame(k1=-0.05), Surface.constant(80.0), tmp_path)
     assert "--engine ortho" in str(caught.value.remedy)
     assert [path.name for path in tmp_path.iterdir() if "gdal" in path.name] == []
+
+
+def test_what_gdals_warper_cannot_do_as_asked_is_refused_or_said(tiny, tmp_path):
+    cubic = OutputOptions(engine="gdal", dem_interpolation="cubic")
+    with pytest.raises(InputError, match="--dem-interpolation"):
+        pipeline.rectify(tiny.image, tmp_path / "cubic", surface=SurfaceOptions(height=500.0), output=cubic)
+    assert not list((tmp_path / "cubic").glob("*.tif"))
+    arrays = WarpResult(0.0, 0.1, 1, 0, 0, 10_000_000, 1, 1.0, "GEOLOC_ARRAY")
+    assert "about 1000 MB" in arrays.notes(512_000_000)[0]
+    assert not arrays.notes(1_000_000_000)
+    assert not dataclasses.replace(arrays, transformer="RPC").notes(512_000_000)
