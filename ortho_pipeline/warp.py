@@ -310,10 +310,10 @@ class _Job:
         seen = self.lattices.build(blocks, terrain)
         for group, heights, origin, area in terrain.groups(seen):
             self._warp(group, heights, origin, area, tile, out, valid)
-        _, high, _, fill = _range(self.profile.dtype, self.profile)
+        low, _, _, fill = _range(self.profile.dtype, self.profile)
         out = as_written(out, valid, self.profile.dtype, fill)
         if self.profile.validity == "nodata":
-            _keep_off_nodata(out, valid, fill, high)
+            _keep_off_nodata(out, valid, fill, low)
         # NaN says for itself which band has no value; an integer cannot, so there a pixel needs all of its bands.
         mask = np.asarray((np.any if self.any_band else np.all)(valid, axis=0))
         with self._lock:
@@ -424,14 +424,19 @@ def _range(dtype: np.dtype[Any], profile: Profile) -> tuple[float, float, bool, 
     return -math.inf, math.inf, False, fill
 
 
-def _keep_off_nodata(out: NDArray[Any], valid: NDArray[np.bool_], fill: Any, high: float) -> None:
-    """Move valid pixels that happened to get the nodata value to the next value, as GDAL does."""
+def _keep_off_nodata(out: NDArray[Any], valid: NDArray[np.bool_], fill: Any, low: float) -> None:
+    """Move valid pixels that happened to get the nodata value to the value beside it, for every kernel.
+
+    To the one that GDAL takes: of integers one less (one more for the least), of floating point the next. GDAL before
+    3.11 does so for integers that it interpolates only.
+    """
     if np.isnan(fill):
         return
     for band, good in zip(out, valid, strict=True):
         clash = (band == fill) & good
         if clash.any():
             if band.dtype.kind in "iu":
-                band[clash] = fill + 1 if fill < high else fill - 1
+                band[clash] = fill - 1 if fill > low else fill + 1
             else:
-                band[clash] = np.nextafter(fill, np.inf, dtype=band.dtype)
+                greatest = np.finfo(band.dtype).max
+                band[clash] = np.nextafter(fill, greatest if fill < greatest else 0, dtype=band.dtype)

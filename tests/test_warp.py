@@ -23,6 +23,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import sha256
 from ortho_pipeline.models import RPC, SensorModel
 from ortho_pipeline.raster import Grid, RasterSource
+from ortho_pipeline.raster_writer import Profile
 from ortho_pipeline.rpc import export_rpc, rpc_metadata
 from ortho_pipeline.warp import rectify, rectify_gdal
 
@@ -512,12 +513,32 @@ def test_mask_and_nan_are_not_valid(scene, tmp_path):
 
 
 def test_a_valid_pixel_never_becomes_nodata(scene, tmp_path):
-    """Between 4 and 6 lies 5, which is nodata: such a pixel moves to the next value."""
+    """Between 4 and 6 lies 5, which is nodata: such a pixel moves to the value beside it."""
     pixels = np.full((1, HEIGHT, WIDTH), 4, np.uint8)
     pixels[:, :, ::2] = 6
     path = scene.write(pixels, nodata=5)
     rectify(scene.model, RasterSource(path), Surface.constant(700.0), grid_of(150.0), tmp_path / "o.tif")
     assert set(np.unique(read(tmp_path / "o.tif")[0])) == {4, 6}
+
+
+@pytest.mark.parametrize(("nodata", "moved"), [(7, 6), (0, 1), (255, 254)])
+def test_it_moves_to_the_value_that_gdal_takes(scene, tmp_path, nodata, moved):
+    """With nearest, and with the other kernels, of which every GDAL knows it."""
+    path = scene.write(np.full((1, HEIGHT, WIDTH), nodata, np.uint8))
+    source = RasterSource(path)
+    for kernel in ("nearest", "bilinear"):
+        rectify(
+            scene.model, source, Surface.constant(700.0), grid_of(150.0), tmp_path / "o.tif", resampling=kernel,
+            profile=Profile.of(source, nodata=nodata),
+        )  # fmt: skip
+        assert set(np.unique(read(tmp_path / "o.tif")[0])) == {moved}
+    flat = gdal.GetDriverByName("MEM").Create("", 4, 4, 1)
+    flat.SetGeoTransform((0, 1, 0, 4, 0, -1))
+    flat.GetRasterBand(1).Fill(nodata)
+    warped = gdal.Warp(
+        "", flat, format="MEM", dstNodata=nodata, resampleAlg="bilinear", outputBounds=(0.5, 1, 3.5, 3)
+    ).ReadAsArray()
+    assert set(np.unique(warped)) == {moved}
 
 
 def test_palette_is_kept_by_nearest_and_refused_by_others(scene, tmp_path):
