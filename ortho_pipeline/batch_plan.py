@@ -9,7 +9,7 @@ import itertools
 import os
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
@@ -193,7 +193,7 @@ class _Planner:
         # Nothing outside of the root is searched either.
         fixed = "/".join(itertools.takewhile(lambda part: not glob.has_magic(part), parts))
         self._inside(fixed or ("/" if pattern.startswith("/") else "."), field)
-        names = glob.glob(os.path.join(glob.escape(str(self.base)), pattern), recursive=True)
+        names = set(_found("/" if pattern.startswith("/") else str(self.base), [part for part in parts if part]))
         paths = [Path(os.path.abspath(name)) for name in sorted(names) if os.path.isfile(name)]
         # A pattern with ** would take the orthos of the last run for scenes.
         return [path for path in paths if not path.is_relative_to(self.output)]
@@ -332,6 +332,22 @@ class _Planner:
                         "the scenes of a mosaic share a grid", file=self.path, field=f"defaults.output.{field}",
                         remedy="say it under defaults: output: (such as crs: EPSG:32635 and resolution: 2.5)",
                     )  # fmt: skip
+
+
+def _found(base: str, parts: Sequence[str]) -> Iterator[str]:
+    """Yield what a pattern matches below a folder.
+
+    ``**`` walks no linked folders, as in shells: two links that lead up again would give 2 to the power of 40 paths.
+    """
+    at = parts.index("**") if "**" in parts else len(parts)
+    tops = glob.iglob(os.path.join(glob.escape(base), *parts[:at]))
+    if at == len(parts):
+        yield from tops
+        return
+    for top in tops:
+        for folder, names, _ in os.walk(top):
+            names[:] = [name for name in names if not name.startswith(".")]
+            yield from _found(folder, parts[at + 1 :] or ["*"])
 
 
 def for_run(jobs: Sequence[Job], run: str, memory: int, threads: int | None) -> list[Job]:

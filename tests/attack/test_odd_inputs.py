@@ -1,0 +1,140 @@
+"""Inputs that are cut off, misnamed, linked in circles or at the edges of the Earth: right, or an error that helps."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ortho_pipeline import batch_plan, pipeline
+from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.options import OutputOptions, SurfaceOptions
+from ortho_pipeline.rpc import fit_rpc
+from ortho_pipeline.simulate import LineScanner
+
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
+SMALL = OutputOptions(extent=(530600.0, 4122000.0, 530800.0, 4122200.0))
+
+
+def copied(folder: Path, stem: str = "scene") -> Path:
+    """Copy the sample scene and DEM under a name of their own."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for ending in (".tif", "_RPC.TXT"):
+        shutil.copyfile(SAMPLE / f"scene{ending}", folder / f"{stem}{ending}")
+    shutil.copyfile(SAMPLE / "dem.tif", folder / "dem.tif")
+    return folder / f"{stem}.tif"
+
+
+def helps(error: OrthoError, out: Path, word: str = "") -> None:
+    """Hold that an error names what it is about and what to do, and that there is no ortho."""
+    assert word in str(error)
+    assert error.remedy
+    assert not list(out.rglob("*.tif"))
+
+
+def rectify(image: Path, out: Path) -> Path:
+    surface = SurfaceOptions(dem=str(image.parent / "dem.tif"))
+    pipeline.rectify(image, out, surface=surface, output=SMALL)
+    return out / f"{image.stem}_ortho.tif"
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+def test_a_source_that_is_cut_off_is_named_and_leaves_no_ortho(tmp_path, share):
+    image = copied(tmp_path / "in")
+    data = image.read_bytes()
+    # The directory of this file lies in front of its tiles: it opens, and its pixels are not there.
+    image.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(InputError) as caught:
+        pipeline.rectify(image, tmp_path / "out", surface=SurfaceOptions(dem=str(image.parent / "dem.tif")))
+    helps(caught.value, tmp_path / "out", "scene.tif")
+
+
+@pytest.mark.parametrize("kind", ["folder", "no XML", "loop"])
+def test_an_aux_xml_that_cannot_be_read_is_an_error_or_does_no_harm(tmp_path, kind):
+    image = copied(tmp_path / "in")
+    aux = Path(f"{image}.aux.xml")
+    if kind == "folder":
+        aux.mkdir()
+    elif kind == "loop":
+        aux.symlink_to(aux.name)
+    else:
+        aux.write_bytes(b"\xff\xfe<PAMDataset><Metadata domain=")
+    try:
+        assert rectify(image, tmp_path / "out").is_file()
+    except InputError as error:
+        helps(error, tmp_path / "out", "aux.xml")
+
+
+ODD = [
+    "a\nb",
+    'a"b',
+    "a'b",
+    "a%41b",
+    "a%sb",
+    "-a",
+    "a;b",
+    "a&b<c>",
+    "a" * 120,
+    "ä" * 50,
+    "a b ",
+    os.fsdecode(b"a\xff\xfe"),
+]
+
+
+@pytest.mark.parametrize("stem", ODD, ids=[ascii(stem[:8]) for stem in ODD])
+def test_odd_names_give_an_ortho_of_that_name_or_an_error_about_it(tmp_path, stem):
+    image = copied(tmp_path / "in", stem)
+    try:
+        assert rectify(image, tmp_path / "out").is_file()
+    except InputError as error:
+        helps(error, tmp_path / "out")
+
+
+def test_links_in_circles_end_below_two_stars(tmp_path):
+    folder = tmp_path / "in"
+    copied(folder / "a")
+    (folder / "a" / "up").symlink_to(folder)
+    # Two that lead up: followed to the system's limit of 40 links they would be 2 to the power of 40 paths.
+    (folder / "a" / "again").symlink_to(folder)
+    (folder / "a" / "self").symlink_to("self")
+    (folder / "run.yaml").write_text(
+        "scenes:\n  - images: '**/scene.tif'\noutput: out\ndefaults:\n  surface: {dem: a/dem.tif}\n"
+        "  output: {crs: 'EPSG:32636', resolution: 10}\n"
+    )
+    planned = batch_plan.plan(folder / "run.yaml")
+    assert len(planned.jobs) == 1
+
+
+#: Longitude, latitude, degrees off nadir, heights: each at an edge of what there is.
+EDGES = {
+    "north pole": (40.0, 89.7, 10.0, (0.0, 500.0)),
+    "south pole": (-120.0, -89.7, 10.0, (2500.0, 3300.0)),
+    "antimeridian": (179.999, 10.0, 20.0, (0.0, 500.0)),
+    "60 degrees off nadir": (33.35, 37.25, 60.0, (650.0, 1350.0)),
+    "below the sea": (35.5, 31.5, 20.0, (-450.0, -380.0)),
+}
+
+
+@pytest.mark.parametrize("place", EDGES)
+def test_an_rpc_at_an_edge_is_the_model_or_says_that_it_is_none(tmp_path, place):
+    lon, lat, angle, heights = EDGES[place]
+    camera = LineScanner.over(
+        lon, lat, float(np.mean(heights)), image_width=500, image_height=500, gsd=5.0, off_nadir_deg=angle,
+        heights=heights,
+    )  # fmt: skip
+    image = np.random.default_rng(2).uniform(0, 500, (200, 2))
+    height = np.random.default_rng(3).uniform(*heights, 200)
+    ground = camera.image_to_ground(image, height)
+    # The model itself: there and back.
+    assert np.abs(camera.ground_to_image(ground) - image).max() < 1e-3
+    try:
+        low, high = ground.min(axis=0), ground.max(axis=0)
+        found = fit_rpc(camera, (low[0], low[1], high[0], high[1]), heights)
+    except OrthoError as error:
+        helps(error, tmp_path)
+        return
+    # What it says of itself is what is measured at points of its own; 0.05 px is beside what any control resolves.
+    assert np.abs(found.rpc.ground_to_image(ground) - image).max() <= max(0.05, 1.5 * found.max_error_px)
