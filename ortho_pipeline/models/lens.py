@@ -96,8 +96,13 @@ class Interior:
         """Square of the radius r up to which the distortion is monotonic; beyond it the image would fold over."""
         if not (self.k1 or self.k2 or self.k3):
             return math.inf
-        roots = np.roots([7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
-        real = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real
+        # 1 + 3 k1 u + 5 k2 u^2 + 7 k3 u^3 with u = 1 / (scale v): coefficients of at most 1, and a leading one of 1.
+        terms = (3 * self.k1, 5 * self.k2, 7 * self.k3)
+        scale = max(abs(term) ** (1 / power) for power, term in enumerate(terms, start=1))
+        if not 1e-30 < scale < 1e100:
+            return math.inf if scale < 1 else 0.0
+        roots = np.roots([1.0, *(term / scale**power for power, term in enumerate(terms, start=1))])
+        real = 1 / (scale * roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 1e-30)].real)
         return float(real.min(initial=math.inf))
 
     @property

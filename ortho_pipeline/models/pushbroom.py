@@ -125,6 +125,7 @@ class Pushbroom(SensorModel):
                 axes = left @ right
                 axes.setflags(write=False)
                 object.__setattr__(self, name, axes)
+        object.__setattr__(self, "line_period", float(self.line_period))
         if not (math.isfinite(self.line_period) and self.line_period > 0):
             raise InputError("the line period is positive", field="line_period")
         low, high = (float(value) for value in self.heights)
