@@ -88,6 +88,17 @@ def completed(
         raise
 
 
+@contextlib.contextmanager
+def of_option(name: str) -> Iterator[None]:
+    """Name the option whose value is refused, by what knows of values and not where they come from."""
+    try:
+        yield
+    except OrthoError as error:
+        if error.file is None:
+            error.field = name
+        raise
+
+
 def reads(remedy: str, field: str | None = None) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
     """Decorate a function whose first argument is the file that it reads: its refusals are `completed`."""
 

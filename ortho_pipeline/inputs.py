@@ -18,7 +18,7 @@ import pyproj
 from ortho_pipeline import crop, dem, plugins, raster
 from ortho_pipeline.allowance import startable_threads
 from ortho_pipeline.crs import Vertical, parse_crs
-from ortho_pipeline.errors import InputError, OrthoError, counted
+from ortho_pipeline.errors import InputError, OrthoError, counted, of_option
 from ortho_pipeline.files import sha256, states
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.locations import archive_of, located
@@ -134,7 +134,8 @@ def open_surface(options: SurfaceOptions, scene: SceneOptions = SceneOptions()) 
         return dem.Surface.constant(options.height)
     if options.dem is None:
         raise InputError("there are no heights", field="--dem", remedy="give --dem FILE or --height METRES")
-    vertical = None if options.vertical is None else Vertical.parse(options.vertical)
+    with of_option("--dem-vertical"):
+        vertical = None if options.vertical is None else Vertical.parse(options.vertical)
     return dem.Surface.open(
         options.dem, vertical, override=options.override_vertical, fill=options.fill,
         **scene.access,
@@ -191,8 +192,10 @@ def read_control(scene: Scene, options: PointOptions, opened: SceneOptions = Sce
 
 
 def _given_points(scene: Scene, options: PointOptions, opened: SceneOptions) -> Points:
-    crs = None if options.crs is None else parse_crs(options.crs)
-    vertical = None if options.vertical is None else Vertical.parse(options.vertical)
+    with of_option("--points-crs"):
+        crs = None if options.crs is None else parse_crs(options.crs)
+    with of_option("--points-vertical"):
+        vertical = None if options.vertical is None else Vertical.parse(options.vertical)
     path = point_file(options)
     origin = options.pixel_origin
     if path is None or os.fspath(path) == OWN_POINTS:

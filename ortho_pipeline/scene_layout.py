@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from ortho_pipeline import footprint
 from ortho_pipeline.crs import map_crs
 from ortho_pipeline.dem import Surface
-from ortho_pipeline.errors import completed
+from ortho_pipeline.errors import completed, of_option
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions
@@ -78,7 +78,8 @@ def lay_out(
         lay = footprint.lay(model, surface, *size)
         lay.require_coverage(surface)
         model = lay.fitted(model)
-        crs = map_crs(output.crs) if output.crs else None
+        with of_option("--output-crs"):
+            crs = map_crs(output.crs) if output.crs else None
         grid = footprint.choose_grid(
             model, lay, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
         )
