@@ -307,3 +307,65 @@ def test_roots_open_what_they_hold(tmp_path):
     with pytest.raises(InputError, match=f"--root {tmp_path}"):
         open_dataset(path)
     only(path, 9, roots=[tmp_path])
+
+
+# -- runs with a mosaic ----------------------------------------------------------------------------------------------
+
+RUN = """
+defaults:
+  surface: {dem: dem.tif, vertical: ellipsoid}
+  output: {crs: "EPSG:32734", resolution: 20}
+scenes:
+  - images: raw/*.tif
+mosaic: {format: COG, order: first-on-top}
+"""
+
+
+def plant(image: Path, kind: str, secret: Path, url: str) -> None:
+    """Put a side-car beside an image that leads to a secret and to a server."""
+    if kind == ".aux.xml":
+        Path(f"{image}.aux.xml").write_text(
+            f'<PAMDataset><Metadata domain="overviews"><MDI key="OVERVIEW_FILE">{secret}</MDI></Metadata></PAMDataset>'
+        )
+    elif kind == ".ovr":
+        hostile.wms(Path(f"{image}.ovr"), url)
+    else:
+        hostile.vrt(Path(f"{image}.msk"), hostile.source(str(secret), tag="sourcefilename"))
+
+
+def test_a_run_with_a_mosaic_reads_nothing_outside(trap, tiny, tmp_path):
+    """Hostile files beside scenes, then beside the orthos of an earlier run that the mosaic is made of."""
+    secret = Path(trap.pipes["vrt-absolute"]).parents[2] / "secret.tif"
+    raw = tmp_path / "raw"
+    raw.mkdir()
+    (tmp_path / "dem.tif").write_bytes(tiny.dem.read_bytes())
+    (tmp_path / "p.yaml").write_text(RUN)
+    kinds = (".msk", ".ovr", ".aux.xml")
+    for name in "abc":
+        (raw / f"{name}.tif").write_bytes(tiny.image.read_bytes())
+
+    def run(*more: str) -> tuple[int, str]:
+        done = CliRunner().invoke(cli, ["run", str(tmp_path / "p.yaml"), "--executor", "sequential", *more])
+        return done.exit_code, done.output
+
+    assert run()[0] == 0
+    mosaic = tmp_path / "out" / "mosaic.tif"
+    honest = open_dataset(mosaic).ReadAsArray()
+    for name, kind in zip("abc", kinds, strict=True):
+        ortho = tmp_path / "out" / name / f"{name}_ortho.tif"
+        plant(ortho, kind, secret, trap.url)
+        mosaic.unlink(missing_ok=True)
+        code, said = run()
+        assert code == 3, said
+        assert ortho.name in said
+        assert "Remedy" in said
+        assert not mosaic.exists()
+        Path(f"{ortho}{kind}").unlink(missing_ok=True)
+    assert run()[0] == 0
+    np.testing.assert_array_equal(open_dataset(mosaic).ReadAsArray(), honest)
+    for name, kind in zip("ab", kinds, strict=False):
+        plant(raw / f"{name}.tif", kind, secret, trap.url)
+    code, said = run()
+    assert code == 3, said
+    assert not trap.asked
+    assert not trap.readers
