@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from ortho_pipeline import inputs, plugins
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.files import states, together, whole_or_nothing, write_text
 from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.locations import archive_of, located, place
 from ortho_pipeline.model_file import SavedModel, write_model_file
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.registration import Registration
@@ -55,8 +55,8 @@ def register(
     InputError
         If an image is given twice or cannot be read, the sizes or types differ, or nothing matches.
     """
-    paths = [Path(image) for image in images]
-    chosen = paths[0] if reference is None else Path(reference)
+    paths = [place(located(image, allow_network=scene.allow_network)) for image in images]
+    chosen = paths[0] if reference is None else place(located(reference, allow_network=scene.allow_network))
     names = [path.stem for path in paths]
     if chosen not in paths or len(set(names)) != len(names):
         wrong = "the reference is not among the images" if chosen not in paths else "two images have one name"
@@ -69,7 +69,7 @@ def register(
     elif opened.models:
         files["model"] = Path(folder) / f"{chosen.stem}_bands_model.json"
     for path in files.values():
-        if path.resolve() in {one.resolve() for one in (*paths, Path(opened.model_source))}:
+        if path.resolve() in {one.resolve() for one in (*paths, place(opened.model_source))}:
             raise InputError(
                 "this path would be read and written", file=path, field="-o", remedy="choose another folder"
             )
@@ -77,14 +77,16 @@ def register(
     with together(folder, files["image"].stem):
         if beside is not None:
             with whole_or_nothing(beside, side_cars=False) as temporary:
-                shutil.copyfile(opened.model_source, temporary)
+                Path(temporary).write_bytes(place(opened.model_source).read_bytes())
         done = stack_bands(
             dict(zip(names, paths, strict=True)), files["image"], reference=chosen.stem, transform=transform
         )
         if "model" in files:
             size = opened.width, opened.height
             write_model_file(SavedModel(opened.model, opened.sensor, opened.model_source, size), files["model"])
-        document = _document(opened, chosen, names, done, inputs.hashed(dict.fromkeys(paths, "band")))
+        # Bands in an archive are those of the archive.
+        read = {archive_of(str(path)) or Path(path): "band" for path in paths}
+        document = _document(opened, chosen, names, done, inputs.hashed(read))
         write_text(files["table"], json.dumps(document, indent=1, allow_nan=False) + "\n")
         inputs.refuse_changed(begun)
     return Result(files, document, _text(chosen, done))
@@ -92,7 +94,7 @@ def register(
 
 def _metadata_beside(scene: Scene, image: Path) -> Path | None:
     sensor = plugins.Host.discover().sensors.get(scene.sensor)
-    if sensor is None or sensor.metadata_beside is None or not Path(scene.model_source).is_file():
+    if sensor is None or sensor.metadata_beside is None or not place(scene.model_source).is_file():
         return None
     return sensor.metadata_beside(str(image))
 

@@ -57,10 +57,12 @@ class Ellipse:
     """An ellipse in an image; lengths in pixels, `centre` (column, row) from the outer corner of the first pixel.
 
     `covariance` (2, 2) is that of the centre, from how the edges scatter about the ellipse: pixels that were resampled
-    before make it too small by what they share. `axes` are the half-axes, the longer first, and `angle_deg` turns from
-    the direction of the columns to the longer one, towards growing rows, within -90 to 90. `seen` is the share of the
-    circumference that shows the edge, in `edges` places which scatter by `scatter` about the ellipse. `contrast` is the
-    brightness inside minus that outside, and `psf_sigma` the Gaussian blur of the edge beside the pixel's aperture.
+    before make it too small by what they share. So does an image of a small circle with hardly any noise: for half-axes
+    of 8 and 7 px the error is 1.1 sigma with noise of 5 % of the contrast (error 0.03 px), 1.4 with 0.6 % (0.005 px)
+    and 1.5 with 0.1 % (0.003 px; forty centres each). `axes` are the half-axes, the longer first, and `angle_deg` turns
+    from the direction of the columns to the longer one, towards growing rows, within -90 to 90. `seen` is the share of
+    the circumference that shows the edge, in `edges` places which scatter by `scatter` about the ellipse. `contrast` is
+    the brightness inside minus that outside, `psf_sigma` the Gaussian blur of the edge beside the pixel's aperture.
     """
 
     centre: Array

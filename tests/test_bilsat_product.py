@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -321,3 +322,20 @@ def test_bands_that_do_not_match_leave_nothing(cameras, tmp_path):
         bands.register([cameras["image"], noise], tmp_path / "out", reference=cameras["image_nir"])
     with pytest.raises(InputError, match="one name"):
         bands.register([cameras["image"], cameras["image"]], tmp_path / "out")
+
+
+def test_bands_in_an_archive_are_registered_as_those_on_disk(cameras, tmp_path):
+    order = [cameras[name] for name in ("image_blue", "image")]
+    with zipfile.ZipFile(tmp_path / "xs.zip", "w") as made:
+        for path in cameras["image"].parent.iterdir():
+            made.write(path, path.name)
+    inside = [f"/vsizip/{tmp_path / 'xs.zip'}/{path.name}" for path in order]
+    disk = bands.register(order, tmp_path / "disk", reference=order[1])
+    zipped = bands.register(inside, tmp_path / "zipped", reference=inside[1])
+    pixels = [gdal.Open(str(made.files["image"])).ReadAsArray() for made in (disk, zipped)]
+    np.testing.assert_array_equal(*pixels)
+    assert [disk.document[key] for key in ("sensor", "bands", "registrations")] == [
+        zipped.document[key] for key in ("sensor", "bands", "registrations")
+    ]
+    assert open_scene(zipped.files["image"]).sensor == "bilsat"
+    assert {entry["path"] for entry in zipped.document["inputs"]} == {str(tmp_path / "xs.zip")}

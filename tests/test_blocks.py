@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -439,3 +440,20 @@ def test_a_file_of_one_image_is_no_block(tmp_path: Path) -> None:
     }  # fmt: skip
     with pytest.raises(InputError, match="in which image"):
         read(tmp_path, json.dumps({"type": "FeatureCollection", "features": [feature]}), "a.geojson")
+
+
+def test_images_in_an_archive_are_adjusted_and_intersected_as_those_on_disk(stereo: Stereo, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "pair.zip", "w") as made:
+        for name in stereo.rpcs:
+            made.write(stereo.image(name), f"{name}/BAND.tif")
+    inside = [f"/vsizip/{tmp_path / 'pair.zip'}/{name}/BAND.tif" for name in stereo.rpcs]
+    points = stereo.write()
+    for command in ("adjust", "intersect"):
+        found = []
+        for label, images in (("disk", stereo.images), ("zip", inside)):
+            out = tmp_path / f"{command}-{label}"
+            target = out if command == "adjust" else out / "points.geojson"
+            found.append(json.loads(run(command, *images, "--points", points, "-o", target, "--json")))
+        one, other = (document["report"]["adjustment"]["images"] if command == "adjust" else document["points"]
+                      for document in found)  # fmt: skip
+        assert one == other
