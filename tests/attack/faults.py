@@ -189,9 +189,11 @@ def _command(words: Sequence[str], folder: Path, writer: int, prepare: Callable[
         os.dup2(writer, 1)
         os.dup2(writer, 2)
         os.close(writer)
-        # A shell lets what it starts in the background ignore these, and nohup the second.
+        # A shell lets what it starts in the background ignore some of these, and nohup others.
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        for number in (signal.SIGHUP, signal.SIGTERM, signal.SIGQUIT):
+            signal.signal(number, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_SETMASK, [])
         sys.argv = ["ortho", *words]
         if prepare is not None:
             prepare()
