@@ -27,12 +27,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import pyproj
 
-from ortho_pipeline.adjustment import adjust
-from ortho_pipeline.block_points import BlockPoints
+from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.models import RPC, ImageCorrection
-from ortho_pipeline.models.pushbroom_start import pushbroom_of_metadata
-from ortho_pipeline.rpc import export_rpc
-from ortho_pipeline.simulate import LineScanner
+from ortho_pipeline.models.pushbroom.start import pushbroom_of_metadata
+from ortho_pipeline.simulation.scanner import LineScanner
 
 SIDE, GSD, PIXELS = 10, 2.5, 4800
 #: Distance (degrees) of the middles of images; each covers 12 km, so a point is in about six of them.

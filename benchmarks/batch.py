@@ -28,9 +28,10 @@ from typing import Any
 
 from osgeo import gdal
 
-from ortho_pipeline import batch, pipeline
+from ortho_pipeline import commands
+from ortho_pipeline.batch import runner as batch
+from ortho_pipeline.exchange.rpc import rpc_metadata, rpc_of_dataset
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
-from ortho_pipeline.rpc import rpc_metadata, rpc_of_dataset
 
 SAMPLE = Path(__file__).resolve().parent.parent / "sample_data"
 SIDE = 400
@@ -64,7 +65,7 @@ def make_scenes(folder: Path, count: int) -> None:
 def loop(folder: Path) -> None:
     """Rectify all scenes one after the other, with nothing around it."""
     for image in sorted((folder / "raw").glob("*.tif")):
-        pipeline.rectify(
+        commands.rectify(
             image, folder / "out" / image.stem, surface=SurfaceOptions(dem=folder / "dem.tif"), output=OutputOptions()
         )
 

@@ -33,13 +33,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import pyproj
 
-from ortho_pipeline.adjustment import BlockFit, adjust
-from ortho_pipeline.block_points import BlockPoints
+from ortho_pipeline.block.adjustment import BlockFit, adjust
+from ortho_pipeline.block.local_frame import GroundFrame
+from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.errors import DegeneratePoints
-from ortho_pipeline.ground_frame import GroundFrame
+from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.models import RPC, ImageCorrection
-from ortho_pipeline.rpc import export_rpc
-from ortho_pipeline.simulate import LineScanner
+from ortho_pipeline.simulation.scanner import LineScanner
 
 LON, LAT, PIXELS = 33.35, 37.25, 4000
 ERRORS, CONTROL = (0.0, 0.2, 0.5, 1.0), (4, 6, 9, 20)

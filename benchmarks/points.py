@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from warp import Job
 
-from ortho_pipeline.dem import Surface
-from ortho_pipeline.rays import intersect
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.rays import intersect
 
 POINTS = 2_000_000
 ROUNDS = 5

@@ -23,11 +23,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from test_compare import MAPS, SENSORS, scene_of
 
-from ortho_pipeline.comparison import _choose, _doubts, _tests, available_models, compare, own_name
-from ortho_pipeline.control_hull import empty_parts
-from ortho_pipeline.crs import ground_transform
+from ortho_pipeline.estimation.comparison import _choose, _doubts, _tests, available_models, compare, own_name
+from ortho_pipeline.estimation.statistics import student_of
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.points import Points
-from ortho_pipeline.statistics import student_of
+from ortho_pipeline.points.control_hull import empty_parts
 
 LAYOUTS = ("even", "clusters", "strip", "corner", "flat")
 COUNTS = (16, 24, 40, 60)

@@ -29,12 +29,12 @@ import numpy as np
 import pyproj
 from osgeo import gdal, osr
 
-from ortho_pipeline.dem import Surface
+from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.models import RPC, SensorModel
 from ortho_pipeline.models.rpc_box import RPC_TERMS
-from ortho_pipeline.raster import Grid, RasterSource
-from ortho_pipeline.rpc import rpc_metadata
-from ortho_pipeline.warp import rectify
+from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.warp.engine import rectify
 
 gdal.UseExceptions()
 
@@ -165,10 +165,10 @@ def ours(job: Job, out: Path, kernel: str = "bilinear", *extra: str) -> list[str
 
 API = """
 import sys, pyproj
-from ortho_pipeline.dem import Surface
-from ortho_pipeline.raster import Grid, RasterSource, open_dataset
-from ortho_pipeline.rpc import rpc_of_dataset
-from ortho_pipeline.warp import rectify
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
+from ortho_pipeline.exchange.rpc import rpc_of_dataset
+from ortho_pipeline.warp.engine import rectify
 image, dem, out, step, *extent = sys.argv[1:]
 grid = Grid.of_extent(pyproj.CRS("EPSG:32735"), [float(value) for value in extent], (float(step), float(step)))
 model = rpc_of_dataset(open_dataset(image))[0]
@@ -300,10 +300,10 @@ def alone(job: Job, model: SensorModel | None = None, kernel: str = "bilinear") 
 WARP_CPU = """
 import sys, time, pyproj
 from pathlib import Path
-from ortho_pipeline.dem import Surface
-from ortho_pipeline.raster import Grid, RasterSource, open_dataset
-from ortho_pipeline.rpc import rpc_of_dataset
-from ortho_pipeline.warp import rectify
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
+from ortho_pipeline.exchange.rpc import rpc_of_dataset
+from ortho_pipeline.warp.engine import rectify
 image, dem, out, step, *extent = sys.argv[1:]
 grid = Grid.of_extent(pyproj.CRS("EPSG:32735"), [float(value) for value in extent], (float(step), float(step)))
 model = rpc_of_dataset(open_dataset(image))[0]

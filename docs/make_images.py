@@ -10,7 +10,7 @@ import matplotlib
 import numpy as np
 from osgeo import gdal
 
-from ortho_pipeline import pipeline
+from ortho_pipeline import commands
 from ortho_pipeline.options import PointOptions, SurfaceOptions
 
 matplotlib.use("Agg")
@@ -29,8 +29,8 @@ def main() -> None:
     image, points = SAMPLE / "scene.tif", PointOptions(gcps=SAMPLE / "gcps.geojson")
     with tempfile.TemporaryDirectory() as folder:
         surface = SurfaceOptions(dem=SAMPLE / "dem.tif")
-        result = pipeline.rectify(image, folder, points=points, surface=surface)
-        fit = json.loads(json.dumps(pipeline.fit(image, points, surface=surface).to_json()))
+        result = commands.rectify(image, folder, points=points, surface=surface)
+        fit = json.loads(json.dumps(commands.fit(image, points, surface=surface).to_json()))
         ortho = gdal.Open(str(result.files["ortho"]))
         pixels = ortho.ReadAsArray().astype(float)
         pixels[ortho.GetRasterBand(1).GetMaskBand().ReadAsArray() == 0] = np.nan

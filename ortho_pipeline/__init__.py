@@ -1,66 +1,146 @@
 """Orthorectification of satellite imagery on GDAL: sensor plugins, honest adjustment, fast exact warping.
 
 The names below are the public interface; each is loaded when it is first used, so importing the package is light.
+`docs/architecture.md` shows the rooms.
 """
 
 from __future__ import annotations
 
 import importlib
-from typing import Any
+import sys
+import warnings
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ortho_pipeline.block.adjustment import adjust as adjust
+    from ortho_pipeline.block.intersection import intersect as intersect
+    from ortho_pipeline.block.points import BlockPoints as BlockPoints
+    from ortho_pipeline.block.points import read_block_points as read_block_points
+    from ortho_pipeline.commands import rectify as rectify
+    from ortho_pipeline.errors import OrthoError as OrthoError
+    from ortho_pipeline.estimation.comparison import compare as compare
+    from ortho_pipeline.estimation.fit import Fit as Fit
+    from ortho_pipeline.estimation.fit import fit as fit
+    from ortho_pipeline.estimation.problem import Prior as Prior
+    from ortho_pipeline.exchange.model_file import load_model as load_model
+    from ortho_pipeline.exchange.model_file import save_model as save_model
+    from ortho_pipeline.exchange.rpc import export_rpc as export_rpc
+    from ortho_pipeline.exchange.rpc import read_rpc as read_rpc
+    from ortho_pipeline.exchange.rpc import write_rpc_txt as write_rpc_txt
+    from ortho_pipeline.geodesy.crs import Vertical as Vertical
+    from ortho_pipeline.hookspecs import Scene as Scene
+    from ortho_pipeline.hookspecs import Sensor as Sensor
+    from ortho_pipeline.hookspecs import hookimpl as hookimpl
+    from ortho_pipeline.imaging.ellipse import Ellipse as Ellipse
+    from ortho_pipeline.imaging.ellipse import fit_ellipse as fit_ellipse
+    from ortho_pipeline.models import RPC as RPC
+    from ortho_pipeline.models import ImageCorrection as ImageCorrection
+    from ortho_pipeline.models import SensorModel as SensorModel
+    from ortho_pipeline.options import OutputOptions as OutputOptions
+    from ortho_pipeline.options import PointOptions as PointOptions
+    from ortho_pipeline.options import SceneOptions as SceneOptions
+    from ortho_pipeline.options import SurfaceOptions as SurfaceOptions
+    from ortho_pipeline.plugins import open_scene as open_scene
+    from ortho_pipeline.points import Points as Points
+    from ortho_pipeline.points import read_points as read_points
+    from ortho_pipeline.points import write_points as write_points
+    from ortho_pipeline.raster.source import Grid as Grid
+    from ortho_pipeline.raster.source import RasterSource as RasterSource
+    from ortho_pipeline.surface.dem import Surface as Surface
+
+__version__: str
 
 #: Public name -> module that holds it.
 _HOMES = {
-    "BlockPoints": "block_points",
-    "Ellipse": "ellipse",
-    "Fit": "estimation",
-    "Grid": "raster",
+    "BlockPoints": "block.points",
+    "Ellipse": "imaging.ellipse",
+    "Fit": "estimation.fit",
+    "Grid": "raster.source",
     "ImageCorrection": "models",
     "OrthoError": "errors",
     "OutputOptions": "options",
     "PointOptions": "options",
     "Points": "points",
-    "Prior": "problem",
+    "Prior": "estimation.problem",
     "RPC": "models",
-    "RasterSource": "raster",
+    "RasterSource": "raster.source",
     "Scene": "hookspecs",
     "SceneOptions": "options",
     "Sensor": "hookspecs",
     "SensorModel": "models",
-    "Surface": "dem",
+    "Surface": "surface.dem",
     "SurfaceOptions": "options",
-    "Vertical": "crs",
-    "adjust": "adjustment",
-    "compare": "comparison",
-    "export_rpc": "rpc",
-    "fit": "estimation",
-    "fit_ellipse": "ellipse",
+    "Vertical": "geodesy.crs",
+    "adjust": "block.adjustment",
+    "compare": "estimation.comparison",
+    "export_rpc": "exchange.rpc",
+    "fit": "estimation.fit",
+    "fit_ellipse": "imaging.ellipse",
     "hookimpl": "hookspecs",
-    "load_model": "model_file",
-    "intersect": "intersection",
+    "intersect": "block.intersection",
+    "load_model": "exchange.model_file",
     "open_scene": "plugins",
-    "read_block_points": "block_points",
+    "read_block_points": "block.points",
     "read_points": "points",
-    "read_rpc": "rpc",
-    "rectify": "pipeline",
-    "save_model": "model_file",
+    "read_rpc": "exchange.rpc",
+    "rectify": "commands",
+    "save_model": "exchange.model_file",
     "write_points": "points",
-    "write_rpc_txt": "rpc",
+    "write_rpc_txt": "exchange.rpc",
 }
 
 __all__ = sorted(_HOMES)  # noqa: PLE0605
 
+#: Modules that plugins and scripts imported before there were rooms -> where they are now.
+_MOVED = {
+    "bands": "commands.bands",
+    "crs": "geodesy.crs",
+    "dem": "surface.dem",
+    "geometry": "geodesy.ellipsoid",
+    "locations": "files.locations",
+    "pipeline": "commands",
+    "problem": "estimation.problem",
+    "rpc": "exchange.rpc",
+}
 
-def __getattr__(name: str) -> Any:
-    if name == "__version__":
-        from importlib.metadata import version
+if not TYPE_CHECKING:  # a checker knows the names from above, and no others
 
-        return version("ortho-pipeline")
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
+    def __getattr__(name: str) -> Any:
+        if name == "__version__":
+            from importlib.metadata import version
+
+            return version("ortho-pipeline")
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:
     return [*__all__, "__version__"]
+
+
+class _Moved(MetaPathFinder, Loader):
+    """Find a module under the name that it had before."""
+
+    def find_spec(self, fullname: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        package, _, name = fullname.rpartition(".")
+        return ModuleSpec(fullname, self) if package == __name__ and name in _MOVED else None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        now = f"{__name__}.{_MOVED[spec.name.rpartition('.')[2]]}"
+        warnings.warn(f"{spec.name} is {now} now", DeprecationWarning, stacklevel=2)
+        # The import system writes into the module it gets; the real one must keep its own name.
+        module = ModuleType(spec.name, importlib.import_module(now).__doc__)
+        module.__dict__.update({k: v for k, v in vars(sys.modules[now]).items() if not k.startswith("__")})
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Do nothing: it is filled already."""
+
+
+sys.meta_path.append(_Moved())

@@ -1,5 +1,5 @@
 """``python -m ortho_pipeline`` is `ortho`."""
 
-from ortho_pipeline.cli import main
+from ortho_pipeline.cli.program import main
 
 main()

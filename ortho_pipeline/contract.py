@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.crs import parse_crs
 from ortho_pipeline.errors import OrthoError, counted
-from ortho_pipeline.geometry import units_per_metre
+from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.geodesy.ellipsoid import units_per_metre
 from ortho_pipeline.hookspecs import Piece, Scene, Sensor
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.problem import Prior
 
 #: No image has smaller pixels (m), and no scene is narrower: its ground is in other units than its CRS.
 SMALLEST_PIXEL, NARROWEST = 1e-3, 1.0

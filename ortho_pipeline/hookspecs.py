@@ -5,7 +5,7 @@ A plugin is a module that is named in the entry-point group ``ortho_pipeline`` o
 into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole of a plugin::
 
     from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-    from ortho_pipeline.rpc import rpc_of_dataset
+    from ortho_pipeline.exchange.rpc import rpc_of_dataset
 
     @hookimpl
     def ortho_sensors():
@@ -19,8 +19,8 @@ into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole
         return Scene("tinysat", dataset.GetDescription(), dataset.RasterXSize, dataset.RasterYSize, {"rpc": rpc},
                      source, facts={"band": int(band)})
 
-Files beside an image are found from ``ortho_pipeline.locations.place(dataset.GetDescription())``, which has the methods
-of `pathlib.Path` for an image on disk and for one in an archive (docs/plugins.md).
+Files beside an image are found from ``ortho_pipeline.files.locations.place(dataset.GetDescription())``, which has the
+methods of `pathlib.Path` for an image on disk and for one in an archive (docs/plugins.md).
 
 The host tries every scene at a few points before it works with it (`ortho_pipeline.contract`). Test more with
 `ortho_pipeline.testing.check_sensor`.
@@ -36,9 +36,9 @@ from typing import Any
 
 import pluggy
 
-from ortho_pipeline.locations import place
+from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.files.locations import place
 from ortho_pipeline.models.base import SensorModel
-from ortho_pipeline.problem import Prior
 
 PROJECT_NAME = "ortho_pipeline"
 hookspec = pluggy.HookspecMarker(PROJECT_NAME)

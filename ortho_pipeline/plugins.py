@@ -23,11 +23,11 @@ import pluggy
 
 from ortho_pipeline import hookspecs
 from ortho_pipeline.contract import described, scene_faults, sensor_faults
-from ortho_pipeline.crop import placed
 from ortho_pipeline.errors import InputError, OrthoError, PluginError, Terminated, completed
+from ortho_pipeline.exchange.crop import placed
 from ortho_pipeline.hookspecs import PROJECT_NAME, Scene, Sensor
 from ortho_pipeline.models import KINDS, SensorModel
-from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.raster.source import open_dataset
 
 BUNDLED = "ortho-pipeline"
 HOOKS = ("ortho_sensors", "ortho_models")

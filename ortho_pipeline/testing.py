@@ -91,7 +91,7 @@ def check_sensor(sensor: Sensor, path: str | PathLike[str], **options: Any) -> S
     AssertionError
     """
     # Here, because models and estimation are tested without GDAL.
-    from ortho_pipeline.raster import open_dataset
+    from ortho_pipeline.raster.source import open_dataset
 
     _assert_none(sensor_faults(sensor))
     assert sensor.name == sensor.name.lower().strip(), f"{sensor.name!r}: names are in lower case, without blanks"
@@ -128,7 +128,7 @@ def _assert_none(faults: Iterator[str]) -> None:
 
 def _check_foreign(sensor: Sensor) -> None:
     """Check that a sensor leaves datasets alone that nobody can take for its own."""
-    from ortho_pipeline.raster import gdal
+    from ortho_pipeline.raster.source import gdal
 
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder, "foreign.tif"))

@@ -23,14 +23,14 @@ from ortho_ikonos.simulation import write_product as write_ikonos
 from ortho_orbview3.simulation import write_product as write_orbview3
 from osgeo import gdal
 
-from ortho_pipeline.crs import Vertical
-from ortho_pipeline.dem import write_dem as write_dem_file
+from ortho_pipeline.exchange.rpc import RpcExport, fit_rpc, write_rpc_txt
 from ortho_pipeline.files import whole_or_nothing, write_text
-from ortho_pipeline.landscape import Landscape, Terrain
+from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.points import Points, write_points
-from ortho_pipeline.rpc import RpcExport, fit_rpc, write_rpc_txt
-from ortho_pipeline.simulate import LineScanner, SimulatedPoints, render, simulate_points
+from ortho_pipeline.simulation.scanner import LineScanner, SimulatedPoints, render, simulate_points
+from ortho_pipeline.simulation.terrain import Landscape, Terrain
+from ortho_pipeline.surface.dem import write_dem as write_dem_file
 
 gdal.UseExceptions()
 

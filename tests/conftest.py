@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from osgeo import gdal, osr
 
+from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.models import RPC
-from ortho_pipeline.rpc import rpc_metadata
 
 ROOT = Path(__file__).resolve().parent.parent
 REAL = ROOT.parent / "shared" / "data"

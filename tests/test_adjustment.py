@@ -7,26 +7,26 @@ from dataclasses import replace
 import numpy as np
 import pyproj
 import pytest
+from ortho_cartosat.truth import StereoPair
 
-from ortho_pipeline import block_solver
-from ortho_pipeline.adjustment import BlockFit, adjust
-from ortho_pipeline.block_points import BlockPoints
-from ortho_pipeline.block_steps import Steps
-from ortho_pipeline.crs import ground_transform
+from ortho_pipeline.block import solver as block_solver
+from ortho_pipeline.block.adjustment import BlockFit, adjust
+from ortho_pipeline.block.intersection import intersect
+from ortho_pipeline.block.local_frame import GroundFrame
+from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.block.steps import Steps
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
-from ortho_pipeline.estimation import fit
-from ortho_pipeline.experiments.cartosat_scene import StereoPair
-from ortho_pipeline.geometry import geocentric
-from ortho_pipeline.ground_frame import GroundFrame
-from ortho_pipeline.intersection import intersect
+from ortho_pipeline.estimation.fit import fit
+from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.exchange.rpc import export_rpc
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.ellipsoid import geocentric
 from ortho_pipeline.models import RPC, FrameCamera, ImageCorrection, SensorModel, start_model
 from ortho_pipeline.models.base import Constraints
 from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.models.pushbroom_start import pushbroom_of_metadata
-from ortho_pipeline.problem import Prior
-from ortho_pipeline.rpc import export_rpc
-from ortho_pipeline.selection import select_control
-from ortho_pipeline.simulate import LineScanner
+from ortho_pipeline.models.pushbroom.start import pushbroom_of_metadata
+from ortho_pipeline.points.selection import select_control
+from ortho_pipeline.simulation.scanner import LineScanner
 
 LON, LAT = 33.35, 37.25
 SIZE = 4000

@@ -11,13 +11,13 @@ import pyproj
 import pytest
 from osgeo import gdal
 
-from ortho_pipeline.adjustment import adjust
-from ortho_pipeline.block_points import BlockPoints
-from ortho_pipeline.crs import ground_transform
+from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.intersection import intersect
+from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.errors import DegeneratePoints
-from ortho_pipeline.intersection import intersect
+from ortho_pipeline.exchange.rpc import read_rpc, rpc_of_dataset
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models import RPC, ImageCorrection
-from ortho_pipeline.rpc import read_rpc, rpc_of_dataset
 
 pytestmark = pytest.mark.realdata
 #: Half of the windows that are compared, and how far a match may lie from where the RPCs put it (px).

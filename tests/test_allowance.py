@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from ortho_pipeline.allowance import require_memory, startable_threads
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.files.allowance import require_memory, startable_threads
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data"
 EXTENT = ("530600", "4122000", "530800", "4122200")

@@ -13,12 +13,12 @@ import pytest
 from click.testing import CliRunner, Result
 from osgeo import gdal
 
-from ortho_pipeline import pipeline
-from ortho_pipeline.cli import cli
+from ortho_pipeline import commands
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded, sha256
-from ortho_pipeline.inputs import open_scene
-from ortho_pipeline.locations import MAX_READ, VsiPath
+from ortho_pipeline.files.locations import MAX_READ, VsiPath
 from ortho_pipeline.models import model_from_dict
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.plugins import Host
@@ -92,7 +92,7 @@ def test_bands_and_points_of_other_bands_in_an_archive(sample, tmp_path):
     points.write_text("\n".join([*lines[:start], *rows]) + "\n")
     control = PointOptions(gcps=points)
     on_disk, inside_too = (
-        pipeline.fit(f"{place}/po_39001_red_0000000.tif", points=control).to_json() for place in (folder, inside)
+        commands.fit(f"{place}/po_39001_red_0000000.tif", points=control).to_json() for place in (folder, inside)
     )
     assert inside_too["rmse"] == on_disk["rmse"]
     assert inside_too["rmse"]["control"]["n"] == 20
@@ -102,7 +102,7 @@ def test_the_ortho_from_an_archive_is_that_from_disk(sample, tmp_path):
     folder = sample / "ikonos"
     inside = zipped(folder, tmp_path / "order.zip")
     made = {
-        place: pipeline.rectify(
+        place: commands.rectify(
             f"{place}/po_39001_red_0000000.tif", tmp_path / str(number),
             scene=SceneOptions(sensor_options={"bands": "red,nir"}),
             surface=SurfaceOptions(dem=f"{place}/dem.tif"),
@@ -129,7 +129,7 @@ def test_the_ortho_from_an_archive_is_that_from_disk(sample, tmp_path):
     ],
 )  # fmt: skip
 def test_the_record_names_all_metadata_that_were_read(sample, sensor, beside):
-    from ortho_pipeline.inputs import files_read
+    from ortho_pipeline.commands.inputs import files_read
 
     image = sample / sensor / PRODUCTS[sensor]
     read = {path.name for path in files_read(image, opened=open_scene(image))}
@@ -287,7 +287,7 @@ def test_an_rpc_beside_the_target_of_a_link(sample, tmp_path):
     (tmp_path / "links").mkdir()
     link = tmp_path / "links" / "image.tif"
     link.symlink_to(tmp_path / "image.tif")
-    result = pipeline.rectify(link, tmp_path / "out", surface=SurfaceOptions(height=0.0),
+    result = commands.rectify(link, tmp_path / "out", surface=SurfaceOptions(height=0.0),
                               output=OutputOptions(resolution=(20.0, 20.0)))  # fmt: skip
     inputs = result.document["report"]["provenance"]["inputs"]
     assert {Path(one["path"]).name for one in inputs} == {"image.tif", "image_RPC.TXT"}

@@ -20,13 +20,15 @@ import pytest
 from click.testing import CliRunner, Result
 from osgeo import gdal
 
-from ortho_pipeline import batch, batch_config, batch_plan
-from ortho_pipeline.batch_manifest import Record, locked
-from ortho_pipeline.cli import cli
+from ortho_pipeline.batch import config as batch_config
+from ortho_pipeline.batch import plan as batch_plan
+from ortho_pipeline.batch import runner as batch
+from ortho_pipeline.batch.executors import Processes, WorkerDied, completed
+from ortho_pipeline.batch.records import Record, locked
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.executors import Processes, WorkerDied, completed
+from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.rpc import rpc_metadata
 
 ROOT = Path(__file__).resolve().parent.parent
 FILE = """
@@ -490,7 +492,7 @@ def test_what_an_earlier_run_wrote_is_removed_also_after_a_crash(block, monkeypa
     block.run(only=["s0"])
     block.write()
     with monkeypatch.context() as patched:
-        patched.setattr(batch.pipeline, "rectify", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+        patched.setattr(batch.commands, "rectify", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             block.run(only=["s0"])
     assert batch.list_scenes(block.file)[0]["state"] == "started"
@@ -499,14 +501,14 @@ def test_what_an_earlier_run_wrote_is_removed_also_after_a_crash(block, monkeypa
 
 
 def test_an_input_that_changes_meanwhile_is_no_success(block, monkeypatch):
-    rectify = batch.pipeline.rectify
+    rectify = batch.commands.rectify
 
     def slow(*given: Any, **options: Any) -> Any:
         result = rectify(*given, **options)
         block.scene("raw/s0.tif", 33)
         return result
 
-    monkeypatch.setattr(batch.pipeline, "rectify", slow)
+    monkeypatch.setattr(batch.commands, "rectify", slow)
     outcome = batch.run(block.file, executor="sequential", only=["s0"]).scenes[0]
     assert outcome.error["message"] == "this file changed while the scene was made"
     monkeypatch.undo()
@@ -564,7 +566,7 @@ def test_an_unexpected_error_keeps_its_trace(block, monkeypatch):
     def burst(*_: Any, **__: Any) -> None:
         raise ZeroDivisionError("of all things")
 
-    monkeypatch.setattr(batch.pipeline, "rectify", burst)
+    monkeypatch.setattr(batch.commands, "rectify", burst)
     result = batch.run(block.file, executor="sequential", only=["s0"])
     assert result.scenes[0].error["message"] == "of all things"
     assert "ZeroDivisionError" in result.scenes[0].error["trace"]

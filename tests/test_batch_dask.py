@@ -18,10 +18,10 @@ import pytest
 from click.testing import CliRunner
 from osgeo import gdal
 
-from ortho_pipeline import batch
-from ortho_pipeline.cli import cli
+from ortho_pipeline.batch import runner as batch
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.rpc import rpc_metadata
+from ortho_pipeline.exchange.rpc import rpc_metadata
 
 distributed = pytest.importorskip("distributed")
 

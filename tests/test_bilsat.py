@@ -9,13 +9,9 @@ import numpy as np
 import ortho_bilsat
 import ortho_frame
 import pytest
+from ortho_bilsat.experiment import ROWS, error_vectors, naive, reproduce
 from ortho_bilsat.survey import Survey, read_survey, write_survey
-from osgeo import gdal
-
-from ortho_pipeline.errors import InputError, TooFewPoints
-from ortho_pipeline.estimation import fit
-from ortho_pipeline.experiments.bilsat import ROWS, error_vectors, naive, reproduce
-from ortho_pipeline.experiments.bilsat_scene import (
+from ortho_bilsat.truth import (
     FOCAL_LENGTH,
     MAP_CRS,
     PITCH,
@@ -26,15 +22,19 @@ from ortho_pipeline.experiments.bilsat_scene import (
     Snapshot,
     render,
 )
-from ortho_pipeline.experiments.tables import is_within
-from ortho_pipeline.geometry import geocentric, geodetic
-from ortho_pipeline.models.frame import FrameCamera
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError, TooFewPoints
+from ortho_pipeline.estimation.fit import fit
+from ortho_pipeline.exchange.rpc import export_rpc
+from ortho_pipeline.geodesy.ellipsoid import geocentric, geodetic
+from ortho_pipeline.imaging.band_stack import stack_bands
+from ortho_pipeline.imaging.registration import TRANSFORMS, Transform, register
+from ortho_pipeline.models.frame.camera import FrameCamera
+from ortho_pipeline.models.frame.resection import resect
 from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.models.resection import resect
 from ortho_pipeline.plugins import open_scene
-from ortho_pipeline.registration import TRANSFORMS, Transform, register
-from ortho_pipeline.rpc import export_rpc
-from ortho_pipeline.stack import stack_bands
+from ortho_pipeline.simulation.tables import is_within
 from ortho_pipeline.testing import check_sensor
 
 XS = Interior(SIZE, SIZE, FOCAL_LENGTH, PITCH, PITCH)

@@ -10,30 +10,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ortho_bilsat.experiment import ROWS, reproduce
+from ortho_bilsat.page import page
 from ortho_bilsat.simulation import write_product
 from ortho_bilsat.survey import read_survey
+from ortho_bilsat.truth import FOCAL_LENGTH, PITCH, SIZE
 from osgeo import gdal
 
-from ortho_pipeline import bands, pipeline
-from ortho_pipeline.cli import cli
-from ortho_pipeline.crs import parse_crs
-from ortho_pipeline.dem import Surface
+from ortho_pipeline import commands
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands import bands
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation import fit
-from ortho_pipeline.experiments.bilsat import ROWS, reproduce
-from ortho_pipeline.experiments.bilsat_page import page
-from ortho_pipeline.experiments.bilsat_scene import FOCAL_LENGTH, PITCH, SIZE
-from ortho_pipeline.experiments.page import text
-from ortho_pipeline.experiments.tables import is_missed
-from ortho_pipeline.geometry import geocentric
-from ortho_pipeline.models.frame import FrameCamera
+from ortho_pipeline.estimation.fit import fit
+from ortho_pipeline.exchange.rpc import export_rpc, rpc_metadata
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.geodesy.ellipsoid import geocentric
+from ortho_pipeline.models.frame.camera import FrameCamera
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
-from ortho_pipeline.raster import Grid, RasterSource, open_dataset
-from ortho_pipeline.rpc import export_rpc, rpc_metadata
-from ortho_pipeline.warp import rectify
+from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
+from ortho_pipeline.simulation.page import text
+from ortho_pipeline.simulation.tables import is_missed
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.warp.engine import rectify
 
 
 @pytest.fixture
@@ -129,7 +130,7 @@ def test_declared_options_reach_the_sensor_and_others_are_refused(product, tmp_p
         assert done.exit_code == 2
     assert "attitude: survey (default" in run("sensors")
     # What is read is recorded, and never written over.
-    result = pipeline.rectify(
+    result = commands.rectify(
         image, tmp_path / "o", scene=SceneOptions(sensor="bilsat", sensor_options={"survey": str(survey)}),
         surface=SurfaceOptions(dem=product / "dem.tif"), output=OutputOptions(resolution=2000.0),
     )  # fmt: skip
@@ -141,10 +142,10 @@ def test_declared_options_reach_the_sensor_and_others_are_refused(product, tmp_p
 
 def test_the_model_itself_is_adjusted_from_the_survey_and_from_zero_angles(product):
     points = PointOptions(product / "gcps.csv", correction="model", check="every:4")
-    with_survey = pipeline.fit(product / "bilsat.tif", points)
+    with_survey = commands.fit(product / "bilsat.tif", points)
     assert with_survey.fit.param_names == ("X_L", "Y_L", "Z_L", "omega", "phi", "kappa")
     assert with_survey.fit.priors["Z_L"].sigma == 300.0
-    from_zero = pipeline.fit(product / "bilsat.tif", points, SceneOptions(sensor_options={"attitude": "zero"}))
+    from_zero = commands.fit(product / "bilsat.tif", points, SceneOptions(sensor_options={"attitude": "zero"}))
     # The same points; only the prior of the attitude is missing.
     assert set(from_zero.fit.priors) == {"X_L", "Y_L", "Z_L"}
     image = np.array([[0, 0], [256, 0], [128, 128], [256, 256.0]])
@@ -152,12 +153,12 @@ def test_the_model_itself_is_adjusted_from_the_survey_and_from_zero_angles(produ
     assert np.abs(from_zero.fit.model.ground_to_image(ground) - image).max() < 0.5
     # Two points are enough with what the survey knows.
     few = PointOptions(product / "gcps.csv", correction="model", select="even:2")
-    assert pipeline.fit(product / "bilsat.tif", few).fit.rmse("check")["total"] < 2.5
+    assert commands.fit(product / "bilsat.tif", few).fit.rmse("check")["total"] < 2.5
 
 
 def test_a_model_without_parameters_of_its_own_says_so(tiny):
     with pytest.raises(InputError, match="no parameters of its own"):
-        pipeline.fit(tiny.image, PointOptions(tiny.gcps, crs="EPSG:4326", vertical="ellipsoid", correction="model"))
+        commands.fit(tiny.image, PointOptions(tiny.gcps, crs="EPSG:4326", vertical="ellipsoid", correction="model"))
 
 
 def test_frame_images_work_from_the_command_line(tmp_path, product):

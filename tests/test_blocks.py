@@ -11,14 +11,14 @@ import pytest
 from click.testing import CliRunner
 from osgeo import gdal
 
-from ortho_pipeline.block_images import labels_of, points_of_images
-from ortho_pipeline.block_points import BlockPoints, read_block_points
-from ortho_pipeline.cli import cli
+from ortho_pipeline.block.points import BlockPoints, read_block_points
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.block_images import labels_of, points_of_images
 from ortho_pipeline.errors import CrsError, DatumError, InputError
-from ortho_pipeline.model_file import load_model
+from ortho_pipeline.exchange.model_file import load_model
+from ortho_pipeline.exchange.rpc import export_rpc, read_rpc, rpc_metadata
 from ortho_pipeline.models import RPC
-from ortho_pipeline.rpc import export_rpc, read_rpc, rpc_metadata
-from ortho_pipeline.simulate import LineScanner
+from ortho_pipeline.simulation.scanner import LineScanner
 
 LON, LAT, SIZE = 24.4, -33.65, 400
 #: Height of EGM96 there above the ellipsoid (field notes, trap 1).

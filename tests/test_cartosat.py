@@ -9,22 +9,22 @@ from pathlib import Path
 import numpy as np
 import ortho_cartosat
 import pytest
+from ortho_cartosat import truth as simulated
 from ortho_cartosat.layout import partner_of, rpc_of
 from ortho_cartosat.metadata import read_metadata
+from ortho_cartosat.truth import BIASES, Attitude, Scanner, StereoPair, aim, local_metres
 from osgeo import gdal
 
 from ortho_pipeline.errors import DegeneratePoints, InputError
-from ortho_pipeline.estimation import fit
-from ortho_pipeline.experiments import cartosat_scene as simulated
-from ortho_pipeline.experiments.cartosat_scene import BIASES, Attitude, Scanner, StereoPair, aim, local_metres
-from ortho_pipeline.geometry import geocentric
-from ortho_pipeline.models.pushbroom_start import SoftSigmas
+from ortho_pipeline.estimation.fit import fit
+from ortho_pipeline.exchange.rpc_files import read_rpc_text
+from ortho_pipeline.geodesy.ellipsoid import geocentric
+from ortho_pipeline.models.pushbroom.start import SoftSigmas
 from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
-from ortho_pipeline.raster import open_dataset
-from ortho_pipeline.rpc_files import read_rpc_text
-from ortho_pipeline.selection import select_control
-from ortho_pipeline.simulate import EARTH_A, LineScanner
+from ortho_pipeline.points.selection import select_control
+from ortho_pipeline.raster.source import open_dataset
+from ortho_pipeline.simulation.scanner import EARTH_A, LineScanner
 from ortho_pipeline.testing import check_sensor
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -146,7 +146,7 @@ def test_smaller_images_cover_the_same_ground():
 
 
 def test_the_truth_shares_no_code_with_the_models_and_no_estimator_sees_it():
-    scene = ast.parse((ROOT / "ortho_pipeline/experiments/cartosat_scene.py").read_text())
+    scene = ast.parse((ROOT / "plugins/ortho_cartosat/truth.py").read_text())
     used = {
         node.module: {one.name for one in node.names} for node in ast.walk(scene) if isinstance(node, ast.ImportFrom)
     }

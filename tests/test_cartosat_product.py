@@ -10,25 +10,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ortho_cartosat import experiment as cartosat
+from ortho_cartosat.experiment import ROWS, VIEWS, Block, delivered_rpcs, error_vectors, reproduce
+from ortho_cartosat.page import page
 from ortho_cartosat.simulation import BANDS, write_product
+from ortho_cartosat.truth import StereoPair
 
-from ortho_pipeline.adjustment import adjust
-from ortho_pipeline.block_points import read_block_points
-from ortho_pipeline.cli import cli
-from ortho_pipeline.crs import ground_transform
+from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.points import read_block_points
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.experiments import cartosat
-from ortho_pipeline.experiments.cartosat import ROWS, VIEWS, Block, delivered_rpcs, error_vectors, reproduce
-from ortho_pipeline.experiments.cartosat_page import page
-from ortho_pipeline.experiments.cartosat_scene import StereoPair
-from ortho_pipeline.experiments.page import text
-from ortho_pipeline.experiments.tables import is_missed, is_within
-from ortho_pipeline.geometry import geocentric
-from ortho_pipeline.model_file import read_model_file
+from ortho_pipeline.exchange.model_file import read_model_file
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.ellipsoid import geocentric
 from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
-from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.raster.source import open_dataset
+from ortho_pipeline.simulation.page import text
+from ortho_pipeline.simulation.tables import is_missed, is_within
 
 
 def run(*arguments: object) -> str:

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from click.testing import CliRunner, Result
 
-from ortho_pipeline import pipeline
-from ortho_pipeline.cli import cli
+from ortho_pipeline import commands
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import ModelError
 
 HEAVY = ("numba", "matplotlib", "scipy", "pyproj", "osgeo", "numpy")
@@ -27,7 +27,7 @@ def fit_arguments(tiny: Any) -> list[Any]:
 
 def test_help_does_not_load_heavy_libraries():
     code = (
-        "import sys; from click.testing import CliRunner; from ortho_pipeline.cli import cli; "
+        "import sys; from click.testing import CliRunner; from ortho_pipeline.cli.program import cli; "
         "r = CliRunner().invoke(cli, ['rectify', '--help']); assert r.exit_code == 0, r.output; "
         f"print([name for name in {HEAVY!r} if name in sys.modules])"
     )
@@ -169,9 +169,9 @@ def test_failure_and_interruption_have_their_exit_codes(monkeypatch):
     def interrupt() -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline, "doctor", fail)
+    monkeypatch.setattr(commands, "doctor", fail)
     assert run("doctor").exit_code == 1
-    monkeypatch.setattr(pipeline, "doctor", interrupt)
+    monkeypatch.setattr(commands, "doctor", interrupt)
     done = run("doctor")
     assert done.exit_code == 130
     assert "Interrupted" in done.stderr
@@ -183,7 +183,7 @@ WITHOUT_GDAL = """
 import json, sys
 sys.modules["osgeo"] = None
 from click.testing import CliRunner
-from ortho_pipeline.cli import cli
+from ortho_pipeline.cli.program import cli
 done = {line: CliRunner().invoke(cli, line.split()) for line in sys.argv[1:]}
 print(json.dumps({line: [one.exit_code, one.stdout, one.stderr] for line, one in done.items()}))
 """
@@ -212,7 +212,7 @@ def test_an_unforeseen_error_is_one_line_and_a_traceback_only_with_debug(monkeyp
     def fail() -> None:
         raise KeyError("nobody thought of this")
 
-    monkeypatch.setattr(pipeline, "doctor", fail)
+    monkeypatch.setattr(commands, "doctor", fail)
     done = run("doctor", "--json")
     assert done.exit_code == 1
     assert "nobody thought of this" in done.stderr

@@ -11,22 +11,25 @@ import numpy as np
 import pyproj
 import pytest
 from click.testing import CliRunner
+from ortho_bilsat import truth as bilsat_scene
+from ortho_cartosat import truth as cartosat_scene
+from ortho_ikonos import truth as ikonos_scene
+from ortho_ikonos.experiment import vendor_rpc
+from ortho_orbview3 import truth as orbview3_scene
 from osgeo import gdal
 
-from ortho_pipeline import pipeline
-from ortho_pipeline.cli import cli
-from ortho_pipeline.comparison import Row, available_models, compare, recommend
-from ortho_pipeline.crs import ground_transform
+from ortho_pipeline import commands
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.experiments import bilsat_scene, cartosat_scene, ikonos_scene, orbview3_scene
-from ortho_pipeline.experiments.ikonos import vendor_rpc
-from ortho_pipeline.landscape import Terrain
-from ortho_pipeline.model_choice import fit_family
+from ortho_pipeline.estimation.comparison import Row, available_models, compare, recommend
+from ortho_pipeline.estimation.family_fit import fit_family
+from ortho_pipeline.exchange.rpc import read_rpc
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models import RPC, families
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
-from ortho_pipeline.rpc import read_rpc
-from ortho_pipeline.simulate import LineScanner, simulate_points
+from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
+from ortho_pipeline.simulation.terrain import Terrain
 
 CAMERA = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(650.0, 1350.0))
 TERRAIN = Terrain("EPSG:32636", 531100.0, 4122700.0)
@@ -115,7 +118,7 @@ def test_fourteen_models_are_all_fitted_to_sixty_points():
 
 
 def test_the_scenes_own_model_takes_part(tiny):
-    document = pipeline.compare(tiny.image, points_of(tiny), models="rpc,rpc+shift,rpc+affine,affine3d").to_json()
+    document = commands.compare(tiny.image, points_of(tiny), models="rpc,rpc+shift,rpc+affine,affine3d").to_json()
     rows = {row["model"]: row for row in document["rows"]}
     assert rows["rpc"]["rmse"]["control"]["total"] > 3
     assert rows["rpc+shift"]["rmse"]["loo"]["total"] < 0.3
@@ -127,17 +130,17 @@ def test_the_scenes_own_model_takes_part(tiny):
 def test_a_plain_image_is_rectified_from_points_alone(tiny, tmp_path, crs):
     image = plain(tiny)
     with pytest.raises(InputError):
-        pipeline.fit(image, points_of(tiny))
+        commands.fit(image, points_of(tiny))
     options = points_of(tiny, fit_model="affine3d", model_crs=crs)
-    fitted = pipeline.fit(image, options)
+    fitted = commands.fit(image, options)
     assert fitted.scene.sensor == "points only"
     assert fitted.fit.rmse("loo")["total"] < 0.5
     if crs not in (None, "utm"):
         return
     surface = SurfaceOptions(dem=tiny.dem, vertical="ellipsoid")
     output = OutputOptions(resolution=4.8, crs="EPSG:32734")
-    own = pipeline.rectify(tiny.image, tmp_path / "own", points=points_of(tiny), surface=surface, output=output)
-    ours = pipeline.rectify(image, tmp_path / "ours", points=options, surface=surface, output=output)
+    own = commands.rectify(tiny.image, tmp_path / "own", points=points_of(tiny), surface=surface, output=output)
+    ours = commands.rectify(image, tmp_path / "ours", points=options, surface=surface, output=output)
     first, second = (gdal.Open(str(result.files["ortho"])) for result in (own, ours))
     assert first.GetGeoTransform()[1] == second.GetGeoTransform()[1]
     shift = [round((b - a) / 4.8) for a, b in zip(*(d.GetGeoTransform()[0:4:3] for d in (first, second)), strict=True)]
@@ -150,14 +153,14 @@ def test_a_plain_image_is_rectified_from_points_alone(tiny, tmp_path, crs):
     assert both.mean() > 0.5
     # The wavelength is 44 pixels, the amplitude 300: a shift of a tenth of a pixel makes 4.
     assert np.median(np.abs(one - other)[both]) < 10
-    saved = pipeline.rectify(
+    saved = commands.rectify(
         image, tmp_path / "again", scene=SceneOptions(model=ours.files["model"]), surface=surface, output=output
     )
     np.testing.assert_array_equal(gdal.Open(str(saved.files["ortho"])).ReadAsArray(), second.ReadAsArray())
 
 
 def test_compare_writes_the_report_of_the_recommended_model(tiny, tmp_path):
-    result = pipeline.compare(plain(tiny), points_of(tiny), models="affine2d,affine3d,rfm3", folder=tmp_path / "out")
+    result = commands.compare(plain(tiny), points_of(tiny), models="affine2d,affine3d,rfm3", folder=tmp_path / "out")
     assert set(result.files) == {"residuals", "style", "report", "html"}
     report = json.loads(result.files["report"].read_text())
     assert report["comparison"]["recommendation"]["model"] == report["adjustment"]["model"] == "affine3d"
@@ -168,14 +171,14 @@ def test_compare_writes_the_report_of_the_recommended_model(tiny, tmp_path):
 
 @pytest.mark.parametrize("spec", ["even:6", "cluster:6", "random:6:3", "ids:p0,p1,p2,p3,p4,p5"])
 def test_selected_points_control_and_the_others_check(tiny, spec):
-    document = pipeline.compare(tiny.image, points_of(tiny, select=spec), models="rpc+shift").to_json()
+    document = commands.compare(tiny.image, points_of(tiny, select=spec), models="rpc+shift").to_json()
     assert document["points"] == {"control": 6, "check": 6}
     with pytest.raises(InputError, match="--select"):
-        pipeline.fit(tiny.image, points_of(tiny, select=spec, check="every:3"))
+        commands.fit(tiny.image, points_of(tiny, select=spec, check="every:3"))
 
 
 def test_prune_takes_out_what_the_points_do_not_justify(tiny):
-    result = pipeline.fit(tiny.image, points_of(tiny, correction="affine", prune=True))
+    result = commands.fit(tiny.image, points_of(tiny, correction="affine", prune=True))
     assert {"col_shift", "row_shift"} <= set(result.fit.param_names)
     assert len(result.removed) >= 2
     assert any("do not justify" in text for text in result.warnings)
@@ -192,21 +195,21 @@ def test_prune_takes_out_what_the_points_do_not_justify(tiny):
 )
 def test_contradicting_options_are_refused(tiny, options, field):
     with pytest.raises(InputError) as caught:
-        pipeline.fit(tiny.image, points_of(tiny, **options))
+        commands.fit(tiny.image, points_of(tiny, **options))
     assert caught.value.field == field
 
 
 def test_an_unknown_model_is_refused(tiny):
     with pytest.raises(InputError, match="nonsense"):
-        pipeline.compare(tiny.image, points_of(tiny), models="dlt,nonsense")
+        commands.compare(tiny.image, points_of(tiny), models="dlt,nonsense")
 
 
 def test_points_without_heights_serve_flat_models_only(tiny):
     path = tiny.write(tiny.folder / "flat.csv", [row[:5] for row in tiny.points(8)], "id,col,row,x,y")
     options = PointOptions(gcps=path, crs="EPSG:4326", fit_model="affine2d")
-    assert pipeline.fit(plain(tiny), options).fit.rmse("control")["n"] == 8
+    assert commands.fit(plain(tiny), options).fit.rmse("control")["n"] == 8
     with pytest.raises(InputError, match="without a height"):
-        pipeline.fit(plain(tiny), PointOptions(gcps=path, crs="EPSG:4326", fit_model="affine3d"))
+        commands.fit(plain(tiny), PointOptions(gcps=path, crs="EPSG:4326", fit_model="affine3d"))
 
 
 # -- command line ----------------------------------------------------------------------------------------------------

@@ -16,8 +16,9 @@ def run(code: str) -> subprocess.CompletedProcess[str]:
 def test_a_command_runs_where_no_cache_can_be_written() -> None:
     done = run(
         f"sys.argv = ['ortho', 'info', {str(SCENE)!r}]\n"
-        "from ortho_pipeline.models import pushbroom_kernel, rpc_kernel\n"
-        "from ortho_pipeline.cli import main\n"
+        "from ortho_pipeline.models import rpc_kernel\n"
+        "from ortho_pipeline.models.pushbroom import kernel as pushbroom_kernel\n"
+        "from ortho_pipeline.cli.program import main\n"
         "main()"
     )
     assert done.returncode == 0, done.stderr
@@ -28,7 +29,9 @@ def test_a_command_runs_where_no_cache_can_be_written() -> None:
 def test_every_kernel_is_made_without_a_cache_and_computes_the_same() -> None:
     done = run(
         "import numpy as np\n"
-        "from ortho_pipeline import kernels, lattice_kernel, ray_kernel\n"
+        "from ortho_pipeline.warp import kernels\n"
+        "from ortho_pipeline.warp import lattice_kernel\n"
+        "from ortho_pipeline.surface import ray_kernel\n"
         "out = np.empty((1, 1))\n"
         "kernels.heights_at(np.array([[[0.5, 0.25]]]), np.array([[0.0, 4.0], [8.0, 12.0]]), 0, 0, False, out)\n"
         "print(out[0, 0])"

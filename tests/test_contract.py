@@ -15,7 +15,7 @@ from osgeo import gdal
 
 from ortho_pipeline.contract import model_faults, sensor_faults
 from ortho_pipeline.errors import InputError, PluginError
-from ortho_pipeline.estimation import Prior
+from ortho_pipeline.estimation.fit import Prior
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models import KINDS
 from ortho_pipeline.models.base import SensorModel

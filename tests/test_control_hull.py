@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from ortho_pipeline import pipeline
-from ortho_pipeline.cli import cli
-from ortho_pipeline.control_hull import COVERED, control_hull, empty_parts, uncovered
+from ortho_pipeline import commands
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.options import PointOptions, SurfaceOptions
+from ortho_pipeline.points.control_hull import COVERED, control_hull, empty_parts, uncovered
 
 SIZE = (1000, 800)
 
@@ -76,10 +76,10 @@ def left_half(tiny, tmp_path):
 
 def test_fit_rectify_and_compare_say_so(tiny, tmp_path):
     points = left_half(tiny, tmp_path)
-    assert any("empty: right." in text for text in pipeline.fit(tiny.image, points).warnings)
-    made = pipeline.rectify(tiny.image, tmp_path, points=points, surface=SurfaceOptions(height=0.0))
+    assert any("empty: right." in text for text in commands.fit(tiny.image, points).warnings)
+    made = commands.rectify(tiny.image, tmp_path, points=points, surface=SurfaceOptions(height=0.0))
     assert any("empty: right." in text for text in json.loads(made.files["report"].read_text())["warnings"])
-    notes = pipeline.compare(tiny.image, points, models="rpc,rpc+shift").to_json()["warnings"]
+    notes = commands.compare(tiny.image, points, models="rpc,rpc+shift").to_json()["warnings"]
     assert any("empty: right." in text for text in notes)
     order = [
         "compare",
@@ -96,6 +96,6 @@ def test_fit_rectify_and_compare_say_so(tiny, tmp_path):
     assert "empty: right." in done.output
     # Nothing is adjusted: nothing is extrapolated.
     plain = PointOptions(gcps=points.gcps, crs="EPSG:4979", vertical="ellipsoid", correction="none")
-    assert not any("empty:" in text for text in pipeline.fit(tiny.image, plain).warnings)
+    assert not any("empty:" in text for text in commands.fit(tiny.image, plain).warnings)
     everywhere = PointOptions(gcps=tiny.gcps, crs="EPSG:4979", vertical="ellipsoid")
-    assert not any("empty:" in text for text in pipeline.fit(tiny.image, everywhere).warnings)
+    assert not any("empty:" in text for text in commands.fit(tiny.image, everywhere).warnings)

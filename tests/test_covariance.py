@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from ortho_pipeline import report
-from ortho_pipeline.covariance import CovarianceAnalysis, analyse, analyse_fit
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation import Fit, fit
-from ortho_pipeline.ground_error import viewing
+from ortho_pipeline.estimation.fit import Fit, fit
+from ortho_pipeline.estimation.ground_residuals import viewing
+from ortho_pipeline.estimation.spatial_correlation import CovarianceAnalysis, analyse, analyse_fit
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.landscape import Terrain
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.points import Points
-from ortho_pipeline.simulate import LineScanner, simulate_points
+from ortho_pipeline.report import document as report
+from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
+from ortho_pipeline.simulation.terrain import Terrain
 
 Array = np.ndarray
 SIDE = 10_000.0

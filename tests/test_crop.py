@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from osgeo import gdal
 
-from ortho_pipeline import pipeline
-from ortho_pipeline.crop import moved, noted_offset
+from ortho_pipeline import commands
+from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.inputs import open_scene
+from ortho_pipeline.exchange.crop import moved, noted_offset
+from ortho_pipeline.exchange.rpc import read_rpc, rpc_metadata, write_rpc_txt
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.options import PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.plugins import open_scene as open_product
-from ortho_pipeline.raster import open_dataset
-from ortho_pipeline.rpc import read_rpc, rpc_metadata, write_rpc_txt
+from ortho_pipeline.raster.source import open_dataset
 
 gdal.UseExceptions()
 CORNER = (100.0, 50.0)
@@ -127,10 +127,10 @@ def test_every_command_knows_the_place(tiny, whole, tmp_path):
     rows = [(name, col - 100, row - 50, *ground) for name, col, row, *ground in tiny.points(12)]
     points = PointOptions(gcps=tiny.write(tmp_path / "p.csv", rows), crs="EPSG:4979", vertical="ellipsoid")
     options, surface = SceneOptions(rpc=whole), SurfaceOptions(dem=tiny.dem, vertical="ellipsoid")
-    values = pipeline.fit(crop, points, options).fit.model.params
+    values = commands.fit(crop, points, options).fit.model.params
     np.testing.assert_allclose(values, tiny.bias, atol=0.15)
-    assert pipeline.info(crop, options)["facts"]["crop_offset"] == [100.0, 50.0]
-    result = pipeline.rectify(crop, tmp_path / "out", scene=options, points=points, surface=surface)
+    assert commands.info(crop, options)["facts"]["crop_offset"] == [100.0, 50.0]
+    result = commands.rectify(crop, tmp_path / "out", scene=options, points=points, surface=surface)
     assert any("column 100, row 50" in text for text in result.document["report"]["warnings"])
     exported = read_rpc(result.files["rpc"])
     found = exported.image_to_ground([[50.0, 30.0]], 500.0)
@@ -139,13 +139,13 @@ def test_every_command_knows_the_place(tiny, whole, tmp_path):
     # The model file is one of the crop now.
     again = open_scene(crop, SceneOptions(model=result.files["model"]))
     np.testing.assert_allclose(ground_of(again), expected, atol=1e-9)
-    compared = pipeline.compare(crop, points, models="rpc,rpc+shift", scene=options)
+    compared = commands.compare(crop, points, models="rpc,rpc+shift", scene=options)
     assert compared.comparison.best.model == "rpc+shift"
 
 
 def test_a_saved_model_of_the_whole_serves_its_crops(tiny, tmp_path):
     surface = SurfaceOptions(dem=tiny.dem, vertical="ellipsoid")
-    model = pipeline.rectify(tiny.image, tmp_path / "out", surface=surface).files["model"]
+    model = commands.rectify(tiny.image, tmp_path / "out", surface=surface).files["model"]
     crop = cut(tiny, tmp_path / "crop.tif")
     np.testing.assert_allclose(ground_of(open_scene(crop, SceneOptions(model=model))), truth(tiny), atol=1e-9)
     bare = cut(tiny, tmp_path / "bare.tif", None)

@@ -16,9 +16,9 @@ import pyproj
 import pytest
 from pyproj.database import query_crs_info
 
-from ortho_pipeline import crs as module
-from ortho_pipeline.crs import GroundTransform, Vertical, declared_vertical, horizontal, parse_crs, utm_crs
 from ortho_pipeline.errors import CrsError, DatumError
+from ortho_pipeline.geodesy import crs as module
+from ortho_pipeline.geodesy.crs import GroundTransform, Vertical, declared_vertical, horizontal, parse_crs, utm_crs
 
 EGM96 = Path("/usr/share/proj/egm96_15.gtx")
 needs_egm96 = pytest.mark.skipif(not EGM96.is_file(), reason="Debian's proj-data (egm96_15.gtx) is not installed")
@@ -34,7 +34,7 @@ def test_egm96_is_found_out_of_the_box() -> None:
 
 @needs_egm96
 def test_system_grids_are_found_in_a_fresh_process_and_other_threads() -> None:
-    code = "from ortho_pipeline.crs import Vertical; print(Vertical.parse('egm96').undulation([24.4], [-33.65])[0])"
+    code = "from ortho_pipeline import Vertical; print(Vertical.parse('egm96').undulation([24.4], [-33.65])[0])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert float(done.stdout) == pytest.approx(28.208, abs=0.01)
     seen: list[float] = []

@@ -11,20 +11,22 @@ import numpy as np
 import pytest
 
 import ortho_pipeline as op
-from ortho_pipeline import blocks, pipeline
-from ortho_pipeline.delivered import accuracy_before
+from ortho_pipeline import commands
+from ortho_pipeline.commands import block as blocks
+from ortho_pipeline.commands import results
+from ortho_pipeline.commands.inputs import open_scene
+from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.inputs import open_scene
-from ortho_pipeline.model_file import read_model_file
 from ortho_pipeline.models import FrameCamera
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.options import BlockOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.report.delivered import accuracy_before
 
 WRONG = ("delivered", "Vendors", "5 to 25 m")
 
 
-def rectify(tiny: Any, folder: Path, model: Path | None = None, **points: Any) -> pipeline.Result:
-    return pipeline.rectify(
+def rectify(tiny: Any, folder: Path, model: Path | None = None, **points: Any) -> results.Result:
+    return commands.rectify(
         tiny.image, folder, scene=SceneOptions(model=model),
         points=PointOptions(**{"crs": "EPSG:4979", "vertical": "ellipsoid", **points}),
         surface=SurfaceOptions(dem=tiny.dem, vertical="ellipsoid"), output=OutputOptions(format="GTiff"),
@@ -62,7 +64,7 @@ def test_a_model_of_a_block_says_so(sample, tmp_path):
         [folder / "BANDF.tif", folder / "BANDA.tif"], tmp_path / "adj", BlockOptions(points=folder / "points.csv")
     )
     model = next(path for path in made.files.values() if path.name == "BANDF_model.json")
-    result = pipeline.rectify(
+    result = commands.rectify(
         folder / "BANDF.tif", tmp_path / "out", scene=SceneOptions(model=model),
         surface=SurfaceOptions(dem=folder / "dem.tif"),
     )  # fmt: skip

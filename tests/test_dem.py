@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from osgeo import gdal, osr
 
-from ortho_pipeline.crs import GroundTransform, Vertical
-from ortho_pipeline.datum import dem_unit
-from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import CrsError, DatumError, InputError
-from ortho_pipeline.footprint import lay
+from ortho_pipeline.geodesy.crs import GroundTransform, Vertical
+from ortho_pipeline.geodesy.datum import dem_unit
 from ortho_pipeline.models.base import SensorModel
-from ortho_pipeline.rays import intersect
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.footprint import lay
+from ortho_pipeline.surface.rays import intersect
 
 gdal.UseExceptions()
 EGM96 = Path("/usr/share/proj/egm96_15.gtx")

@@ -9,11 +9,11 @@ import pytest
 from click.testing import CliRunner
 from osgeo import gdal, osr
 
-from ortho_pipeline.cli import cli
-from ortho_pipeline.crs import Vertical, ground_transform, parse_crs
-from ortho_pipeline.dem import Surface
-from ortho_pipeline.dem_accuracy import check_dem, read_check_heights, slopes_at
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
+from ortho_pipeline.surface.accuracy import check_dem, read_check_heights, slopes_at
+from ortho_pipeline.surface.dem import Surface
 
 UTM = "EPSG:32634"
 WEST, NORTH, STEP, SIDE = 500_000.0, 4_000_000.0, 10.0, 300

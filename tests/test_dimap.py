@@ -17,13 +17,13 @@ from ortho_rpc.dimap import has_dimap_pushbroom, read_dimap_pushbroom
 from osgeo import gdal
 from seeds import dimap_text
 
-from ortho_pipeline.cli import cli
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.geometry import enu_from_ecef, geocentric
+from ortho_pipeline.exchange.rpc import rpc_metadata
+from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
 from ortho_pipeline.models import RPC, Pushbroom
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.plugins import open_scene
-from ortho_pipeline.rpc import rpc_metadata
 from ortho_pipeline.testing import check_sensor_model
 
 PLEIADES = "DIM_PHR1A_P_201303310839568_SEN_620285101-001.XML"

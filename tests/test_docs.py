@@ -12,7 +12,7 @@ import click
 import pytest
 
 import ortho_pipeline
-from ortho_pipeline.cli import cli
+from ortho_pipeline.cli.program import cli
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("sample_data/**/*.md")])

@@ -12,10 +12,10 @@ from click.testing import CliRunner
 from osgeo import gdal
 from scipy.special import ndtr
 
-from ortho_pipeline import resolution
-from ortho_pipeline.cli import cli
-from ortho_pipeline.edge import APERTURE, Segment, analyse_edge, edge_response
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.imaging import resolution
+from ortho_pipeline.imaging.edge import APERTURE, Segment, analyse_edge, edge_response
 
 Array = np.ndarray
 

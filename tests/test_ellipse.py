@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from ortho_pipeline.ellipse import fit_ellipse
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.imaging.ellipse import fit_ellipse
 
 Array = np.ndarray
 Inside = Callable[[Array, Array], Array]

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from osgeo import gdal
 
-from ortho_pipeline import pipeline
-from ortho_pipeline.dem import NEAREST_METRES, Surface
+from ortho_pipeline import commands
 from ortho_pipeline.errors import CoverageError, CrsError, InputError
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
+from ortho_pipeline.surface.dem import NEAREST_METRES, Surface
 
 
 def dem_of(tiny, **options):
@@ -30,7 +30,7 @@ def moved(tiny, path, east=0.0, up=0.0, pitch=None):
 def refused(tiny, folder, match, kind=InputError, **options):
     given = {"surface": dem_of(tiny), **options}
     with pytest.raises(kind, match=match) as caught:
-        pipeline.rectify(tiny.image, folder, **given)
+        commands.rectify(tiny.image, folder, **given)
     assert not folder.exists() or not list(folder.iterdir())
     assert caught.value.remedy
     return caught.value
@@ -47,7 +47,7 @@ def test_an_extent_at_the_other_turn_of_longitude_is_the_same_extent(tiny, tmp_p
     for turn in (0.0, 360.0):
         extent = (lon - 0.002 + turn, lat - 0.002, lon + 0.002 + turn, lat + 0.002)
         output = OutputOptions(crs="EPSG:4326", extent=extent, resolution=1e-4)
-        assert pipeline.check(tiny.image, surface=dem_of(tiny), output=output)["grid"]["size"] == [40, 40]
+        assert commands.check(tiny.image, surface=dem_of(tiny), output=output)["grid"]["size"] == [40, 40]
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_heights_beyond_those_of_the_model_are_named(tiny, tmp_path, fill):
 def test_nearest_takes_no_height_from_far_away(tiny, tmp_path):
     far, near = (moved(tiny, tmp_path / f"{east}.tif", east=east) for east in (NEAREST_METRES + 10_000.0, 1500.0))
     refused(tiny, tmp_path / "out", "15.4 km", CoverageError, surface=dem_of(tiny, dem=far, fill="nearest"))
-    done = pipeline.check(tiny.image, surface=dem_of(tiny, dem=near, fill="nearest"))
+    done = commands.check(tiny.image, surface=dem_of(tiny, dem=near, fill="nearest"))
     assert 0 < done["coverage"] < 1
     surface = Surface.open(far, "ellipsoid", fill="nearest")
     reach = surface.nearest_reach
@@ -112,7 +112,7 @@ def test_hardly_any_valid_pixel_is_said(tiny, tmp_path):
     dataset.GetRasterBand(1).SetNoDataValue(7)
     dataset.GetRasterBand(1).WriteArray(pixels)
     dataset = None
-    done = pipeline.rectify(tiny.image, tmp_path / "out", surface=dem_of(tiny))
+    done = commands.rectify(tiny.image, tmp_path / "out", surface=dem_of(tiny))
     assert any(
         "of the pixels that the scene covers have a value" in text for text in done.document["report"]["warnings"]
     )
@@ -150,5 +150,5 @@ def test_a_fill_rule_does_not_read_the_whole_dem(tiny, tmp_path, monkeypatch, fi
     large = None
     read, inside = [], Surface._read_metres
     monkeypatch.setattr(Surface, "_read_metres", lambda self, *window: read.append(window) or inside(self, *window))
-    pipeline.check(tiny.image, surface=dem_of(tiny, dem=dem, fill=fill))
+    commands.check(tiny.image, surface=dem_of(tiny, dem=dem, fill=fill))
     assert max(left + width for left, _, width, _ in read) < 3000

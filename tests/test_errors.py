@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ortho_pipeline.comparison import compare
 from ortho_pipeline.errors import InputError, TooFewPoints, counted
-from ortho_pipeline.estimation import fit
-from ortho_pipeline.landscape import Terrain
-from ortho_pipeline.model_choice import fit_family
+from ortho_pipeline.estimation.comparison import compare
+from ortho_pipeline.estimation.family_fit import fit_family
+from ortho_pipeline.estimation.fit import fit
+from ortho_pipeline.imaging.registration import Transform
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.points import Points, read_points
-from ortho_pipeline.registration import Transform
-from ortho_pipeline.selection import select_control
-from ortho_pipeline.simulate import LineScanner, simulate_points
+from ortho_pipeline.points.selection import select_control
+from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
+from ortho_pipeline.simulation.terrain import Terrain
 
 ROOT = Path(__file__).resolve().parents[1]
 #: What sentences count.

@@ -10,7 +10,7 @@ import pyproj
 import pytest
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
-from ortho_pipeline.estimation import Prior, fit
+from ortho_pipeline.estimation.fit import Prior, fit
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.points import Points
 

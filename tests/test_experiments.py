@@ -7,10 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ortho_bilsat import experiment as bilsat
+from ortho_cartosat import experiment as cartosat
+from ortho_ikonos import experiment as ikonos
+from ortho_orbview3 import experiment as orbview3
 
-from ortho_pipeline.experiments import bilsat, cartosat, ikonos, orbview3
-from ortho_pipeline.experiments.page import Figure, Reason, draw_curve, draw_vectors, page, text
-from ortho_pipeline.experiments.tables import (
+from ortho_pipeline.simulation.page import Figure, Reason, draw_curve, draw_vectors, page, text
+from ortho_pipeline.simulation.tables import (
     ROLES,
     SOURCES,
     VERDICTS,

@@ -12,13 +12,14 @@ import pytest
 from click.testing import CliRunner
 from osgeo import gdal
 
-from ortho_pipeline import pipeline
-from ortho_pipeline.cli import cli
+from ortho_pipeline import commands
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.inputs import open_surface
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.gcp_export import FORMATS
+from ortho_pipeline.exchange.gcp import FORMATS
+from ortho_pipeline.exchange.rpc import export_rpc, read_rpc
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.options import PointOptions, SurfaceOptions
-from ortho_pipeline.rpc import export_rpc, read_rpc
 
 REAL_RPCS = (
     "gdal/gcore/data/md_ov_rpc.txt",
@@ -31,7 +32,7 @@ def points_of(tiny: Any, **more: Any) -> PointOptions:
 
 
 def fitted(tiny: Any) -> Any:
-    return pipeline.fit(tiny.image, points_of(tiny)).fit.model
+    return commands.fit(tiny.image, points_of(tiny)).fit.model
 
 
 def ground_to_image(path: Path, ground: np.ndarray, *options: str) -> np.ndarray:
@@ -159,7 +160,7 @@ def test_rpc_stands_for_any_camera_over_30_km_and_1500_m(camera):
 @pytest.mark.realdata
 @pytest.mark.parametrize("name", REAL_RPCS)
 def test_rpc_stands_for_a_vendors_rpc(real, name):
-    from ortho_pipeline.rpc import fit_rpc
+    from ortho_pipeline.exchange.rpc import fit_rpc
 
     path = next(real.rglob(Path(name).name))
     model = read_rpc(path)
@@ -173,11 +174,11 @@ def test_rpc_stands_for_a_vendors_rpc(real, name):
 @pytest.mark.parametrize("family", ["affine3d", "dlt", "poly2"])
 def test_a_model_from_points_alone_is_exported_as_rpc(tiny, tmp_path, family):
     points = points_of(tiny, fit_model=family, model_crs="utm")
-    result = pipeline.export(tiny.image, tmp_path / "out", formats=["rpc-txt"], points=points)
+    result = commands.export(tiny.image, tmp_path / "out", formats=["rpc-txt"], points=points)
     assert result.document["max_error_px"] < 0.02
-    model = pipeline.fit(tiny.image, points).fit.model
+    model = commands.fit(tiny.image, points).fit.model
     written = read_rpc(result.files["rpc-txt"])
-    from ortho_pipeline.crs import ground_transform
+    from ortho_pipeline.geodesy.crs import ground_transform
 
     ground = ground_transform("EPSG:4979", model.crs)(GROUND)
     np.testing.assert_allclose(written.ground_to_image(GROUND), model.ground_to_image(ground), rtol=0, atol=0.02)
@@ -188,7 +189,7 @@ def test_a_model_from_points_alone_is_exported_as_rpc(tiny, tmp_path, family):
 
 @pytest.mark.parametrize("name", ["vrt", "tag"])
 def test_gdal_maps_with_the_exported_rpc(tiny, tmp_path, name):
-    path = pipeline.export(tiny.image, tmp_path / "out", formats=[name], points=points_of(tiny)).files[name]
+    path = commands.export(tiny.image, tmp_path / "out", formats=[name], points=points_of(tiny)).files[name]
     expected = fitted(tiny).ground_to_image(GROUND)
     np.testing.assert_allclose(ground_to_image(path, GROUND, "METHOD=RPC"), expected, atol=1e-6)
 
@@ -196,7 +197,7 @@ def test_gdal_maps_with_the_exported_rpc(tiny, tmp_path, name):
 @pytest.mark.parametrize("name", ["rpc-txt", "rpb"])
 def test_gdal_maps_with_an_exported_side_car(tiny, tmp_path, name):
     out = tmp_path / "out"
-    pipeline.export(tiny.image, out, formats=[name], points=points_of(tiny))
+    commands.export(tiny.image, out, formats=[name], points=points_of(tiny))
     gdal.GetDriverByName("GTiff").Create(str(out / "tiny.tif"), tiny.width, tiny.height, 1)
     expected = fitted(tiny).ground_to_image(GROUND)
     np.testing.assert_allclose(ground_to_image(out / "tiny.tif", GROUND, "METHOD=RPC"), expected, atol=1e-6)
@@ -204,7 +205,7 @@ def test_gdal_maps_with_an_exported_side_car(tiny, tmp_path, name):
 
 @pytest.mark.parametrize("name", ["gcp", "gcp-tag"])
 def test_measured_points_are_gcps_that_gdal_fits_to(tiny, tmp_path, name):
-    path = pipeline.export(tiny.image, tmp_path / "out", formats=[name], points=points_of(tiny)).files[name]
+    path = commands.export(tiny.image, tmp_path / "out", formats=[name], points=points_of(tiny)).files[name]
     dataset = gdal.Open(str(path))
     assert not dataset.GetMetadata("RPC")
     rows = tiny.points(12)
@@ -223,8 +224,8 @@ def test_a_gross_error_is_no_gcp_and_check_points_are_none(tiny, tmp_path, name)
     rows[4][1] += 60.0
     tiny.write(tiny.gcps, rows)
     points = points_of(tiny, check="ids:p12,p13")
-    assert [name for name, _ in pipeline.fit(tiny.image, points).fit.rejected] == ["p4"]
-    result = pipeline.export(tiny.image, tmp_path / "out", formats=[name], points=points)
+    assert [name for name, _ in commands.fit(tiny.image, points).fit.rejected] == ["p4"]
+    result = commands.export(tiny.image, tmp_path / "out", formats=[name], points=points)
     found = [(p.GCPPixel, p.GCPLine) for p in gdal.Open(str(result.files[name])).GetGCPs()]
     np.testing.assert_allclose(found, [row[1:3] for k, row in enumerate(rows) if k not in (4, 12, 13)], atol=1e-4)
     assert result.document["gcps"]["n"] == 11
@@ -234,7 +235,7 @@ def test_a_gross_error_is_no_gcp_and_check_points_are_none(tiny, tmp_path, name)
 
 def test_without_points_a_grid_of_gcps_stands_for_the_model(tiny, tmp_path):
     surface = SurfaceOptions(height=500.0)
-    result = pipeline.export(tiny.image, tmp_path / "out", formats=["gcp"], surface=surface)
+    result = commands.export(tiny.image, tmp_path / "out", formats=["gcp"], surface=surface)
     assert result.document["gcps"]["n"] == 121
     assert "500 m" in result.summary
     found = ground_to_image(result.files["gcp"], GROUND, "METHOD=GCP_POLYNOMIAL", "MAX_GCP_ORDER=2")
@@ -244,7 +245,7 @@ def test_without_points_a_grid_of_gcps_stands_for_the_model(tiny, tmp_path):
 @pytest.mark.parametrize("with_dem", [False, True])
 def test_geolocation_arrays_map_as_the_model(tiny, tmp_path, with_dem):
     surface = SurfaceOptions(dem=tiny.dem, vertical="ellipsoid") if with_dem else SurfaceOptions(height=500.0)
-    result = pipeline.export(
+    result = commands.export(
         tiny.image, tmp_path / "out", formats=["geolocation"], points=points_of(tiny), surface=surface
     )
     assert result.document["geolocation"]["max_error_px"] < 0.05
@@ -255,9 +256,9 @@ def test_geolocation_arrays_map_as_the_model(tiny, tmp_path, with_dem):
     assert all(good)
     model = fitted(tiny)
     if with_dem:
-        from ortho_pipeline.rays import intersect
+        from ortho_pipeline.surface.rays import intersect
 
-        expected = intersect(model, image, pipeline.open_surface(surface))
+        expected = intersect(model, image, open_surface(surface))
     else:
         expected = model.image_to_ground(image, 500.0)
     # A pixel is about 5e-5 degrees.
@@ -287,7 +288,7 @@ def test_what_stands_for_the_model_is_not_beside_a_geotransform(tiny, tmp_path, 
     # A product on a plane looks like a map: gdalwarp would take its geotransform, and so would a GeoTIFF.
     gdal.Open(str(tiny.image), gdal.GA_Update).SetGeoTransform((500000.0, 1.0, 0.0, 6000000.0, 0.0, -1.0))
     surface = SurfaceOptions(height=500.0)
-    path = pipeline.export(tiny.image, tmp_path / "out", formats=[name], surface=surface).files[name]
+    path = commands.export(tiny.image, tmp_path / "out", formats=[name], surface=surface).files[name]
     dataset = gdal.Open(str(path))
     assert dataset.GetGeoTransform(can_return_null=True) is None
     assert bool(dataset.GetGCPs()) == (name != "geolocation")
@@ -296,6 +297,6 @@ def test_what_stands_for_the_model_is_not_beside_a_geotransform(tiny, tmp_path, 
 
 def test_an_unknown_format_is_refused(tiny, tmp_path):
     with pytest.raises(InputError, match="no format is called shp") as caught:
-        pipeline.export(tiny.image, tmp_path / "out", formats=["rpb", "shp"])
+        commands.export(tiny.image, tmp_path / "out", formats=["rpb", "shp"])
     assert "geolocation" in str(caught.value.remedy)
     assert not (tmp_path / "out").exists()

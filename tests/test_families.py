@@ -9,8 +9,8 @@ import pyproj
 import pytest
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
-from ortho_pipeline.estimation import fit
-from ortho_pipeline.model_choice import fit_family, k_fold, prune
+from ortho_pipeline.estimation.family_fit import fit_family, k_fold, prune
+from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.models import (
     ImageCorrection,
     Rational,

@@ -60,10 +60,11 @@ def test_sha256(tmp_path):
 
 RECTIFY = """
 import resource, signal, sys
-from ortho_pipeline import warp, raster
-from ortho_pipeline.dem import Surface
-from ortho_pipeline.crs import parse_crs
-from ortho_pipeline.rpc import rpc_of_dataset
+from ortho_pipeline.warp import engine as warp
+from ortho_pipeline.raster import source as raster
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.exchange.rpc import rpc_of_dataset
 image, out, driver, limit = sys.argv[1], sys.argv[2], sys.argv[3], int(sys.argv[4])
 if limit:
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

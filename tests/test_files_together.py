@@ -31,7 +31,7 @@ def dying(function):
             os._exit(7)
         return function(*given, **named)
     return call
-import ortho_pipeline.files as files
+from ortho_pipeline.files import whole as files
 for name in ("replace", "unlink", "fsync", "open", "mkdir"):
     setattr(os, name, dying(getattr(os, name)))
 with files.together(folder, "scene") as outputs:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from ortho_pipeline import pipeline
-from ortho_pipeline.cli import cli
+from ortho_pipeline import commands
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import PointOptions
 
@@ -49,26 +49,26 @@ def test_the_significance_is_the_users(tiny):
     strict = json.loads(run(tiny, "--correction", "affine", "--significance", str(between), "--json").stdout)
     assert strict["statistics"]["not_justified"] == [max(p, key=p.__getitem__)]
     assert strict["statistics"]["significance"] == pytest.approx(between)
-    kept = pipeline.fit(tiny.image, points_of(tiny, correction="affine", prune=True, significance=0.999))
-    assert len(kept.fit.param_names) > len(pipeline.fit(
+    kept = commands.fit(tiny.image, points_of(tiny, correction="affine", prune=True, significance=0.999))
+    assert len(kept.fit.param_names) > len(commands.fit(
         tiny.image, points_of(tiny, correction="affine", prune=True)
     ).fit.param_names)  # fmt: skip
     assert run(tiny, "--significance", "0").exit_code == 2
 
 
 def test_parameters_are_chosen_by_name(tiny):
-    whole = pipeline.fit(tiny.image, points_of(tiny, correction="affine")).fit
+    whole = commands.fit(tiny.image, points_of(tiny, correction="affine")).fit
     assert whole.param_names[:1] == ("col_shift",)
-    chosen = pipeline.fit(tiny.image, points_of(tiny, correction="affine", params="col_shift, row_shift")).fit
-    shift = pipeline.fit(tiny.image, points_of(tiny, correction="shift")).fit
+    chosen = commands.fit(tiny.image, points_of(tiny, correction="affine", params="col_shift, row_shift")).fit
+    shift = commands.fit(tiny.image, points_of(tiny, correction="shift")).fit
     assert chosen.param_names == ("col_shift", "row_shift")
     np.testing.assert_allclose(chosen.values, shift.values, atol=1e-9)
     np.testing.assert_allclose(chosen.residuals, shift.residuals, atol=1e-9)
     # A family from the points: affine12 without its two products is affine3d.
-    twelve = pipeline.fit(tiny.image, points_of(tiny, fit_model="affine12")).fit
-    eight = pipeline.fit(tiny.image, points_of(tiny, fit_model="affine3d")).fit
+    twelve = commands.fit(tiny.image, points_of(tiny, fit_model="affine12")).fit
+    eight = commands.fit(tiny.image, points_of(tiny, fit_model="affine3d")).fit
     names = ",".join(name for name in twelve.param_names if name in eight.param_names)
-    again = pipeline.fit(tiny.image, points_of(tiny, fit_model="affine12", params=names)).fit
+    again = commands.fit(tiny.image, points_of(tiny, fit_model="affine12", params=names)).fit
     assert len(twelve.param_names) == 12
     np.testing.assert_allclose(again.residuals, eight.residuals, atol=1e-8)
 
@@ -85,7 +85,7 @@ def test_parameters_are_chosen_by_name(tiny):
 )
 def test_what_makes_no_sense_is_refused(tiny, options, field):
     with pytest.raises(InputError) as caught:
-        pipeline.fit(tiny.image, points_of(tiny, **options))
+        commands.fit(tiny.image, points_of(tiny, **options))
     assert caught.value.field == field
     assert caught.value.remedy
 
@@ -93,11 +93,11 @@ def test_what_makes_no_sense_is_refused(tiny, options, field):
 def test_the_weight_of_the_regularisation_is_the_users(tiny):
     tiny.write(tiny.gcps, tiny.points(20))
     for text, expected in (("1e-4", 1e-4), ("none", None)):
-        assert pipeline.fit(tiny.image, points_of(tiny, fit_model="rfm1", ridge=text)).fit.ridge == expected
-    found = pipeline.fit(tiny.image, points_of(tiny, fit_model="rfm1", ridge="gcv")).fit.ridge
-    assert pipeline.fit(tiny.image, points_of(tiny, fit_model="rfm1")).fit.ridge == found
+        assert commands.fit(tiny.image, points_of(tiny, fit_model="rfm1", ridge=text)).fit.ridge == expected
+    found = commands.fit(tiny.image, points_of(tiny, fit_model="rfm1", ridge="gcv")).fit.ridge
+    assert commands.fit(tiny.image, points_of(tiny, fit_model="rfm1")).fit.ridge == found
     strong, weak = (
-        np.abs(pipeline.fit(tiny.image, points_of(tiny, fit_model="rfm1", ridge=text)).fit.values[-6:]).max()
+        np.abs(commands.fit(tiny.image, points_of(tiny, fit_model="rfm1", ridge=text)).fit.values[-6:]).max()
         for text in ("1e3", "1e-6")
     )
     assert strong < 0.01 * weak
@@ -105,8 +105,8 @@ def test_the_weight_of_the_regularisation_is_the_users(tiny):
 
 def test_the_distance_of_neighbours_is_the_users(tiny):
     tiny.write(tiny.gcps, tiny.points(30))
-    found = pipeline.fit(tiny.image, points_of(tiny, near=700.0)).to_json()["covariance"]["control"]
+    found = commands.fit(tiny.image, points_of(tiny, near=700.0)).to_json()["covariance"]["control"]
     assert found["near_m"] == 700.0
     assert found["classes"][0]["to_m"] == 700.0
-    other = pipeline.fit(tiny.image, points_of(tiny)).to_json()["covariance"]["control"]
+    other = commands.fit(tiny.image, points_of(tiny)).to_json()["covariance"]["control"]
     assert other["near_m"] != 700.0

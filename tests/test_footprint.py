@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ortho_pipeline.dem import Surface, write_dem
 from ortho_pipeline.errors import CoverageError
-from ortho_pipeline.footprint import Footprint, choose_grid, lay
+from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.models import FrameCamera, ImageCorrection
-from ortho_pipeline.models.frame import MAP
+from ortho_pipeline.models.frame.camera import MAP
 from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.rpc import export_rpc
+from ortho_pipeline.surface.dem import Surface, write_dem
+from ortho_pipeline.surface.footprint import Footprint, choose_grid, lay
 
 CRS, X, Y = "EPSG:32651", 300_000.0, 2_700_000.0
 #: A drone 200 m above the ellipsoid and 120 m above the ground: pixels of 0.12 m, 120 x 80 m in all.

@@ -9,15 +9,15 @@ import pyproj
 import pytest
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
-from ortho_pipeline.estimation import Prior, fit
-from ortho_pipeline.geometry import angles_of_rotation, geocentric, geodetic, meet_height, rotation_of_angles
+from ortho_pipeline.estimation.fit import Prior, fit
+from ortho_pipeline.estimation.problem import Problem
+from ortho_pipeline.geodesy.ellipsoid import angles_of_rotation, geocentric, geodetic, meet_height, rotation_of_angles
 from ortho_pipeline.models import ImageCorrection, model_from_dict
 from ortho_pipeline.models.base import SensorModel
-from ortho_pipeline.models.frame import EXTERIOR, MAP, PARAMETERS, FrameCamera
+from ortho_pipeline.models.frame.camera import EXTERIOR, MAP, PARAMETERS, FrameCamera
+from ortho_pipeline.models.frame.resection import resect
 from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.models.resection import resect
 from ortho_pipeline.points import Points
-from ortho_pipeline.problem import Problem
 from ortho_pipeline.testing import check_sensor_model
 
 BILSAT = Interior(2048, 2048, 0.180, 27.6 * 0.180 / 686e3, 27.6 * 0.180 / 686e3)

@@ -11,9 +11,9 @@ import pytest
 from osgeo import gdal
 from scipy.spatial.transform import Rotation
 
-from ortho_pipeline import pipeline
+from ortho_pipeline import commands
+from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.inputs import open_scene
 from ortho_pipeline.options import SceneOptions
 
 LENS = {"projection_type": "perspective", "width": 60, "height": 40, "focal": 0.8, "k1": 0.0, "k2": 0.0}
@@ -110,18 +110,18 @@ def test_a_damaged_reconstruction_is_named(tmp_path, changes, field):
 def test_info_says_what_is_missing(tmp_path):
     path = image(tmp_path)
     with pytest.raises(InputError) as error:
-        pipeline.info(path)
+        commands.info(path)
     assert "--sensor NAME, which says what it needs (for images in general: frame" in str(error.value)
     with pytest.raises(InputError) as error:
-        pipeline.info(path, SceneOptions(sensor="frame"))
+        commands.info(path, SceneOptions(sensor="frame"))
     for option in ("camera", "exterior", "vertical"):
         assert f"--sensor-option {option}=" in str(error.value.remedy)
     with pytest.raises(InputError) as error:
-        pipeline.info(path, SceneOptions(sensor_options={"exterior": "reconstruction.json"}))
+        commands.info(path, SceneOptions(sensor_options={"exterior": "reconstruction.json"}))
     assert error.value.field == "vertical"
     write(tmp_path)
     exterior = str(tmp_path / "reconstruction.json")
     options = SceneOptions(sensor_options={"exterior": exterior, "vertical": "ellipsoid"})
-    assert "not stated" in pipeline.info(path, options)["facts"]["ground_heights"]
+    assert "not stated" in commands.info(path, options)["facts"]["ground_heights"]
     stated = SceneOptions(sensor_options={**options.sensor_options, "heights": "850,950"})
-    assert "ground_heights" not in pipeline.info(path, stated)["facts"]
+    assert "ground_heights" not in commands.info(path, stated)["facts"]

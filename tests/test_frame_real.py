@@ -12,15 +12,15 @@ from ortho_frame import open_scene
 from scipy.spatial.transform import Rotation
 from skimage.registration import phase_cross_correlation
 
-from ortho_pipeline import load_model, pipeline
-from ortho_pipeline.crs import Vertical, ground_transform, parse_crs
-from ortho_pipeline.dem import Surface
-from ortho_pipeline.geometry import angles_of_rotation
-from ortho_pipeline.models.frame import MAP, TOPOCENTRIC, FrameCamera
+from ortho_pipeline import commands, load_model
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
+from ortho_pipeline.geodesy.ellipsoid import angles_of_rotation
+from ortho_pipeline.models.frame.camera import MAP, TOPOCENTRIC, FrameCamera
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.raster import Grid, RasterSource, open_dataset
-from ortho_pipeline.rays import intersect
-from ortho_pipeline.warp import rectify
+from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.rays import intersect
+from ortho_pipeline.warp.engine import rectify
 
 pytestmark = pytest.mark.realdata
 NGI = ("05_0182", "05_0184", "06_0251", "06_0253")
@@ -188,7 +188,7 @@ def test_a_drone_scene_is_usable_by_default(real, tmp_path):
     folder = real / "orthority" / "odm"
     name = "100_0005_0142"
     options = {"exterior": str(folder / "opensfm" / "reconstruction.json"), "vertical": "ellipsoid"}
-    result = pipeline.rectify(
+    result = commands.rectify(
         folder / "images" / f"{name}.tif", tmp_path,
         scene=SceneOptions(sensor="frame", sensor_options={**options, "frame": "map", "crs": "EPSG:32651"}),
         surface=SurfaceOptions(dem=folder / "odm_dem" / "dsm.tif", vertical="ellipsoid", fill="mask"),

@@ -14,21 +14,21 @@ import pyproj
 import pytest
 from osgeo import gdal
 
-from ortho_pipeline import pipeline
-from ortho_pipeline.dem import Surface
+from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.gdal_engine import EXPRESSED, Exact, Transformer
-from ortho_pipeline.model_choice import fit_family
+from ortho_pipeline.estimation.family_fit import fit_family
+from ortho_pipeline.exchange.rpc import RpcExport, export_rpc
 from ortho_pipeline.models import FrameCamera, ImageCorrection, SensorModel
 from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.models.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom_start import pushbroom_of_tables
+from ortho_pipeline.models.pushbroom.line_camera import LineCamera
+from ortho_pipeline.models.pushbroom.start import pushbroom_of_tables
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.points import Points
-from ortho_pipeline.raster import Grid, RasterSource
-from ortho_pipeline.rpc import RpcExport, export_rpc
-from ortho_pipeline.simulate import LineScanner
-from ortho_pipeline.warp import WarpResult, rectify, rectify_gdal
+from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.simulation.scanner import LineScanner
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.warp.engine import WarpResult, rectify, rectify_gdal
+from ortho_pipeline.warp.gdal_engine import EXPRESSED, Exact, Transformer
 
 UTM = pyproj.CRS.from_epsg(32651)
 EAST, NORTH = 500_000.0, 1_000_000.0
@@ -223,7 +223,7 @@ def test_where_nothing_stands_for_the_model_the_remedy_is_our_engine(tmp_path, m
 def test_what_gdals_warper_cannot_do_as_asked_is_refused_or_said(tiny, tmp_path):
     cubic = OutputOptions(engine="gdal", dem_interpolation="cubic")
     with pytest.raises(InputError, match="--dem-interpolation"):
-        pipeline.rectify(tiny.image, tmp_path / "cubic", surface=SurfaceOptions(height=500.0), output=cubic)
+        commands.rectify(tiny.image, tmp_path / "cubic", surface=SurfaceOptions(height=500.0), output=cubic)
     assert not list((tmp_path / "cubic").glob("*.tif"))
     arrays = WarpResult(0.0, 0.1, 1, 0, 0, 10_000_000, 1, 1.0, "GEOLOC_ARRAY")
     assert "about 1000 MB" in arrays.notes(512_000_000)[0]

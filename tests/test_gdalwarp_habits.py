@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 from osgeo import gdal
 
-from ortho_pipeline.cli import cli
+from ortho_pipeline.cli.program import cli
 
 #: Not on whole multiples of the resolution, and larger than the scene.
 EXTENT = (402003.0, 6679002.0, 404011.0, 6681004.0)
@@ -69,7 +69,7 @@ def test_the_grid_is_that_of_gdalwarp(tiny, tmp_path, tap):
 
 def given_output(monkeypatch, *words: Any) -> Any:
     """Return the output options that `rectify` is called with."""
-    from ortho_pipeline import pipeline
+    from ortho_pipeline import commands
 
     given = {}
 
@@ -77,7 +77,7 @@ def given_output(monkeypatch, *words: Any) -> Any:
         given["output"] = output
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline, "rectify", rectify)
+    monkeypatch.setattr(commands, "rectify", rectify)
     run("rectify", "a.tif", "-o", "out", *words)
     return given["output"]
 

@@ -15,17 +15,17 @@ import pytest
 from ortho_ikonos.metadata import read_header, read_metadata
 from osgeo import gdal, osr
 
-from ortho_pipeline import pipeline
-from ortho_pipeline.crs import ground_transform
+from ortho_pipeline import commands
+from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation import fit
-from ortho_pipeline.geometry import geocentric
-from ortho_pipeline.inputs import open_scene
-from ortho_pipeline.model_file import load_model
+from ortho_pipeline.estimation.fit import fit
+from ortho_pipeline.exchange.model_file import load_model
+from ortho_pipeline.exchange.rpc import export_rpc, read_rpc, write_rpb, write_rpc_txt
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.ellipsoid import geocentric
 from ortho_pipeline.models import ImageCorrection, MapPlane, Pieces
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.plugins import Host
-from ortho_pipeline.rpc import export_rpc, read_rpc, write_rpb, write_rpc_txt
 from ortho_pipeline.testing import check_sensor, check_sensor_model
 
 UTM = "EPSG:32639"
@@ -406,17 +406,17 @@ def measured(model: MapPlane, count: int, tmp_path: Path, noise: float = 0.0) ->
 def test_one_point_shifts_and_more_turn_the_line_of_sight(tmp_path):
     image = write_order(tmp_path / "order")
     truth = plane(shift=(12.0, -7.5), relief=tuple(np.add(plane().relief, (0.004, -0.003))))
-    one = pipeline.fit(image, PointOptions(gcps=measured(plane(shift=(12.0, -7.5)), 1, tmp_path), correction="shift"))
+    one = commands.fit(image, PointOptions(gcps=measured(plane(shift=(12.0, -7.5)), 1, tmp_path), correction="shift"))
     np.testing.assert_allclose(one.fit.model.params, [12.0, 7.5], atol=1e-6)
     assert one.fit.model_name == "geo+shift"
-    all_of_it = pipeline.fit(
+    all_of_it = commands.fit(
         image, PointOptions(gcps=measured(truth, 8, tmp_path, noise=0.1), correction="model")
     ).fit  # fmt: skip
     sigma = np.sqrt(np.diag(all_of_it.covariance))
     assert (np.abs(all_of_it.model.params - truth.params) < 4 * sigma).all()
     assert sigma[2] < 0.003
     # One point and what the vendor knows of the rest: a shift, the direction hardly moves.
-    soft = pipeline.fit(image, PointOptions(gcps=measured(plane(shift=(12.0, -7.5)), 1, tmp_path), correction="model"))
+    soft = commands.fit(image, PointOptions(gcps=measured(plane(shift=(12.0, -7.5)), 1, tmp_path), correction="model"))
     np.testing.assert_allclose(soft.fit.predicted, soft.fit.points.image, atol=0.05)
     np.testing.assert_allclose(soft.fit.model.relief, plane().relief, atol=0.02)
 
@@ -440,7 +440,7 @@ def test_an_order_opens_best_model_first(tmp_path, rpc):
     other = open_order(image, geometry="geo")
     assert next(iter(other.models)) == "geo"
     assert set(other.priors) == {"shift_x", "shift_y", "relief_x", "relief_y"}
-    assert pipeline.info(image)["sensor"] == "ikonos"
+    assert commands.info(image)["sensor"] == "ikonos"
 
 
 def test_only_ikonos_orders_are_recognised(tmp_path):
@@ -587,7 +587,7 @@ def test_colour_images_share_the_outer_corner_of_the_panchromatic_one(tmp_path):
 def test_bands_are_stacked_and_each_is_as_by_itself(tmp_path):
     bands = write_bands(tmp_path / "order")
     options = {"surface": SurfaceOptions(height=1330.0), "output": OutputOptions(resolution=4.0)}
-    made = pipeline.rectify(
+    made = commands.rectify(
         bands["red"], tmp_path / "all", scene=SceneOptions(sensor_options={"bands": "all"}), **options
     )
     stack = gdal.Open(str(made.files["ortho"]))
@@ -595,7 +595,7 @@ def test_bands_are_stacked_and_each_is_as_by_itself(tmp_path):
     hashed = {entry["path"] for entry in made.document["report"]["provenance"]["inputs"]}
     assert {*map(str, bands.values()), str(tmp_path / "order" / "po_39001_metadata.txt")} <= hashed
     for number, (band, path) in enumerate(bands.items(), start=1):
-        alone = pipeline.rectify(path, tmp_path / band, **options)
+        alone = commands.rectify(path, tmp_path / band, **options)
         np.testing.assert_array_equal(
             gdal.Open(str(alone.files["ortho"])).ReadAsArray(), stack.GetRasterBand(number).ReadAsArray()
         )
@@ -636,7 +636,7 @@ def write_shared(path: Path, images: tuple[Path, Path], bias: tuple[float, float
 def test_components_share_one_adjustment(tmp_path, correction):
     images = write_components(tmp_path / "order")
     gcps = write_shared(tmp_path / "gcps.csv", images, (4.0, -3.0))
-    first, second = (pipeline.fit(image, PointOptions(gcps=gcps, correction=correction)).fit for image in images)
+    first, second = (commands.fit(image, PointOptions(gcps=gcps, correction=correction)).fit for image in images)
     assert first.used.sum() == second.used.sum() == 12
     assert isinstance(first.model.model, Pieces)
     np.testing.assert_allclose(first.rmse("control")["total"], second.rmse("control")["total"], rtol=1e-6)
@@ -657,7 +657,7 @@ def corrected(model: ImageCorrection, image: np.ndarray) -> np.ndarray:
 def test_the_rpc_of_a_component_takes_the_shared_shift_exactly(tmp_path):
     images = write_components(tmp_path / "order")
     gcps = write_shared(tmp_path / "gcps.csv", images, (4.0, -3.0))
-    made = pipeline.rectify(
+    made = commands.rectify(
         images[1], tmp_path / "out", points=PointOptions(gcps=gcps), surface=SurfaceOptions(height=1300.0)
     )
     assert made.document["report"]["rpc"]["exact"]
@@ -686,7 +686,7 @@ def test_a_point_of_several_bands_counts_once(tmp_path):
     rows.append(f"g1,80.2,15.2,{535000 + 320},{3957000 - 60},{PLANE},{bands['red'].name}")
     path = tmp_path / "gcps.csv"
     path.write_text(f"#CRS: {UTM}\n#vertical: ellipsoid\nid,col,row,x,y,h,image\n" + "\n".join(rows) + "\n")
-    fitted = pipeline.fit(bands["red"], PointOptions(gcps=path, correction="none")).fit
+    fitted = commands.fit(bands["red"], PointOptions(gcps=path, correction="none")).fit
     assert sorted(fitted.points.ids) == ["g0", "g1", "g2"]
     # The image that is adjusted comes first.
     np.testing.assert_array_equal(fitted.points.image[fitted.points.ids.index("g1")], [80.2, 15.2])
@@ -703,12 +703,12 @@ def test_points_in_the_panchromatic_image_adjust_the_colour_bands(tmp_path, orig
     path = tmp_path / "gcps.csv"
     path.write_text(f"#CRS: {UTM}\n#vertical: ellipsoid\nid,col,row,x,y,h,image,sigma_image\n" + "\n".join(rows) + "\n")
     options = PointOptions(gcps=path, correction="shift", pixel_origin=origin)
-    found = pipeline.fit(bands["red"], options).fit
+    found = commands.fit(bands["red"], options).fit
     np.testing.assert_allclose(found.model.params, [1.5, -1.0], atol=1e-6)
     np.testing.assert_allclose(found.points.sigma_image, 0.125)
     # Coarser by as much, and the same in metres, the other way round.
     path.write_text(path.read_text().replace("pan_0000000", "red_0000000"))
-    found = pipeline.fit(tmp_path / "order" / "po_39001_pan_0000000.tif", options).fit
+    found = commands.fit(tmp_path / "order" / "po_39001_pan_0000000.tif", options).fit
     np.testing.assert_allclose(found.points.sigma_image, 2.0)
 
 
@@ -792,7 +792,7 @@ def test_gdalwarp_makes_the_same_ortho_of_the_rpc(tmp_path, rpc, options, exact)
     image = write_order(tmp_path / "order", rpc=rpc)
     dem = slope(tmp_path / "dem.tif")
     gcps = measured(plane(shift=(5.0, -4.0)), 15, tmp_path, noise=0.2)
-    made = pipeline.rectify(
+    made = commands.rectify(
         image, tmp_path / "out", points=PointOptions(gcps=gcps, **options),
         surface=SurfaceOptions(dem=dem, vertical="ellipsoid"), output=OutputOptions(extent=EXTENT, resolution=1.0),
     )  # fmt: skip
@@ -815,11 +815,11 @@ def test_gdalwarp_makes_the_same_ortho_of_the_control_points(tmp_path, family, o
     image = write_order(tmp_path / "order")
     gcps = measured(plane(shift=(5.0, -4.0)), 15, tmp_path, noise=0.2)
     points = PointOptions(gcps=gcps, fit_model=family)
-    made = pipeline.rectify(
+    made = commands.rectify(
         image, tmp_path / "out", points=points, surface=SurfaceOptions(height=PLANE),
         output=OutputOptions(extent=EXTENT, resolution=1.0),
     )  # fmt: skip
-    exported = pipeline.export(image, tmp_path / "gcp", points=points, formats=["gcp"])
+    exported = commands.export(image, tmp_path / "gcp", points=points, formats=["gcp"])
     theirs = warped_by_gdal(
         exported.files["gcp"], made.files["ortho"], tmp_path, "METHOD=GCP_POLYNOMIAL", f"MAX_GCP_ORDER={order}"
     )
@@ -836,7 +836,7 @@ def test_the_fitted_rpc_stands_for_the_plane_as_stated():
 def test_fits_are_linear_in_the_parameters(tmp_path):
     start = plane()
     scene = open_order(write_order(tmp_path / "order"))
-    points = pipeline.fit(
+    points = commands.fit(
         scene.path, PointOptions(gcps=measured(plane(shift=(3.0, 4.0)), 5, tmp_path), correction="none")
     ).fit.points
     again = fit(start, points, robust=False)

@@ -8,12 +8,8 @@ import numpy as np
 import pyproj
 import pytest
 from click.testing import CliRunner
-
-from ortho_pipeline.cli import cli
-from ortho_pipeline.crs import utm_crs
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.experiments import ikonos
-from ortho_pipeline.experiments.ikonos_scene import (
+from ortho_ikonos import experiment as ikonos
+from ortho_ikonos.truth import (
     BIAS,
     EXTENT,
     MAP_CRS,
@@ -23,10 +19,14 @@ from ortho_pipeline.experiments.ikonos_scene import (
     VendorModel,
     to_map,
 )
-from ortho_pipeline.experiments.page import text
-from ortho_pipeline.model_choice import fit_family
-from ortho_pipeline.rpc import fit_rpc, read_rpc
-from ortho_pipeline.simulate import geocentric
+
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.estimation.family_fit import fit_family
+from ortho_pipeline.exchange.rpc import fit_rpc, read_rpc
+from ortho_pipeline.geodesy.crs import utm_crs
+from ortho_pipeline.simulation.page import text
+from ortho_pipeline.simulation.scanner import geocentric
 
 
 def on_map(ground):

@@ -9,11 +9,7 @@ import pytest
 from click.testing import CliRunner
 from ortho_ikonos.metadata import read_metadata
 from ortho_ikonos.simulation import ORDER, write_product
-
-from ortho_pipeline import pipeline
-from ortho_pipeline.cli import cli
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.experiments.ikonos_scene import (
+from ortho_ikonos.truth import (
     DARK,
     FINEST,
     MAP_CRS,
@@ -23,11 +19,15 @@ from ortho_pipeline.experiments.ikonos_scene import (
     render,
     to_map,
 )
-from ortho_pipeline.model_file import load_model
+
+from ortho_pipeline import commands
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.options import PointOptions
 from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
-from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.raster.source import open_dataset
 
 #: Of the sample, as sample_data/make.py has them.
 SEED, SIZE, PIXEL = 1, 800, 12.5
@@ -209,8 +209,8 @@ def test_points_of_components_are_measured_in_the_component_that_they_lie_in(tmp
     assert all(0 < len(points) < 40 and points.image[:, 0].max() < 64.5 for points in read.values())
     assert sum(map(len, read.values())) == 40
     # ... and all of them adjust either component as they adjust the whole.
-    expected = pipeline.fit(whole["image"], PointOptions(gcps=whole["gcps"])).fit
+    expected = commands.fit(whole["image"], PointOptions(gcps=whole["gcps"])).fit
     for path in images:
-        found = pipeline.fit(path, PointOptions(gcps=cut["gcps"])).fit
+        found = commands.fit(path, PointOptions(gcps=cut["gcps"])).fit
         assert len(found.points) == 40
         np.testing.assert_allclose(found.rmse("check")["total"], expected.rmse("check")["total"], atol=1e-3)

@@ -14,11 +14,11 @@ import pyproj
 import pytest
 from osgeo import gdal, osr
 
-from ortho_pipeline.crs import ground_transform
-from ortho_pipeline.inputs import open_scene
+from ortho_pipeline.commands.inputs import open_scene
+from ortho_pipeline.exchange.rpc import read_rpc
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models import RPC, MapPlane
 from ortho_pipeline.options import SceneOptions
-from ortho_pipeline.rpc import read_rpc
 from ortho_pipeline.testing import check_sensor
 
 pytestmark = pytest.mark.realdata
@@ -222,7 +222,7 @@ def test_colour_and_panchromatic_images_share_a_corner(real):
 
 def test_points_bring_the_plane_onto_the_real_rpc(blosseville):
     """One point takes the bias of the plane out; more also the error of the nominal direction."""
-    from ortho_pipeline.estimation import fit
+    from ortho_pipeline.estimation.fit import fit
     from ortho_pipeline.points import Points
 
     scene, rpc = blosseville

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from ortho_pipeline import files, pipeline
+from ortho_pipeline import commands, files
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import PointOptions, SurfaceOptions
 
@@ -32,7 +32,7 @@ def test_no_thread_outlives_a_command_that_fails(tiny, tmp_path):
         raise CancelledError
 
     with pytest.raises(InputError, match=r"nowhere\.csv"):
-        pipeline.rectify(
+        commands.rectify(
             tiny.image, tmp_path / "out", points=PointOptions(gcps=tmp_path / "nowhere.csv"),
             surface=SurfaceOptions(dem=tiny.dem, vertical="ellipsoid"), digest=slow,
         )  # fmt: skip
@@ -81,7 +81,7 @@ def served(tiny: Any) -> Iterator[str]:
 #: The command line in an interpreter that takes its time to end, so that what a thread does meanwhile surely matters.
 _LATE = """
 import time
-from ortho_pipeline.cli import main
+from ortho_pipeline.cli.program import main
 class Late:
     def __del__(self, sleep=time.sleep):
         sleep(1.6)

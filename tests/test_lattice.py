@@ -13,17 +13,17 @@ import pyproj
 import pytest
 from osgeo import gdal
 
-from ortho_pipeline.crs import GroundTransform
-from ortho_pipeline.dem import Surface
+from ortho_pipeline.geodesy.crs import GroundTransform
 from ortho_pipeline.models import Pushbroom, SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
-from ortho_pipeline.models.frame import FrameCamera
+from ortho_pipeline.models.frame.camera import FrameCamera
 from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.models.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom_start import pushbroom_of_tables
-from ortho_pipeline.raster import Grid, RasterSource
-from ortho_pipeline.simulate import LineScanner
-from ortho_pipeline.warp import WarpResult, rectify
+from ortho_pipeline.models.pushbroom.line_camera import LineCamera
+from ortho_pipeline.models.pushbroom.start import pushbroom_of_tables
+from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.simulation.scanner import LineScanner
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.warp.engine import WarpResult, rectify
 
 UTM = pyproj.CRS.from_epsg(32651)
 EAST, NORTH = 500_000.0, 1_000_000.0

@@ -1,8 +1,13 @@
-"""The architecture, held by reading the imports: docs/architecture.md says why."""
+"""The architecture, held by reading the imports: docs/architecture.md says why.
+
+`python tests/test_layers.py` writes the table of rooms into that page.
+"""
 
 from __future__ import annotations
 
 import ast
+import graphlib
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,58 +18,52 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "ortho_pipeline"
 
-#: A module imports only from lines above its own.
-LAYERS = """
+#: Rooms, and modules that stand between them, bottom to top: each imports only itself and what is on lines above.
+ROOMS = """
 errors options
-locations
 files
-geoid_grid
-crs geometry notebook compiled allowance voids
-point_table datum
-point_csv point_geojson point_lists point_ground
-point_files
+display
+geodesy
 points
-models least_squares statistics
-problem block_points ground_frame
-ridge block_steps block_system intersection
-blunders block_solver report_text
-block_variance
-registration estimation hookspecs swaps model_file kernels lattice_kernel ray_kernel landscape rpc_files
-block_blunders
-model_choice block_checks selection ground_error drawing contract control_hull
-comparison report_plots adjustment covariance map_scale delivered
-gate
+models
+estimation
+hookspecs
+contract
 raster
-raster_output
-raster_writer
-rpc dem preview edge outline crop stack
-plugins rays gdal_engine resolution ellipse
-footprint lattice simulate inputs testing dem_accuracy
-gcp_export scene_fit warp mosaic
-scene_layout
-report experiments stac block_images results
-pipeline block_report
-studies bands batch_config batch_manifest executors
-batch_plan
-blocks batch
-cli_command
-cli_options cli_text
-cli_studies cli_blocks cli_batch
+surface
+exchange
+plugins
+testing
+imaging
+block
+warp
+simulation
+report
+commands
+batch
 cli
 """
-LINE = {name: number for number, line in enumerate(LAYERS.split("\n")) for name in line.split()}
-GDAL_MODULES = {"locations", "gate", "raster", "raster_output", "raster_writer", "dem", "mosaic", "plugins"}
-GDAL_MODULES |= {"rpc", "stack", "gcp_export", "gdal_engine"}
-NUMBA_MODULES = {"compiled"}
-MAX_LINES, MAX_FUNCTION = 600, 50
+LINE = {name: number for number, line in enumerate(ROOMS.split("\n")) for name in line.split()}
+#: Where GDAL, numba and matplotlib are imported.
+GDAL_MODULES = {"files.locations", "raster.gate", "raster.source", "raster.output", "raster.ortho", "surface.dem"}
+GDAL_MODULES |= {"plugins", "exchange.rpc", "exchange.gcp", "imaging.band_stack", "warp.mosaic", "warp.gdal_engine"}
+NUMBA_MODULES = {"files.compiled"}
+MATPLOTLIB_MODULES = {"display.drawing"}
+MAX_ENTRIES, MAX_MODULES, MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_PARAMETERS = 26, 12, 600, 250, 50, 12
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 PLUGIN_FILES = sorted((ROOT / "plugins").rglob("*.py"))
+PLUGINS = {path.name for path in (ROOT / "plugins").iterdir() if path.is_dir()}
 
 
 def module_of(path: Path) -> str:
-    """Return the name that stands in LAYERS: the module, or the folder that it lies in."""
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    """Return the dotted name of a module below the package."""
+    return ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
+
+
+def room_of(module: str) -> str:
+    """Return the name that stands in ROOMS: the room, or a module that stands between rooms."""
+    return module.partition(".")[0]
 
 
 def imports(tree: ast.AST) -> Iterator[tuple[str, bool]]:
@@ -75,12 +74,16 @@ def imports(tree: ast.AST) -> Iterator[tuple[str, bool]]:
             for alias in node.names:
                 yield alias.name, node in top
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, "relative imports hide the layer"
-            if node.module == "ortho_pipeline":
-                for alias in node.names:
-                    yield f"ortho_pipeline.{alias.name}", node in top
-            else:
-                yield str(node.module), node in top
+            assert node.level == 0, "relative imports hide the room"
+            for alias in node.names:
+                inside = f"{node.module}.{alias.name}"
+                yield inside if is_module(inside) else str(node.module), node in top
+
+
+def is_module(dotted: str) -> bool:
+    """Whether a dotted name is a module or a room of the package."""
+    path = ROOT.joinpath(*dotted.split("."))
+    return dotted.startswith("ortho_pipeline.") and (path.is_dir() or path.with_suffix(".py").is_file())
 
 
 def parse(path: Path) -> ast.Module:
@@ -89,15 +92,24 @@ def parse(path: Path) -> ast.Module:
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_imports_point_upwards(path: Path) -> None:
-    name = module_of(path)
-    if name in ("__init__", "__main__"):
+    room = room_of(module_of(path))
+    if room in ("__init__", "__main__"):
         return
-    assert name in LINE, f"{name} has no place in LAYERS: where does it belong?"
+    assert room in LINE, f"{room} has no place in ROOMS: where does it belong?"
     for imported, _ in imports(parse(path)):
         parts = imported.split(".")
-        if parts[0] != "ortho_pipeline" or parts[1] == name:
-            continue
-        assert LINE[parts[1]] < LINE[name], f"{name} imports {parts[1]}, which is not above it"
+        assert parts[0] not in PLUGINS, f"{path.name} imports {imported}: the host knows no plugin by name"
+        if parts[0] == "ortho_pipeline" and parts[1] != room:
+            assert LINE[parts[1]] < LINE[room], f"{module_of(path)} imports {imported}, which is not below {room}"
+
+
+@pytest.mark.parametrize("room", sorted({room_of(module_of(path)) for path in FILES if path.parent != PACKAGE}))
+def test_no_circle_in_a_room(room: str) -> None:
+    graph: dict[str, set[str]] = {}
+    for path in (PACKAGE / room).rglob("*.py"):
+        module = f"ortho_pipeline.{module_of(path)}"
+        graph[module] = {name for name, at_top in imports(parse(path)) if at_top and name.startswith("ortho_pipeline.")}
+    graphlib.TopologicalSorter(graph).prepare()
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
@@ -110,21 +122,21 @@ def test_heavy_libraries_stay_where_they_belong(path: Path) -> None:
         if library == "numba":
             assert name in NUMBA_MODULES, f"{name} imports numba"
         if library == "matplotlib":
-            assert (name, at_top) == ("drawing", False), f"{name}: matplotlib only inside functions of drawing"
+            assert name in MATPLOTLIB_MODULES, f"{name} imports matplotlib"
+            assert not at_top, f"{name}: matplotlib only inside functions"
 
 
 def test_the_package_itself_imports_nothing_of_its_own() -> None:
     heavy = {"numpy", "scipy", "numba", "osgeo", "pyproj", "matplotlib", "ortho_pipeline"}
-    assert not [name for name, _ in imports(parse(PACKAGE / "__init__.py")) if name.split(".")[0] in heavy]
+    top = [name for name, at_top in imports(parse(PACKAGE / "__init__.py")) if at_top]
+    assert not [name for name in top if name.split(".")[0] in heavy]
 
 
 def test_the_command_line_defers_heavy_imports() -> None:
-    names = ("errors", "options", "cli_command", "cli_options", "cli_text", "cli_studies", "cli_blocks", "cli_batch")
-    light = {f"ortho_pipeline.{name}" for name in names}
-    for path in PACKAGE.glob("cli*.py"):
+    for path in (PACKAGE / "cli").glob("*.py"):
         for imported, at_top in imports(parse(path)):
             if at_top and imported.startswith("ortho_pipeline"):
-                assert imported in light
+                assert imported.split(".")[1] in ("cli", "errors", "options"), f"{path.name} imports {imported}"
 
 
 @pytest.mark.parametrize("path", FILES + PLUGIN_FILES, ids=lambda path: str(path.relative_to(ROOT)))
@@ -142,8 +154,38 @@ def code_lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     return 0 if not body else (node.end_lineno or 0) - body[0].lineno + 1
 
 
+def test_rooms_are_few_and_small() -> None:
+    assert len([path for path in PACKAGE.iterdir() if path.name != "__pycache__"]) <= MAX_ENTRIES
+    for folder in {path.parent for path in FILES}:
+        assert len(list(folder.glob("*.py"))) <= MAX_MODULES, f"{folder.name} is full"
+
+
 def test_no_drawer_for_everything() -> None:
     assert not [path for path in FILES if path.stem in ("utils", "util", "helpers", "misc", "common")]
+
+
+def table() -> str:
+    """Return the table of rooms as it stands in docs/architecture.md."""
+    rows = ["| room | what lives there | modules |", "|---|---|---|"]
+    for line in ROOMS.split("\n"):
+        for name in line.split():
+            path = PACKAGE / name
+            file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+            doc = (ast.get_docstring(parse(file)) or "").split("\n\n")[0].replace("\n", " ")
+            inside = (one.relative_to(path).with_suffix("").as_posix() for one in sorted(path.rglob("*.py")))
+            said = ", ".join(f"`{one}`" for one in inside if not one.endswith("__init__"))
+            rows.append(f"| `{name}{'/' if path.is_dir() else '.py'}` | {doc} | {said} |")
+    return "\n".join(rows)
+
+
+MARKS = re.compile(r"(<!-- rooms -->\n).*?(\n<!-- end of rooms -->)", re.DOTALL)
+
+
+def test_the_map_of_the_house_is_true() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    found = MARKS.search(page)
+    assert found
+    assert found[0] == f"{found[1]}{table()}{found[2]}", "write it again: python tests/test_layers.py"
 
 
 def test_starting_a_command_loads_nothing_that_few_need() -> None:
@@ -158,6 +200,11 @@ def test_starting_a_command_loads_nothing_that_few_need() -> None:
         "pystac",
         "pydantic",
     )
-    code = f"import sys, ortho_pipeline.pipeline; print(*[name for name in {heavy!r} if name in sys.modules])"
+    code = f"import sys, ortho_pipeline.commands; print(*[name for name in {heavy!r} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+if __name__ == "__main__":
+    page = ROOT / "docs" / "architecture.md"
+    page.write_text(MARKS.sub(lambda found: found[1] + table() + found[2], page.read_text(encoding="utf-8")))

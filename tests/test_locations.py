@@ -16,12 +16,12 @@ import pytest
 from click.testing import CliRunner, Result
 from osgeo import gdal
 
-from ortho_pipeline import pipeline
-from ortho_pipeline.cli import cli
+from ortho_pipeline import commands
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.locations import VsiPath, archive_of, in_local_archive, located
+from ortho_pipeline.files.locations import VsiPath, archive_of, in_local_archive, located
 from ortho_pipeline.options import SceneOptions
-from ortho_pipeline.raster import open_dataset
+from ortho_pipeline.raster.source import open_dataset
 
 POINTS = ["--points-crs", "EPSG:4979", "--points-vertical", "ellipsoid"]
 
@@ -235,13 +235,13 @@ def test_our_own_vrt_opens_where_a_root_holds_both(tiny, tmp_path):
 
 
 def test_the_root_of_a_run_is_a_root_of_its_images(tiny, tmp_path):
-    from ortho_pipeline import batch_plan
+    from ortho_pipeline.batch import plan as batch_plan
 
     vrt = adjusted(tiny, tmp_path)
     file = tmp_path / "run.yaml"
     file.write_text(f"output: made\nscenes:\n  - {{image: out/{vrt.name}, surface: {{height: 500}}}}\n")
     job = batch_plan.plan(file).jobs[0]
-    assert pipeline.info(job.image, job.scene)["sensor"] == "rpc"
+    assert commands.info(job.image, job.scene)["sensor"] == "rpc"
 
 
 @pytest.mark.parametrize("source", ["../../secret.tif", "/etc/hostname", "link.tif"])

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ortho_pipeline.estimation import Fit, fit
-from ortho_pipeline.landscape import Terrain
-from ortho_pipeline.map_scale import judge, map_scale, nmas_limit
+from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.points import Points
-from ortho_pipeline.simulate import LineScanner, simulate_points
+from ortho_pipeline.report.map_scale import judge, map_scale, nmas_limit
+from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
+from ortho_pipeline.simulation.terrain import Terrain
 
 CAMERA = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(650.0, 1350.0))
 TERRAIN = Terrain("EPSG:32636", 531100.0, 4122700.0)

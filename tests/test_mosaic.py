@@ -17,13 +17,14 @@ from click.testing import CliRunner
 from osgeo import gdal
 from scipy.ndimage import gaussian_filter, shift
 
-from ortho_pipeline import batch, mosaic
-from ortho_pipeline.cli import cli
+from ortho_pipeline.batch import runner as batch
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.mosaic import Ortho, lay_out, measure_seam, overlaps, write_cog, write_vrt
-from ortho_pipeline.raster import Grid, open_dataset
-from ortho_pipeline.raster_writer import Profile, RasterWriter
-from ortho_pipeline.rpc import rpc_metadata
+from ortho_pipeline.exchange.rpc import rpc_metadata
+from ortho_pipeline.raster.ortho import Profile, RasterWriter
+from ortho_pipeline.raster.source import Grid, open_dataset
+from ortho_pipeline.warp import mosaic
+from ortho_pipeline.warp.mosaic import Ortho, lay_out, measure_seam, overlaps, write_cog, write_vrt
 
 UTM = pyproj.CRS("EPSG:32635")
 SIDE = 700

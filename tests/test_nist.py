@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ortho_pipeline.least_squares import minimise, solve_linear
+from ortho_pipeline.estimation.least_squares import minimise, solve_linear
 
 
 def numbers(text: str) -> np.ndarray:

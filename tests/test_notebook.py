@@ -29,7 +29,7 @@ def test_a_fit_shows_itself():
 
 
 def test_names_from_files_are_text_and_not_html():
-    from ortho_pipeline.notebook import fit_html, text_html
+    from ortho_pipeline.display.notebook import fit_html, text_html
 
     document = {
         "model": "<b>", "rmse": {"control": {"n": 1, "col": 0.1, "row": 0.1, "total": 0.14}, "check": None},

@@ -16,17 +16,17 @@ from ortho_orbview3.product import read_product
 from ortho_orbview3.simulation import write_product
 from osgeo import gdal
 
-from ortho_pipeline import pipeline
-from ortho_pipeline.cli import cli
-from ortho_pipeline.covariance import in_metres
+from ortho_pipeline import commands
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation import fit
+from ortho_pipeline.estimation.fit import fit
+from ortho_pipeline.estimation.spatial_correlation import in_metres
+from ortho_pipeline.exchange.rpc import export_rpc, rpc_metadata
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.options import PointOptions
 from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
-from ortho_pipeline.raster import open_dataset
-from ortho_pipeline.rpc import export_rpc, rpc_metadata
+from ortho_pipeline.raster.source import open_dataset
 from ortho_pipeline.testing import check_sensor
 
 STEMS = {
@@ -142,7 +142,7 @@ def test_a_small_family_is_far_off_on_an_original_scene(delivery):
     totals = {}
     for family in ("affine14", "affine12", "affine3d", "dlt"):
         options = PointOptions(f"{stem}_gcps.csv", fit_model=family)
-        found = pipeline.fit(f"{stem}.tif", options)
+        found = commands.fit(f"{stem}.tif", options)
         totals[family] = found.fit.rmse("control")["total"] * 24
         said = [text for text in found.warnings if "original scene" in text]
         assert said == [text for name, text in ortho_orbview3.UNSUITED.items() if name == family]
@@ -166,12 +166,12 @@ def test_points_that_a_family_cannot_follow_are_not_hidden(delivery, tmp_path):
 
 def test_only_what_fits_an_unsuited_family_is_warned(delivery):
     stem = delivery / STEMS["443940"]
-    assert not pipeline.info(f"{stem}.tif")["warnings"]
-    compared = pipeline.compare(f"{stem}.tif", PointOptions(f"{stem}_gcps.csv"), models="rpc+affine,affine14,affine3d")
+    assert not commands.info(f"{stem}.tif")["warnings"]
+    compared = commands.compare(f"{stem}.tif", PointOptions(f"{stem}_gcps.csv"), models="rpc+affine,affine14,affine3d")
     rows = {row["model"]: row["warnings"] for row in compared.to_json()["rows"]}
     assert ortho_orbview3.UNSUITED["affine3d"] in rows.pop("affine3d")
     assert "original scene" not in str(rows)
-    best = pipeline.fit(f"{stem}.tif", PointOptions(f"{stem}_gcps.csv", correction="affine"))
+    best = commands.fit(f"{stem}.tif", PointOptions(f"{stem}_gcps.csv", correction="affine"))
     assert "original scene" not in str(best.warnings)
 
 

@@ -8,16 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ortho_orbview3 import experiment as orbview3
+from ortho_orbview3 import page as orbview3_page
+from ortho_orbview3 import statements as orbview3_statements
+from ortho_orbview3 import truth as simulated
 
-from ortho_pipeline.cli import cli
-from ortho_pipeline.edge import analyse_edge
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.experiments import orbview3, orbview3_page, orbview3_statements
-from ortho_pipeline.experiments import orbview3_scene as simulated
-from ortho_pipeline.experiments.page import text
-from ortho_pipeline.experiments.tables import is_missed, is_within
-from ortho_pipeline.model_choice import fit_family
-from ortho_pipeline.simulate import geocentric
+from ortho_pipeline.estimation.family_fit import fit_family
+from ortho_pipeline.imaging.edge import analyse_edge
+from ortho_pipeline.simulation.page import text
+from ortho_pipeline.simulation.scanner import geocentric
+from ortho_pipeline.simulation.tables import is_missed, is_within
 
 SCENES = tuple(simulated.SCENES)
 

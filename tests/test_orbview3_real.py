@@ -13,10 +13,10 @@ from ortho_orbview3.product import read_product, rpc_text_of
 from osgeo import gdal
 
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.exchange.rpc import read_rpc
+from ortho_pipeline.exchange.rpc_files import rpc_metadata
 from ortho_pipeline.models import RPC
 from ortho_pipeline.plugins import open_scene
-from ortho_pipeline.rpc import read_rpc
-from ortho_pipeline.rpc_files import rpc_metadata
 from ortho_pipeline.testing import check_sensor
 
 pytestmark = pytest.mark.realdata

@@ -12,12 +12,14 @@ import pytest
 from osgeo import gdal
 
 import ortho_pipeline
-from ortho_pipeline import pipeline, plugins
+from ortho_pipeline import commands, plugins
+from ortho_pipeline.commands import results
+from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CoverageError, DatumError, DegeneratePoints, InputError, PluginError
-from ortho_pipeline.model_file import read_model_file
+from ortho_pipeline.exchange.model_file import read_model_file
+from ortho_pipeline.exchange.rpc import export_rpc, read_rpc, rpc_metadata, write_rpc_txt
 from ortho_pipeline.models import KINDS
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.rpc import export_rpc, read_rpc, rpc_metadata, write_rpc_txt
 
 CRS = "EPSG:4979"
 
@@ -30,9 +32,9 @@ def dem_of(tiny: Any, **options: Any) -> SurfaceOptions:
     return SurfaceOptions(**{"dem": tiny.dem, "vertical": "ellipsoid", **options})
 
 
-def rectify(tiny: Any, folder: Path, **options: Any) -> pipeline.Result:
+def rectify(tiny: Any, folder: Path, **options: Any) -> results.Result:
     given = {"points": points_of(tiny), "surface": dem_of(tiny), **options}
-    return pipeline.rectify(tiny.image, folder, **given)
+    return commands.rectify(tiny.image, folder, **given)
 
 
 def valid(path: Path) -> np.ndarray:
@@ -82,7 +84,7 @@ def test_a_bright_pixel_lands_on_its_ground_point(tiny, tmp_path):
     left, dx, _, top, _, dy = ortho.GetGeoTransform()
     found = np.array([left + dx * (columns.mean() + 0.5), top + dy * (rows.mean() + 0.5)])
     truth = tiny.model.image_to_ground([[210.5, 120.5]], 500.0)
-    expected = ortho_pipeline.crs.ground_transform(CRS, "EPSG:32734")(truth)[0, :2]
+    expected = ortho_pipeline.geodesy.crs.ground_transform(CRS, "EPSG:32734")(truth)[0, :2]
     np.testing.assert_allclose(found, expected, atol=0.05 * 4.8 + 0.25)
 
 
@@ -109,7 +111,7 @@ def test_a_saved_model_of_another_image_is_refused(tiny, tmp_path):
     other = tmp_path / "other.tif"
     gdal.Translate(str(other), str(tiny.image), srcWin=[0, 0, 100, 100])
     with pytest.raises(InputError, match="400 x 300"):
-        pipeline.rectify(other, tmp_path / "x", scene=SceneOptions(model=model), surface=dem_of(tiny))
+        commands.rectify(other, tmp_path / "x", scene=SceneOptions(model=model), surface=dem_of(tiny))
 
 
 def test_both_engines_agree(tiny, tmp_path):
@@ -142,9 +144,9 @@ def test_the_engine_of_gdal_reports_how_far_its_rpc_is_off_the_model(tiny, tmp_p
 
 
 def test_export_writes_every_format_exactly(tiny, tmp_path):
-    result = pipeline.export(tiny.image, tmp_path / "out", points=points_of(tiny))
+    result = commands.export(tiny.image, tmp_path / "out", points=points_of(tiny))
     assert result.document["exact"]
-    fitted = pipeline.fit(tiny.image, points_of(tiny)).fit.model
+    fitted = commands.fit(tiny.image, points_of(tiny)).fit.model
     ground = np.array([[20.004, -30.003, 430.0], [19.996, -29.997, 610.0]])
     for name in ("rpc-txt", "rpb", "tag", "vrt"):
         if name == "vrt":
@@ -216,25 +218,25 @@ def test_swapped_coordinates_are_named(tiny, case):
     rows = [(row[0], *(np.array(row[1:]) * signs).tolist()) for row in tiny.points(8)]
     path = tiny.write(tiny.folder / "swapped.csv", [tuple(row[i] for i in order) for row in rows])
     with pytest.raises(InputError, match=message):
-        pipeline.fit(tiny.image, points_of(tiny, path))
+        commands.fit(tiny.image, points_of(tiny, path))
 
 
 def test_rows_from_the_bottom_are_named(tiny):
     rows = [(name, col, tiny.height - row, *ground) for name, col, row, *ground in tiny.points(8, noise=0.0)]
     path = tiny.write(tiny.folder / "bottom.csv", rows)
     with pytest.raises(InputError, match="from the bottom"):
-        pipeline.fit(tiny.image, points_of(tiny, path))
+        commands.fit(tiny.image, points_of(tiny, path))
 
 
 def test_points_of_another_place_are_refused(tiny):
     rows = [(name, col, row, lon + 5, lat, h) for name, col, row, lon, lat, h in tiny.points(8)]
     with pytest.raises(InputError, match="outside of the model's domain"):
-        pipeline.fit(tiny.image, points_of(tiny, tiny.write(tiny.folder / "far.csv", rows)))
+        commands.fit(tiny.image, points_of(tiny, tiny.write(tiny.folder / "far.csv", rows)))
 
 
 def test_no_redundancy_is_said(tiny):
     path = tiny.write(tiny.folder / "one.csv", tiny.points(1))
-    result = pipeline.fit(tiny.image, points_of(tiny, path))
+    result = commands.fit(tiny.image, points_of(tiny, path))
     document = result.to_json()
     assert document["redundancy"] == 0
     assert document["sigma0"] is None
@@ -242,7 +244,7 @@ def test_no_redundancy_is_said(tiny):
 
 
 def test_few_check_points_are_said(tiny):
-    document = pipeline.fit(tiny.image, points_of(tiny, check="every:3")).to_json()
+    document = commands.fit(tiny.image, points_of(tiny, check="every:3")).to_json()
     assert any("30" in warning for warning in document["warnings"])
     assert document["rmse"]["check"]["n"] == 4
     assert not any(point["used"] for point in document["points"] if point["role"] == "check")
@@ -266,20 +268,20 @@ def test_too_many_gross_errors_are_an_error(tiny):
         name, col, row, *ground = rows[i]
         rows[i] = (name, col + random.uniform(-40, 40), row + random.uniform(-40, 40), *ground)
     with pytest.raises(DegeneratePoints, match="4 of 9"):
-        pipeline.fit(tiny.image, points_of(tiny, tiny.write(tiny.folder / "bad.csv", rows)))
+        commands.fit(tiny.image, points_of(tiny, tiny.write(tiny.folder / "bad.csv", rows)))
 
 
 def test_the_same_id_twice_is_an_error(tiny):
     rows = tiny.points(5)
     with pytest.raises(InputError, match="p0"):
-        pipeline.fit(tiny.image, points_of(tiny, tiny.write(tiny.folder / "twice.csv", [*rows, rows[0]])))
+        commands.fit(tiny.image, points_of(tiny, tiny.write(tiny.folder / "twice.csv", [*rows, rows[0]])))
 
 
 def test_points_outside_of_the_image_are_used_and_named(tiny):
     ground = np.array([[20.0115, -30.0, 500.0]])
     image = tiny.model.ground_to_image(ground)[0] + tiny.bias
     rows = [*tiny.points(6), ("beyond", *image.tolist(), *ground[0].tolist())]
-    result = pipeline.fit(tiny.image, points_of(tiny, tiny.write(tiny.folder / "beyond.csv", rows)))
+    result = commands.fit(tiny.image, points_of(tiny, tiny.write(tiny.folder / "beyond.csv", rows)))
     assert result.fit.used.all()
     assert any("beyond" in warning for warning in result.warnings)
 
@@ -293,7 +295,7 @@ def test_nothing_is_read_and_written(tiny, tmp_path, where):
         image = tiny.image.rename(folder.parent / "tiny.vrt.tif")
         folder = folder.parent
     with pytest.raises(InputError, match=r"attach to the source|read and written"):
-        pipeline.rectify(image, folder, surface=dem_of(tiny), points=points_of(tiny))
+        commands.rectify(image, folder, surface=dem_of(tiny), points=points_of(tiny))
 
 
 def test_points_cannot_be_an_output(tiny, tmp_path):
@@ -309,7 +311,7 @@ def test_names_with_blanks_accents_and_links(tiny, tmp_path):
     folder.mkdir()
     image = folder / "scène 1.tif"
     image.symlink_to(tiny.image)
-    result = pipeline.rectify(image, folder / "sortie", surface=dem_of(tiny), points=points_of(tiny))
+    result = commands.rectify(image, folder / "sortie", surface=dem_of(tiny), points=points_of(tiny))
     assert result.files["ortho"].name == "scène 1_ortho.tif"
     assert gdal.Open(str(result.files["vrt"])).GetMetadata("RPC")
 
@@ -333,8 +335,8 @@ def test_points_without_heights_take_them_from_the_dem(tiny):
     path = tiny.folder / "gcps.points"
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(InputError, match="without a height"):
-        pipeline.fit(tiny.image, PointOptions(gcps=path))
-    result = pipeline.fit(tiny.image, PointOptions(gcps=path), surface=dem_of(tiny))
+        commands.fit(tiny.image, PointOptions(gcps=path))
+    result = commands.fit(tiny.image, PointOptions(gcps=path), surface=dem_of(tiny))
     np.testing.assert_allclose(result.fit.values, tiny.bias, atol=1e-3)
 
 
@@ -351,8 +353,8 @@ def quickbird(real: Path, **options: Any) -> dict[str, Any]:
 def test_quickbird_from_end_to_end(real, tmp_path):
     image = real / "orthority" / "rpc" / "qb2_basic1b.tif"
     output = OutputOptions(crs="EPSG:32735")
-    result = pipeline.rectify(image, tmp_path / "out", output=output, **quickbird(real))
-    fit = pipeline.fit(image, quickbird(real)["points"]).to_json()
+    result = commands.rectify(image, tmp_path / "out", output=output, **quickbird(real))
+    fit = commands.fit(image, quickbird(real)["points"]).to_json()
     assert fit["raw_bias"]["col"] == pytest.approx(-3.0, abs=0.15)
     assert fit["raw_bias"]["row"] == pytest.approx(-2.1, abs=0.15)
     assert fit["rmse"]["control"]["total"] <= 0.15
@@ -366,7 +368,7 @@ def test_quickbird_from_end_to_end(real, tmp_path):
 def test_quickbird_without_the_geoid_is_refused(real, tmp_path):
     image = real / "orthority" / "rpc" / "qb2_basic1b.tif"
     with pytest.raises(DatumError) as caught:
-        pipeline.rectify(image, tmp_path / "out", **quickbird(real, vertical=None))
+        commands.rectify(image, tmp_path / "out", **quickbird(real, vertical=None))
     text = str(caught.value)
     assert "EGM2008" in text
     assert "us_nga_egm08_25.tif" in text
@@ -381,8 +383,8 @@ def test_quickbird_finds_a_blunder_among_five_points(real, tmp_path):
     path.write_text(json.dumps(given))
     image = real / "orthority" / "rpc" / "qb2_basic1b.tif"
     options = quickbird(real) | {"points": PointOptions(gcps=path)}
-    result = pipeline.rectify(image, tmp_path / "out", output=OutputOptions(crs="EPSG:32735"), **options)
-    fit = pipeline.fit(image, options["points"]).to_json()
+    result = commands.rectify(image, tmp_path / "out", output=OutputOptions(crs="EPSG:32735"), **options)
+    fit = commands.fit(image, options["points"]).to_json()
     assert len(fit["rejected"]) == 1
     name = fit["rejected"][0]["id"]
     assert [point["id"] for point in fit["points"] if not point["used"]] == [name]
@@ -439,14 +441,14 @@ def global_dem(tmp_path, west, rise=0.0):
 @pytest.mark.parametrize("lon", [179.995, -179.995])
 def test_a_scene_at_the_antimeridian_with_a_global_dem(tiny, tmp_path, lon):
     image, surface = moved(tiny, tmp_path, lon), global_dem(tmp_path, -180)
-    result = pipeline.rectify(image, tmp_path / "out", surface=surface)
+    result = commands.rectify(image, tmp_path / "out", surface=surface)
     assert result.document["report"]["surface"]["coverage"] == 1.0
-    flat = pipeline.rectify(image, tmp_path / "flat", surface=SurfaceOptions(height=500.0))
+    flat = commands.rectify(image, tmp_path / "flat", surface=SurfaceOptions(height=500.0))
     one, other = (gdal.Open(str(made.files["ortho"])) for made in (result, flat))
     assert one.GetGeoTransform() == other.GetGeoTransform()
     np.testing.assert_array_equal(one.ReadAsArray(), other.ReadAsArray())
     # With an RPC and this DEM, GDAL itself would lose one side without a word.
-    gdals = pipeline.rectify(image, tmp_path / "gdal", surface=surface, output=OutputOptions(engine="gdal"))
+    gdals = commands.rectify(image, tmp_path / "gdal", surface=surface, output=OutputOptions(engine="gdal"))
     assert gdals.document["report"]["warp"]["transformer"] == "GEOLOC_ARRAY"
     theirs, ours = (gdal.Open(str(made.files["ortho"])).ReadAsArray() for made in (gdals, result))
     np.testing.assert_array_equal(theirs > 0, ours > 0)
@@ -457,7 +459,7 @@ def test_gdal_s_engine_over_the_seam_of_a_global_dem(tiny, tmp_path):
     image, surface = moved(tiny, tmp_path, 0.0), global_dem(tmp_path, 0, rise=3.0)
     pixels = {}
     for engine in ("ortho", "gdal"):
-        result = pipeline.rectify(image, tmp_path / engine, surface=surface, output=OutputOptions(engine=engine))
+        result = commands.rectify(image, tmp_path / engine, surface=surface, output=OutputOptions(engine=engine))
         made = gdal.Open(str(result.files["ortho"]))
         pixels[engine] = made.ReadAsArray().astype(float)
     assert (pixels["ortho"] > 0).mean() > 0.7
@@ -487,7 +489,7 @@ def test_model_files_may_name_model_families_of_plugins(tiny, tmp_path, monkeypa
     monkeypatch.setattr(plugins.Host, "discover", classmethod(called.append))
     path = tmp_path / "m_model.json"
     ortho_pipeline.save_model(tiny.model, path)
-    pipeline.open_scene(tiny.image, SceneOptions(model=path))
+    open_scene(tiny.image, SceneOptions(model=path))
     assert called
 
 
@@ -495,10 +497,10 @@ def test_a_model_of_another_place_is_a_warning(tiny):
     """A shift fits exactly, and nothing else said that the delivered model is four images away."""
     rows = [(name, col + 4 * tiny.width, *others) for name, col, *others in tiny.points(12)]
     moved = tiny.write(tiny.folder / "moved.csv", rows)
-    (warning,) = [text for text in pipeline.fit(tiny.image, points_of(tiny, moved)).warnings if "image sizes" in text]
+    (warning,) = [text for text in commands.fit(tiny.image, points_of(tiny, moved)).warnings if "image sizes" in text]
     assert warning.startswith("the model as delivered is 4.01 image sizes away from the points: ")
-    assert not [text for text in pipeline.fit(tiny.image, points_of(tiny)).warnings if "image sizes" in text]
-    family = pipeline.fit(tiny.image, points_of(tiny, moved, fit_model="affine3d")).warnings
+    assert not [text for text in commands.fit(tiny.image, points_of(tiny)).warnings if "image sizes" in text]
+    family = commands.fit(tiny.image, points_of(tiny, moved, fit_model="affine3d")).warnings
     assert not [text for text in family if "image sizes" in text]
 
 

@@ -10,15 +10,17 @@ from pathlib import Path
 
 import pytest
 
-from ortho_pipeline import pipeline
+from ortho_pipeline import commands
+from ortho_pipeline.commands import rectification
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import OutputOptions, PointOptions, SurfaceOptions
+from ortho_pipeline.report import document as report
 
 
 def rectify(tiny, folder, points=True, **options):
     control = PointOptions(gcps=tiny.gcps, crs="EPSG:4326", vertical="ellipsoid") if points else PointOptions()
     surface = SurfaceOptions(dem=tiny.dem, vertical="ellipsoid")
-    return pipeline.rectify(tiny.image, folder, points=control, surface=surface, output=OutputOptions(**options))
+    return commands.rectify(tiny.image, folder, points=control, surface=surface, output=OutputOptions(**options))
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -30,14 +32,14 @@ def test_an_image_that_changes_meanwhile_is_refused_and_the_old_outputs_stay(tin
     out = tmp_path / "out"
     rectify(tiny, out)
     before = contents(out)
-    warp = pipeline._warp
+    warp = rectification._warp
 
     def meddling(*given):
         found = warp(*given)
         os.utime(tiny.dem, ns=(1, 1))
         return found
 
-    monkeypatch.setattr(pipeline, "_warp", meddling)
+    monkeypatch.setattr(rectification, "_warp", meddling)
     with pytest.raises(InputError, match="changed while it was being used"):
         rectify(tiny, out)
     assert contents(out) == before
@@ -51,7 +53,7 @@ def test_a_failure_at_the_end_leaves_no_mixture(tiny, tmp_path, monkeypatch):
     def fail(*_, **__):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(pipeline.report, "write_report_html", fail)
+    monkeypatch.setattr(report, "write_report_html", fail)
     with pytest.raises(ZeroDivisionError):
         rectify(tiny, out, resampling="cubic")
     assert contents(out) == before
@@ -91,13 +93,14 @@ def test_a_signal_ends_the_command_and_leaves_nothing(tiny, tmp_path, number):
     out = tmp_path / "out"
     code = """
 import sys, time
-from ortho_pipeline import cli, pipeline
-warp = pipeline._warp
+from ortho_pipeline.cli import program as cli
+from ortho_pipeline.commands import rectification
+warp = rectification._warp
 def slow(*given):
     found = warp(*given)
     print("ready", flush=True)
     time.sleep(60)
-pipeline._warp = slow
+rectification._warp = slow
 cli.main()
 """
     command = [sys.executable, "-c", code, "rectify", str(tiny.image), "--dem", str(tiny.dem), "--dem-vertical",

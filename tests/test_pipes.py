@@ -17,7 +17,7 @@ INFO = """
 import sys
 from pathlib import Path
 from click.testing import CliRunner
-from ortho_pipeline.cli import cli
+from ortho_pipeline.cli.program import cli
 for name in sys.argv[2:]:
     pipe = Path(sys.argv[1]).with_name(name)
     import os

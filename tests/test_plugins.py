@@ -10,12 +10,12 @@ import ortho_rpc
 import pytest
 from osgeo import gdal
 
-from ortho_pipeline import pipeline
+from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError, PluginError, Terminated
+from ortho_pipeline.exchange.rpc import rpc_metadata, write_rpc_txt
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models import RPC, SensorModel
 from ortho_pipeline.plugins import Host
-from ortho_pipeline.rpc import rpc_metadata, write_rpc_txt
 
 gdal.UseExceptions()
 
@@ -127,7 +127,7 @@ def test_the_doctor_lists_what_stops_other_commands(install, source):
     install("third-party", "third_party_plugin", source)
     with pytest.raises(PluginError):
         Host(installed=True)
-    document = pipeline.doctor()
+    document = commands.doctor()
     (broken,) = document["broken"]
     assert (broken["plugin"], broken["distribution"], broken["version"]) == ("third_party_plugin", "third-party", "1.2")
     assert "third_party_plugin (third-party 1.2)" in broken["error"]

@@ -12,12 +12,12 @@ import numpy as np
 import pyproj
 import pytest
 
-from ortho_pipeline import pipeline
-from ortho_pipeline.block_points import read_block_points
+from ortho_pipeline import commands
+from ortho_pipeline.block.points import read_block_points
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.options import PointOptions
-from ortho_pipeline.point_table import MAX_FILE
 from ortho_pipeline.points import Points, one_mark, read_points, write_points
+from ortho_pipeline.points.rows import MAX_FILE
 
 
 def write(path: Path, text: str) -> Path:
@@ -354,13 +354,13 @@ def test_a_mark_that_was_measured_twice_is_told(tiny, tmp_path: Path) -> None:
     twin = ("twin", col + 0.2, row - 0.1, lon, lat + 0.002 / 111_000, h)
     path = tiny.write(tmp_path / "p.csv", [*rows, twin])
     given = PointOptions(gcps=path, crs="EPSG:4979", vertical="ellipsoid")
-    told = [text for text in pipeline.fit(tiny.image, given).warnings if "measured twice" in text]
+    told = [text for text in commands.fit(tiny.image, given).warnings if "measured twice" in text]
     assert len(told) == 1
     assert f"{id_} and twin" in told[0]
     # Metres apart they are two, and a check point adds no redundancy.
     far = tiny.write(tmp_path / "far.csv", [*rows, ("other", col + 0.5, row, lon, lat + 2.0 / 111_000, h)])
     for more in ({"gcps": far}, {"check": "ids:twin"}):
-        found = pipeline.fit(tiny.image, dataclasses.replace(given, **more)).warnings
+        found = commands.fit(tiny.image, dataclasses.replace(given, **more)).warnings
         assert not [text for text in found if "measured twice" in text]
 
 

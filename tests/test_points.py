@@ -11,10 +11,10 @@ import numpy as np
 import pyproj
 import pytest
 
-from ortho_pipeline.crs import GroundTransform, Vertical
 from ortho_pipeline.errors import CrsError, DatumError, InputError
-from ortho_pipeline.point_files import read_table
+from ortho_pipeline.geodesy.crs import GroundTransform, Vertical
 from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, read_points, write_points
+from ortho_pipeline.points.formats import read_table
 
 HEADER = "id,col,row,x,y,h\n"
 ROW = "a,10.5,20.25,24.4,-33.65,100\n"

@@ -14,25 +14,25 @@ import pyproj
 import pytest
 
 from ortho_pipeline.errors import DegeneratePoints, InputError
-from ortho_pipeline.estimation import fit
-from ortho_pipeline.geometry import geocentric
+from ortho_pipeline.estimation.fit import fit
+from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.exchange.rpc import fit_rpc
+from ortho_pipeline.geodesy.ellipsoid import geocentric
 from ortho_pipeline.models import Pushbroom, model_from_dict
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.models.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom import angles_of, rotations
-from ortho_pipeline.models.pushbroom_constraints import Observations, OrbitShape
-from ortho_pipeline.models.pushbroom_start import (
+from ortho_pipeline.models.pushbroom.constraints import Observations, OrbitShape
+from ortho_pipeline.models.pushbroom.line_camera import LineCamera
+from ortho_pipeline.models.pushbroom.scanner import angles_of, rotations
+from ortho_pipeline.models.pushbroom.splines import Spline
+from ortho_pipeline.models.pushbroom.start import (
     mounting_of_angles,
     pushbroom_of_metadata,
     pushbroom_of_tables,
     rotations_of_angles,
     rotations_of_quaternions,
 )
-from ortho_pipeline.models.splines import Spline
 from ortho_pipeline.points import Points
-from ortho_pipeline.problem import Prior
-from ortho_pipeline.rpc import fit_rpc
-from ortho_pipeline.simulate import LineScanner
+from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.testing import check_sensor_model
 
 FOCAL, PIXEL = 1.945, 7e-6

@@ -15,15 +15,15 @@ from ortho_rpc.dimap import has_dimap_pushbroom, read_dimap_pushbroom
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation import fit
-from ortho_pipeline.geometry import geocentric
+from ortho_pipeline.estimation.fit import fit
+from ortho_pipeline.exchange.rpc import rpc_metadata
+from ortho_pipeline.exchange.rpc_files import read_rpc_text
+from ortho_pipeline.geodesy.ellipsoid import geocentric
 from ortho_pipeline.models import RPC, Pushbroom
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.models.pushbroom_start import pushbroom_of_metadata
+from ortho_pipeline.models.pushbroom.start import pushbroom_of_metadata
 from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import Points
-from ortho_pipeline.rpc import rpc_metadata
-from ortho_pipeline.rpc_files import read_rpc_text
 from ortho_pipeline.testing import check_sensor_model
 
 SCENE = "P1BP--2018122638935449CP"

@@ -16,8 +16,8 @@ import pytest
 import shapely
 
 import ortho_pipeline as op
-from ortho_pipeline import pipeline
-from ortho_pipeline.cli import cli
+from ortho_pipeline import commands
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -25,16 +25,18 @@ ROOT = Path(__file__).resolve().parent.parent
 # -- types
 
 
-def test_the_package_is_typed_and_its_lazy_names_are_those_of_the_stub() -> None:
+def test_the_package_is_typed_and_its_lazy_names_are_those_that_checkers_know() -> None:
     assert files("ortho_pipeline").joinpath("py.typed").is_file()
-    stub = ast.parse((ROOT / "ortho_pipeline" / "__init__.pyi").read_text())
+    package = ast.parse((ROOT / "ortho_pipeline" / "__init__.py").read_text())
+    (known,) = (node for node in package.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
     homes = {
         alias.name: node.module.removeprefix("ortho_pipeline.")
-        for node in stub.body
+        for node in known.body
         if isinstance(node, ast.ImportFrom) and node.module
         for alias in node.names
     }
     assert homes == op._HOMES
+    assert set(op.__all__) == set(homes)
     for name in op.__all__:
         assert getattr(op, name) is not None
 
@@ -97,7 +99,7 @@ def test_rectify_takes_a_scene_and_points(tiny, tmp_path: Path) -> None:
     assert record["points"]["gcps"] == str(points)
     # With options around them: half of the points only check.
     options = op.PointOptions(gcps=points, check="every:2", correction="shift")
-    found = pipeline.fit(scene, options).fit
+    found = commands.fit(scene, options).fit
     assert (found.points.check.sum(), found.points.control.sum()) == (6, 6)
 
 
@@ -106,9 +108,9 @@ def test_what_objects_say_themselves_is_not_said_again(tiny) -> None:
     points = op.read_points(tiny.gcps, crs="EPSG:4979", vertical="ellipsoid")
     for more in ({"crs": "EPSG:4326"}, {"vertical": "egm96"}, {"pixel_origin": "center"}):
         with pytest.raises(InputError, match="themselves"):
-            pipeline.fit(scene, op.PointOptions(gcps=points, **more))
+            commands.fit(scene, op.PointOptions(gcps=points, **more))
     with pytest.raises(InputError, match="open already"):
-        pipeline.fit(scene, op.PointOptions(gcps=points), op.SceneOptions(rpc="tag"))
+        commands.fit(scene, op.PointOptions(gcps=points), op.SceneOptions(rpc="tag"))
 
 
 def test_own_points_take_the_options_of_points(tiny, tmp_path: Path) -> None:
@@ -119,9 +121,9 @@ def test_own_points_take_the_options_of_points(tiny, tmp_path: Path) -> None:
     dataset.SetGCPs([gdal.GCP(lon, lat, h, col, row) for _, col, row, lon, lat, h in rows], "")
     dataset = None
     given = op.PointOptions(gcps="own", crs="EPSG:4326", vertical="ellipsoid")
-    assert len(pipeline.fit(tiny.image, given).fit.points) == 6
+    assert len(commands.fit(tiny.image, given).fit.points) == 6
     with pytest.raises(InputError, match="points-crs"):
-        pipeline.fit(tiny.image, op.PointOptions(gcps="own"))
+        commands.fit(tiny.image, op.PointOptions(gcps="own"))
 
 
 # -- points
@@ -179,3 +181,21 @@ def test_the_table_of_options_is_that_of_the_command_line() -> None:
             if flag.removeprefix("--").replace("-", "_") not in (field, field.removesuffix("s")):
                 other[f"{groups[group]}.{field}"] = flag
     assert rows == other
+
+
+def test_modules_are_found_under_the_names_that_they_had_before_there_were_rooms() -> None:
+    code = (
+        "import warnings; warnings.simplefilter('error')\n"
+        "from ortho_pipeline.geodesy import ellipsoid\n"
+        "try:\n    import ortho_pipeline.geometry\n"
+        "except DeprecationWarning as said:\n    print(said)\n"
+        "warnings.simplefilter('ignore')\n"
+        "from ortho_pipeline.geometry import geocentric\n"
+        "from ortho_pipeline import pipeline, rpc\n"
+        "print(geocentric is ellipsoid.geocentric, pipeline.rectify is not None, rpc.rpc_of_dataset is not None)\n"
+        "for name in __import__('ortho_pipeline')._MOVED: __import__(f'ortho_pipeline.{name}')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == [
+        "ortho_pipeline.geometry is ortho_pipeline.geodesy.ellipsoid now", "True True True",
+    ]  # fmt: skip

@@ -9,10 +9,10 @@ import pyproj
 import pytest
 from osgeo import gdal
 
-from ortho_pipeline import rays
-from ortho_pipeline.dem import Surface
 from ortho_pipeline.models import RPC
-from ortho_pipeline.rays import MANY, intersect
+from ortho_pipeline.surface import rays
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.rays import MANY, intersect
 
 
 @pytest.fixture(scope="module")

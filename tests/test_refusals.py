@@ -9,7 +9,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from ortho_pipeline.cli import cli
+from ortho_pipeline.cli.program import cli
 
 BAD = "no such thing!"
 

@@ -14,8 +14,9 @@ import pytest
 from click.testing import CliRunner
 from osgeo import gdal
 
-from ortho_pipeline import pipeline
-from ortho_pipeline.cli import cli
+from ortho_pipeline import commands
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands import results
 from ortho_pipeline.options import PointOptions, SurfaceOptions
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -26,17 +27,17 @@ BROWSERS_OWN = {"accounts.google.com", "clients2.google.com", "update.googleapis
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> dict[str, pipeline.Result | pipeline.CompareResult]:
+def made(tmp_path_factory) -> dict[str, results.Result | results.CompareResult]:
     """Return the results of rectify and compare on the sample scene."""
     folder, sample = tmp_path_factory.mktemp("report"), ROOT / "sample_data"
     image, surface = sample / "scene.tif", SurfaceOptions(dem=sample / "dem.tif")
     points = PointOptions(gcps=sample / "gcps.geojson")
-    rectified = pipeline.rectify(
+    rectified = commands.rectify(
         image, folder / "rectify", points=PointOptions(gcps=sample / "gcps.geojson", correction="affine"),
         surface=surface, command="ortho rectify",
     )  # fmt: skip
-    compared = pipeline.compare(image, points, folder=folder / "compare", surface=surface)
-    bare = pipeline.rectify(image, folder / "bare", surface=surface)
+    compared = commands.compare(image, points, folder=folder / "compare", surface=surface)
+    bare = commands.rectify(image, folder / "bare", surface=surface)
     return {"rectify": rectified, "compare": compared, "bare": bare}
 
 

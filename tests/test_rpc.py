@@ -11,11 +11,9 @@ import pyproj
 import pytest
 from osgeo import gdal
 
-from ortho_pipeline import rpc as rpc_module
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.models import RPC, ImageCorrection
-from ortho_pipeline.models.base import SensorModel, as_ground
-from ortho_pipeline.rpc import (
+from ortho_pipeline.exchange import rpc as rpc_module
+from ortho_pipeline.exchange.rpc import (
     export_rpc,
     files_of,
     fit_rpc,
@@ -28,6 +26,8 @@ from ortho_pipeline.rpc import (
     write_tagged_copy,
     write_vrt,
 )
+from ortho_pipeline.models import RPC, ImageCorrection
+from ortho_pipeline.models.base import SensorModel, as_ground
 
 gdal.UseExceptions()
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.rpc import read_rpc
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.models.rpc_box import RPC_TERMS, has_pole
-from ortho_pipeline.rpc import read_rpc
 
 NUMBERS = [f"{name}_{part}" for name in ("col", "row", "lon", "lat", "h") for part in ("off", "scale")]
 COEFFICIENTS = ["col_num", "col_den", "row_num", "row_den"]

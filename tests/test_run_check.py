@@ -11,8 +11,8 @@ import pytest
 from click.testing import CliRunner, Result
 from osgeo import gdal
 
-from ortho_pipeline import raster
-from ortho_pipeline.cli import cli
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.raster import source as raster
 
 NAMES = ["one_with_a_name_that_is_far_longer_than_a_line_of_a_terminal_would_ever_be_and_then_some", "two", "three"]
 POINTS = "{gcps: gcps.csv, crs: 'EPSG:4979', vertical: ellipsoid, check: 'ids:p1'}"

@@ -9,9 +9,9 @@ import pyproj
 import pytest
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.landscape import Landscape, Terrain
 from ortho_pipeline.models import KINDS
-from ortho_pipeline.simulate import LineScanner, geocentric, geodetic, meet_terrain, render, simulate_points
+from ortho_pipeline.simulation.scanner import LineScanner, geocentric, geodetic, meet_terrain, render, simulate_points
+from ortho_pipeline.simulation.terrain import Landscape, Terrain
 from ortho_pipeline.testing import check_sensor_model
 
 CENTRE = (33.35, 37.25, 850.0)
@@ -217,8 +217,8 @@ def test_no_points_is_an_error(camera, terrain, counts):
 
 
 def test_sample_is_what_its_truth_says(sample):
+    from ortho_pipeline.exchange.rpc import read_rpc
     from ortho_pipeline.points import read_points
-    from ortho_pipeline.rpc import read_rpc
 
     truth = json.loads((sample / "truth.json").read_text(encoding="utf-8"))
     camera = LineScanner.from_dict(truth["camera"])
@@ -238,7 +238,7 @@ def test_sample_is_what_its_truth_says(sample):
 
 
 def test_sample_dem_is_the_terrain(sample):
-    from ortho_pipeline.dem import Surface
+    from ortho_pipeline.surface.dem import Surface
 
     truth = json.loads((sample / "truth.json").read_text(encoding="utf-8"))
     terrain = Terrain(**truth["terrain"])

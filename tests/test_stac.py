@@ -18,12 +18,13 @@ from click.testing import CliRunner
 from osgeo import gdal
 from pystac.validation import JsonSchemaSTACValidator
 
-from ortho_pipeline import batch, pipeline
-from ortho_pipeline.cli import cli
+from ortho_pipeline import commands
+from ortho_pipeline.batch import runner as batch
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import OutputOptions, PointOptions, SurfaceOptions
-from ortho_pipeline.outline import to_geojson, valid_outline
-from ortho_pipeline.stac import acquisition_time
+from ortho_pipeline.raster.valid_area import to_geojson, valid_outline
+from ortho_pipeline.report.stac import acquisition_time
 
 TIME = "2005-08-03T08:12:31.25Z"
 BASE = "https://stac-extensions.github.io"
@@ -59,7 +60,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     """Rectify the sample scene with a STAC item."""
     sample = Path(__file__).resolve().parent.parent / "sample_data"
     folder = tmp_path_factory.mktemp("stac")
-    result = pipeline.rectify(
+    result = commands.rectify(
         sample / "scene.tif", folder, points=PointOptions(gcps=sample / "gcps.geojson"),
         surface=SurfaceOptions(dem=sample / "dem.tif"), output=OutputOptions(stac=True, acquired=TIME, resolution=5),
     )  # fmt: skip
@@ -143,10 +144,10 @@ def test_accuracy_is_that_of_check_points_only(made, tiny, tmp_path):
     assert properties["accuracy:geometric_y_stddev"] == pytest.approx(shifts[:, 1].std(ddof=1), abs=1e-4)
     surface, output = SurfaceOptions(dem=tiny.dem, vertical="ellipsoid"), OutputOptions(stac=True, acquired=TIME)
     given = PointOptions(gcps=tiny.gcps, crs="EPSG:4979", vertical="ellipsoid")
-    pipeline.rectify(tiny.image, tmp_path / "a", points=given, surface=surface, output=output)
+    commands.rectify(tiny.image, tmp_path / "a", points=given, surface=surface, output=output)
     with_control = json.loads((tmp_path / "a" / "tiny_stac.json").read_text())["properties"]
     assert with_control["ortho:accuracy_from"] == "leave-one-out residuals"
-    pipeline.rectify(tiny.image, tmp_path / "b", surface=surface, output=output)
+    commands.rectify(tiny.image, tmp_path / "b", surface=surface, output=output)
     without = json.loads((tmp_path / "b" / "tiny_stac.json").read_text())
     assert not [name for name in without["properties"] if name.startswith("accuracy")]
     assert not [uri for uri in without["stac_extensions"] if "accuracy" in uri]

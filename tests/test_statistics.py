@@ -9,10 +9,10 @@ import pyproj
 import pytest
 
 from ortho_pipeline.errors import InputError, TooFewPoints
-from ortho_pipeline.model_choice import fit_family
+from ortho_pipeline.estimation.family_fit import fit_family
+from ortho_pipeline.estimation.statistics import correlation_of, student_of, total_correlation_of
 from ortho_pipeline.points import Points
-from ortho_pipeline.selection import select_control
-from ortho_pipeline.statistics import correlation_of, student_of, total_correlation_of
+from ortho_pipeline.points.selection import select_control
 
 SIZE = (10_000, 10_000)
 

@@ -7,9 +7,9 @@ import pyproj
 import pytest
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.estimation.coordinate_swaps import SWAPS, refuse_swapped
 from ortho_pipeline.models import RPC
 from ortho_pipeline.points import Points
-from ortho_pipeline.swaps import SWAPS, refuse_swapped
 
 ROWS = 2000.0
 

@@ -8,10 +8,10 @@ import ortho_rpc
 import pytest
 from osgeo import gdal
 
+from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.hookspecs import Scene, Sensor
 from ortho_pipeline.models import KINDS, RPC, ImageCorrection
 from ortho_pipeline.models.base import SensorModel, as_ground
-from ortho_pipeline.rpc import rpc_metadata
 from ortho_pipeline.testing import check_sensor, check_sensor_model
 
 GROUND = np.array([(x, y, h) for x in (-0.5, 0.0, 0.7) for y in (-0.6, 0.4) for h in (-0.5, 0.9)])

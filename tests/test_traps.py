@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from osgeo import gdal
 
-from ortho_pipeline import pipeline
+from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.raster import open_dataset
-from ortho_pipeline.raster_output import checked_options
-from ortho_pipeline.rpc import rpc_metadata
+from ortho_pipeline.exchange.rpc import rpc_metadata
+from ortho_pipeline.raster.output import checked_options
+from ortho_pipeline.raster.source import open_dataset
 
 
 @pytest.mark.parametrize("size", [(4_000_001, 1), (1, 4_000_001)])
@@ -38,7 +38,7 @@ def test_the_rpc_of_an_image_is_used_and_not_its_control_points(tiny):
                      gdal.GCP(10.0, 51.0, 0.0, 0.0, 300.0)], "")  # fmt: skip
     dataset = None
     assert dataset is None
-    found = pipeline.info(tiny.image)
+    found = commands.info(tiny.image)
     assert next(iter(found["models"])) == "rpc"
     lon, lat = found["corners_lon_lat"][0]
     assert abs(lon - tiny.model.lon_off) < 0.1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from ortho_pipeline.voids import nearest_heights
+from ortho_pipeline.surface.voids import nearest_heights
 
 
 def source(heights):
@@ -22,7 +22,7 @@ def test_pieces_are_those_of_one_distance_transform(monkeypatch, reach):
     heights[40:95, 30:120] = np.nan
     heights[random.random(heights.shape) < 0.3] = np.nan
     distance = distance_transform_edt(np.isnan(heights))
-    monkeypatch.setattr("ortho_pipeline.voids._PIECE", 32)
+    monkeypatch.setattr("ortho_pipeline.surface.voids._PIECE", 32)
     filled = nearest_heights(source(heights), heights.shape, (0, 0, 170, 150), reach)
     assert np.array_equal(np.isnan(filled), distance > reach)
     valid = np.argwhere(~np.isnan(heights))

@@ -17,15 +17,15 @@ import pytest
 from osgeo import gdal
 from scipy.interpolate import RegularGridInterpolator
 
-from ortho_pipeline import warp
-from ortho_pipeline.dem import Surface
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.rpc import export_rpc, rpc_metadata
 from ortho_pipeline.files import sha256
 from ortho_pipeline.models import RPC, SensorModel
-from ortho_pipeline.raster import Grid, RasterSource
-from ortho_pipeline.raster_writer import Profile
-from ortho_pipeline.rpc import export_rpc, rpc_metadata
-from ortho_pipeline.warp import rectify, rectify_gdal
+from ortho_pipeline.raster.ortho import Profile
+from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.warp import engine as warp
+from ortho_pipeline.warp.engine import rectify, rectify_gdal
 
 UTM = pyproj.CRS.from_epsg(32735)
 WIDTH, HEIGHT, GSD = 700, 620, 0.5
@@ -826,7 +826,7 @@ def test_an_output_that_may_exceed_4_gb_is_a_bigtiff(scene, tmp_path):
     source = RasterSource(scene.write(texture()))
     small = grid_of(20.0)
     large = Grid(UTM, EAST, NORTH, GSD, GSD, 60_000, 40_000)  # 4.8 GB, none of it over the scene
-    from ortho_pipeline.raster_writer import Profile, RasterWriter
+    from ortho_pipeline.raster.ortho import Profile, RasterWriter
 
     for grid, expected in ((small, 42), (large, 43)):
         with RasterWriter(tmp_path / "o.tif", grid, Profile.of(source), driver="GTiff") as writer:

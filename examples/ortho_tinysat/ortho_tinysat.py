@@ -8,11 +8,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.geometry import geocentric
+from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.files.locations import place
+from ortho_pipeline.geodesy.ellipsoid import geocentric
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-from ortho_pipeline.locations import place
 from ortho_pipeline.models import SensorModel
-from ortho_pipeline.problem import Prior
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,12 +10,12 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.families import Family, families, family_of
-from ortho_pipeline.models.frame import FrameCamera
-from ortho_pipeline.models.geo import MapPlane
-from ortho_pipeline.models.pieces import Pieces
-from ortho_pipeline.models.pushbroom import Pushbroom
+from ortho_pipeline.models.frame.camera import FrameCamera
+from ortho_pipeline.models.map_plane import MapPlane
+from ortho_pipeline.models.mosaicked import Pieces
+from ortho_pipeline.models.pushbroom.scanner import Pushbroom
 from ortho_pipeline.models.rational import RPC, Rational
-from ortho_pipeline.models.start import model_crs, start_model
+from ortho_pipeline.models.rational_start import model_crs, start_model
 
 #: Model classes by the `kind` under which files name them; the hook `ortho_models` adds to it.
 KINDS: dict[str, type[SensorModel]] = {

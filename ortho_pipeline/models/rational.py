@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.geometry import horizon_from_geodetic
+from ortho_pipeline.geodesy.ellipsoid import horizon_from_geodetic
 from ortho_pipeline.models.base import (
     INVERSE_TOLERANCE,
     INVERSE_VERIFIED,

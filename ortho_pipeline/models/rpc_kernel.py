@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ortho_pipeline.compiled import compiled, inlined
+from ortho_pipeline.files.compiled import compiled, inlined
 
 
 @inlined

@@ -11,12 +11,12 @@ from osgeo import gdal
 
 from ortho_bilsat.survey import MARK, Survey, read_survey
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.estimation.problem import priors_at
 from ortho_pipeline.files import read_bounded
-from ortho_pipeline.geometry import geodetic, orbital_from_ecef
+from ortho_pipeline.files.locations import place
+from ortho_pipeline.geodesy.ellipsoid import geodetic, orbital_from_ecef
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-from ortho_pipeline.locations import place
-from ortho_pipeline.models.frame import LOOKS_PAST, FrameCamera, camera_from_platform, exterior_sigmas
-from ortho_pipeline.problem import priors_at
+from ortho_pipeline.models.frame.camera import LOOKS_PAST, FrameCamera, camera_from_platform, exterior_sigmas
 
 
 @hookimpl

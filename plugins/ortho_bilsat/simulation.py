@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 import pyproj
 
+from ortho_bilsat import truth as simulated
 from ortho_bilsat.survey import Survey, write_survey
-from ortho_pipeline.dem import write_terrain
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.experiments import bilsat_scene as simulated
 from ortho_pipeline.files import write_text
-from ortho_pipeline.geometry import orbital_from_ecef
+from ortho_pipeline.geodesy.ellipsoid import orbital_from_ecef
+from ortho_pipeline.imaging.band_stack import write_bands
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.points import write_points
-from ortho_pipeline.stack import write_bands
+from ortho_pipeline.surface.dem import write_terrain
 
 #: Standard deviation (rad) of the attitude that a survey gives, per axis: a star camera of a small satellite.
 ATTITUDE_SIGMA = math.radians(0.02)

@@ -18,7 +18,7 @@ import numpy as np
 
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import decoded, read_bounded
-from ortho_pipeline.locations import place
+from ortho_pipeline.files.locations import place
 from ortho_pipeline.models.base import Array
 
 MAX_BYTES = 1_000_000

@@ -13,15 +13,15 @@ import numpy as np
 import pyproj
 from osgeo import gdal
 
-from ortho_pipeline.dem import write_terrain
+from ortho_cartosat import truth as simulated
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.experiments import cartosat_scene as simulated
+from ortho_pipeline.exchange.rpc import write_rpc_txt
 from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points
-from ortho_pipeline.raster_output import close, raster_output
-from ortho_pipeline.rpc import write_rpc_txt
-from ortho_pipeline.selection import select_control
+from ortho_pipeline.points.selection import select_control
+from ortho_pipeline.raster.output import close, raster_output
+from ortho_pipeline.surface.dem import write_terrain
 
 MAP, GEOID = simulated.MAP_CRS, "EPSG:5773"
 SMALLEST, LARGEST = 64, simulated.SIZE

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ortho_pipeline.errors import InputError, counted, reads
 from ortho_pipeline.files import read_bounded, read_json
-from ortho_pipeline.geometry import angles_of_rotation
+from ortho_pipeline.geodesy.ellipsoid import angles_of_rotation
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.lens import Interior
 

@@ -12,9 +12,9 @@ import pyproj
 from osgeo import gdal
 
 from ortho_ikonos.metadata import Component, Delivery, Placement, read_header
-from ortho_pipeline.crs import same_crs
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.locations import place
+from ortho_pipeline.files.locations import place
+from ortho_pipeline.geodesy.crs import same_crs
 
 _NAME = re.compile(
     r"(?P<order>po_[^/\\]+)_(?P<band>[a-z]{2,4})_(?P<component>\d{7})\.(?:tiff?|ntf|nitf)", re.IGNORECASE | re.ASCII

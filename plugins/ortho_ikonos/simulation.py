@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 from osgeo import gdal, osr
 
-from ortho_pipeline.dem import write_terrain
+from ortho_ikonos import truth as simulated
+from ortho_ikonos.truth import GeoScene, VendorModel
 from ortho_pipeline.errors import InputError, counted
-from ortho_pipeline.experiments import ikonos_scene as simulated
-from ortho_pipeline.experiments.ikonos_scene import GeoScene, VendorModel
+from ortho_pipeline.exchange.rpc import fit_rpc, write_rpc_txt
 from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points, write_points
-from ortho_pipeline.raster_output import close, raster_output
-from ortho_pipeline.rpc import fit_rpc, write_rpc_txt
+from ortho_pipeline.raster.output import close, raster_output
+from ortho_pipeline.surface.dem import write_terrain
 
 ORDER = "39001"
 GEOID = "EPSG:5773"

@@ -13,8 +13,8 @@ from osgeo import gdal
 from ortho_orbview3.product import Product, choose_rpc, label_of, read_product, rpc_text_of
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded
+from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-from ortho_pipeline.locations import place
 from ortho_pipeline.models.rational import RPC
 
 #: Names of the USGS: 3v, year, month, day, and p for panchromatic or m for multispectral.

@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 from osgeo import gdal
 
+from ortho_orbview3 import truth as simulated
 from ortho_orbview3.product import COEFFICIENT_KEYS, CORNERS, ERROR_KEYS, SCALAR_KEYS
-from ortho_pipeline.dem import write_terrain
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.experiments import orbview3_scene as simulated
+from ortho_pipeline.exchange.rpc import rpc_metadata, write_rpc_txt
 from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.points import write_points
-from ortho_pipeline.raster_output import close, raster_output
-from ortho_pipeline.rpc import rpc_metadata, write_rpc_txt
+from ortho_pipeline.raster.output import close, raster_output
+from ortho_pipeline.surface.dem import write_terrain
 
 GEOID = "EPSG:5773"
 #: Metres of a pixel that can be asked for; the real ones are 1 m.

@@ -11,11 +11,11 @@ from typing import Any
 
 from osgeo import gdal
 
+from ortho_pipeline.exchange.rpc import has_rpc, rpc_of_dataset
+from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-from ortho_pipeline.locations import place
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.models.rational import RPC
-from ortho_pipeline.rpc import has_rpc, rpc_of_dataset
 from ortho_rpc.rigorous import Rigorous, rigorous_beside
 
 # What GDAL's readers of vendor metadata agree on, and what it is called here.

@@ -33,11 +33,11 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import read_bounded
-from ortho_pipeline.locations import place
+from ortho_pipeline.files.locations import place
 from ortho_pipeline.models import require_view
-from ortho_pipeline.models.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom import Pushbroom
-from ortho_pipeline.models.pushbroom_start import pushbroom_of_tables, rotations_of_quaternions
+from ortho_pipeline.models.pushbroom.line_camera import LineCamera
+from ortho_pipeline.models.pushbroom.scanner import Pushbroom
+from ortho_pipeline.models.pushbroom.start import pushbroom_of_tables, rotations_of_quaternions
 from ortho_rpc.dimap_file import MAX_SIZE, MOST_TERMS, DimapFile
 
 Array = NDArray[np.float64]

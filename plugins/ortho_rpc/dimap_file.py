@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.files import read_bounded
-from ortho_pipeline.models.line_camera import MOST_PIXELS
+from ortho_pipeline.models.pushbroom.line_camera import MOST_PIXELS
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.models.pushbroom import Pushbroom
+from ortho_pipeline.models.pushbroom.scanner import Pushbroom
 from ortho_pipeline.models.rational import RPC
 from ortho_rpc.dimap import has_dimap_pushbroom, images_of, read_dimap_pushbroom
 from ortho_rpc.dimap_file import DimapFile

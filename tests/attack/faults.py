@@ -181,7 +181,7 @@ def _command(words: Sequence[str], folder: Path, writer: int, prepare: Callable[
     """Be the command: never returns."""
     code = 1
     try:
-        from ortho_pipeline import cli
+        from ortho_pipeline.cli import program as cli
 
         os.setsid()
         os.chdir(folder)
@@ -551,12 +551,12 @@ def may_mount() -> bool:
 
 def load() -> None:
     """Load what commands use, so that each forked process has it."""
-    import ortho_pipeline.bands
-    import ortho_pipeline.batch
-    import ortho_pipeline.blocks
-    import ortho_pipeline.pipeline
-    import ortho_pipeline.studies
-    import ortho_pipeline.warp  # noqa: F401
+    import ortho_pipeline.batch.runner
+    import ortho_pipeline.commands.bands
+    import ortho_pipeline.commands.block
+    import ortho_pipeline.commands.rectification
+    import ortho_pipeline.commands.studies
+    import ortho_pipeline.warp.engine  # noqa: F401
     from ortho_pipeline import plugins
 
     plugins.Host.discover()

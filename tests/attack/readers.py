@@ -20,20 +20,22 @@ from ortho_ikonos.metadata import read_header, read_metadata
 from ortho_orbview3.product import read_product
 from ortho_rpc.dimap import read_dimap_pushbroom
 
-from ortho_pipeline import batch_plan, pipeline, report
-from ortho_pipeline.batch_manifest import FileState, Record
-from ortho_pipeline.block_points import read_block_points
-from ortho_pipeline.crs import Vertical, ground_transform, parse_crs
-from ortho_pipeline.dem import Surface
-from ortho_pipeline.inputs import open_scene
-from ortho_pipeline.model_file import read_model_file, save_model
+from ortho_pipeline import commands
+from ortho_pipeline.batch import plan as batch_plan
+from ortho_pipeline.batch.records import FileState, Record
+from ortho_pipeline.block.points import read_block_points
+from ortho_pipeline.commands.inputs import open_scene
+from ortho_pipeline.exchange.model_file import read_model_file, save_model
+from ortho_pipeline.exchange.rpc import rpc_of_dataset
+from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpb
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.options import PointOptions, SceneOptions
 from ortho_pipeline.points import read_points
-from ortho_pipeline.raster import RasterSource, open_dataset
-from ortho_pipeline.rpc import rpc_of_dataset
-from ortho_pipeline.rpc_files import read_rpc_text, write_rpb
-from ortho_pipeline.stac import acquisition_time
+from ortho_pipeline.raster.source import RasterSource, open_dataset
+from ortho_pipeline.report import document as report
+from ortho_pipeline.report.stac import acquisition_time
+from ortho_pipeline.surface.dem import Surface
 
 
 @dataclass(frozen=True)
@@ -231,12 +233,12 @@ def _model(path: Path) -> Any:
 
 
 def _report_seed(folder: Path) -> bytes:
-    fitted = pipeline.fit(seeds.SAMPLE / "scene.tif", PointOptions(gcps=seeds.SAMPLE / "gcps.geojson", check="every:4"))
+    fitted = commands.fit(seeds.SAMPLE / "scene.tif", PointOptions(gcps=seeds.SAMPLE / "gcps.geojson", check="every:4"))
     return json.dumps(report.build_report(scene=fitted.scene, fit=fitted.fit)).encode()
 
 
 def _report(path: Path) -> Any:
-    pipeline.write_plots(path, path.with_name("plots"))
+    commands.write_plots(path, path.with_name("plots"))
     return []
 
 

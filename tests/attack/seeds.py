@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from osgeo import gdal, osr
 
+from ortho_pipeline.exchange.rpc_files import COEFFICIENTS, SCALARS, read_rpc_text, rpc_metadata
 from ortho_pipeline.models import RPC
-from ortho_pipeline.rpc_files import COEFFICIENTS, SCALARS, read_rpc_text, rpc_metadata
 
 SAMPLE = Path(__file__).resolve().parent.parent.parent / "sample_data"
 ORBVIEW3 = "3v050620p0000443940a5200000000200m_001443940"

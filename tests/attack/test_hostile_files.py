@@ -20,12 +20,12 @@ import pytest
 from click.testing import CliRunner
 from osgeo import gdal
 
-from ortho_pipeline.cli import cli
-from ortho_pipeline.dem import Surface
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.mosaic import Ortho, lay_out
-from ortho_pipeline.outline import valid_outline
-from ortho_pipeline.raster import RasterSource, open_dataset
+from ortho_pipeline.raster.source import RasterSource, open_dataset
+from ortho_pipeline.raster.valid_area import valid_outline
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.warp.mosaic import Ortho, lay_out
 
 sys.path.insert(0, str(Path(__file__).parent))
 import hostile
@@ -160,14 +160,14 @@ def test_every_way_in_leads_through_the_gate(trap, tiny, tmp_path, name):
 
 CLOSED = """
 import sys
-from ortho_pipeline import cli
-from ortho_pipeline.locations import located
+from ortho_pipeline.cli import program as cli
+from ortho_pipeline.files.locations import located
 sys.argv = ["ortho", "--version"]
 try:
     cli.main()
 except SystemExit:
     pass
-from ortho_pipeline.raster import gdal, open_dataset
+from ortho_pipeline.raster.source import gdal, open_dataset
 url, image = {url!r}, {image!r}
 open_dataset(image)
 wms = "<GDAL_WMS><Service name='TMS'><ServerUrl>" + url + "/${{z}}</ServerUrl></Service><DataWindow><SizeX>64</SizeX>" \

@@ -12,12 +12,12 @@ from fuzz import Attack, Tally
 from mutate import mutant
 from readers import BY_NAME, READERS
 
-from ortho_pipeline import batch_plan
-from ortho_pipeline.batch_manifest import FileState, Record
+from ortho_pipeline.batch import plan as batch_plan
+from ortho_pipeline.batch.records import FileState, Record
 from ortho_pipeline.errors import InputError, completed, reads
+from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.files import parse_json
-from ortho_pipeline.model_file import read_model_file
-from ortho_pipeline.stac import acquisition_time
+from ortho_pipeline.report.stac import acquisition_time
 
 #: Mutants of each reader: hundreds, but as many as take about a second where a file takes milliseconds.
 FEW, MANY = 150, 5000

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ortho_pipeline import batch_plan, pipeline
+from ortho_pipeline import commands
+from ortho_pipeline.batch import plan as batch_plan
 from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.exchange.rpc import fit_rpc
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
-from ortho_pipeline.rpc import fit_rpc
-from ortho_pipeline.simulate import LineScanner
+from ortho_pipeline.simulation.scanner import LineScanner
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 SMALL = OutputOptions(extent=(530600.0, 4122000.0, 530800.0, 4122200.0))
@@ -37,7 +38,7 @@ def helps(error: OrthoError, out: Path, word: str = "") -> None:
 
 def rectify(image: Path, out: Path) -> Path:
     surface = SurfaceOptions(dem=str(image.parent / "dem.tif"))
-    pipeline.rectify(image, out, surface=surface, output=SMALL)
+    commands.rectify(image, out, surface=surface, output=SMALL)
     return out / f"{image.stem}_ortho.tif"
 
 
@@ -48,7 +49,7 @@ def test_a_source_that_is_cut_off_is_named_and_leaves_no_ortho(tmp_path, share):
     # The directory of this file lies in front of its tiles: it opens, and its pixels are not there.
     image.write_bytes(data[: int(len(data) * share)])
     with pytest.raises(InputError) as caught:
-        pipeline.rectify(image, tmp_path / "out", surface=SurfaceOptions(dem=str(image.parent / "dem.tif")))
+        commands.rectify(image, tmp_path / "out", surface=SurfaceOptions(dem=str(image.parent / "dem.tif")))
     helps(caught.value, tmp_path / "out", "scene.tif")
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from ortho_pipeline.cli import cli
-from ortho_pipeline.rpc_files import write_rpb
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.exchange.rpc_files import write_rpb
 
 sys.path.insert(0, str(Path(__file__).parent))
 import mutate

@@ -10,10 +10,10 @@ import pytest
 from click.testing import CliRunner
 from osgeo import gdal, osr
 
-from ortho_pipeline.cli import cli
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.raster import RasterSource, limit_cache, open_dataset, open_pixels
-from ortho_pipeline.rpc import rpc_metadata
+from ortho_pipeline.exchange.rpc import rpc_metadata
+from ortho_pipeline.raster.source import RasterSource, limit_cache, open_dataset, open_pixels
 
 #: Beyond the default of 512 MB.
 SIDE = 24_500

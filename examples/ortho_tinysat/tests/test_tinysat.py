@@ -8,7 +8,7 @@ import pytest
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.geometry import geocentric
+from ortho_pipeline.geodesy.ellipsoid import geocentric
 from ortho_pipeline.testing import check_sensor
 
 gdal.UseExceptions()

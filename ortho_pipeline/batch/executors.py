@@ -1,0 +1,230 @@
+"""Who does the work of a run: this process, processes of its own, dask's workers, or an executor of the caller.
+
+Nothing heavy is imported at the top: a worker process sets its budget of threads before NumPy is loaded.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from multiprocessing import connection
+from multiprocessing.context import SpawnContext, SpawnProcess
+from typing import Any, TypeVar
+
+from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.files.allowance import require_memory, startable_threads
+
+#: Jobs that are handed over before their turn, so that no worker waits for the next one.
+_AHEAD = 256
+#: Environment variables that bound the threads of numerical libraries.
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+Job = TypeVar("Job")
+Outcome = TypeVar("Outcome")
+
+
+class WorkerDied(OrthoError):
+    """The process that worked on a job ended without a word."""
+
+
+class Sequential(Executor):
+    """Works in the calling thread, at once."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Call the function and return its finished future."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+class Processes:
+    """A pool of spawned processes that outlives the death of some of them.
+
+    Parameters
+    ----------
+    workers : int
+    threads : int
+        Budget of each worker for numerical libraries.
+    """
+
+    def __init__(self, workers: int, threads: int) -> None:
+        self.workers, self.threads = workers, threads
+        self._spawned: list[SpawnProcess] = []
+        self._pool: ProcessPoolExecutor | None = None
+
+    def completed(self, work: Callable[[Job], Outcome], jobs: Iterable[Job]) -> Iterator[tuple[Job, Future[Outcome]]]:
+        """Yield jobs and their finished futures, in the order in which they end.
+
+        A process that dies takes the pool with it. Whatever it was given is done again, one job at a time, so that only
+        a job that kills its process every time ends with `WorkerDied`.
+        """
+        suspects: list[Job] = []
+        try:
+            for job, future in self._on_new_pools(2 * self.workers, work, iter(jobs)):
+                if isinstance(future.exception(), BrokenExecutor):
+                    suspects.append(job)
+                else:
+                    yield job, future
+            for job, future in self._on_new_pools(1, work, iter(suspects)):
+                yield job, _died(future)
+        finally:
+            self.stop()
+
+    def _on_new_pools(
+        self, ahead: int, work: Callable[[Job], Outcome], jobs: Iterator[Job]
+    ) -> Iterator[tuple[Job, Future[Outcome]]]:
+        """Yield as `completed`, with a new pool for the rest after one has broken."""
+        broken = True
+        while broken:
+            broken = False
+            # A pool whose own threads fail to begin is waited for without end.
+            require_memory()
+            startable_threads(2)
+            self._pool = ProcessPoolExecutor(
+                min(self.workers, ahead), mp_context=_Spawning(self._spawned),
+                initializer=start_worker, initargs=(self.threads,),
+            )  # fmt: skip
+            for job, future in _completed(self._pool, ahead, work, jobs):
+                broken = broken or isinstance(future.exception(), BrokenExecutor)
+                yield job, future
+            # Nothing is under way any more; an interpreter takes its time to end by itself.
+            self.stop()
+
+    def stop(self) -> None:
+        """End all processes now; whatever they had not finished is not there."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+        for process in self._spawned:
+            with contextlib.suppress(ValueError):
+                process.terminate()
+        for process in self._spawned:
+            with contextlib.suppress(ValueError):
+                process.join(10)
+        self._spawned.clear()
+
+
+class _Spawning(SpawnContext):
+    """Spawns processes and remembers them, to be able to end them."""
+
+    def __init__(self, spawned: list[SpawnProcess]) -> None:
+        super().__init__()
+        self._spawned = spawned
+
+    def Process(self, *args: Any, **kwargs: Any) -> SpawnProcess:  # type: ignore[override]  # noqa: N802
+        """Return a new process, as `multiprocessing` names this method."""
+        process = SpawnProcess(*args, **kwargs)
+        self._spawned.append(process)
+        return process
+
+
+def start_worker(threads: int) -> None:
+    """Prepare a worker process: threads, signals, imports; it ends when its parent does."""
+    for name in _THREADS:
+        os.environ[name] = str(threads)
+    # Ctrl-C goes to all processes of the terminal; what happens then is for the parent to decide.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    require_memory()
+    startable_threads(1)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+    import ortho_pipeline.commands.rectification
+    import ortho_pipeline.warp.engine  # noqa: F401
+
+
+def _end_with(sentinel: int) -> None:
+    connection.wait([sentinel])
+    os._exit(1)
+
+
+def completed(
+    executor: Executor | Processes, work: Callable[[Job], Outcome], jobs: Iterable[Job]
+) -> Iterator[tuple[Job, Future[Outcome]]]:
+    """Yield jobs and their finished futures, in the order in which they end; a job's exception is its future's.
+
+    An executor of the caller that breaks takes the rest of the jobs with it.
+    """
+    if isinstance(executor, Processes):
+        yield from executor.completed(work, jobs)
+        return
+    ahead = 1 if isinstance(executor, Sequential) else _AHEAD
+    rest = iter(jobs)
+    for job, future in _completed(executor, ahead, work, rest):
+        yield job, _died(future)
+    for job in rest:
+        yield job, _died(_submitted(executor, work, job))
+
+
+def _completed(
+    executor: Executor, ahead: int, work: Callable[[Job], Outcome], jobs: Iterator[Job]
+) -> Iterator[tuple[Job, Future[Outcome]]]:
+    waiting: dict[Future[Outcome], Job] = {}
+    try:
+        broken = False
+        while True:
+            for job in () if broken else jobs:
+                waiting[_submitted(executor, work, job)] = job
+                if len(waiting) >= ahead:
+                    break
+            if not waiting:
+                return
+            done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+            for future in done:
+                broken = broken or isinstance(future.exception(), BrokenExecutor)
+                yield waiting.pop(future), future
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+def _submitted(executor: Executor, work: Callable[[Job], Outcome], job: Job) -> Future[Outcome]:
+    try:
+        return executor.submit(work, job)
+    except BrokenExecutor as error:
+        failed: Future[Outcome] = Future()
+        failed.set_exception(error)
+        return failed
+
+
+def _died(future: Future[Outcome]) -> Future[Outcome]:
+    """Return the future, with the death of a worker in words that say what to do."""
+    error = future.exception()
+    if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":
+        return future
+    told: Future[Outcome] = Future()
+    told.set_exception(
+        WorkerDied("the process that made this scene was killed", remedy="give it more memory, or --workers 1")
+    )
+    return told
+
+
+def dask_executor(scheduler: str) -> Any:
+    """Return the client and an executor over the workers of a dask scheduler.
+
+    Raises
+    ------
+    InputError
+        If dask is not installed, or no scheduler answers.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise InputError(
+            "dask is not installed", field="--scheduler", remedy="pip install 'ortho-pipeline[dask]'"
+        ) from error
+    try:
+        client = Client(scheduler, timeout="5s", set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"no dask scheduler answers at {scheduler!r} ({error or type(error).__name__})", field="--scheduler",
+            remedy="give its address, for example tcp://host:8786",
+        ) from error  # fmt: skip
+    return client, client.get_executor(pure=False)

@@ -1,0 +1,368 @@
+"""From a pipeline file to jobs: patterns, placeholders, paths inside of their root, names that do not collide."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import glob
+import itertools
+import os
+import re
+import unicodedata
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pyproj
+
+from ortho_pipeline import plugins
+from ortho_pipeline.batch.config import Config, Entry, MosaicSettings, Settings, merged, read_config
+from ortho_pipeline.commands.inputs import OWN_POINTS
+from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.raster import source as raster
+
+#: Folder of records and locks within the output folder.
+STATE = ".run"
+#: Files of a run beside the folders of the scenes, by what they are.
+RUN_FILES = {"log": "run.jsonl", "summary": "run.json", "catalog": "catalog.json", "seams": "mosaic.json"}
+_PLACEHOLDER = re.compile(r"\{(\w+)\}")
+_NAME_BYTES = 150
+_WALKS, _PATTERN_BYTES = 2, 1000
+
+
+@dataclass(frozen=True)
+class Job:
+    """One scene: all that a worker has to know, in absolute paths.
+
+    Parameters
+    ----------
+    name : str
+        Name of the scene and of its folder within `output`.
+    versions : mapping
+        Software of the process that made the plan; a worker has to have the same.
+    run : str
+        The run that asks for it.
+    """
+
+    name: str
+    image: Path
+    output: Path
+    scene: SceneOptions = SceneOptions()
+    points: PointOptions = PointOptions()
+    surface: SurfaceOptions = SurfaceOptions()
+    ortho: OutputOptions = OutputOptions()
+    versions: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    run: str = ""
+
+    @property
+    def folder(self) -> Path:
+        """Where the outputs go."""
+        return self.output / self.name
+
+    @property
+    def record(self) -> Path:
+        """File of the scene's record."""
+        return self.output / STATE / f"{self.name}.json"
+
+    @property
+    def lock(self) -> Path:
+        """File of the scene's lock."""
+        return self.output / STATE / f"{self.name}.lock"
+
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """What was asked for, as JSON values, without the budget of the machine."""
+        options = {name: dataclasses.asdict(getattr(self, name)) for name in ("scene", "points", "surface", "ortho")}
+        for budget in ("memory", "threads"):
+            del options["ortho"][budget]
+        return {"name": self.name, "image": str(self.image), **options}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A pipeline file, worked out."""
+
+    path: Path
+    output: Path
+    jobs: tuple[Job, ...]
+    mosaic: MosaicSettings | None = None
+
+    def chosen(self, only: Sequence[str] = (), shard: tuple[int, int] | None = None) -> tuple[Job, ...]:
+        """Return the jobs of these names, or the k-th (from 1) of n parts.
+
+        Raises
+        ------
+        InputError
+            If there is no scene of a name, or no such part.
+        """
+        known = {job.name: job for job in self.jobs}
+        for name in only:
+            if name not in known:
+                raise InputError(f"no scene is called {name!r}", file=self.path, field="--only",
+                                 remedy="'ortho run FILE --list' lists the names")  # fmt: skip
+        jobs = tuple(known[name] for name in dict.fromkeys(only)) if only else self.jobs
+        if shard is None:
+            return jobs
+        part, parts = shard
+        if not 1 <= part <= parts:
+            raise InputError(f"there is no part {part} of {parts}", field="--shard", remedy="for example 1/4")
+        return jobs[part - 1 :: parts]
+
+
+@reads("see docs/run.md for the form of the file")
+def plan(path: str | os.PathLike[str], root: str | os.PathLike[str] | None = None) -> Plan:
+    """Read a pipeline file and work out its scenes.
+
+    Parameters
+    ----------
+    root : path, optional
+        Folder that every path has to lie in; that of the file without. The file's own ``root`` can only narrow it: who
+        wrote the file is not who says what it may read.
+
+    Raises
+    ------
+    InputError
+        For a wrong file, a path outside of the root, a pattern without a match, or two scenes of one name.
+    """
+    return _Planner(Path(path), read_config(path), root).plan()
+
+
+@functools.cache
+def versions() -> dict[str, Any]:
+    """Return the software that results depend on."""
+    packages = ("ortho-pipeline", "numpy", "scipy", "numba")
+    return {
+        **{name: metadata.version(name) for name in packages},
+        "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
+        "proj": pyproj.proj_version_str,
+        "plugins": sorted(f"{one.plugin} ({one})" for one in plugins.Host.discover().plugins()),
+    }
+
+
+class _Planner:
+    def __init__(self, path: Path, config: Config, root: str | os.PathLike[str] | None) -> None:
+        self.path, self.config = path, config
+        self.base = Path(os.path.abspath(path)).parent
+        self.root = self.base.resolve() if root is None else Path(root).resolve()
+        if config.root is not None:
+            self.root = self._inside(config.root, "root")
+        self.output = self._inside(config.output, "output")
+
+    def plan(self) -> Plan:
+        if self.output == self.base:
+            raise InputError("the outputs would lie among the inputs", file=self.path, field="output",
+                             remedy="choose a folder of their own, for example out")  # fmt: skip
+        found: dict[Path, list[tuple[int, Entry]]] = {}
+        for number, entry in enumerate(self.config.scenes):
+            for image in self._images(entry, number):
+                found.setdefault(image, []).append((number, entry))
+        jobs = [self._job(image, entries) for image, entries in found.items()]
+        self._check_names(jobs)
+        self._check_mosaic(jobs)
+        return Plan(self.path, self.output, tuple(jobs), self.config.mosaic)
+
+    # -- images ------------------------------------------------------------------------------------------------------
+
+    def _images(self, entry: Entry, number: int) -> list[Path]:
+        if entry.image is not None:
+            return [self._inside(entry.image, f"scenes[{number}].image")]
+        found: dict[Path, None] = {}
+        excluded = {image for pattern in _listed(entry.exclude)
+                    for image in self._matches(pattern, f"scenes[{number}].exclude")}  # fmt: skip
+        for pattern in _listed(entry.images):
+            matches = [image for image in self._matches(pattern, f"scenes[{number}].images") if image not in excluded]
+            if not matches:
+                raise InputError(
+                    f"nothing matches {pattern!r}", file=self.path, field=f"scenes[{number}].images",
+                    remedy=f"check the pattern, which is relative to {self.base}",
+                )  # fmt: skip
+            for image in matches:
+                found[self._inside(str(image), f"scenes[{number}].images")] = None
+        return list(found)
+
+    def _matches(self, pattern: str, field: str) -> list[Path]:
+        parts = pattern.split("/")
+        # Every ** walks all folders below each that the one before it found.
+        if parts.count("**") > _WALKS or len(os.fsencode(pattern)) > _PATTERN_BYTES:
+            raise InputError(
+                f"{pattern[:60]!r} is too long a search", file=self.path, field=field,
+                remedy=f"at most {_WALKS} times ** and {_PATTERN_BYTES} bytes in a pattern",
+            )  # fmt: skip
+        # Nothing outside of the root is searched either.
+        fixed = "/".join(itertools.takewhile(lambda part: not glob.has_magic(part), parts))
+        self._inside(fixed or ("/" if pattern.startswith("/") else "."), field)
+        names = set(_found("/" if pattern.startswith("/") else str(self.base), [part for part in parts if part]))
+        paths = [Path(os.path.abspath(name)) for name in sorted(names) if os.path.isfile(name)]
+        # A pattern with ** would take the orthos of the last run for scenes.
+        return [path for path in paths if not path.is_relative_to(self.output)]
+
+    # -- one scene ---------------------------------------------------------------------------------------------------
+
+    def _job(self, image: Path, entries: Sequence[tuple[int, Entry]]) -> Job:
+        where = f"scenes[{entries[-1][0]}]"
+        settings = merged(self.config.defaults, *(entry for _, entry in entries))
+        names = [entry.name for _, entry in entries if entry.name is not None]
+        name = self._filled(names[-1] if names else "{stem}", image, f"{where}.name")
+        return Job(
+            name=self._checked_name(name, image, where), image=image, output=self.output,
+            scene=self._scene(settings, image, where), points=self._points(settings, image, where),
+            surface=self._surface(settings, image, where), ortho=self._ortho(settings), versions=versions(),
+        )  # fmt: skip
+
+    def _scene(self, settings: Settings, image: Path, where: str) -> SceneOptions:
+        given = settings.scene
+        options = {}
+        for key, value in given.sensor_options.items():
+            text = str(value).lower() if isinstance(value, bool) else str(value)
+            options[key] = self._perhaps_file(text, image, f"{where}.scene.sensor_options.{key}")
+        rpc = given.rpc if given.rpc in ("tag", "sidecar") else self._file(given.rpc, image, f"{where}.scene.rpc")
+        model = self._file(given.model, image, f"{where}.scene.model")
+        return SceneOptions(
+            sensor=given.sensor, rpc=rpc, model=model, roots=(str(self.root),), sensor_options=options,
+            crop_offset=given.crop_offset,
+        )  # fmt: skip
+
+    def _points(self, settings: Settings, image: Path, where: str) -> PointOptions:
+        values = dict(settings.points)
+        if values["gcps"] != OWN_POINTS:
+            values["gcps"] = self._file(values["gcps"], image, f"{where}.points.gcps")
+        if values["vertical"] is not None:
+            values["vertical"] = self._perhaps_file(values["vertical"], image, f"{where}.points.vertical")
+        return PointOptions(**values)
+
+    def _surface(self, settings: Settings, image: Path, where: str) -> SurfaceOptions:
+        values = dict(settings.surface)
+        values["dem"] = self._file(values["dem"], image, f"{where}.surface.dem")
+        values["fill"] = str(values["fill"])
+        if values["vertical"] is not None:
+            values["vertical"] = self._perhaps_file(values["vertical"], image, f"{where}.surface.vertical")
+        return SurfaceOptions(**values)
+
+    def _ortho(self, settings: Settings) -> OutputOptions:
+        values = dict(settings.output)
+        values["creation_options"] = {key: str(value) for key, value in values["creation_options"].items()}
+        return OutputOptions(**values)
+
+    # -- paths -------------------------------------------------------------------------------------------------------
+
+    def _inside(self, text: str, field: str) -> Path:
+        """Return an absolute path, which has to lie in the root wherever its links lead."""
+        if "\0" in text or "://" in text or text.startswith("/vsi"):
+            raise InputError(f"{text!r} is no path of a file", file=self.path, field=field, remedy="give a file")
+        path = Path(os.path.abspath(self.base / text))
+        try:
+            resolved = path.resolve()
+            path.is_file()
+        except (OSError, RuntimeError, ValueError) as error:
+            # Names longer than the file system's, links in a circle, surrogates.
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"{text[:60]!r} is no path of a file ({reason})", file=self.path, field=field,
+                             remedy="check the name, and the links on its way") from error  # fmt: skip
+        if not resolved.is_relative_to(self.root):
+            raise InputError(
+                f"{text} lies outside of the root {self.root}", file=self.path, field=field,
+                remedy=f"move it there, or allow a folder that holds both with --root {self._common(path.resolve())}",
+            )  # fmt: skip
+        return path
+
+    def _common(self, place: Path) -> str:
+        return os.path.commonpath([self.base.resolve(), place if place.is_dir() else place.parent])
+
+    def _file(self, text: str | None, image: Path, field: str) -> str | None:
+        return None if text is None else str(self._inside(self._filled(text, image, field), field))
+
+    def _perhaps_file(self, text: str, image: Path, field: str) -> str:
+        """Return the path of a value that names a file, any other value as it is."""
+        text = self._filled(text, image, field)
+        looks = os.sep in text and not text.startswith("+")
+        if looks or _is_file(self.base / text):
+            return str(self._inside(text, field))
+        if _is_file(Path(text)):
+            raise InputError(
+                f"{text!r} is a file of the current folder, but paths are relative to the pipeline file",
+                file=self.path, field=field, remedy=f"give its path relative to {self.base}",
+            )  # fmt: skip
+        return text
+
+    def _filled(self, text: str, image: Path, field: str) -> str:
+        values = {"stem": image.stem, "folder": image.parent.name}
+
+        def value(match: re.Match[str]) -> str:
+            if match[1] not in values:
+                raise InputError(f"{match[0]} is not known", file=self.path, field=field, remedy="{stem} or {folder}")
+            return values[match[1]]
+
+        return _PLACEHOLDER.sub(value, text)
+
+    # -- checks ------------------------------------------------------------------------------------------------------
+
+    def _checked_name(self, name: str, image: Path, where: str) -> str:
+        bad = not name or name.startswith(".") or name != name.strip() or len(os.fsencode(name)) > _NAME_BYTES
+        if bad or any(letter in "/\\:\0" or not letter.isprintable() for letter in name):
+            raise InputError(
+                f"{name!r} is no name of a folder (for {image.name})", file=self.path, field=f"{where}.name",
+                remedy="letters, digits, blanks, dashes; not first a dot",
+            )  # fmt: skip
+        return name
+
+    def _check_names(self, jobs: Sequence[Job]) -> None:
+        taken: dict[str, Job] = {}
+        for job in jobs:
+            # Some file systems do not tell upper from lower case, or one way of writing é from another.
+            key = unicodedata.normalize("NFC", job.name).casefold()
+            if key in (*RUN_FILES.values(), "mosaic.vrt", "mosaic.tif"):
+                raise InputError(f"{job.name!r} is a file of the run itself", file=self.path, field="name",
+                                 remedy="give the scene another name")  # fmt: skip
+            other = taken.setdefault(key, job)
+            if other is not job:
+                raise InputError(
+                    f"{other.image} and {job.image} would both be the scene {job.name!r}", file=self.path,
+                    field="scenes.name", remedy="tell them apart, for example with name: '{folder}_{stem}'",
+                )  # fmt: skip
+
+    def _check_mosaic(self, jobs: Sequence[Job]) -> None:
+        if self.config.mosaic is None:
+            return
+        for job in jobs:
+            for field in ("crs", "resolution"):
+                if getattr(job.ortho, field) is None:
+                    raise InputError(
+                        "the scenes of a mosaic share a grid", file=self.path, field=f"defaults.output.{field}",
+                        remedy="say it under defaults: output: (such as crs: EPSG:32635 and resolution: 2.5)",
+                    )  # fmt: skip
+
+
+def _found(base: str, parts: Sequence[str]) -> Iterator[str]:
+    """Yield what a pattern matches below a folder.
+
+    ``**`` walks no linked folders, as in shells: two links that lead up again would give 2 to the power of 40 paths.
+    """
+    at = parts.index("**") if "**" in parts else len(parts)
+    tops = glob.iglob(os.path.join(glob.escape(base), *parts[:at]))
+    if at == len(parts):
+        yield from tops
+        return
+    for top in tops:
+        for folder, names, _ in os.walk(top):
+            names[:] = [name for name in names if not name.startswith(".")]
+            yield from _found(folder, parts[at + 1 :] or ["*"])
+
+
+def for_run(jobs: Sequence[Job], run: str, memory: int, threads: int | None) -> list[Job]:
+    """Return the jobs of a run, with the bytes and threads that each may use."""
+    return [replace(job, run=run, ortho=replace(job.ortho, memory=memory, threads=threads)) for job in jobs]
+
+
+def _is_file(path: Path) -> bool:
+    """Tell whether there is a file of this name; a text that can be no name is none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def _listed(patterns: str | Sequence[str] | None) -> list[str]:
+    return [patterns] if isinstance(patterns, str) else list(patterns or [])

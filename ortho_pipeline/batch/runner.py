@@ -1,0 +1,515 @@
+"""Many scenes: each made once, again only when something that it depends on has changed.
+
+The work on a scene is `commands.rectify`. A failing scene does not stop the others. Whatever ends a run, the next one
+goes on where it stood, and ends with the same bytes as a run that nothing interrupted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from ortho_pipeline import commands
+from ortho_pipeline.batch.executors import Processes, Sequential, completed, dask_executor
+from ortho_pipeline.batch.plan import RUN_FILES, STATE, Job, Plan, for_run, plan, versions
+from ortho_pipeline.batch.records import Digests, FileState, Record, key_of, locked, siblings
+from ortho_pipeline.commands import inputs
+from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_text
+from ortho_pipeline.report.stac import write_catalog
+from ortho_pipeline.warp import mosaic
+
+SCHEMA_VERSION = 1
+EXECUTORS = ("sequential", "processes", "dask")
+#: Larger files beside an image are no metadata.
+_COMPANION_BYTES = 5_000_000
+#: A larger file is no report on a mosaic.
+_REPORT_BYTES = 50_000_000
+#: Seams from which on they are measured by several processes.
+_MANY_SEAMS = 64
+#: Checksums that this process has taken.
+_digests = Digests()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a scene.
+
+    Parameters
+    ----------
+    status : {'done', 'unchanged', 'failed'}
+    facts : mapping
+        JSON values: sensor, model, RMSE, ortho, view.
+    error : mapping, optional
+        Kind, message, file, field, remedy, and the trace of what is no `OrthoError`.
+    """
+
+    name: str
+    status: str
+    seconds: float = 0.0
+    files: Mapping[str, str] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    error: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class BatchResult:
+    """What became of all scenes."""
+
+    scenes: tuple[Outcome, ...]
+    files: Mapping[str, Path]
+    seconds: float
+    mosaic: Mapping[str, Any] | None = None
+
+    def count(self, status: str) -> int:
+        """Return how many scenes ended so."""
+        return sum(scene.status == status for scene in self.scenes)
+
+    @property
+    def failed(self) -> int:
+        """How many scenes, or the mosaic of them, could not be made."""
+        return self.count("failed") + bool(self.mosaic and self.mosaic.get("error"))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of ``ortho run --json`` (docs/run.md)."""
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "counts": {status: self.count(status) for status in ("done", "unchanged", "failed")},
+            "seconds": self.seconds,
+            "scenes": [dict(vars(scene)) for scene in self.scenes],
+            "mosaic": self.mosaic,
+            "files": {name: str(path) for name, path in self.files.items()},
+        }
+
+
+# -- one scene -------------------------------------------------------------------------------------------------------
+
+
+def make_scene(job: Job, verify: bool = False) -> Outcome:
+    """Make a scene unless it is there already; called in a worker, and never raises for what is wrong with a scene.
+
+    The lock of the scene is held meanwhile: a scene that a scheduler hands out twice is made once.
+
+    Parameters
+    ----------
+    verify : bool
+        Judge outputs by their content, whatever their dates say.
+    """
+    begin = time.monotonic()
+    try:
+        with confined(job.output), locked(job.lock, wait=True):
+            return _make_locked(job, verify, begin)
+    except OrthoError as error:
+        return Outcome(job.name, "failed", time.monotonic() - begin, error=error_document(error))
+
+
+def _make_locked(job: Job, verify: bool, begin: float) -> Outcome:
+    clear_up(job.record)
+    record = Record.read(job.record)
+    # What an earlier run wrote, and this one may not write any more.
+    before = record.outputs if record is not None else ()
+    try:
+        _check_versions(job)
+        listing = siblings(_folders(job))
+        good = _still_good(record, job, listing, verify)
+        if good is not None:
+            # A worker of this run may have made it and died before it could say so.
+            mine = bool(job.run) and good.run == job.run
+            seconds = good.seconds if mine else time.monotonic() - begin
+            return Outcome(job.name, "done" if mine else "unchanged", seconds, _paths(good, job), good.facts)
+        if record is not None:
+            Record(job.name, "", "started", outputs=before).write(job.record)
+        result = commands.rectify(
+            job.image, job.folder, scene=job.scene, points=job.points, surface=job.surface, output=job.ortho,
+            name=job.name, digest=_digests,
+        )  # fmt: skip
+        report = result.document["report"]
+        read = _as_read(job, report)
+        made = tuple(FileState.of(role, path, name=path.name) for role, path in result.files.items())
+        _remove(job.folder, {one.path for one in before} - {one.path for one in made})
+        done = Record(
+            job.name, key_of(read, job.configuration, job.versions), "done", read, made, listing,
+            time.monotonic() - begin, _facts(report), run=job.run,
+        )  # fmt: skip
+        done.write(job.record)
+        return Outcome(job.name, "done", done.seconds, _paths(done, job), done.facts)
+    except Exception as error:
+        told = error_document(error)
+        failed = Record(job.name, "", "failed", outputs=before, seconds=time.monotonic() - begin, error=told)
+        with contextlib.suppress(OrthoError):
+            failed.write(job.record)
+        return Outcome(job.name, "failed", failed.seconds, error=told)
+
+
+def _check_versions(job: Job) -> None:
+    here = versions()
+    other = [
+        f"{name} {here[name]} in place of {job.versions.get(name)}"
+        for name in here
+        if here[name] != job.versions.get(name)
+    ]
+    if other:
+        raise InputError(f"this worker has other software than the run: {'; '.join(other)}", field="--scheduler",
+                         remedy="install the same versions everywhere")  # fmt: skip
+
+
+def _still_good(record: Record | None, job: Job, listing: str, verify: bool) -> Record | None:
+    """Return the record with the present dates if inputs, settings and outputs have the content recorded."""
+    if record is None or record.status != "done" or not isinstance(record.facts.get("lean_m_per_m"), int | float):
+        return None
+    if not verify:
+        _digests.learn(record.inputs)
+    known = {one.path: one.role for one in record.inputs if os.path.isfile(one.path)}
+    found = inputs.hashed(inputs.files_read(job.image, job.scene, job.points, job.surface), _digests)
+    read = _states(job, {**{one["path"]: one["role"] for one in found}, **known})
+    if record.key != key_of(read, job.configuration, job.versions) or not record.intact(job.folder, verify):
+        return None
+    fresh = replace(record, inputs=read, siblings=listing, outputs=_restated(record.outputs, job.folder))
+    if fresh != record:
+        fresh.write(job.record)
+    return fresh
+
+
+def _as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
+    """Return the files that a report was made from; one that has changed in the meantime is an error."""
+    used = {one["path"]: one for one in report["provenance"]["inputs"]}
+    roles = {path: one["role"] for path, one in used.items()}
+    source = str(report["scene"]["model_source"])
+    if os.path.isfile(source):
+        roles.setdefault(os.path.abspath(source), "model source")
+    states = _states(job, roles)
+    for state in states:
+        if state.path in used and used[state.path]["sha256"] != state.sha256:
+            raise InputError("this file changed while the scene was made", file=state.path, remedy="run again")
+    return states
+
+
+def _folders(job: Job) -> list[str | os.PathLike[str]]:
+    """Return the files in whose folders a new name could change the scene."""
+    return [path for path in (job.image, inputs.point_file(job.points), job.surface.dem, *job.scene.files.values())
+            if path is not None and os.path.isabs(path)]  # fmt: skip
+
+
+def _states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:
+    """Return all files that a scene depends on: those of `roles`, and small companions of the image."""
+    known = dict(roles)
+    stem = job.image.stem
+    for entry in os.scandir(job.image.parent):
+        rest = entry.name.removeprefix(stem)
+        belongs = rest != entry.name and rest[:1] in ("_", ".", "-") and entry.path not in known
+        if belongs and entry.is_file() and entry.stat().st_size <= _COMPANION_BYTES:
+            known[entry.path] = "companion"
+    return tuple(FileState.of(role, Path(path), _digests) for path, role in sorted(known.items()))
+
+
+def _restated(outputs: Sequence[FileState], folder: Path) -> tuple[FileState, ...]:
+    """Return outputs of unchanged content with their present dates."""
+    return tuple(replace(one, mtime_ns=(folder / one.path).stat().st_mtime_ns) for one in outputs)
+
+
+def _remove(folder: Path, names: set[str]) -> None:
+    for name in names:
+        (folder / name).unlink(missing_ok=True)
+
+
+def _paths(record: Record, job: Job) -> dict[str, str]:
+    return {one.role: str(job.folder / one.path) for one in record.outputs}
+
+
+def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a summary says of a scene."""
+    scene, adjustment = report["scene"], report["adjustment"]
+    return {
+        "sensor": scene["sensor"],
+        "model": adjustment["model"],
+        "lean_m_per_m": scene["lean_m_per_m"],
+        "rmse_px": {which: rmse and rmse["total"] for which, rmse in adjustment["rmse"].items()},
+        "rmse_m": {which: rmse and rmse["total"] for which, rmse in report["rmse_m"].items()},
+        "ortho": {name: report["ortho"][name] for name in ("crs", "resolution", "size", "valid_share")},
+        "warnings": list(report["warnings"]),
+    }
+
+
+def error_document(error: BaseException) -> dict[str, Any]:
+    """Return an error as JSON values."""
+    kind = type(error).__name__
+    if isinstance(error, OrthoError):
+        return {"kind": kind, "message": error.message, "file": error.file, "field": error.field,
+                "remedy": error.remedy}  # fmt: skip
+    trace = "".join(traceback.format_exception(error))
+    return {"kind": kind, "message": str(error) or kind, "file": None, "field": None, "remedy": None, "trace": trace}
+
+
+# -- all scenes ------------------------------------------------------------------------------------------------------
+
+
+def run(
+    config: str | os.PathLike[str] | Plan,
+    *,
+    executor: str | Executor | None = None,
+    workers: int | None = None,
+    threads: int | None = None,
+    memory: int = 512_000_000,
+    scheduler: str | None = None,
+    only: Sequence[str] = (),
+    shard: tuple[int, int] | None = None,
+    verify: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> BatchResult:
+    """Make all scenes of a pipeline file.
+
+    Parameters
+    ----------
+    executor : {'sequential', 'processes', 'dask'} or concurrent.futures.Executor, optional
+        Default: processes, or dask where a scheduler is given. An executor of the caller is not shut down.
+    workers, threads, memory : int
+        Processes; threads and bytes of each scene. Default: all processors, divided among the workers.
+    scheduler : str, optional
+        Address of a dask scheduler.
+    only, shard : optional
+        Names of scenes, or (k, n) for the k-th of n parts. The mosaic is made by a run of all scenes.
+    verify : bool
+        Take all checksums again.
+
+    Raises
+    ------
+    InputError
+        If the file is wrong, or another run works in the output folder. What is wrong with a scene is its outcome.
+    """
+    planned = config if isinstance(config, Plan) else plan(config)
+    jobs, part = planned.chosen(only, shard), bool(only) or shard is not None
+    lock = planned.output / STATE / "run.lock"
+    with (
+        confined(planned.output),
+        locked(lock, shared=part, owner=f"'ortho run {planned.path.name}'"),
+        _crew(executor, workers, threads, scheduler, len(jobs)) as (crew, budget),
+    ):
+        return _Run(planned, part, verify, progress).make(crew, for_run(jobs, _run_id(), memory, budget))
+
+
+def _run_id() -> str:
+    return f"{datetime.now(UTC).isoformat(timespec='microseconds')} {os.getpid()}"
+
+
+def list_scenes(config: str | os.PathLike[str] | Plan) -> list[dict[str, Any]]:
+    """Return name, image and state (new, started, done, changed, failed) of each scene, without making any."""
+    planned = config if isinstance(config, Plan) else plan(config)
+    listings: dict[Path, list[str]] = {}
+    listed = []
+    for job in planned.jobs:
+        record = Record.read(job.record)
+        state = "new" if record is None else record.status
+        if state == "done" and record is not None and not _untouched(record, job, listings):
+            state = "changed"
+        listed.append({"name": job.name, "image": str(job.image), "state": state})
+    return listed
+
+
+def check_scenes(
+    config: str | os.PathLike[str] | Plan, only: Sequence[str] = (), shard: tuple[int, int] | None = None
+) -> list[dict[str, Any]]:
+    """Open what every scene is made from (images, points, DEM and its coverage) and read no pixel.
+
+    Returns
+    -------
+    list of dict
+        Name and image, and what `commands.check` says or ``error``.
+    """
+    planned = config if isinstance(config, Plan) else plan(config)
+    checked: list[dict[str, Any]] = []
+    for job in planned.chosen(only, shard):
+        one: dict[str, Any] = {"name": job.name, "image": str(job.image)}
+        try:
+            one |= commands.check(job.image, scene=job.scene, points=job.points, surface=job.surface, output=job.ortho)
+        except OrthoError as error:
+            one["error"] = error_document(error)
+        checked.append(one)
+    return checked
+
+
+class _Run:
+    """One call of `run`: the log, the count, the end."""
+
+    def __init__(
+        self, planned: Plan, part: bool, verify: bool, progress: Callable[[float], None] | None
+    ) -> None:  # fmt: skip
+        self.planned, self.part, self.verify, self.progress = planned, part, verify, progress
+        self.begin = time.monotonic()
+        self.log_path = planned.output / RUN_FILES["log"]
+        self.outcomes: dict[str, Outcome] = {}
+
+    def make(self, crew: Executor | Processes, jobs: Sequence[Job]) -> BatchResult:
+        self.log("run started", scenes=len(jobs), file=str(self.planned.path), versions=versions())
+        try:
+            changed = list(self._without_unchanged(jobs))
+            work = _verify_scene if self.verify else make_scene
+            for job, future in completed(crew, work, changed):
+                self._note(_outcome(job, future), len(jobs))
+            made = None if self.part or self.planned.mosaic is None else self._mosaic(crew, jobs)
+        except KeyboardInterrupt:
+            self.log("run interrupted", finished=len(self.outcomes), scenes=len(jobs))
+            raise
+        return self._finish(jobs, made)
+
+    def _mosaic(self, crew: Executor | Processes, jobs: Sequence[Job]) -> dict[str, Any]:
+        """Make the mosaic of the scenes that there are; what is wrong with it is in the document."""
+        present = [job for job in jobs if self.outcomes[job.name].status != "failed"]
+        try:
+            document = _Mosaic(self.planned, present, self.outcomes).make(crew)
+        except OrthoError as error:
+            document = {"error": error_document(error)}
+        missing = [job.name for job in jobs if job not in present]
+        self.log("mosaic", **{name: value for name, value in document.items() if name != "seams"}, missing=missing)
+        return {**document, "missing": missing}
+
+    def _without_unchanged(self, jobs: Sequence[Job]) -> Iterator[Job]:
+        """Yield the jobs that dates and sizes alone do not show to be done."""
+        listings: dict[Path, list[str]] = {}
+        for job in jobs:
+            record = None if self.verify else Record.read(job.record)
+            if record is not None and _untouched(record, job, listings):
+                self._note(Outcome(job.name, "unchanged", files=_paths(record, job), facts=record.facts), len(jobs))
+            else:
+                yield job
+
+    def _note(self, outcome: Outcome, total: int) -> None:
+        self.outcomes[outcome.name] = outcome
+        self.log("scene", **vars(outcome))
+        if self.progress:
+            self.progress(len(self.outcomes) / total)
+
+    def _finish(self, jobs: Sequence[Job], made: dict[str, Any] | None) -> BatchResult:
+        ordered = tuple(self.outcomes[job.name] for job in jobs)
+        files = {"log": self.log_path}
+        items = [Path(outcome.files["stac"]) for outcome in ordered if "stac" in outcome.files]
+        if items and not self.part:
+            files["catalog"] = self.planned.output / RUN_FILES["catalog"]
+            write_catalog(files["catalog"], items, self.planned.path.stem)
+        if not self.part:
+            files["summary"] = self.planned.output / RUN_FILES["summary"]
+        if made is not None and "file" in made:
+            files |= {"mosaic": Path(made["file"]), "seams": self.planned.output / RUN_FILES["seams"]}
+        result = BatchResult(ordered, files, time.monotonic() - self.begin, made)
+        if not self.part:
+            write_text(files["summary"], json.dumps(result.to_json(), indent=1, allow_nan=False) + "\n")
+        self.log("run finished", counts=result.to_json()["counts"], seconds=result.seconds)
+        return result
+
+    def log(self, event: str, **fields: Any) -> None:
+        """Append a line to the log; several runs of parts may do so at once."""
+        line = {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event, **fields}
+        append_line(self.log_path, json.dumps(line, allow_nan=False, default=str))
+
+
+class _Mosaic:
+    """The mosaic of a run, made again only when an ortho or the settings have changed."""
+
+    def __init__(self, planned: Plan, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) -> None:
+        assert planned.mosaic is not None
+        self.output, self.settings = planned.output, planned.mosaic
+        self.path = planned.output / f"mosaic.{'vrt' if self.settings.format == 'VRT' else 'tif'}"
+        self.report = planned.output / RUN_FILES["seams"]
+        self.record = planned.output / STATE / "mosaic" / "record.json"
+        self.orthos = [
+            mosaic.Ortho(job.name, Path(outcomes[job.name].files["ortho"]), outcomes[job.name].facts["lean_m_per_m"])
+            for job in jobs
+        ]
+        # What the records know of the orthos need not be taken again.
+        known = [Record.read(job.record) for job in jobs]
+        self.inputs = tuple(
+            replace(state, role=job.name, path=str(job.folder / state.path))
+            for job, record in zip(jobs, known, strict=True)
+            for state in (record.outputs if record else ())
+            if state.role == "ortho"
+        )
+        order = {ortho.name: ortho.lean for ortho in self.orthos}
+        self.key = key_of(self.inputs, {**self.settings.model_dump(), "order": list(order.items())}, versions())
+
+    def make(self, crew: Executor | Processes) -> dict[str, Any]:
+        record = Record.read(self.record)
+        if record is not None and record.key == self.key and record.intact(self.output):
+            # A record may lie: what it vouches for is read as any other file, and made again if it is no report.
+            with contextlib.suppress(InputError):
+                document = read_json(self.report, _REPORT_BYTES, "run again")
+                if isinstance(document, dict):
+                    return {**document, "status": "unchanged"}
+        self.record.unlink(missing_ok=True)
+        layout = mosaic.lay_out(self.orthos, self.settings.order)
+        with together(self.output, "mosaic"):
+            if self.settings.format == "VRT":
+                mosaic.write_vrt(layout, self.path)
+            else:
+                mosaic.write_cog(layout, self.path)
+            document = {"file": str(self.path), **mosaic.summary(layout, self._seams(layout, crew))}
+            write_text(self.report, json.dumps(document, indent=1, allow_nan=False) + "\n")
+            if record is not None:
+                retire({self.output / one.path for one in record.outputs} - {self.path, self.report})
+        made = tuple(FileState.of(role, path, name=path.name) for role, path in
+                     (("mosaic", self.path), ("seams", self.report)))  # fmt: skip
+        Record("mosaic", self.key, "done", self.inputs, made).write(self.record)
+        return {**document, "status": "done"}
+
+    def _seams(self, layout: mosaic.Layout, crew: Executor | Processes) -> list[dict[str, Any]]:
+        if not self.settings.seams:
+            return []
+        pairs = mosaic.overlaps(layout)
+        # New processes for a few seams take longer than these.
+        crew = Sequential() if isinstance(crew, Processes) and len(pairs) < _MANY_SEAMS else crew
+        found = {id(pair): future.result() for pair, future in completed(crew, mosaic.measure_seam, pairs)}
+        return [found[id(pair)] for pair in pairs]
+
+
+def _verify_scene(job: Job) -> Outcome:
+    return make_scene(job, verify=True)
+
+
+def _outcome(job: Job, future: Future[Outcome]) -> Outcome:
+    error = future.exception()
+    return future.result() if error is None else Outcome(job.name, "failed", error=error_document(error))
+
+
+def _untouched(record: Record, job: Job, listings: dict[Path, list[str]]) -> bool:
+    """Tell whether nothing that a scene depends on has another size, date or neighbour than when it was made."""
+    return (
+        record.status == "done"
+        and all(one.untouched() for one in record.inputs)
+        and all(one.untouched(job.folder) for one in record.outputs)
+        and record.siblings == siblings(_folders(job), listings)
+        and record.key == key_of(record.inputs, job.configuration, job.versions)
+    )
+
+
+@contextlib.contextmanager
+def _crew(
+    executor: str | Executor | None, workers: int | None, threads: int | None, scheduler: str | None, jobs: int
+) -> Iterator[tuple[Executor | Processes, int | None]]:
+    """Yield who does the work, and the threads of each scene."""
+    if scheduler is not None and executor not in ("dask", None):
+        raise InputError("a scheduler is for dask", field="--scheduler", remedy="leave out --executor, or say dask")
+    if isinstance(executor, Executor):
+        yield executor, threads or 1
+    elif executor == "dask" or scheduler is not None:  # a scheduler alone means dask
+        if scheduler is None:
+            raise InputError("dask needs the address of its scheduler", field="--scheduler",
+                             remedy="for example tcp://host:8786")  # fmt: skip
+        client, pool = dask_executor(scheduler)
+        with client:
+            yield pool, threads or 1
+    elif executor == "sequential":
+        yield Sequential(), threads
+    elif executor in ("processes", None):
+        processors = len(os.sched_getaffinity(0))
+        count = max(1, min(workers or processors, jobs))
+        budget = threads or max(1, processors // count)
+        yield Processes(count, budget), budget
+    else:
+        raise InputError(f"no executor is called {executor!r}", field="--executor", remedy=", ".join(EXECUTORS))

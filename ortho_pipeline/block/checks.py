@@ -1,0 +1,113 @@
+"""Known points that are far from where a block puts them: named, and left as they are.
+
+Check points take no part with their ground, so nothing of theirs is ever left out; what is wrong with one of them
+spoils the accuracy that is stated. Control points with little influence can be far off without being rejected. Both are
+tested here against the covariance of the adjusted ground and the accuracy of their own, and said.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ortho_pipeline.block.blunders import tests_of_ground
+from ortho_pipeline.block.solver import BlockProblem, Solved
+from ortho_pipeline.block.variance_components import Variances
+from ortho_pipeline.models.base import Array
+
+#: Chance that of a good block any point is named.
+_RISK = 0.01
+
+
+@dataclass(frozen=True)
+class Outlying:
+    """A known point that the block contradicts.
+
+    Parameters
+    ----------
+    point, role : str
+        Its id; check or control.
+    what : {'plan', 'height', 'ground'}
+    metres : float
+        How far it is off.
+    sigmas : float
+        The same over its standard deviation (root of the mean square of the axes).
+    """
+
+    point: str
+    role: str
+    what: str
+    metres: float
+    sigmas: float
+
+    def __str__(self) -> str:
+        """Say it to people."""
+        where = {"plan": "its place in plan is", "height": "its height is", "ground": "its ground is"}[self.what]
+        taken = "it counts in the accuracy all the same" if self.role == "check" else "it was used all the same"
+        return (
+            f"{self.role} point {self.point}: {where} {self.metres:.2f} m ({self.sigmas:.1f} sigma) from where the "
+            f"block puts it; {taken}: check its coordinates and measurements"
+        )
+
+
+def outlying(
+    problem: BlockProblem,
+    solved: Solved,
+    variances: Variances,
+    residuals: Array,
+    covariance: Array,
+    used: np.ndarray,
+) -> tuple[Outlying, ...]:
+    """Return the check points, and the control points that were used, which the block contradicts.
+
+    Parameters
+    ----------
+    residuals : ndarray (N, 3)
+        Known minus adjusted ground, metres east, north, up.
+    covariance : ndarray (N, 3, 3)
+        Of the adjusted ground, m².
+    used : ndarray (N,) of bool
+        Whose ground was used.
+    """
+    from scipy.special import fdtrc
+
+    points = problem.points
+    own = _sigmas(problem, variances)
+    freedom = max(variances.redundancy[0], 1.0)
+    found: list[tuple[int, str, float, float, float]] = []
+    for k in np.flatnonzero(points.check):
+        for what, axes in (("plan", (0, 1)), ("height", (2,))):
+            apart, part = residuals[k, axes], covariance[k][np.ix_(axes, axes)]
+            if not (np.isfinite(apart).all() and np.isfinite(part).all()):
+                continue
+            spread = part + np.diag(own[k, axes] ** 2)
+            square = float(apart @ np.linalg.solve(spread, apart)) / len(axes)
+            if variances.estimated and (points.sigma_ground[k, axes] == 0).any():
+                chance = variances.chance_of(apart, part, axes)
+            else:
+                chance = float(fdtrc(len(axes), freedom, square))
+            found.append((int(k), what, math.hypot(*apart), math.sqrt(square), chance))
+    squares, ranks = tests_of_ground(problem, solved)
+    for k in np.flatnonzero(used & (ranks > 0)):
+        of = min(freedom, variances.freedom) if problem.unstated[k].any() else freedom
+        apart, square = residuals[k, np.isfinite(residuals[k])], float(squares[k] / ranks[k])
+        chance = float(fdtrc(ranks[k], of, square))
+        found.append((int(k), "ground", float(np.linalg.norm(apart)), math.sqrt(square), chance))
+    return tuple(
+        Outlying(points.ids[k], str(points.roles[k]), what, metres, sigmas)
+        for k, what, metres, sigmas, chance in found
+        if chance < _RISK / len(found)
+    )
+
+
+def _sigmas(problem: BlockProblem, variances: Variances) -> Array:
+    """Return the sigmas ``(N, 3)`` of known ground; for check points that state none, those of control."""
+    stated = problem.points.sigma_ground
+    control = stated[problem.points.control]
+    found = np.zeros(3)
+    for axis, estimated in enumerate((variances.sigma_xy, variances.sigma_xy, variances.sigma_h)):
+        known = control[control[:, axis] > 0, axis]
+        found[axis] = estimated if estimated is not None else (np.median(known) if len(known) else 0.0)
+    return np.where(stated > 0, stated, found)

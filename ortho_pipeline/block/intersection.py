@@ -1,0 +1,274 @@
+r"""Forward intersection: the ground point that the rays of several images meet in best.
+
+For each point alone the sum of squares of :math:`(l_i - f_i(X)) / \sigma_i` over its rays is minimised, all points side
+by side. The covariance of a point is :math:`\sigma_0^2 (B^T B)^{-1}` with the weighted partials :math:`B` of its rays;
+errors of the models themselves are not in it (they are in that of an adjustment).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
+from ortho_pipeline.block.points import BlockPoints, Index
+from ortho_pipeline.errors import InputError, TooFewPoints, counted
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.models.base import Array, SensorModel
+
+#: Rays whose point is so many times less certain along its worst direction than along its best are parallel.
+PARALLEL = 3e3
+_STEPS = 30
+#: A step beyond this (m) comes from a linearisation too far from the point.
+_LONGEST = 50_000.0
+
+
+@dataclass(frozen=True, eq=False)
+class Intersection:
+    """Ground points of rays.
+
+    Parameters
+    ----------
+    points : BlockPoints
+    ground : ndarray (N, 3)
+        Lon, lat (degrees), ellipsoidal height; NaN where fewer than two rays, or parallel ones, leave it open.
+    covariance : ndarray (N, 3, 3)
+        m², east, north, up.
+    residuals : ndarray (M, 2)
+        Measured minus predicted, px.
+    angles_deg : ndarray (N,)
+        Largest angle between two rays of the point.
+    sigma0 : float or None
+        Standard error of unit weight of all points together; None without redundancy.
+    """
+
+    points: BlockPoints
+    ground: Array
+    covariance: Array
+    residuals: Array
+    angles_deg: Array
+    sigma0: float | None
+
+    def __repr__(self) -> str:
+        met = int(np.isfinite(self.ground).all(axis=1).sum())
+        sigma0 = "unknown" if self.sigma0 is None else f"{self.sigma0:.3g}"
+        return (
+            f"<{met} of {counted(len(self.points), 'point')} intersected from "
+            f"{counted(self.points.rays, 'ray')}: sigma0 {sigma0}>"
+        )
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations east, north, up in metres ``(N, 3)``."""
+        return sigmas_of(self.covariance)
+
+    @property
+    def rays(self) -> Index:
+        """Number of rays of each point ``(N,)``."""
+        return np.bincount(self.points.point, minlength=len(self.points)).astype(np.int64)
+
+
+def sigmas_of(covariance: Array) -> Array:
+    """Return the standard deviations ``(N, 3)`` of covariances ``(N, 3, 3)``."""
+    return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+
+
+def intersect(models: Mapping[str, SensorModel], points: BlockPoints, *, scaled: bool = True) -> Intersection:
+    """Intersect the rays of each point, whatever its role; known ground plays no part.
+
+    Parameters
+    ----------
+    models : mapping of image name to SensorModel
+        One for each image of the points.
+    scaled : bool
+        Scale covariances by the estimated sigma0² (of all points together), not by 1.
+
+    Raises
+    ------
+    InputError
+        If an image has no model.
+    TooFewPoints
+        If no point was measured in two images.
+    """
+    chosen = models_of(models, points)
+    counts = np.bincount(points.point, minlength=len(points))
+    if not (counts >= 2).any():
+        raise TooFewPoints(
+            "no point was measured in two images", file=points.source or None,
+            remedy="a point needs rays of two images to be intersected; points of one id are one point",
+        )  # fmt: skip
+    frame = frame_of(chosen, points)
+    local = meet(frame, chosen, points, np.ones(points.rays, dtype=bool))
+    places = frame.places(local)
+    found = np.asarray(np.isfinite(local).all(axis=1))
+    residuals = points.measured - predict(frame, chosen, points, local)
+    used = np.asarray(np.isfinite(residuals).all(axis=1))
+    misfit, rows = _equations(frame, chosen, points, used, local)
+    freedom = 2 * int(used.sum()) - 3 * int(found.sum())
+    sigma0 = math.sqrt(float((misfit**2).sum()) / freedom) if freedom > 0 else None
+    axes = frame.horizons(places.geodetic)
+    covariance = np.full((len(points), 3, 3), np.nan)
+    normal = _per_point(points, rows.swapaxes(1, 2) @ rows)
+    covariance[found] = np.linalg.inv(normal[found])
+    covariance = axes @ covariance @ axes.swapaxes(1, 2)
+    if scaled and sigma0 is not None:
+        covariance *= sigma0**2
+    return Intersection(points, places.geodetic, covariance, residuals, _angles(points, rows, found), sigma0)
+
+
+def models_of(models: Mapping[str, SensorModel], points: BlockPoints) -> tuple[SensorModel, ...]:
+    """Return the models in the order of the images of the points.
+
+    Raises
+    ------
+    InputError
+        If an image has no model, or a model no image.
+    """
+    for here, there, what in (
+        (points.images, models, "there is no model of the image"),
+        (models, points.images, "there are no points of the image"),
+    ):
+        missing = sorted(set(here) - set(there))
+        if missing:
+            raise InputError(
+                f"{what} {missing[0]!r}", file=points.source or None, field="image",
+                remedy=f"images of the points: {', '.join(points.images)}; models: {', '.join(models)}",
+            )  # fmt: skip
+    return tuple(models[name] for name in points.images)
+
+
+def frame_of(models: Sequence[SensorModel], points: BlockPoints) -> GroundFrame:
+    """Return the frame in the middle of the control points, or of the images' domains if there are none."""
+    known = points.known_in(GEODETIC)[points.control]
+    if np.isfinite(known).all(axis=1).any():
+        return GroundFrame.about(known)
+    centres = [ground_transform(model.crs, GEODETIC)(model.domain[0][None]) for model in models]
+    return GroundFrame.about(np.concatenate(centres))
+
+
+def predict(frame: GroundFrame, models: Sequence[SensorModel], points: BlockPoints, local: Array) -> Array:
+    """Return the image points ``(M, 2)`` at which points ``(N, 3)`` of the frame are seen by their rays' images."""
+    places = frame.places(local)
+    predicted = np.full((points.rays, 2), np.nan)
+    for number, model in enumerate(models):
+        rays = np.flatnonzero(points.image == number)
+        if len(rays):
+            predicted[rays] = places.project(model, points.point[rays])
+    return predicted
+
+
+def meet(frame: GroundFrame, models: Sequence[SensorModel], points: BlockPoints, used: np.ndarray) -> Array:
+    """Return the points ``(N, 3)`` of the frame that the rays in the mask `used` ``(M,)`` meet in; NaN where none.
+
+    Gauss-Newton for each point by itself, with steps halved where they do not descend, from where the rays pass the
+    reference heights of their models.
+    """
+    local = _first(frame, models, points, used)
+    used = used & np.asarray(np.isfinite(local).all(axis=1))[points.point]
+    counts = np.bincount(points.point[used], minlength=len(points))
+    used &= counts[points.point] >= 2
+    open_points = np.flatnonzero(np.bincount(points.point[used], minlength=len(points)) >= 2)
+    moving = np.zeros(len(points), dtype=bool)
+    moving[open_points] = True
+    parallel = np.logical_not(moving)
+    factor = np.ones(len(points))
+    squares, shift = np.full(len(points), np.inf), np.zeros((len(points), 3))
+    before = local.copy()
+    for _ in range(_STEPS):
+        mask = used & moving[points.point]
+        if not mask.any():
+            break
+        misfit, rows = _equations(frame, models, points, mask, local)
+        now = _per_point(points, (misfit**2).sum(axis=1))
+        with np.errstate(invalid="ignore"):
+            worse = moving & ~(now <= squares * (1 + 1e-9) + 1e-14)
+        factor[worse] /= 2
+        better = moving & ~worse
+        squares[better], before[better], factor[better] = now[better], local[better], 1.0
+        normal = _per_point(points, rows.swapaxes(1, 2) @ rows)
+        right = _per_point(points, (rows.swapaxes(1, 2) @ misfit[:, :, None])[:, :, 0])
+        rows_better = np.flatnonzero(better)
+        step, open_ = _solved(normal[rows_better], right[rows_better])
+        parallel[rows_better] = open_
+        shift[rows_better] = np.where(open_[:, None], 0.0, step)
+        local[moving] = before[moving] + factor[moving, None] * shift[moving]
+        length = np.linalg.norm(shift, axis=1) * factor
+        moving &= ~parallel & (length > 1e-7) & (factor > 1e-4)
+    local[parallel | ~np.isfinite(squares)] = np.nan
+    return local
+
+
+def _solved(normal: Array, right: Array) -> tuple[Array, np.ndarray]:
+    """Return steps ``(n, 3)``, none longer than is sensible, and which of the points their rays leave open."""
+    if not len(normal):
+        return np.zeros((0, 3)), np.zeros(0, dtype=bool)
+    finite = np.asarray(np.isfinite(normal).all(axis=(1, 2)))
+    values, vectors = np.linalg.eigh(np.where(finite[:, None, None], normal, np.eye(3)))
+    left_open = ~finite | ~(values[:, 0] * PARALLEL**2 > values[:, 2])
+    turned = (vectors.swapaxes(1, 2) @ right[:, :, None])[:, :, 0]
+    turned = np.where(left_open[:, None], 0.0, turned)
+    step = (vectors @ (turned / np.where(left_open[:, None], 1.0, values))[:, :, None])[:, :, 0]
+    length = np.maximum(np.linalg.norm(step, axis=1), _LONGEST)
+    return step * (_LONGEST / length)[:, None], left_open
+
+
+def _first(frame: GroundFrame, models: Sequence[SensorModel], points: BlockPoints, used: np.ndarray) -> Array:
+    """Return the mean of where the rays of each point pass the reference heights of their models."""
+    total, count = np.zeros((len(points), 3)), np.zeros(len(points))
+    for number, model in enumerate(models):
+        rays = np.flatnonzero(used & (points.image == number))
+        if not len(rays):
+            continue
+        ground = model.image_to_ground(points.measured[rays], model.reference_height)
+        local = frame.of_geodetic(ground_transform(model.crs, GEODETIC)(ground))
+        good = np.isfinite(local).all(axis=1)
+        total[points.point[rays[good]]] += local[good]  # an image has at most one ray of a point
+        count[points.point[rays[good]]] += 1
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return total / count[:, None]
+
+
+def _equations(
+    frame: GroundFrame, models: Sequence[SensorModel], points: BlockPoints, used: np.ndarray, local: Array
+) -> tuple[Array, Array]:
+    """Return misfits ``(M, 2)`` over sigma and their partials by the points ``(M, 2, 3)``; zero for rays not used."""
+    places = frame.places(local)
+    misfit, rows = np.zeros((points.rays, 2)), np.zeros((points.rays, 2, 3))
+    for number, model in enumerate(models):
+        rays = np.flatnonzero(used & (points.image == number))
+        if not len(rays):
+            continue
+        of = points.point[rays]
+        sigma = points.sigma_image[rays]
+        misfit[rays] = (points.measured[rays] - places.project(model, of)) / sigma[:, None]
+        rows[rays] = places.ground_partials(model, of) / sigma[:, None, None]
+    return misfit, rows
+
+
+def _per_point(points: BlockPoints, values: Array) -> Array:
+    """Return the sums over the rays of each point ``(N, ...)`` of values ``(M, ...)``."""
+    flat = values.reshape(len(values), -1)
+    sums = [np.bincount(points.point, weights=column, minlength=len(points)) for column in flat.T]
+    total: Array = np.stack(sums, axis=1).astype(float)
+    return total.reshape(len(points), *values.shape[1:])
+
+
+def _angles(points: BlockPoints, rows: Array, found: np.ndarray) -> Array:
+    """Return the largest angle (degrees) between two rays of each point ``(N,)``: along a ray both partials vanish."""
+    directions = np.cross(rows[:, 0], rows[:, 1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    order = np.argsort(points.point, kind="stable")
+    counts = np.bincount(points.point, minlength=len(points))
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    angles = np.full(len(points), np.nan)
+    for count in np.unique(counts[found]):
+        which = np.flatnonzero(found & (counts == count))
+        rays = directions[order[starts[which][:, None] + np.arange(count)]]
+        # The sign of a direction depends on the handedness of the image axes, the same for all of a block or not.
+        cosines = np.abs(rays @ rays.swapaxes(1, 2)).min(axis=(1, 2))
+        angles[which] = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    return angles

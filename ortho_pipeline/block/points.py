@@ -1,0 +1,414 @@
+"""Points of a block: each measured in several images, with or without known ground.
+
+A measurement of a point in an image is called a ray. The table keeps points and rays apart, so that a point has one
+ground, one role and one identity however many images show it.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pyproj
+from numpy.typing import ArrayLike, NDArray
+
+from ortho_pipeline.errors import InputError, counted, reads
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, same_crs
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE, Points
+from ortho_pipeline.points.formats import read_block_table
+from ortho_pipeline.points.ground import ground_of
+from ortho_pipeline.points.rows import OF_GROUND, ROLES, Row, Table, origin_shift
+
+#: Two statements of one point's ground are the same within this (degrees or metres): files round.
+_SAME_PLACE = 1e-9
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class BlockPoints:
+    """Points that were measured in images of a block.
+
+    Parameters
+    ----------
+    ids : tuple of str
+        Of the N points, all different.
+    ground : ndarray (N, 3)
+        x, y in `crs`, height in metres above the ellipsoid; NaN is not known.
+    roles : ndarray (N,) of str
+        ``control``, ``check`` or ``tie``.
+    sigma_ground : ndarray (N, 3)
+        Standard deviation of the ground in metres east, north, up; 0 is not stated: an adjustment estimates it.
+    crs : pyproj.CRS
+        Horizontal CRS, x first.
+    images : tuple of str
+        Names of the images.
+    point, image : ndarray (M,) of int
+        Which point a ray is of, and in which image.
+    measured : ndarray (M, 2)
+        Column, row in pixels.
+    sigma_image : ndarray (M,)
+        Standard deviation of the measurement, px.
+    source : str
+        Where they come from, for people.
+    """
+
+    ids: tuple[str, ...]
+    ground: Array
+    roles: NDArray[np.str_]
+    sigma_ground: Array
+    crs: pyproj.CRS
+    images: tuple[str, ...]
+    point: Index
+    image: Index
+    measured: Array
+    sigma_image: Array
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        count, rays = len(self.ids), len(self.point)
+        for name, shape, kind in (
+            ("ground", (count, 3), float), ("sigma_ground", (count, 3), float), ("point", (rays,), np.int64),
+            ("image", (rays,), np.int64), ("measured", (rays, 2), float), ("sigma_image", (rays,), float),
+            ("roles", (count,), "<U7"),
+        ):  # fmt: skip
+            array = np.asarray(getattr(self, name), dtype=kind)
+            if array.shape != shape:
+                raise InputError(f"{name} has the shape {array.shape}, not {shape}", field=name)
+            object.__setattr__(self, name, array)
+        object.__setattr__(self, "ids", tuple(self.ids))
+        object.__setattr__(self, "images", tuple(self.images))
+        self._check_values()
+        self._check_identity()
+
+    def _check_values(self) -> None:
+        if not np.isin(self.roles, ROLES).all():
+            raise InputError(f"each point has one role of {', '.join(ROLES)}", field="roles")
+        if not np.isfinite(self.measured).all() or not (self.sigma_image > 0).all():
+            raise InputError("measurements are finite, their sigmas positive", field="measured, sigma_image")
+        if not (self.sigma_ground >= 0).all():
+            raise InputError("standard deviations are not negative", field="sigma_ground")
+        for role in ("control", "check"):
+            nowhere = (self.roles == role) & ~np.isfinite(self.ground[:, :2]).all(axis=1)
+            if nowhere.any():
+                names = ", ".join(self.ids[i] for i in np.flatnonzero(nowhere)[:5])
+                raise InputError(
+                    f"{role} points without ground coordinates: {names}", file=self.source or None, field="role",
+                    remedy="give their ground, or make them tie points",
+                )  # fmt: skip
+
+    def _check_identity(self) -> None:
+        if len(set(self.ids)) != len(self.ids) or len(set(self.images)) != len(self.images):
+            raise InputError("an id or the name of an image stands twice", file=self.source or None, field="id")
+        if len(self.point) and not (
+            (self.point >= 0).all() and (self.point < len(self.ids)).all()
+            and (self.image >= 0).all() and (self.image < len(self.images)).all()
+        ):  # fmt: skip
+            raise InputError("a ray is of a point or an image that does not exist", field="point, image")
+        rays, counts = np.unique(self.point * max(len(self.images), 1) + self.image, return_counts=True)
+        if (counts > 1).any():
+            point, image = divmod(int(rays[counts > 1][0]), len(self.images))
+            raise InputError(
+                f"the point {self.ids[point]!r} was measured twice in the image {self.images[image]!r}",
+                file=self.source or None, field="id", remedy="remove one of the two measurements",
+            )  # fmt: skip
+
+    def __repr__(self) -> str:
+        roles = ", ".join(f"{(self.roles == role).sum()} {role}" for role in ROLES if (self.roles == role).any())
+        return (
+            f"<{counted(len(self), 'point')}: {roles or 'none'}; {counted(self.rays, 'ray')} in "
+            f"{counted(len(self.images), 'image')}; {self.source}>"
+        )
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @classmethod
+    def of(cls, tables: Mapping[str, Points]) -> BlockPoints:
+        """Join the tables of single images, by name of the image; points of one id are one point.
+
+        Raises
+        ------
+        InputError
+            If the tables contradict each other in the ground or the role of a point.
+        """
+        if not tables:
+            raise InputError("a block has images with points", field="points")
+        crs = next(iter(tables.values())).crs
+        index: dict[str, int] = {}
+        ground: list[Array] = []
+        sigma_ground: list[Array] = []
+        roles: list[str] = []
+        rays: list[tuple[int, int]] = []
+        for number, (name, table) in enumerate(tables.items()):
+            moved = table if same_crs(table.crs, crs) else table.to_crs(crs)
+            for k, one in enumerate(moved.ids):
+                row = index.setdefault(one, len(index))
+                if row == len(ground):
+                    ground.append(moved.ground[k])
+                    sigma_ground.append(moved.sigma_ground[k])
+                    roles.append(str(moved.roles[k]))
+                else:
+                    _agree(one, name, roles[row], str(moved.roles[k]), ground[row], moved.ground[k], table.source)
+                rays.append((row, number))
+        places = np.array(rays, dtype=np.int64).reshape(-1, 2)
+        return cls(
+            ids=tuple(index), ground=np.array(ground).reshape(-1, 3), roles=np.array(roles, dtype="<U7"),
+            sigma_ground=np.array(sigma_ground).reshape(-1, 3), crs=crs, images=tuple(tables), point=places[:, 0],
+            image=places[:, 1], measured=np.concatenate([table.image for table in tables.values()]),
+            sigma_image=np.concatenate([table.sigma_image for table in tables.values()]),
+            source=", ".join(dict.fromkeys(table.source for table in tables.values() if table.source)),
+        )  # fmt: skip
+
+    @property
+    def control(self) -> NDArray[np.bool_]:
+        """Which points are control ``(N,)``."""
+        return self.roles == "control"
+
+    @property
+    def check(self) -> NDArray[np.bool_]:
+        """Which points are check points ``(N,)``."""
+        return self.roles == "check"
+
+    @property
+    def tie(self) -> NDArray[np.bool_]:
+        """Which points are tie points ``(N,)``."""
+        return self.roles == "tie"
+
+    @property
+    def rays(self) -> int:
+        """Number of measurements M."""
+        return len(self.point)
+
+    def with_roles(self, roles: ArrayLike) -> BlockPoints:
+        """Return these points with other roles ``(N,)``."""
+        return replace(self, roles=np.asarray(roles))
+
+    def with_ground_sigma(self, plan: float, height: float | None = None) -> BlockPoints:
+        """Return these points with standard deviations (m) for ground that states none; height as plan if not given."""
+        height = plan if height is None else height
+        if not (math.isfinite(plan) and plan > 0 and math.isfinite(height) and height > 0):
+            raise InputError(
+                "standard deviations of the ground are positive numbers", field="--ground-sigma",
+                remedy="give metres in plan, or in plan and height, such as 0.5,1",
+            )  # fmt: skip
+        return replace(self, sigma_ground=np.where(self.sigma_ground > 0, self.sigma_ground, (plan, plan, height)))
+
+    def select(self, mask: ArrayLike) -> BlockPoints:
+        """Return the points of a mask ``(N,)`` or of indices, with their rays."""
+        chosen = np.arange(len(self))[np.asarray(mask)]
+        place = np.full(len(self), -1)
+        place[chosen] = np.arange(len(chosen))
+        rays = place[self.point] >= 0
+        return replace(
+            self, ids=tuple(self.ids[i] for i in chosen), ground=self.ground[chosen], roles=self.roles[chosen],
+            sigma_ground=self.sigma_ground[chosen], point=place[self.point[rays]], image=self.image[rays],
+            measured=self.measured[rays], sigma_image=self.sigma_image[rays],
+        )  # fmt: skip
+
+    def in_image(self, name: str) -> Points:
+        """Return the points that were measured in one image, as the table of that image."""
+        if name not in self.images:
+            raise InputError(
+                f"there are no points of the image {name!r}", file=self.source or None, field="image",
+                remedy=f"the images are {', '.join(self.images)}",
+            )  # fmt: skip
+        rays = np.flatnonzero(self.image == self.images.index(name))
+        rows = self.point[rays]
+        return Points(
+            ids=tuple(self.ids[i] for i in rows), image=self.measured[rays], ground=self.ground[rows],
+            roles=self.roles[rows], sigma_image=self.sigma_image[rays], sigma_ground=self.sigma_ground[rows],
+            crs=self.crs, source=self.source,
+        )  # fmt: skip
+
+    def known_in(self, crs: str | pyproj.CRS) -> Array:
+        """Return the known ground ``(N, 3)`` in another CRS; an unknown height makes the whole row NaN."""
+        target = pyproj.CRS.from_user_input(crs)
+        return ground_transform(self.crs, target if target.is_geocentric else horizontal(target))(self.ground)
+
+
+def _agree(
+    one: str, name: str, role: str, other_role: str, ground: Array, other: Array, source: str
+) -> None:  # fmt: skip
+    """Refuse two statements of one point that differ."""
+    for what, same in (
+        ("role", role == other_role),
+        ("ground", np.allclose(ground, other, rtol=0, atol=_SAME_PLACE, equal_nan=True)),
+    ):
+        if not same:
+            raise InputError(
+                f"the {what} of the point {one!r} is another one in the image {name!r}", file=source or None,
+                field="role" if what == "role" else "x, y, h", remedy="points of one id are one point on the ground",
+            )  # fmt: skip
+
+
+# -- reading ---------------------------------------------------------------------------------------------------------
+
+
+@reads("see docs/formats.md for what stands in a file of points")
+def read_block_points(
+    path: str | os.PathLike[str],
+    *,
+    gcps: str | os.PathLike[str] | None = None,
+    crs: str | pyproj.CRS | None = None,
+    vertical: str | Vertical | None = None,
+    pixel_origin: str = "corner",
+) -> BlockPoints:
+    """Read the points of a block: one line per ray as CSV, one feature per point as GeoJSON, or an ODM list.
+
+    Parameters
+    ----------
+    gcps : path, optional
+        Ground of the points in a file of its own (CSV ``id,x,y,h,...`` or GeoJSON).
+    crs, vertical : optional
+        What ground and heights are in, where the files do not say it.
+    pixel_origin : 'corner', 'center', 'corner-1' or 'center-1'
+        As in `read_points`.
+
+    Raises
+    ------
+    InputError, CrsError, DatumError
+        Names file and line, and what to do: for statements of one point that contradict each other, too.
+    """
+    rays = read_block_table(path)
+    shift = origin_shift(path, rays, pixel_origin)
+    _name_by_place(path, rays)
+    joined = _Joined()
+    where = _placed(path, rays, crs, vertical)
+    joined.add(path, rays.rows, where[0])
+    plane = where[1]
+    if gcps is not None:
+        known = read_block_table(gcps, OF_GROUND)
+        _refuse_twice(gcps, known.rows)
+        ground, other = _placed(gcps, known, crs, vertical)
+        plane = other if plane is None else plane
+        if plane is not None and other is not None and not same_crs(plane, other):
+            ground = ground_transform(other, plane)(ground)
+        joined.add(gcps, [row for row in known.rows if row.id in joined.index], ground, known.rows)
+        if not any(row.id in joined.index for row in known.rows):
+            raise InputError(
+                "none of these points was measured in an image", file=gcps, field="id",
+                remedy=f"the ids have to be those of {os.fspath(path)}",
+            )  # fmt: skip
+    return joined.points(path, rays.rows, shift, pyproj.CRS.from_epsg(4326) if plane is None else plane)
+
+
+def _name_by_place(path: str | os.PathLike[str], table: Table) -> None:
+    """Give rays without an id that of their ground: in an ODM list the label is optional, the ground is not."""
+    names: dict[tuple[float, ...], str] = {}
+    for row in table.rows:
+        if row.id is None:
+            if not math.isfinite(row.ground[0]):
+                raise InputError("a point without an id", file=path, field=row.where, remedy="give each point an id")
+            row.id = names.setdefault(row.ground, f"point {len(names) + 1}")
+
+
+def _placed(
+    path: str | os.PathLike[str], table: Table, crs: str | pyproj.CRS | None, vertical: str | Vertical | None
+) -> tuple[Array, pyproj.CRS | None]:
+    """Return the ground of the rows and its CRS; without any ground no CRS has to be known."""
+    for row in table.rows:
+        if math.isfinite(row.ground[0]) != math.isfinite(row.ground[1]) or (
+            math.isfinite(row.ground[2]) and not math.isfinite(row.ground[0])
+        ):
+            raise InputError("ground is x and y, or none", file=path, field=row.where, remedy="give both or neither")
+    if not any(math.isfinite(row.ground[0]) for row in table.rows):
+        return np.full((len(table.rows), 3), np.nan), None
+    return ground_of(path, table, crs, vertical)
+
+
+def _refuse_twice(path: str | os.PathLike[str], rows: Sequence[Row]) -> None:
+    first: dict[str | None, str] = {}
+    for row in rows:
+        if first.setdefault(row.id, row.where) != row.where:
+            raise InputError(
+                f"the id {row.id!r} stands twice, first in {first[row.id]}", file=path, field=row.where,
+                remedy="give each point once",
+            )  # fmt: skip
+
+
+class _Joined:
+    """What the lines of one or two files say of each point, refused where they contradict each other."""
+
+    def __init__(self) -> None:
+        self.index: dict[str, int] = {}
+        self.said: list[dict[str, tuple[Any, str]]] = []
+
+    def add(
+        self, path: str | os.PathLike[str], rows: Sequence[Row], ground: Array, of: Sequence[Row] | None = None
+    ) -> None:
+        """Take in rows; `ground` belongs to all rows of a file, `of`, where these are only some."""
+        place = {id(row): k for k, row in enumerate(of or rows)}
+        for row in rows:
+            number = self.index.setdefault(str(row.id), len(self.index))
+            if number == len(self.said):
+                self.said.append({})
+            x, y, h = ground[place[id(row)]].tolist()
+            where = f"{os.fspath(path)}, {row.where}"
+            said = {
+                "x": x, "y": y, "h": h, "role": row.role or None, "sigma_xy": row.sigma_xy, "sigma_h": row.sigma_h,
+            }  # fmt: skip
+            for name, value in said.items():
+                if value is None or (isinstance(value, float) and math.isnan(value)):
+                    continue
+                before, there = self.said[number].setdefault(name, (value, where))
+                same = abs(before - value) <= _SAME_PLACE if isinstance(value, float) else before == value
+                if not same:
+                    raise InputError(
+                        f"the {name} of the point {row.id!r} is {value} here and {before} in {there}", file=path,
+                        field=row.where, remedy="one point has one ground, one role and one accuracy",
+                    )  # fmt: skip
+
+    def points(
+        self, path: str | os.PathLike[str], rows: Sequence[Row], shift: float, crs: pyproj.CRS
+    ) -> BlockPoints:  # fmt: skip
+        """Return the table of the points, with the rays of `rows`."""
+        said = [{name: value for name, (value, _) in one.items()} for one in self.said]
+        images = tuple(dict.fromkeys(str(row.image_name) for row in rows))
+        ground = np.array([[one.get(name, math.nan) for name in ("x", "y", "h")] for one in said])
+        known = np.isfinite(ground[:, 0])
+        roles = [one.get("role", "control" if there else "tie") for one, there in zip(said, known, strict=True)]
+        measured = np.array([row.image for row in rows]) + shift
+        image = np.array([images.index(str(row.image_name)) for row in rows])
+        point = np.array([self.index[str(row.id)] for row in rows])
+        _refuse_same(path, tuple(self.index), [row.where for row in rows], ground, measured, image, point)
+        return BlockPoints(
+            ids=tuple(self.index), ground=ground, roles=np.array(roles, dtype="<U7"),
+            sigma_ground=np.array([[one.get("sigma_xy", 0.0)] * 2 + [one.get("sigma_h", 0.0)] for one in said]),
+            crs=crs, images=images, point=point, image=image, measured=measured,
+            sigma_image=np.array([DEFAULT_SIGMA_IMAGE if row.sigma_image is None else row.sigma_image for row in rows]),
+            source=os.fspath(path),
+        )  # fmt: skip
+
+
+def _refuse_same(
+    path: str | os.PathLike[str],
+    ids: tuple[str, ...],
+    wheres: Sequence[str],
+    ground: Array,
+    measured: Array,
+    image: Index,
+    point: Index,
+) -> None:
+    """Refuse one place under two ids, on the ground or in an image: a point that counts twice, or a wrong copy."""
+    places: dict[tuple[float, ...], int] = {}
+    for number, key in enumerate(map(tuple, ground.tolist())):
+        other = places.setdefault(key, number) if math.isfinite(key[0]) else number
+        if other != number:
+            raise InputError(
+                f"the points {ids[other]!r} and {ids[number]!r} have the same ground", file=path, field="x, y, h",
+                remedy="remove one of the two",
+            )  # fmt: skip
+    pixels: dict[tuple[float, ...], int] = {}
+    for ray, key in enumerate(zip(image.tolist(), *np.round(measured, 6).T.tolist(), strict=True)):
+        other = pixels.setdefault(key, ray)
+        if other != ray:
+            raise InputError(
+                f"the same pixel of the same image as in {wheres[other]}"
+                + ("" if point[other] == point[ray] else f", but of {ids[point[other]]!r} there"),
+                file=path, field=wheres[ray], remedy="remove one of the two",
+            )  # fmt: skip

@@ -1,0 +1,198 @@
+"""The command `ortho run`: many scenes by a pipeline file."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ortho_pipeline.cli.command import Command, Megabytes
+from ortho_pipeline.cli.options import json_option
+from ortho_pipeline.cli.printing import print_json, progress
+from ortho_pipeline.errors import counted
+
+if TYPE_CHECKING:
+    from ortho_pipeline.batch.plan import Plan
+    from ortho_pipeline.batch.runner import BatchResult, Outcome
+
+FAILED, PARTLY_DONE = 1, 3
+#: More scenes than this are only counted, except for those that failed.
+_SHOWN = 60
+
+
+class _Shard(click.ParamType):
+    name = "K/N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        """Return (k, n) of 'k/n'."""
+        if isinstance(value, tuple):
+            return value
+        match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", value)
+        if not match or not 1 <= int(match[1]) <= int(match[2]):
+            self.fail(f"{value!r} is no part such as 1/4", param, ctx)
+        return int(match[1]), int(match[2])
+
+
+@click.command(cls=Command)
+@click.argument("pipeline_file", metavar="PIPELINE.yaml", type=click.Path(), required=False)
+@click.option(
+    "--executor",
+    type=click.Choice(["sequential", "processes", "dask"]),
+    help="Who does the work  [default: processes; dask with --scheduler]",
+)
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes  [default: all processors]")
+@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Of each scene  [default: shared out]")
+@click.option(
+    "--memory", "-wm", type=Megabytes(), default="512", show_default=True, metavar="MB", help="Of each scene."
+)
+@click.option("--scheduler", metavar="URL", help="Of dask, such as tcp://host:8786.")
+@click.option("--only", multiple=True, metavar="NAME", help="Only this scene; may be repeated.")
+@click.option("--shard", type=_Shard(), metavar="K/N", help="Only the K-th of N parts, for arrays of jobs.")
+@click.option(
+    "--root",
+    type=click.Path(file_okay=False),
+    metavar="DIR",
+    help="Folder that every path of the file has to lie in  [default: that of the file]",
+)
+@click.option("--verify", is_flag=True, help="Judge all files by their content, whatever their dates say.")
+@click.option("--list", "as_list", is_flag=True, help="List the scenes and their state, and do nothing.")
+@click.option("--check", "as_check", is_flag=True, help="Open images, points and DEM, look for gaps, and make nothing.")
+@click.option("--schema", "as_schema", is_flag=True, help="Print the JSON Schema of the file, and do nothing.")
+@json_option
+def run(
+    pipeline_file: str | None,
+    memory: int,
+    root: str | None,
+    as_list: bool,
+    as_check: bool,
+    as_schema: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Make the orthos of all scenes that PIPELINE.yaml names.
+
+    A scene is made once, and again only when its files, its settings or the software have changed, or outputs are
+    missing. What fails does not stop the rest; a run that was interrupted goes on where it stood. Exit code 3: some
+    scenes failed.
+    """
+    if as_schema:
+        from ortho_pipeline.batch import config as batch_config
+
+        return print_json(batch_config.schema())
+    if pipeline_file is None:
+        raise click.UsageError("Missing argument 'PIPELINE.yaml'.")
+    from ortho_pipeline.batch import runner as batch
+
+    planned = batch.plan(pipeline_file, root)
+    if as_list:
+        listed = batch.list_scenes(planned)
+        if as_json:
+            return print_json({"schema_version": batch.SCHEMA_VERSION, "scenes": listed})
+        for scene in listed:
+            click.echo(f"{scene['name']}\t{scene['state']}\t{scene['image']}")
+        return None
+    if as_check:
+        return _check(planned, options["only"], options["shard"], as_json)
+    try:
+        with progress("Orthorectifying scenes") as advance:
+            result = batch.run(planned, memory=memory, progress=advance, **options)
+    except KeyboardInterrupt:
+        click.echo("What is done is kept: run it again to go on.", err=True)
+        raise
+    if as_json:
+        print_json(result.to_json())
+    else:
+        _print_summary(result)
+    if result.failed:
+        click.get_current_context().exit(FAILED if result.count("failed") == len(result.scenes) else PARTLY_DONE)
+    return None
+
+
+def _check(planned: Plan, only: Sequence[str], shard: tuple[int, int] | None, as_json: bool) -> None:
+    """Print what stands in the way of each scene; exit as a run would if that were all."""
+    from ortho_pipeline.batch import runner as batch
+
+    checked = batch.check_scenes(planned, only, shard)
+    failed = [one for one in checked if "error" in one]
+    if as_json:
+        print_json({"schema_version": batch.SCHEMA_VERSION, "scenes": checked})
+    else:
+        for one in checked:
+            click.echo(_checked_text(one))
+        click.echo(f"{counted(len(checked), 'scene')}: {len(checked) - len(failed)} ready, {len(failed)} not")
+    if failed:
+        click.get_current_context().exit(FAILED if len(failed) == len(checked) else PARTLY_DONE)
+
+
+def _checked_text(one: Mapping[str, Any]) -> str:
+    if "error" in one:
+        return f"{one['name']}: {_error_text(one['error'])}"
+    points, grid = one["points"], one["grid"]
+    parts = [
+        f"{one['sensor']}, {one['model']}",
+        f"{counted(points['control'], 'control point')}, {counted(points['check'], 'check point')}",
+        f"DEM covers {100 * one['coverage']:.1f} %",
+        f"{grid['size'][0]} x {grid['size'][1]} px of {grid['resolution'][0]:g} in {grid['crs']}",
+    ]
+    return "\n".join([f"{one['name']}: {'; '.join(parts)}", *(f"  Warning: {text}" for text in one["warnings"])])
+
+
+def _print_summary(result: BatchResult) -> None:
+    """Print a table of the scenes and what went wrong; of many scenes only those that failed."""
+    from rich.console import Console
+    from rich.table import Table
+
+    # A table is cut to the width of the terminal; a file or a pipe has none.
+    wide = None if sys.stdout.isatty() else 10_000
+    console = Console(highlight=False, soft_wrap=True, width=wide)
+    scenes = result.scenes if len(result.scenes) <= _SHOWN else [one for one in result.scenes if one.status == "failed"]
+    table = Table(box=None, pad_edge=False)
+    for title in ("scene", "state", "model", "check px", "left out px", "control px", "seconds"):
+        table.add_column(title, justify="left" if title in ("scene", "state", "model") else "right", no_wrap=True)
+    for scene in scenes:
+        table.add_row(*_row(scene))
+    if scenes:
+        console.print(table)
+    for scene in scenes:
+        if scene.error:
+            console.print(f"\n{scene.name}: {_error_text(scene.error)}", markup=False)
+    counts = ", ".join(f"{result.count(status)} {status}" for status in ("done", "unchanged", "failed"))
+    console.print(f"\n{counted(len(result.scenes), 'scene')}: {counts}  ({result.seconds:.1f} s)")
+    if result.mosaic:
+        console.print(_mosaic_text(result.mosaic), markup=False)
+    for name, path in result.files.items():
+        console.print(f"  {name:<10} {path}", markup=False)
+
+
+def _row(scene: Outcome) -> list[str]:
+    from rich.markup import escape
+
+    rmse = scene.facts.get("rmse_px", {})
+    numbers = ["-" if rmse.get(which) is None else f"{rmse[which]:.3f}" for which in ("check", "loo", "control")]
+    return [escape(scene.name), scene.status, str(scene.facts.get("model", "-")), *numbers, f"{scene.seconds:.1f}"]
+
+
+def _mosaic_text(mosaic: Mapping[str, Any]) -> str:
+    """Return what there is to say of a mosaic and its seams."""
+    if mosaic.get("error"):
+        return f"mosaic: {_error_text(mosaic['error'])}"
+    lines = [f"mosaic: {mosaic['size'][0]} x {mosaic['size'][1]} px of {counted(len(mosaic['on_top_first']), 'scene')}"]
+    if mosaic["seams"]:
+        text = f"seams: {mosaic['seams_measured']} of {len(mosaic['seams'])} measured"
+        if mosaic["worst_seam"]:
+            worst = mosaic["worst_seam"]
+            text += f", median {mosaic['median_seam_px']:.2f} px, worst {worst['px']:.2f} px"
+            text += f" ({worst['first']} and {worst['second']})"
+        lines.append(text)
+    if mosaic["missing"]:
+        lines.append(f"not in the mosaic: {', '.join(mosaic['missing'])}")
+    return "\n".join(lines)
+
+
+def _error_text(error: Mapping[str, Any]) -> str:
+    where = ": ".join(part for part in (error["file"], error["field"]) if part)
+    text = f"{where}: {error['message']}" if where else error["message"]
+    return f"{text}\n  Remedy: {error['remedy']}" if error["remedy"] else text

@@ -1,0 +1,95 @@
+"""The commands `ortho adjust` and `ortho intersect`: several images and the points that they share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import click
+
+from ortho_pipeline.cli.command import Command
+from ortho_pipeline.cli.options import block_options, folder_option, json_option, sensor_options
+from ortho_pipeline.cli.printing import print_result, print_warnings
+from ortho_pipeline.options import BlockOptions, SceneOptions
+
+_images = click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
+_models = click.option(
+    "--models", multiple=True, type=click.Path(), metavar="FILE", help="A saved *_model.json of each image."
+)
+
+
+@click.command(cls=Command)
+@_images
+@folder_option
+@block_options
+@_models
+@click.option(
+    "--correction",
+    type=click.Choice(["none", "shift", "shift-drift", "affine", "model"]),
+    help="What is adjusted: the image points, or the parameters of the model itself  [default: the model's own if it "
+    "has any, else a shift]",
+)
+@click.option(
+    "--ground-sigma",
+    metavar="XY[,H]",
+    help="Sigmas (m) in plan and height of ground that states none in the points file  [default: estimated]",
+)
+@click.option("--model-crs", metavar="CRS", help="Ground of fitted models: geocentric, geographic, utm or EPSG:n.")
+@click.option(
+    "--hold",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="PX",
+    help="Hold the orientation at its start values with this sigma  [default: 10 where nothing else gives a datum]",
+)
+@sensor_options
+@json_option
+def adjust(
+    images: tuple[str, ...],
+    folder: str,
+    points: BlockOptions,
+    models: tuple[str, ...],
+    scene: SceneOptions,
+    as_json: bool,
+    **adjusted: Any,
+) -> None:
+    """Adjust several IMAGEs and the points that they share (bundle adjustment of a stereo pair or a block).
+
+    Writes a model and an RPC of each image, the ground points with their sigmas, and one report. Points with ground
+    coordinates control or check, the others tie the images together. With --models (repeated, in the order of the
+    images) the saved models, such as those of an earlier adjustment, are where it starts.
+    """
+    from ortho_pipeline.commands import block as blocks
+
+    command = click.get_current_context().meta["command"]
+    print_result(
+        blocks.adjust(images, folder, replace(points, **adjusted), scene, models=models, command=command), as_json
+    )
+
+
+@click.command(cls=Command)
+@_images
+@block_options
+@_models
+@click.option(
+    "--output", "-o", type=click.Path(dir_okay=False), metavar="FILE", help="Ground points: .csv or .geojson."
+)
+@sensor_options
+@json_option
+def intersect(
+    images: tuple[str, ...],
+    points: BlockOptions,
+    models: tuple[str, ...],
+    output: str | None,
+    scene: SceneOptions,
+    as_json: bool,
+) -> None:
+    """Intersect the rays of points that were measured in several IMAGEs: ground coordinates with their sigmas.
+
+    With --models (repeated, in the order of the images) the saved models take the place of the images' own.
+    """
+    from ortho_pipeline.commands import block as blocks
+
+    result = blocks.intersect(images, points, scene, models=models, output=output)
+    print_result(result, as_json)
+    if not as_json:
+        print_warnings(result.document["warnings"])

@@ -1,0 +1,182 @@
+"""What commands print: tables for people, one JSON document for programs."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ortho_pipeline.errors import counted
+
+if TYPE_CHECKING:
+    from ortho_pipeline.commands.results import CompareResult, FitResult, Result
+
+
+def print_json(document: Any) -> None:
+    """Print a document for programs."""
+    click.echo(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False))
+
+
+def print_warnings(warnings: Any) -> None:
+    """Print warnings on stderr."""
+    for warning in warnings:
+        click.echo(f"Warning: {warning}", err=True)
+
+
+def print_result(result: Result, as_json: bool) -> None:
+    """Print the summary of a result and its files, or its document."""
+    if as_json:
+        return print_json(result.to_json())
+    click.echo(result.summary)
+    for name, path in result.files.items():
+        click.echo(f"  {name:<10} {path}")
+    return None
+
+
+def print_fit(result: FitResult) -> None:
+    """Print parameters, every residual and the RMSEs."""
+    document = result.to_json()
+    click.echo(f"Sensor {document['sensor']}, model {document['model']} of {document['model_source']}")
+    _print_parameters(document)
+    wide = max([len(point["id"]) for point in document["points"]] + [5])
+    click.echo(f"\n{'point':<{wide}}  role     used    column       row   left out: col.    row")
+    for point in document["points"]:
+        numbers = [*point["residual"], *point["loo_residual"]]
+        shown = "".join(f"{'-' if value is None else f'{value:+.3f}':>10}" for value in numbers)
+        click.echo(f"{point['id']:<{wide}}  {point['role']:<8} {'yes' if point['used'] else 'no':<4}{shown}")
+    click.echo("\nResiduals are measured minus predicted, in pixels; 'left out': had the point taken no part.")
+    if document["raw_bias"] and document["parameters"]:
+        bias = document["raw_bias"]
+        click.echo(f"Model as delivered: column {bias['col']:+.3f}, row {bias['row']:+.3f} on average")
+    for which, label in (("control", "control"), ("check", "check"), ("loo", "leave-one-out")):
+        rmse = document["rmse"][which]
+        text = "no points" if rmse is None else (
+            f"column {rmse['col']:.3f}, row {rmse['row']:.3f}, both {rmse['total']:.3f}  "
+            f"({counted(rmse['n'], 'point')})"
+        )  # fmt: skip
+        click.echo(f"RMSE {label:<14} {text}")
+    if document["outlying"] and (rest := document["rmse_of_agreeing_checks"]):
+        click.echo(
+            f"RMSE of the check points that are not outlying: {rest['total']:.3f}  ({counted(rest['n'], 'point')})"
+        )
+    if document["map_scale"]:
+        click.echo(f"Map scale: {document['map_scale']['statement']}")
+    for role, found in document["covariance"].items():
+        if found:
+            click.echo(f"Residuals of {role} points: {found['statement']}")
+    sigma0 = "unknown" if document["sigma0"] is None else f"{document['sigma0']:.3g}"
+    click.echo(f"Redundancy {document['redundancy']}, sigma0 {sigma0}")
+    print_warnings(document["warnings"])
+
+
+def _print_parameters(document: Mapping[str, Any]) -> None:
+    """Print each parameter with its Student test and its total correlation."""
+    if not document["parameters"]:
+        return
+    statistics = document["statistics"]
+    wide = max(len(name) for name in (*document["parameters"], "parameter"))
+    click.echo(f"  {'parameter':<{wide}} {'value':>14} {'sigma':>9} {'t':>8} {'p':>7}  total correlation")
+    for name, parameter in document["parameters"].items():
+        t, p, total = (statistics[key][name] for key in ("t", "p", "total_correlation"))
+        chance = "-" if p is None else ("< 0.001" if p < 0.001 else f"{p:.3f}")
+        numbers = f"{parameter['value']:>+14.6g} {parameter['sigma']:>9.2g} {'-' if t is None else f'{t:.1f}':>8}"
+        weak = "  not justified" if name in statistics["not_justified"] else ""
+        click.echo(f"  {name:<{wide}} {numbers} {chance:>7}  {'-' if total is None else f'{total:.3f}':>17}{weak}")
+    if statistics["not_justified"]:
+        click.echo(f"  not justified: p above {statistics['significance']:g}; --prune takes such parameters out")
+
+
+def view_text(view: Mapping[str, Any] | None) -> str:
+    """Return the direction of view and the size of a pixel along and across it."""
+    if view is None:
+        return "the middle of the image does not meet the ground"
+    azimuth = view["sensor_azimuth_deg"]
+    place = "straight down" if azimuth is None else (
+        f"{view['incidence_deg']:.1f} deg off the vertical, sensor in azimuth {azimuth:.0f} deg"
+    )  # fmt: skip
+    along, across = view["pixel_m"]["along_view"], view["pixel_m"]["across_view"]
+    return f"{place}; a pixel is {along:.3g} m along the view, {across:.3g} m across"
+
+
+@contextlib.contextmanager
+def progress(title: str) -> Iterator[Callable[[float], None] | None]:
+    """Yield a callable that moves a progress bar on stderr; None where nobody is watching."""
+    if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
+
+
+def print_models(models: list[dict[str, Any]]) -> None:
+    """Print the model families, one a line."""
+    click.echo(f"{'model':<13} {'parameters':>10} {'points':>7} {'ground':>7}  suits")
+    for model in models:
+        numbers = f"{model['parameters']:>10} {model['minimum_points']:>7} {str(model['dimensions']) + 'D':>7}"
+        click.echo(f"{model['name']:<13} {numbers}  {model['suits']}")
+
+
+def print_comparison(result: CompareResult, units: str) -> None:
+    """Print the table of a comparison with its recommendation; `units` are ``px`` or ``m``."""
+    document = result.to_json()
+    rows, points = document["rows"], document["points"]
+    wide = max([len(row["model"]) for row in rows] + [5])
+    axes = ("column", "row") if units == "px" else ("x", "y")
+    click.echo(
+        f"{counted(points['control'], 'control point')}, {counted(points['check'], 'check point')}; RMSE in {units}"
+    )
+    click.echo(
+        f"\n{'':<{wide}}  {'':>6} {'control (the fit)':^28}  {'check':^28}  {'left out':>8} {'condi-':>8}\n"
+        f"{'model':<{wide}}  {'param.':>6} "
+        + 2 * f"{'n':>4}{axes[0]:>8}{axes[1]:>8}{'total':>8}  "
+        + f"{'in turn':>8} {'tion':>8}"
+    )
+    notes: list[str] = []
+    for row in rows:
+        mark = "*" if row["model"] == document["recommendation"]["model"] else " "
+        if row["error"]:
+            click.echo(f"{row['model']:<{wide}}{mark} {row['parameters']:>6}    not fitted: {row['error']}")
+            continue
+        rmse = row["rmse" if units == "px" else "rmse_m"]
+        loo = _error(rmse["loo"]["total"] if rmse["loo"] else None)
+        condition = "-" if row["condition"] is None else f"{row['condition']:.3g}"
+        numbers = "  ".join(_errors(rmse[which], units) for which in ("control", "check"))
+        line = f"{row['model']:<{wide}}{mark} {row['parameters']:>6} {numbers}  {loo} {condition:>8}"
+        if row["warnings"]:
+            notes += [text for text in row["warnings"] if text not in notes]
+            line += "  " + ",".join(f"[{notes.index(text) + 1}]" for text in row["warnings"])
+        click.echo(line)
+    for number, text in enumerate(notes, 1):
+        click.echo(f"\n[{number}] {text}" if number == 1 else f"[{number}] {text}")
+    for point in document["left_out"]:
+        click.echo(f"\nleft out of all models: {point['id']} ({point['reason']})")
+    click.echo(
+        f"\n* Recommended: {document['recommendation']['reason']}."
+        if document["recommendation"]["model"]
+        else f"\nNo recommendation: {document['recommendation']['reason']}."
+    )
+    for name, path in document["files"].items():
+        click.echo(f"  {name:<10} {path}")
+    print_warnings(document["warnings"])
+
+
+def _errors(rmse: Mapping[str, Any] | None, units: str) -> str:
+    if rmse is None:
+        return f"{0:>4}{'-':>8}{'-':>8}{'-':>8}"
+    axes = ("col", "row") if units == "px" else ("x", "y")
+    return f"{rmse['n']:>4}" + "".join(_error(rmse[axis]) for axis in (*axes, "total"))
+
+
+def _error(value: float | None) -> str:
+    if value is None:
+        return f"{'-':>8}"
+    return f"{value:>8.3f}" if value < 1000 else f"{value:>8.2g}"

@@ -1,0 +1,439 @@
+"""The guts of `ortho adjust` and `ortho intersect`: images and points in, models, ground points and a report out."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline import plugins
+from ortho_pipeline.block.adjustment import BlockFit
+from ortho_pipeline.block.adjustment import adjust as adjust_block
+from ortho_pipeline.block.intersection import Intersection
+from ortho_pipeline.block.intersection import intersect as intersect_rays
+from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
+from ortho_pipeline.block.points import BlockPoints, read_block_points
+from ortho_pipeline.block.start import Start
+from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.block_images import labels_of, points_of_images, start_of
+from ortho_pipeline.commands.results import Result
+from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.exchange import rpc
+from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
+from ortho_pipeline.files import together, write_text
+from ortho_pipeline.files.locations import located
+from ortho_pipeline.geodesy.crs import Vertical, parse_crs
+from ortho_pipeline.models import ImageCorrection, SensorModel
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.options import BlockOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.points import assign_roles
+from ortho_pipeline.report import block as block_report
+
+#: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
+_ENOUGH_CHECKS = 30
+
+
+def adjust(
+    images: Sequence[str | os.PathLike[str]],
+    folder: str | os.PathLike[str],
+    points: BlockOptions,
+    scene: SceneOptions = SceneOptions(),
+    *,
+    models: Sequence[str | os.PathLike[str]] = (),
+    command: str | None = None,
+) -> Result:
+    """Adjust images and points together; write a model of each image, the points, adjusted RPCs and one report.
+
+    Parameters
+    ----------
+    images : sequence of path
+        Of one or many scenes; each is opened with its own sensor.
+    folder : path
+        Where all files go; those of images are called by their stems (with folders ahead where stems are the same).
+    models : sequence of path
+        Saved models (``*_model.json``) to start from, one for each image in their order; none: each image's own.
+
+    Returns
+    -------
+    Result
+        `files` has report, html, points, points-csv, and ``<image> model`` and ``<image> rpc`` (where an RPC stands for
+        the model) of each image.
+
+    Raises
+    ------
+    InputError
+        For whatever the user can correct.
+    """
+    labels = labels_of(images)
+    files = _files(labels, Path(folder))
+    _check_models(images, models)
+    scenes = [replace(scene, model=model) for model in models] or [scene] * len(images)
+    _check_paths(files, images, points, scene, *models)
+    table, notes = _read(images, labels, points, scene.allow_network)
+    heights = _heights(table)
+    starts = {
+        label: start_of(image, points, own, table.in_image(label), heights)
+        for label, image, own in zip(labels, images, scenes, strict=True)
+    }
+    fit = adjust_block(
+        {label: start.model for label, start in starts.items()}, table,
+        priors={label: start.priors for label, start in starts.items()}, hold=points.hold,
+    )  # fmt: skip
+    exported: dict[str, rpc.RpcExport] = {}
+    for label in labels:
+        try:
+            exported[label] = rpc.export_rpc(_plain(fit.models[label]))
+            notes += [f"image {label}: {text}" for text in exported[label].warnings]
+        except InputError as error:
+            notes.append(f"image {label}: no RPC is written ({error.message})")
+            del files[f"{label} rpc"]
+    record = _record(images, points, scenes, starts, command)
+    document = block_report.build_document(
+        fit=fit, starts=starts, exported=exported, provenance=record, warnings=[*_warnings(fit, starts), *notes]
+    )
+    with together(folder, "block"):
+        _write(files, document, fit, starts, exported, record)
+    return Result(files, {"report": document}, block_report.summary_text(document))
+
+
+def intersect(
+    images: Sequence[str | os.PathLike[str]],
+    points: BlockOptions,
+    scene: SceneOptions = SceneOptions(),
+    *,
+    models: Sequence[str | os.PathLike[str]] = (),
+    output: str | os.PathLike[str] | None = None,
+) -> Result:
+    """Intersect the rays of points, with the images' own models or with model files in the order of the images.
+
+    Parameters
+    ----------
+    models : sequence of path
+        Saved models (``*_model.json``), one for each image; none: each image's own.
+    output : path, optional
+        A ``.csv`` or ``.geojson`` file of the ground points.
+
+    Raises
+    ------
+    InputError
+        If there are not as many models as images, and for whatever else the user can correct.
+    """
+    labels = labels_of(images)
+    _check_models(images, models)
+    writer = None if output is None else _writer(output)
+    files = {} if output is None else {"points": Path(output)}
+    _check_paths(files, images, points, scene, *models)
+    table, notes = _read(images, labels, points, scene.allow_network)
+    if models:
+        plugins.Host.discover()  # model families of plugins, which a file may name
+        files_of = dict(zip(labels, models, strict=True))
+        chosen = {
+            label: read_model_file(located(path, allow_network=scene.allow_network)).model
+            for label, path in files_of.items()
+        }
+    else:
+        chosen = {
+            label: _own(inputs.open_scene(image, scene), points.model)
+            for label, image in zip(labels, images, strict=True)
+        }
+    found = intersect_rays(chosen, table)
+    rows = _ground_rows(table, found.ground, found.sigmas, _apart(table, found.ground), found.angles_deg)
+    if writer is not None and output is not None:
+        write_text(output, writer(rows))
+    document = {
+        "points": rows, "sigma0": found.sigma0, "warnings": [*notes, *_left_open(found)],
+        "median_residual_px": _median_residual(found),
+    }  # fmt: skip
+    return Result(files, document, _intersection_text(document))
+
+
+# -- reading ---------------------------------------------------------------------------------------------------------
+
+
+def _read(
+    images: Sequence[str | os.PathLike[str]], labels: Sequence[str], options: BlockOptions, allow_network: bool
+) -> tuple[BlockPoints, list[str]]:
+    """Return the points of these images, and what people ought to know of them."""
+    read = read_block_points(
+        located(options.points, allow_network=allow_network),
+        gcps=None if options.gcps is None else located(options.gcps, allow_network=allow_network),
+        crs=None if options.crs is None else parse_crs(options.crs),
+        vertical=None if options.vertical is None else Vertical.parse(options.vertical),
+        pixel_origin=options.pixel_origin,
+    )  # fmt: skip
+    table, strangers = points_of_images(read, images, labels)
+    if options.check is not None:
+        table = assign_roles(table, options.check)
+    if options.ground_sigma is not None:
+        table = table.with_ground_sigma(*_sigmas(options.ground_sigma))
+    notes = [f"points of images that are not given play no part: {', '.join(strangers[:10])}"] if strangers else []
+    flat = table.control & ~np.isfinite(table.ground[:, 2])
+    if flat.any():
+        names = ", ".join(np.array(table.ids)[flat][:10])
+        notes.append(f"control points without a height weigh in in plan only: {names}")
+    return table, notes
+
+
+def _sigmas(text: str) -> list[float]:
+    """Return what ``XY`` or ``XY,H`` says."""
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        found = []
+    if len(found) not in (1, 2):
+        raise InputError(
+            f"{text!r} is not one sigma, or two", field="--ground-sigma",
+            remedy="give metres in plan, or in plan and height, such as 0.5,1",
+        )  # fmt: skip
+    return found
+
+
+def _heights(table: BlockPoints) -> tuple[float, float] | None:
+    known = table.ground[np.isfinite(table.ground[:, 2]), 2]
+    return (float(known.min()), float(known.max())) if len(known) else None
+
+
+def _own(scene: Any, name: str | None) -> SensorModel:
+    if name is not None and name not in scene.models:
+        raise InputError(
+            f"this image has no model {name!r}", file=scene.path, field="--model",
+            remedy=f"its models are {', '.join(scene.models)}",
+        )  # fmt: skip
+    model: SensorModel = scene.model if name is None else scene.models[name]
+    return model
+
+
+def _check_models(images: Sequence[str | os.PathLike[str]], models: Sequence[str | os.PathLike[str]]) -> None:
+    if models and len(models) != len(images):
+        raise InputError(
+            f"{counted(len(models), 'model')} for {counted(len(images), 'image')}", field="--models",
+            remedy="give one model file for each image, in their order",
+        )  # fmt: skip
+
+
+# -- paths -----------------------------------------------------------------------------------------------------------
+
+
+def _files(labels: Sequence[str], folder: Path) -> dict[str, Path]:
+    files = {
+        "report": folder / "block_report.json", "html": folder / "block_report.html",
+        "points": folder / "block_points.geojson", "points-csv": folder / "block_points.csv",
+    }  # fmt: skip
+    for label in labels:
+        files[f"{label} model"] = folder / f"{label}_model.json"
+        files[f"{label} rpc"] = folder / f"{label}_RPC.TXT"
+    return files
+
+
+def _check_paths(
+    files: Mapping[str, Path],
+    images: Sequence[str | os.PathLike[str]],
+    options: BlockOptions,
+    scene: SceneOptions,
+    *more: str | os.PathLike[str],
+) -> None:
+    if not files:
+        return
+    for image in images:
+        for read in (options.points, options.gcps, *more):
+            inputs.check_paths(files, image, scene, PointOptions(gcps=read), SurfaceOptions())
+
+
+def _record(
+    images: Sequence[str | os.PathLike[str]],
+    options: BlockOptions,
+    scenes: Sequence[SceneOptions],
+    starts: Mapping[str, Start],
+    command: str | None,
+) -> dict[str, Any]:
+    """Return what is needed to make the same result again."""
+    read: dict[Path, str] = {}
+    for image, scene, start in zip(images, scenes, starts.values(), strict=True):
+        for given in (options.points, options.gcps):
+            for path, role in inputs.files_read(image, scene, PointOptions(gcps=given), opened=start.scene).items():
+                read.setdefault(path, role)
+    first = next(iter(starts.values())).scene
+    whole = inputs.provenance(
+        first, PointOptions(), None, inputs.hashed(read), command,
+        {"block": options, "scene": replace(scenes[0], model=None)},
+    )  # fmt: skip
+    return {key: whole[key] for key in ("command", "inputs", "options", "software")}
+
+
+# -- what came out ---------------------------------------------------------------------------------------------------
+
+
+def _plain(model: SensorModel) -> SensorModel:
+    """Return the model without a correction that corrects nothing."""
+    return model.model if isinstance(model, ImageCorrection) and model.correction == "none" else model
+
+
+def _warnings(fit: BlockFit, starts: Mapping[str, Start]) -> list[str]:
+    points = fit.points
+    found = [f"image {label}: {text}" for label, start in starts.items() for text in start.scene.warnings]
+    found += fit.warnings
+    for one in fit.rejected[:50]:
+        where = f" in {one.image}" if one.image else (" (its ground)" if one.what == "ground" else "")
+        found.append(f"point {one.point}{where} was left out: {one.reason}")
+    if len(fit.rejected) > 50:
+        found.append(f"and {counted(len(fit.rejected) - 50, 'more gross error')}, all of them in the report")
+    sizes = np.array([(start.scene.width, start.scene.height) for start in starts.values()])[points.image]
+    outside = ((points.measured < 0) | (points.measured > sizes)).any(axis=1)
+    if outside.any():
+        names = ", ".join(dict.fromkeys(points.ids[i] for i in points.point[outside][:10]))
+        found.append(
+            f"{counted(int(outside.sum()), 'measurement')} outside of their images (used all the same): {names}"
+        )
+    if fit.parameters and fit.redundancy == 0:
+        found.append("no redundancy: residuals are zero by construction and say nothing")
+    checks = max((int(rms["n"]) for rms in _check_rms(fit) if rms), default=0)
+    if points.control.any() and checks < _ENOUGH_CHECKS:
+        found.append(
+            f"{counted(checks, 'check point')}: fewer than the 30 that ASPRS 2023 asks for before accuracy is claimed"
+        )
+    return list(dict.fromkeys(found))
+
+
+def _check_rms(fit: BlockFit) -> list[Mapping[str, Any] | None]:
+    return [fit.object_rms(), *(fit.image_rms(image, "check") for image in fit.points.images)]
+
+
+def _write(
+    files: Mapping[str, Path],
+    document: Mapping[str, Any],
+    fit: BlockFit,
+    starts: Mapping[str, Start],
+    exported: Mapping[str, rpc.RpcExport],
+    record: Mapping[str, Any],
+) -> None:
+    rows = _ground_rows(fit.points, fit.ground, fit.ground_sigmas, fit.object_residuals)
+    write_text(files["points"], _geojson(rows))
+    write_text(files["points-csv"], _csv(rows))
+    for label, start in starts.items():
+        scene = start.scene
+        adjustment = {"gauge": fit.gauge, "sigma0": fit.sigma0, **document["adjustment"]["images"][label]}
+        saved = SavedModel(
+            _plain(fit.models[label]), scene.sensor, start.source, (scene.width, scene.height),
+            {**record, "adjustment": adjustment},
+        )  # fmt: skip
+        write_model_file(saved, files[f"{label} model"])
+        if label in exported:
+            rpc.write_rpc_txt(exported[label].rpc, files[f"{label} rpc"])
+    write_text(files["report"], json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    write_text(files["html"], block_report.page(document))
+
+
+def _ground_rows(
+    points: BlockPoints, ground: Array, sigmas: Array, residuals: Array, angles_deg: Array | None = None
+) -> list[dict[str, Any]]:
+    """Return the ground points as JSON values: lon, lat, h, sigmas and known minus found in metres east, north, up."""
+    rays = np.bincount(points.point, minlength=len(points))
+    rows = []
+    for k, name in enumerate(points.ids):
+        row = {
+            "id": name, "role": str(points.roles[k]), "rays": int(rays[k]), "ground": _numbers(ground[k]),
+            "sigma": _numbers(sigmas[k]), "residual": _numbers(residuals[k]),
+        }  # fmt: skip
+        if angles_deg is not None:
+            row["angle_deg"] = float(angles_deg[k]) if np.isfinite(angles_deg[k]) else None
+        rows.append(row)
+    return rows
+
+
+def _numbers(values: Array) -> list[float] | None:
+    return [float(value) for value in values] if np.isfinite(values).all() else None
+
+
+def _writer(path: str | os.PathLike[str]) -> Any:
+    writers = {".csv": _csv, ".geojson": _geojson}
+    suffix = Path(path).suffix.lower()
+    if suffix not in writers:
+        raise InputError(
+            "ground points are not written in this format", file=path, remedy=f"one of {', '.join(writers)}"
+        )
+    return writers[suffix]
+
+
+def _geojson(rows: Sequence[Mapping[str, Any]]) -> str:
+    features = []
+    for row in rows:
+        geometry = None if row["ground"] is None else {"type": "Point", "coordinates": row["ground"]}
+        properties: dict[str, Any] = {"id": row["id"], "kind": row["role"], "rays": row["rays"]}
+        for name, values in (("sigma", row["sigma"]), ("residual", row["residual"])):
+            for axis, value in zip(("e", "n", "h"), values or (None,) * 3, strict=True):
+                properties[f"{name}_{axis}"] = value
+        if "angle_deg" in row:
+            properties["angle_deg"] = row["angle_deg"]
+        features.append({"type": "Feature", "properties": properties, "geometry": geometry})
+    return json.dumps({"type": "FeatureCollection", "features": features}, indent=1, allow_nan=False) + "\n"
+
+
+def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return determined points as a table that --gcps reads."""
+    out = io.StringIO()
+    out.write(f"#CRS: {GEODETIC}\n#vertical: ellipsoid\n")
+    hidden = any(str(row["id"]).startswith("#") for row in rows)
+    writer = csv.writer(out, lineterminator="\n", quoting=csv.QUOTE_ALL if hidden else csv.QUOTE_MINIMAL)
+    writer.writerow(("id", "x", "y", "h", "sigma_xy", "sigma_h", "note"))
+    for row in rows:
+        if row["ground"] is None or row["sigma"] is None:
+            continue
+        note = f"{row['role']}, {counted(row['rays'], 'ray')}"
+        sigma = max(row["sigma"][:2])
+        writer.writerow([row["id"], *map(repr, (*row["ground"], sigma, row["sigma"][2])), note])
+    return out.getvalue()
+
+
+# -- intersections ---------------------------------------------------------------------------------------------------
+
+
+def _apart(points: BlockPoints, ground: Array) -> Array:
+    """Return known minus found ground in metres east, north, up ``(N, 3)``."""
+    known = points.known_in(GEODETIC)
+    if not np.isfinite(known).all(axis=1).any():
+        return np.full((len(points), 3), np.nan)
+    frame = GroundFrame.about(known)
+    apart = frame.of_geodetic(known) - frame.of_geodetic(ground)
+    turned: Array = (frame.horizons(known) @ apart[:, :, None])[:, :, 0]
+    return turned
+
+
+def _median_residual(found: Intersection) -> float | None:
+    lengths = np.hypot(*found.residuals.T)
+    lengths = lengths[np.isfinite(lengths)]
+    return float(np.median(lengths)) if len(lengths) else None
+
+
+def _left_open(found: Intersection) -> list[str]:
+    open_ = ~np.isfinite(found.ground).all(axis=1)
+    if not open_.any():
+        return []
+    names = ", ".join(np.array(found.points.ids)[open_][:10])
+    return [
+        f"{counted(int(open_.sum()), 'point has', 'points have')} no intersection (one ray, parallel rays, or "
+        f"outside of the models): {names}"
+    ]
+
+
+def _intersection_text(document: Mapping[str, Any]) -> str:
+    rows = document["points"]
+    wide = max([5, *(len(row["id"]) for row in rows)])
+    lines = [f"{'point':<{wide}} rays {'longitude':>14} {'latitude':>13} {'h':>10}   sigma E     N     h (m)"]
+    for row in rows:
+        if row["ground"] is None:
+            lines.append(f"{row['id']:<{wide}} {row['rays']:>4} {'no intersection':>14}")
+            continue
+        lon, lat, h = row["ground"]
+        sigma = " ".join(f"{value:5.2f}" for value in row["sigma"])
+        lines.append(f"{row['id']:<{wide}} {row['rays']:>4} {lon:14.8f} {lat:13.8f} {h:10.2f}     {sigma}")
+    median = document["median_residual_px"]
+    sigma0 = "unknown" if document["sigma0"] is None else f"{document['sigma0']:.3g}"
+    lines.append(f"Median residual {'-' if median is None else f'{median:.2f}'} px, sigma0 {sigma0}")
+    return "\n".join(lines)

@@ -1,0 +1,173 @@
+"""The images of a block: a name for each, its points, and the model that its adjustment starts from."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path, PurePath
+
+import numpy as np
+
+from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.block.start import Start
+from ortho_pipeline.commands import inputs
+from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
+from ortho_pipeline.estimation.family_fit import OWN, fit_family
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.models import ImageCorrection, families, family_of, start_model
+from ortho_pipeline.options import BlockOptions, SceneOptions
+from ortho_pipeline.points import Points
+
+
+def labels_of(images: Sequence[str | os.PathLike[str]]) -> list[str]:
+    """Return a name for each image that no other has: its stem, with folders ahead of it where stems are the same.
+
+    Raises
+    ------
+    InputError
+        If an image is given twice.
+    """
+    paths = [Path(os.path.abspath(image)) for image in images]
+    for number, path in enumerate(paths):
+        if path in paths[:number]:
+            raise InputError("this image is given twice", file=images[number], remedy="give each image once")
+    parts = [(*path.parent.parts[1:], path.stem) for path in paths]
+    labels = ["_".join(part[-1:]) for part in parts]
+    for depth in range(2, max(map(len, parts), default=1) + 1):
+        labels = [
+            "_".join(part[-depth:]) if [one.lower() for one in labels].count(label.lower()) > 1 else label
+            for part, label in zip(parts, labels, strict=True)
+        ]
+    # The last resort: stems that differ by suffix alone (a.tif, a.jp2).
+    seen: dict[str, int] = {}
+    for number, label in enumerate(labels):
+        seen[label.lower()] = seen.get(label.lower(), 0) + 1
+        if seen[label.lower()] > 1:
+            labels[number] = f"{label}_{seen[label.lower()]}"
+    return labels
+
+
+def points_of_images(
+    points: BlockPoints, images: Sequence[str | os.PathLike[str]], labels: Sequence[str]
+) -> tuple[BlockPoints, list[str]]:
+    """Return the points whose rays are in the images, with these called by their labels; and names that are of none.
+
+    Raises
+    ------
+    InputError
+        If a name could mean several images, or an image has no points.
+    """
+    owner: dict[int, int] = {}
+    strangers = []
+    for number, name in enumerate(points.images):
+        meant = [k for k, image in enumerate(images) if _means(name, image)]
+        if len(meant) > 1:
+            raise InputError(
+                f"the name {name!r} could mean {' or '.join(os.fspath(images[k]) for k in meant)}",
+                file=points.source, field="image",
+                remedy="write the folder in the points file too, such as aft/BAND.tif",
+            )  # fmt: skip
+        if meant:
+            owner[number] = meant[0]
+        else:
+            strangers.append(name)
+    without = [os.fspath(image) for k, image in enumerate(images) if k not in owner.values()]
+    if without:
+        raise InputError(
+            f"no point was measured in {without[0]}; there are points of {', '.join(points.images[:5])}",
+            file=points.source, field="image", remedy="use the names of the images in the points file",
+        )  # fmt: skip
+    rays = np.isin(points.image, list(owner))
+    kept = replace(
+        points, images=tuple(labels), point=points.point[rays], measured=points.measured[rays],
+        image=np.array([owner[number] for number in points.image[rays].tolist()], dtype=np.int64),
+        sigma_image=points.sigma_image[rays],
+    )  # fmt: skip
+    return kept.select(np.bincount(kept.point, minlength=len(kept)) > 0), strangers
+
+
+def _means(name: str, image: str | os.PathLike[str]) -> bool:
+    """Tell whether a name in a points file means an image: its stem, and as many folders as are named, are the same."""
+    said = [part.lower() for part in re.split(r"[\\/]+", name.strip()) if part not in ("", ".", "..")]
+    path = [part.lower() for part in Path(os.path.abspath(image)).parts]
+    if not said or len(said) > len(path) or said[:-1] != path[len(path) - len(said) : -1]:
+        return False
+    return said[-1] in (path[-1], PurePath(path[-1]).stem) or PurePath(said[-1]).stem == PurePath(path[-1]).stem
+
+
+def start_of(
+    image: str | os.PathLike[str],
+    options: BlockOptions,
+    scene: SceneOptions,
+    table: Points,
+    heights: tuple[float, float] | None,
+) -> Start:
+    """Return what the adjustment of an image starts from.
+
+    Parameters
+    ----------
+    table : Points
+        Its points: a family is started from their control.
+    heights : (float, float), optional
+        Lowest and highest known ground of the block (m), for the domain of a family.
+
+    Raises
+    ------
+    InputError
+        For a model that the image does not have, or options that contradict each other.
+    """
+    named = {family.name for family in families()}
+    opened = inputs.open_image(image, scene, needs_model=options.model not in named)
+    name = options.model
+    if name in named and name not in opened.models:
+        return _family_start(opened, str(name), options, table, heights)
+    if options.model_crs is not None:
+        raise InputError(
+            "--model-crs is the ground CRS of a fitted model", field="--model-crs",
+            remedy=f"give --model with one of {', '.join(sorted(named))}",
+        )  # fmt: skip
+    if name is not None and name not in opened.models:
+        raise InputError(
+            f"this image has no model {name!r}", file=image, field="--model",
+            remedy=f"its models are {', '.join(opened.models)}; models fitted to points are {', '.join(sorted(named))}",
+        )  # fmt: skip
+    own = name if name is not None else next(iter(opened.models))
+    model = opened.models[own]
+    correction = options.correction or (OWN if model.param_names else "shift")
+    if correction == OWN and not model.param_names:
+        raise InputError(
+            f"the model {own!r} has no parameters of its own to adjust", file=image, field="--correction",
+            remedy="take shift, shift-drift or affine",
+        )  # fmt: skip
+    first = own == next(iter(opened.models))
+    source = opened.model_source if first else f"metadata of {Path(opened.path).name}"
+    if correction != OWN:
+        refuse_swapped(model, table.select(np.isfinite(table.ground[:, :2]).all(axis=1)), opened.height)
+        corrected = ImageCorrection.identity(model, correction, (opened.width / 2, opened.height / 2))
+        return Start(opened, corrected, own if correction == "none" else f"{own}+{correction}", source)
+    # The priors of a scene are those of its first model.
+    return Start(opened, model, own, source, opened.priors if first else {})
+
+
+def _family_start(
+    opened: Scene, name: str, options: BlockOptions, table: Points, heights: tuple[float, float] | None
+) -> Start:
+    if options.correction not in (None, OWN):
+        raise InputError(
+            f"the model {name!r} is fitted as a whole", field="--correction", remedy="leave out --correction"
+        )
+    size = opened.width, opened.height
+    if family_of(name).variants:
+        model = fit_family(name, table, crs=options.model_crs, size=size, heights=heights, robust=False).model
+    else:
+        model = start_model(name, table, crs=options.model_crs, size=size, heights=heights)
+    control = int(table.control.sum())
+    return Start(
+        opened,
+        model,
+        getattr(model, "family", name),
+        f"{counted(control, 'control point')} of {Path(table.source).name}",
+    )

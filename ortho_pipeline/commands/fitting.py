@@ -1,0 +1,127 @@
+"""`ortho fit` and `ortho compare`: models and their control, without an ortho."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.inputs import has_surface, open_surface
+from ortho_pipeline.commands.results import (
+    CompareResult,
+    FitResult,
+    outputs_together,
+    write_report,
+)
+from ortho_pipeline.commands.scene_fit import (
+    Adjusted,
+    adjust,
+    heights_around,
+    heights_where_wanted,
+    on_surface,
+    open_adjustable,
+)
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.estimation import comparison as comparing
+from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
+from ortho_pipeline.estimation.family_fit import ridge_of
+from ortho_pipeline.models import families
+from ortho_pipeline.options import PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.report import document as report
+
+if TYPE_CHECKING:
+    pass
+from ortho_pipeline.commands.rectification import _ENDINGS
+
+
+def fit(
+    image: str | os.PathLike[str],
+    points: PointOptions,
+    scene: SceneOptions = SceneOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+) -> FitResult:
+    """Adjust the model of a scene to its control points and hold it against its check points.
+
+    Raises
+    ------
+    InputError
+        If there are no points, or a file is wrong (message names file, field and remedy).
+    """
+    if points.gcps is None:
+        raise InputError("there are no points to fit to", field="--gcps", remedy="give a file of points with --gcps")
+    opened = open_adjustable(image, scene, points)
+    heights = open_surface(surface, scene) if has_surface(surface) else None
+    adjusted = adjust(opened, points, scene, heights)
+    return FitResult(
+        adjusted.scene, adjusted.fit, adjusted.warnings(heights), tuple(adjusted.removed_json()), points.near
+    )  # fmt: skip
+
+
+@outputs_together
+def compare(
+    image: str | os.PathLike[str],
+    points: PointOptions,
+    *,
+    models: str = "all",
+    folder: str | os.PathLike[str] | None = None,
+    scene: SceneOptions = SceneOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+    command: str | None = None,
+) -> CompareResult:
+    """Fit many models to the same points, and recommend one.
+
+    Parameters
+    ----------
+    models : str
+        ``all`` or names separated by commas: those of `models`, and the image's own model with its corrections
+        (``rpc``, ``rpc+shift``, ``rpc+shift-drift``, ``rpc+affine``).
+    folder : path, optional
+        Where the report of the recommended model goes, with the comparison in it.
+
+    Raises
+    ------
+    InputError
+        If there are no points, a model is unknown, or a file is wrong. A model that cannot be fitted is a row.
+    """
+    if points.gcps is None:
+        raise InputError("there are no points to fit to", field="--gcps", remedy="give a file of points with --gcps")
+    if points.correction is not None or points.fit_model is not None:
+        raise InputError("compare takes its models from --models", field="--models", remedy="for example all")
+    if points.params is not None or points.prune:
+        raise InputError(
+            "compare fits whole models", field="--params" if points.params else "--prune", remedy="take ortho fit"
+        )
+    opened = inputs.open_image(image, scene, needs_model=False)
+    names = comparing.choose_models(models, opened.model if opened.models else None)
+    heights = open_surface(surface, scene) if has_surface(surface) else None
+    opened = on_surface(opened, heights)
+    own = opened.model if opened.models else None
+    given = inputs.read_control(opened, points, scene)
+    if own is not None:
+        refuse_swapped(own, given, opened.height)
+    given = heights_where_wanted(given, heights, *names)
+    compared = comparing.compare(
+        given, names, own=own, priors=opened.priors, size=(opened.width, opened.height), crs=points.model_crs,
+        heights=heights_around(given, heights), unsuited=opened.unsuited, ridge=ridge_of(points.ridge),
+        significance=points.significance,
+    )  # fmt: skip
+    result = CompareResult(opened, compared)
+    best = compared.best
+    if folder is None or best is None or best.fit is None:
+        return result
+    stem = Path(image).stem
+    files = {name: Path(folder) / f"{stem}{_ENDINGS[name]}" for name in ("residuals", "style", "report", "html")}
+    inputs.check_paths(files, image, scene, points, surface)
+    if best.model in {family.name for family in families()}:
+        opened = replace(opened, models={best.model: best.fit.model}, model_source="control points")
+    adjusted = Adjusted(opened, best.fit)
+    hashed = inputs.hashed(inputs.files_read(image, scene, points, surface, opened))
+    record = inputs.provenance(opened, points, heights, hashed, command, {"scene": scene, "surface": surface})
+    document = report.build_report(
+        scene=opened, fit=best.fit, surface=heights, comparison=result.to_json(), near=points.near,
+        provenance=record, warnings=adjusted.warnings(heights),
+    )  # fmt: skip
+    write_report(document, best.fit, files)
+    return replace(result, files=files)

@@ -1,0 +1,287 @@
+"""`ortho rectify` and `ortho export`: a scene, its control and a surface in; an ortho, models and a report out."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.inputs import has_surface, open_surface
+from ortho_pipeline.commands.results import (
+    Result,
+    outputs_together,
+    write_report,
+)
+from ortho_pipeline.commands.scene_fit import (
+    adjust,
+    open_adjustable,
+)
+from ortho_pipeline.commands.scene_layout import lay_out, source_of
+from ortho_pipeline.errors import InputError, completed
+from ortho_pipeline.exchange import gcp as gcp_export
+from ortho_pipeline.exchange import rpc
+from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
+from ortho_pipeline.files import retire, sha256, states
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.models import SensorModel
+from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.points import Points
+from ortho_pipeline.raster import source as raster
+from ortho_pipeline.raster.ortho import Profile
+from ortho_pipeline.report import document as report
+from ortho_pipeline.report import stac as stac_items
+from ortho_pipeline.surface import dem, footprint
+
+if TYPE_CHECKING:
+    from ortho_pipeline.warp import engine as warp
+
+
+# -- commands --------------------------------------------------------------------------------------------------------
+
+
+@outputs_together
+def rectify(
+    image: str | os.PathLike[str] | Scene,
+    folder: str | os.PathLike[str],
+    *,
+    scene: SceneOptions = SceneOptions(),
+    points: PointOptions | Points = PointOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+    output: OutputOptions = OutputOptions(),
+    progress: Callable[[float], None] | None = None,
+    command: str | None = None,
+    name: str | None = None,
+    digest: Callable[..., str] = sha256,
+    overwrite: bool = False,
+) -> Result:
+    """Make the orthoimage of a scene, its adjusted model in every format, and the accuracy report.
+
+    `image` may be a scene that is open, `points` a table that is read already, in pixels of that image. Nothing is
+    written before all that can be checked is checked. `name` is the id of the STAC item (the
+    image's stem without one), `digest` takes checksums of the inputs, which it may know. Outputs of the same name are
+    replaced, with their statistics and overviews, and outputs of an earlier run that this one does not make are
+    removed; with `overwrite` also where no report says that a run made them, and old models beside the ortho.
+
+    Returns
+    -------
+    Result
+        `files` has ortho, model, rpc, vrt (unless no RPC stands for the model), residuals and style (with points
+        only), report, html, and stac with thumbnail and overview (if asked for).
+
+    Raises
+    ------
+    InputError
+        For whatever the user can correct: no heights, a DEM that does not cover the scene, a path that is read and
+        written, an old side-car that would attach to the ortho.
+    """
+    stem = Path(image).stem
+    files = {
+        kind: Path(folder) / f"{stem}{ending}" for kind, ending in _ENDINGS.items() if kind not in _STAC or output.stac
+    }
+    points = inputs.point_options(points)
+    inputs.check_paths(files, image, scene, points, surface, overwrite)
+    inputs.require_heights(surface)
+    begun = states(inputs.given_files(image, scene, points, surface))
+    # Before the DEM is read: left alone, GDAL keeps blocks in a share of the machine's memory.
+    raster.limit_cache(output.memory, 1)
+    opened = open_adjustable(image, scene, points)
+    heights = open_surface(surface, scene)
+    acquired = stac_items.acquisition_time(opened.facts, output.acquired) if output.stac else None
+    read = inputs.files_read(image, scene, points, surface, opened)
+    begun = states(read) | begun
+    with inputs.hashed_beside(read, digest) as hashing:
+        laid = lay_out(opened, points, scene, heights, output)
+        adjusted, model, heights, found, grid = laid
+        opened = adjusted.scene
+        exported, complaints = _as_rpc(model)
+        source = source_of(opened, image, scene, output)
+        warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
+        asked = {"scene": scene, "surface": surface, "output": output}
+        record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
+    whole = raster.open_dataset(image, **scene.access)
+    _write_models(model, exported, opened, whole, files, {**record, "adjustment": adjusted.record()})
+    document = report.build_report(
+        scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
+        warp=warped, near=points.near, provenance=record,
+        warnings=[*adjusted.warnings(heights), *found.notes(heights), *laid.sparse(warped.valid_pixels), *complaints,
+                  *warped.notes(output.memory)],
+    )  # fmt: skip
+    write_report(document, adjusted.fit, files)
+    if acquired is not None:
+        stac_items.write_item(files["stac"], document, files, acquired, name or stem)
+    inputs.refuse_changed(begun)
+    retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
+    return Result(files, {"report": document}, report.summary_text(document))
+
+
+def check(
+    image: str | os.PathLike[str],
+    *,
+    scene: SceneOptions = SceneOptions(),
+    points: PointOptions = PointOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+    output: OutputOptions = OutputOptions(),
+) -> dict[str, Any]:
+    """Do all that `rectify` does before the first pixel: what it would say then, it says now.
+
+    Returns
+    -------
+    dict
+        Sensor, model, counts of points, RMSEs in pixels, coverage by the DEM, grid and warnings, as JSON values.
+
+    Raises
+    ------
+    InputError
+        As `rectify`.
+    """
+    inputs.require_heights(surface)
+    opened = open_adjustable(image, scene, points)
+    if output.stac:
+        stac_items.acquisition_time(opened.facts, output.acquired)
+    laid = lay_out(opened, points, scene, open_surface(surface, scene), output)
+    Profile.of(source_of(laid.scene, image, scene, output), output.dtype, output.nodata)
+    return laid.to_json()
+
+
+@outputs_together
+def export(
+    image: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    *,
+    formats: Sequence[str] = gcp_export.FORMATS[:4],
+    scene: SceneOptions = SceneOptions(),
+    points: PointOptions = PointOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+    force: bool = False,
+) -> Result:
+    """Write the model of a scene, adjusted if there are points, in formats that GDAL and every GIS read.
+
+    Parameters
+    ----------
+    formats : sequence of str
+        Some of `gcp_export.FORMATS`: rpc-txt, rpb, vrt, tag, gcp, gcp-tag, geolocation.
+    force : bool
+        Accept an RPC that stands for the model only to more than 0.1 px.
+
+    Returns
+    -------
+    Result
+        `document` says whether the RPC is exact, and the largest error of everything that is not.
+
+    Raises
+    ------
+    InputError
+        For an unknown format, a geolocation without heights, and as `fit`.
+    """
+    formats = gcp_export.check_formats(formats)
+    stem = Path(image).stem
+    files = {name: Path(folder) / f"{stem}{gcp_export.ENDINGS[name]}" for name in formats}
+    inputs.check_paths(files, image, scene, points, surface)
+    opened = open_adjustable(image, scene, points)
+    heights = open_surface(surface, scene) if has_surface(surface) else None
+    adjusted = adjust(opened, points, scene, heights)
+    dataset = raster.open_dataset(image, **scene.access)
+    size = opened.width, opened.height
+    adjustment = adjusted.fit
+    with completed(adjusted.scene.model_source, of="model"):
+        if heights is not None:
+            heights = footprint.facing(adjusted.model, heights, *size)
+        job = gcp_export.Export(
+            dataset, adjusted.model, size, heights, adjustment.points.select(adjustment.used), adjustment.rejected,
+            force=force,
+        )  # fmt: skip
+        for name, path in files.items():
+            job.write(name, path)
+    document = {**job.document, "model": adjustment.model_name, "model_source": adjusted.scene.model_source}
+    return Result(files, document, job.summary(adjustment.model_name, adjusted.scene.model_source))
+
+
+# -- parts -----------------------------------------------------------------------------------------------------------
+
+_ENDINGS = {
+    "ortho": "_ortho.tif",
+    "model": "_model.json",
+    "rpc": "_RPC.TXT",
+    "vrt": ".vrt",
+    "residuals": "_residuals.geojson",
+    "style": "_residuals.qml",
+    "report": "_report.json",
+    "html": "_report.html",
+    "stac": "_stac.json",
+    "thumbnail": "_thumbnail.png",
+    "overview": "_overview.png",
+}
+#: Outputs that are only made with a STAC item.
+_STAC = ("stac", "thumbnail", "overview")
+
+
+def _of_earlier_run(folder: Path, stem: str, files: Mapping[str, Path], *, all_of_them: bool) -> list[Path]:
+    """Return what an earlier run wrote for this scene and this one does not, and side-cars of the ortho it wrote.
+
+    Without its report, only `all_of_them` takes files of such names for its own.
+    """
+    ours = all_of_them
+    if not ours:
+        with contextlib.suppress(InputError):
+            ours = bool(report.read_report_json(folder / f"{stem}{_ENDINGS['report']}"))
+    left = [folder / f"{stem}{ending}" for ending in _ENDINGS.values()] if ours else []
+    return [*(path for path in left if path not in files.values()), *inputs.old_side_cars(files["ortho"])]
+
+
+def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[str]]:
+    """Return the model as RPC and what there is to say about it; None where no RPC stands for it."""
+    try:
+        exported = rpc.export_rpc(model)
+    except InputError as error:
+        return None, [f"no RPC files were written: {error.message}"]
+    return exported, list(exported.warnings)
+
+
+def _warp(
+    model: SensorModel,
+    exported: rpc.RpcExport | None,
+    source: raster.RasterSource,
+    surface: dem.Surface,
+    grid: raster.Grid,
+    path: Path,
+    output: OutputOptions,
+    progress: Callable[[float], None] | None,
+) -> warp.WarpResult:
+    from ortho_pipeline.warp import engine as warp  # the compiled kernels take a while to load: beside the checksums
+
+    common: dict[str, Any] = {
+        "resampling": output.resampling,
+        "dem_interpolation": output.dem_interpolation,
+        "memory": output.memory,
+        "threads": output.threads,
+        "driver": output.format,
+        "creation_options": dict(output.creation_options),
+        "profile": Profile.of(source, output.dtype, output.nodata),
+        "progress": progress,
+    }
+    if output.engine == "ortho":
+        return warp.rectify(model, source, surface, grid, path, tolerance=output.tolerance, **common)
+    if output.engine != "gdal":
+        raise InputError(f"no engine is called {output.engine!r}", field="--engine", remedy="ortho or gdal")
+    return warp.rectify_gdal(model, exported, source, surface, grid, path, **common)
+
+
+def _write_models(
+    model: SensorModel,
+    exported: rpc.RpcExport | None,
+    scene: Scene,
+    dataset: raster.gdal.Dataset,
+    files: dict[str, Path],
+    provenance: Mapping[str, Any],
+) -> None:
+    """Write the model in every format; what cannot be written is taken out of `files`."""
+    size = scene.width, scene.height
+    write_model_file(SavedModel(model, scene.sensor, scene.model_source, size, provenance), files["model"])
+    if exported is None:
+        del files["rpc"], files["vrt"]
+        return
+    rpc.write_rpc_txt(exported.rpc, files["rpc"])
+    rpc.write_vrt(dataset, exported.rpc, files["vrt"])

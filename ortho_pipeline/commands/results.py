@@ -1,0 +1,120 @@
+"""What commands return: documents for ``--json``, files, and what people see of them in a notebook."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+from ortho_pipeline.display import notebook
+from ortho_pipeline.estimation import comparison as comparing
+from ortho_pipeline.estimation.fit import Fit
+from ortho_pipeline.estimation.ground_residuals import viewing
+from ortho_pipeline.estimation.spatial_correlation import analyse_fit
+from ortho_pipeline.files import staged, together, write_text
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.report import document as report
+from ortho_pipeline.report.map_scale import map_scale
+
+SCHEMA_VERSION = 1
+
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A scene and what was adjusted to its points."""
+
+    scene: Scene
+    fit: Fit
+    warnings: tuple[str, ...] = ()
+    removed: tuple[Mapping[str, Any], ...] = ()
+    near: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of ``ortho fit --json`` (docs/formats.md)."""
+        document = self.fit.to_json()
+        document["warnings"] = list(self.warnings)
+        pixels = viewing(self.fit.model, self.scene.width, self.scene.height)["ground_pixel_m"]
+        scale = map_scale(self.fit, max(pixels) if pixels else None)
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "sensor": self.scene.sensor,
+            "model": document.pop("model"),
+            "model_source": self.scene.model_source,
+            **document,
+            "removed": [dict(one) for one in self.removed],
+            "map_scale": None if scale is None else scale.to_json(),
+            "covariance": {role: one and one.to_json() for role, one in analyse_fit(self.fit, near=self.near).items()},
+        }
+
+
+@dataclass(frozen=True)
+class Result:
+    """Files that a command wrote, what it says about them, and a summary for people."""
+
+    files: Mapping[str, Path]
+    document: Mapping[str, Any]
+    summary: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return files and document as JSON values."""
+        files = {name: str(path) for name, path in self.files.items()}
+        return {"schema_version": SCHEMA_VERSION, "files": files, **self.document}
+
+    def _repr_html_(self) -> str:
+        """Show the report in a notebook, or the summary where there is none."""
+        if "html" in self.files:
+            return notebook.page_html(self.files["html"].read_text(encoding="utf-8"))
+        return notebook.text_html(self.summary)
+
+
+@dataclass(frozen=True)
+class CompareResult:
+    """A comparison of models, and the report that was written, if any."""
+
+    scene: Scene
+    comparison: comparing.Comparison
+    files: Mapping[str, Path] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of ``ortho compare --json`` (docs/formats.md)."""
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "image": str(self.scene.path),
+            "sensor": self.scene.sensor,
+            **self.comparison.to_json(),
+            "files": {name: str(path) for name, path in self.files.items()},
+        }
+
+
+def outputs_together(command: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Let the outputs of a command (its first parameter is a file, another one `folder`) appear together."""
+    signature = inspect.signature(command)
+
+    @functools.wraps(command)
+    def wrapper(*given: _P.args, **named: _P.kwargs) -> _R:
+        bound = signature.bind(*given, **named).arguments
+        if bound.get("folder") is None:
+            return command(*given, **named)
+        with together(bound["folder"], Path(next(iter(bound.values()))).stem):
+            return command(*given, **named)
+
+    return wrapper
+
+
+def write_report(document: Mapping[str, Any], fit: Fit, files: dict[str, Path]) -> None:
+    """Write report and residuals; without points there are no residuals, and they are taken out of `files`."""
+    if len(fit.points):
+        write_text(files["residuals"], json.dumps(report.residuals_geojson(fit), allow_nan=False))
+        write_text(files["style"], report.residuals_style(document))
+    else:
+        del files["residuals"], files["style"]
+    report.write_report_json(document, files["report"])
+    report.write_report_html(document, files["html"], ortho=staged(files["ortho"]) if "ortho" in files else None)

@@ -1,0 +1,221 @@
+"""What a scene, an image, a DEM and the installation tell: `ortho info`, `edge`, `dem-check`, `report`, `doctor`."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyproj
+
+from ortho_pipeline import plugins
+from ortho_pipeline.commands.inputs import open_scene, open_surface
+from ortho_pipeline.commands.results import (
+    SCHEMA_VERSION,
+    Result,
+    outputs_together,
+)
+from ortho_pipeline.errors import InputError, completed, counted
+from ortho_pipeline.estimation.ground_residuals import viewing
+from ortho_pipeline.files import write_text
+from ortho_pipeline.geodesy import crs as crs_module
+from ortho_pipeline.imaging import resolution
+from ortho_pipeline.models import families
+from ortho_pipeline.options import SceneOptions, SurfaceOptions
+from ortho_pipeline.raster import source as raster
+from ortho_pipeline.report import document as report
+from ortho_pipeline.surface import accuracy as dem_accuracy
+from ortho_pipeline.surface import footprint
+
+if TYPE_CHECKING:
+    pass
+from ortho_pipeline.commands.rectification import _ENDINGS
+
+
+def sensors() -> dict[str, Any]:
+    """List the installed sensors, where each comes from, and the plugins that are broken."""
+    host = plugins.Host.discover()
+    listed = [
+        {
+            "name": sensor.name,
+            "description": sensor.description,
+            "options": dict(sensor.options),
+            "distribution": host.provenance(name).distribution,
+            "version": host.provenance(name).version,
+        }
+        for name, sensor in host.sensors.items()
+    ]
+    return {"schema_version": SCHEMA_VERSION, "sensors": listed, "broken": [entry.to_json() for entry in host.broken]}
+
+
+def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> dict[str, Any]:
+    """Describe a scene: sensor, size, models and their source, facts, position and ground sample distance."""
+    scene = open_scene(image, options)
+    model = scene.model
+    size = scene.width, scene.height
+    with completed(scene.model_source, of="model"):
+        crs = footprint.output_crs(model, *size)
+        gsd = footprint.ground_sample_distance(model, crs, *size)
+    corners = np.array([[0.0, 0.0], [size[0], 0.0], [size[0], size[1]], [0.0, size[1]]])
+    to_geographic = crs_module.ground_transform(model.crs, "EPSG:4979")
+    ground = to_geographic(model.image_to_ground(corners, model.reference_height))
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "image": str(image),
+        "sensor": scene.sensor,
+        "size": list(size),
+        "models": {name: other.kind for name, other in scene.models.items()},
+        "model_source": scene.model_source,
+        "height_range": list(model.height_range),
+        "reference_height": model.reference_height,
+        "utm": crs_text(crs),
+        "gsd_m": gsd,
+        "view": viewing(model, *size)["view"],
+        "corners_lon_lat": [[_number(value) for value in row] for row in ground[:, :2]],
+        "facts": dict(scene.facts),
+        "warnings": list(scene.warnings),
+    }
+
+
+def models() -> list[dict[str, Any]]:
+    """List the classical model families, simple to complex, and what a scene's own model can be corrected by."""
+    return [family.to_json() for family in families()]
+
+
+@outputs_together
+def write_plots(report_file: str | os.PathLike[str], folder: str | os.PathLike[str], kind: str = "svg") -> Result:
+    """Write the plots of a report again, each as a picture of its own.
+
+    Parameters
+    ----------
+    report_file : path
+        A ``<stem>_report.json``.
+    kind : {'svg', 'png'}
+
+    Raises
+    ------
+    InputError
+        If it is no report, or PNG is asked for and matplotlib is not installed.
+    """
+    with completed(report_file, remedy="give a <stem>_report.json as it was written, or make it again"):
+        document = report.read_report_json(report_file)
+        stem = Path(report_file).stem
+        files = report.write_plots(document, Path(folder), stem, kind)
+    return Result(
+        files, {}, f"{counted(len(files), 'plot')} of {Path(report_file).name.removesuffix(_ENDINGS['report'])}"
+    )
+
+
+@outputs_together
+def edge(
+    image: str | os.PathLike[str],
+    folder: str | os.PathLike[str] | None = None,
+    *,
+    edge: str | None = None,
+    band: int = 1,
+    allow_network: bool = False,
+) -> Result:
+    """Measure the effective resolution of an image from one edge, or from those that are found.
+
+    Parameters
+    ----------
+    folder : path, optional
+        Where the document and a plot of the typical edge go.
+    edge : str, optional
+        ``x1,y1,x2,y2``, columns and rows of its ends.
+
+    Raises
+    ------
+    InputError
+        If there is no such edge, or none is found.
+    """
+    given = None if edge is None else resolution.parse_edge(edge)
+    found = resolution.measure(image, edge=given, band=band, allow_network=allow_network)
+    document, stem = resolution.document(found, image, band), Path(image).stem
+    files = (
+        {}
+        if folder is None
+        else {"json": Path(folder) / f"{stem}_edges.json", "svg": Path(folder) / f"{stem}_edge.svg"}
+    )
+    if files:
+        write_text(files["json"], json.dumps(document, indent=1, allow_nan=False) + "\n")
+        write_text(files["svg"], resolution.plot(resolution.typical(found)).svg(alone=True) + "\n")
+    return Result(files, document, resolution.text(document))
+
+
+def dem_check(
+    dem_file: str | os.PathLike[str],
+    points: str | os.PathLike[str],
+    *,
+    crs: str | None = None,
+    vertical: str | None = None,
+    surface: SurfaceOptions = SurfaceOptions(),
+    scene: SceneOptions = SceneOptions(),
+) -> Result:
+    """Compare a DEM with check heights, by the slope of the terrain.
+
+    Parameters
+    ----------
+    points : path
+        CSV or GeoJSON with x, y and h.
+    crs, vertical : str, optional
+        What they are in, where the file does not say it.
+    surface : SurfaceOptions
+        How the heights of the DEM are to be understood.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be used, or no check point lies on the DEM.
+    """
+    heights = open_surface(replace(surface, dem=dem_file), scene)
+    ground, plane, ids = dem_accuracy.read_check_heights(points, crs, vertical)
+    found = dem_accuracy.check_dem(heights, ground, plane, ids)
+    if not found.overall.count:
+        raise InputError(
+            f"none of the {counted(len(ids), 'check point')} has a height in this DEM", file=dem_file, field="--points",
+            remedy="check the CRS of the points, and whether they lie on the DEM",
+        )  # fmt: skip
+    document = {
+        "dem": str(dem_file), "check_points": str(points), "surface": dict(heights.provenance), **found.to_json()
+    }  # fmt: skip
+    return Result({}, document, dem_accuracy.summary(document))
+
+
+def doctor() -> dict[str, Any]:
+    """Return versions of GDAL, PROJ and the compiled parts, geoid grids, and plugins with their distributions.
+
+    A plugin that breaks the contract, at which other commands stop, is among the broken ones here.
+    """
+    host = plugins.Host(installed=True, lenient=True)
+    packages = ("ortho-pipeline", "numpy", "scipy", "numba", "pyproj", "click", "pluggy")
+    allowed = [name for name in raster.DRIVERS if raster.gdal.GetDriverByName(name) is not None]
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "packages": {name: metadata.version(name) for name in packages},
+        "gdal": {
+            "version": raster.gdal.VersionInfo("RELEASE_NAME"),
+            "bindings": raster.gdal.__version__,
+            "drivers": allowed,
+        },
+        "proj": crs_module.proj_info(),
+        "grids": crs_module.grids(),
+        "plugins": [entry.to_json() for entry in host.plugins()],
+        "sensors": list(host.sensors),
+        "broken": [entry.to_json() for entry in host.broken],
+        "cpus": os.cpu_count(),
+    }
+
+
+def crs_text(crs: pyproj.CRS) -> str:
+    """Return ``EPSG:n`` where there is such a code, the name otherwise."""
+    authority = crs.to_authority()
+    return ":".join(authority) if authority else crs.name
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,273 @@
+"""A scene adjusted to its points: its own model with a correction, or a model family from the points alone."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.commands import inputs
+from ortho_pipeline.errors import CoverageError, InputError, ModelError, counted
+from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
+from ortho_pipeline.estimation.family_fit import OWN, Removed, fit_family, fit_own, prune, restricted, ridge_of
+from ortho_pipeline.estimation.fit import Fit, fit
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
+from ortho_pipeline.options import PointOptions, SceneOptions
+from ortho_pipeline.points import Points, marks_warning
+from ortho_pipeline.points.control_hull import uncovered
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.footprint import lay
+
+#: A delivered model that is so many image sizes off belongs to another place, or reads its metadata wrongly.
+_ELSEWHERE = 3.0
+#: How far (in parts of their own extent) beyond the points the DEM is asked for its range of heights.
+_MARGIN = 0.25
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """A scene and what was adjusted to its points.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its models are those that were adjusted: of an image without a model of its own, the fitted family.
+    fit : Fit
+    removed : tuple of Removed
+        Parameters that ``--prune`` took out.
+    """
+
+    scene: Scene
+    fit: Fit
+    removed: tuple[Removed, ...] = ()
+
+    @property
+    def model(self) -> SensorModel:
+        """The adjusted model of the image, without a correction that corrects nothing."""
+        model = self.fit.model
+        if not isinstance(model, ImageCorrection):
+            return model
+        inner = model.model.first if isinstance(model.model, Pieces) else model.model
+        return inner if model.correction == "none" else dataclasses.replace(model, model=inner)
+
+    def record(self) -> dict[str, Any]:
+        """Return what the model was adjusted by as JSON values: now, or before where it comes adjusted from a file."""
+        return self.fit.to_json() if self.scene.adjusted is None else dict(self.scene.adjusted)
+
+    def removed_json(self) -> list[dict[str, Any]]:
+        """Return the removed parameters as JSON values."""
+        return [{"name": one.name, "t": one.t, "p": one.p} for one in self.removed]
+
+    def warnings(self, surface: Surface | None) -> tuple[str, ...]:
+        """Return what people ought to know before they trust the numbers."""
+        scene, adjusted, points = self.scene, self.fit, self.fit.points
+        found = [*scene.warnings, *(scene.unsuited[name] for name in scene.models if name in scene.unsuited)]
+        found += adjusted.warnings
+        if surface is not None:
+            found += surface.provenance.get("warnings", [])
+        found += [f"point {name} was left out: {reason}" for name, reason in adjusted.rejected]
+        found += [f"{one.role} point {one.id} contradicts the others: {one.reason}" for one in adjusted.outlying]
+        found += marks_warning(points.select(adjusted.used & points.control))
+        inside = ((points.image >= 0) & (points.image <= (scene.width, scene.height))).all(axis=1)
+        if not inside.all():
+            outside = ", ".join(np.array(points.ids)[~inside])
+            found.append(f"points outside of the image (used all the same): {outside}")
+        found += self._elsewhere()
+        if len(adjusted.param_names):
+            found += uncovered(points.image[adjusted.used], (self.scene.width, self.scene.height))
+        if adjusted.used.any() and len(adjusted.param_names) and adjusted.redundancy == 0:
+            found.append("no redundancy: the RMSE of the control points is zero by construction and says nothing")
+        checks = int(points.check.sum())
+        if len(points) and checks < 30:
+            found.append(
+                f"{counted(checks, 'check point')}: fewer than the 30 that ASPRS 2023 asks for before accuracy "
+                "is claimed"
+            )
+        if self.removed:
+            names = ", ".join(f"{one.name} (t {one.t:.1f})" for one in self.removed)
+            found.append(f"parameters that the points do not justify were removed: {names}")
+        return tuple(dict.fromkeys(found))
+
+    def _elsewhere(self) -> list[str]:
+        """Return a warning if the points say that the model, as delivered, shows quite another place."""
+        bias = self.fit.raw_bias
+        if bias is None or self.fit.model_name in {family.name for family in families()}:
+            return []
+        sizes = max(abs(bias["col"]) / self.scene.width, abs(bias["row"]) / self.scene.height)
+        if not sizes > _ELSEWHERE:
+            return []
+        return [
+            f"the model as delivered is {sizes:.3g} image sizes away from the points: points or metadata of another "
+            "scene, longitude and latitude exchanged, or an angle of another sign or unit"
+        ]
+
+
+def open_adjustable(image: Any, scene: SceneOptions, points: PointOptions) -> Scene:
+    """Open the scene; only where a model family is fitted may it be without a model of its own.
+
+    Raises
+    ------
+    InputError
+        If options contradict each other, or the image has no model and none is fitted.
+    """
+    if points.fit_model is None:
+        if points.model_crs is not None:
+            raise InputError(
+                "--model-crs is the ground CRS of a fitted model", field="--model-crs", remedy="give --fit-model"
+            )
+        if points.ridge != "auto":
+            raise InputError("--ridge regularises a fitted model", field="--ridge", remedy="give --fit-model")
+        return inputs.open_scene(image, scene)
+    if scene.model is not None or points.correction is not None:
+        other = "--model" if scene.model is not None else "--correction"
+        raise InputError(
+            f"--fit-model takes the place of the image's own model, {other} starts from it", field="--fit-model",
+            remedy=f"leave out one of --fit-model and {other}",
+        )  # fmt: skip
+    if points.gcps is None:
+        raise InputError("a model is fitted to points", field="--gcps", remedy="give a file of points with --gcps")
+    if points.fit_model not in {family.name for family in families()}:
+        raise InputError(
+            f"no model is called {points.fit_model!r}", field="--fit-model",
+            remedy=f"one of {', '.join(family.name for family in families())} (see `ortho models`)",
+        )  # fmt: skip
+    return inputs.open_image(image, scene, needs_model=False)
+
+
+def on_surface(scene: Scene, surface: Surface | None) -> Scene:
+    """Return the scene with models that are meant for the heights under it, where their own range is but a guess."""
+    if surface is None:
+        return scene
+    models = dict(scene.models)
+    for name, model in models.items():
+        if model.with_heights(*model.height_range) is model:
+            continue
+        # A model that only starts an adjustment may look anywhere.
+        with contextlib.suppress(ModelError, InputError):
+            models[name] = lay(model, surface, scene.width, scene.height).fitted(model)
+    return dataclasses.replace(scene, models=models)
+
+
+def adjust(scene: Scene, options: PointOptions, opened: SceneOptions, surface: Surface | None) -> Adjusted:
+    """Adjust the model of a scene, or fit the family of the options to the points alone.
+
+    Without points nothing is adjusted, and the model is as it was delivered.
+
+    Raises
+    ------
+    InputError
+        If points are missing or wrong, or do not determine the model.
+    """
+    scene = on_surface(scene, surface)
+    points = inputs.read_control(scene, options, opened)
+    done = _from_points(scene, options, points, surface) if options.fit_model else _corrected(
+        scene, options, opened, points, surface
+    )  # fmt: skip
+    done = dataclasses.replace(done, fit=dataclasses.replace(done.fit, significance=options.significance))
+    if not options.prune:
+        return done
+    pruned = prune(done.fit)
+    if options.fit_model:
+        scene = dataclasses.replace(done.scene, models={options.fit_model: pruned.fit.model})
+        return Adjusted(scene, pruned.fit, tuple(pruned.removed))
+    return Adjusted(done.scene, pruned.fit, tuple(pruned.removed))
+
+
+def params_of(options: PointOptions) -> tuple[str, ...] | None:
+    """Return the names of ``--params``, None without it."""
+    if options.params is None:
+        return None
+    return tuple(dict.fromkeys(name.strip() for name in options.params.split(",") if name.strip()))
+
+
+def _corrected(
+    scene: Scene, options: PointOptions, opened: SceneOptions, points: Points, surface: Surface | None
+) -> Adjusted:
+    if options.correction != OWN:
+        # What adjusts its own parameters may start anywhere.
+        refuse_swapped(shared_model(scene), points, scene.height)
+    points = inputs.with_heights(points, surface)
+    correction = options.correction
+    if correction is None:
+        correction = "shift" if points.control.any() and opened.model is None else "none"
+    elif correction != "none" and opened.model is not None:
+        raise InputError(
+            "a model file is an adjusted model: adjusting it again would count points twice",
+            field="--correction",
+            remedy="adjust the scene's own model with all points (leave out --model)",
+        )
+    if correction == OWN:
+        scene = _by_own_parameters(scene)
+        return Adjusted(scene, fit_own(restricted(scene.model, params_of(options)), points, scene.priors))
+    start = ImageCorrection.identity(shared_model(scene), correction, (scene.width / 2, scene.height / 2))
+    start = restricted(start, params_of(options))
+    name = scene.model.kind if correction == "none" else f"{scene.model.kind}+{correction}"
+    return Adjusted(scene, fit(start, points, robust=correction != "none", name=name))
+
+
+def _by_own_parameters(scene: Scene) -> Scene:
+    """Return the scene with the first of its models that has parameters in front, such as a pushbroom beside an RPC."""
+    chosen = scene.adjustable
+    if chosen is None or scene.models[chosen] is scene.model:
+        return scene
+    rest = {name: model for name, model in scene.models.items() if name != chosen}
+    source = f"metadata of {Path(scene.path).name}"
+    return dataclasses.replace(scene, models={chosen: scene.models[chosen], **rest}, model_source=source)
+
+
+def shared_model(scene: Scene) -> SensorModel:
+    """Return the model of a scene, with those of the other pieces of its acquisition where they have their own."""
+    parts = {(0.0, 0.0): (scene.model, (scene.width, scene.height))}
+    for piece in scene.pieces:
+        if piece.model is not None and piece.size is not None:
+            # The bands of a component have the same geometry.
+            parts.setdefault(piece.offset, (piece.model, piece.size))
+    if len(parts) == 1:
+        return scene.model
+    models, sizes = zip(*parts.values(), strict=True)
+    return Pieces(models, tuple(parts), sizes)
+
+
+def _from_points(scene: Scene, options: PointOptions, points: Points, surface: Surface | None) -> Adjusted:
+    name = str(options.fit_model)
+    points = heights_where_wanted(points, surface, name)
+    adjusted = fit_family(
+        name, points, crs=options.model_crs, size=(scene.width, scene.height), heights=heights_around(points, surface),
+        ridge=ridge_of(options.ridge), params=params_of(options),
+    )  # fmt: skip
+    source = f"{counted(int(adjusted.used.sum()), 'control point')} of {Path(points.source).name or scene.path}"
+    fitted = dataclasses.replace(scene, models={name: adjusted.model}, model_source=source)
+    return Adjusted(fitted, adjusted)
+
+
+def heights_where_wanted(points: Points, surface: Surface | None, *names: str) -> Points:
+    """Fill missing heights from the surface; without one they are an error unless only 2D models are fitted."""
+    flat = {family.name for family in families() if family.dimensions == 2}
+    if surface is None and set(names) <= flat:
+        return points
+    return inputs.with_heights(points, surface)
+
+
+def heights_around(points: Points, surface: Surface | None) -> tuple[float, float] | None:
+    """Return the lowest and highest terrain about the points (m), None where no surface says."""
+    if surface is None or not len(points):
+        return None
+    if surface.constant_height is not None:
+        return surface.constant_height, surface.constant_height
+    plan = np.column_stack([points.ground[:, :2], np.zeros(len(points))])
+    samples = surface.samples_at(ground_transform(points.crs, surface.crs)(plan)[:, :2])
+    low, high = np.nanmin(samples, axis=0), np.nanmax(samples, axis=0)
+    reach = _MARGIN * (high - low) + 1
+    rows, columns = surface.shape
+    u0, v0 = (int(value) for value in np.clip(np.floor(low - reach), 0, (columns, rows)))
+    u1, v1 = (int(value) for value in np.clip(np.ceil(high + reach) + 1, 0, (columns, rows)))
+    try:
+        return surface.range_within(u0, v0, u1 - u0, v1 - v0)
+    except CoverageError:
+        return None

@@ -1,0 +1,77 @@
+"""Numbers as people read them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+
+def flat(value: Any, name: str = "") -> Iterable[tuple[str, str]]:
+    """Yield the leaves of nested values as (path of keys, text); what is None or empty is left out."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from flat(item, f"{name} · {key}" if name else str(key))
+    elif isinstance(value, list):
+        if value:
+            yield name, ", ".join(str(item) for item in value)
+    elif value is not None:
+        yield name, str(value)
+
+
+def _decimals(value: float) -> int:
+    """Return how many decimals show three digits of a value, at least two and at most five."""
+    return 2 if abs(value) >= 1 or value == 0 else min(5, 2 - math.floor(math.log10(abs(value))))
+
+
+def px(value: float) -> str:
+    """Return pixels."""
+    return f"{fixed(value)} px"
+
+
+def metres(value: float) -> str:
+    """Return metres."""
+    return f"{value:.2f} m" if abs(value) < 10 else f"{value:.1f} m"
+
+
+def fixed(value: float | None) -> str:
+    """Return a value with three digits."""
+    if value is None:
+        return "–"
+    # Below 1e-9 it is rounding, and "0.00" is not "0.00000".
+    return f"{value:.2f}" if abs(value) >= 0.1 or abs(value) < 1e-9 else f"{value:.{min(_decimals(value), 4)}f}"
+
+
+def signed(value: float | None) -> str:
+    """Return a value with its sign and two decimals."""
+    if value is None:
+        return "–"
+    text = f"{value:+.2f}"
+    return "0.00" if text[1:] == "0.00" else text.replace("-", "−")
+
+
+def short(value: float, sign: str = "") -> str:
+    """Return three significant digits."""
+    return f"{value:{sign}.3g}".replace("-", "−") if value else "0"
+
+
+def share(value: float | None) -> str:
+    """Return a share (0 to 1) in per cent."""
+    if value is None:
+        return "–"
+    # "100 %" is only said where it is so.
+    return "100 %" if value >= 1 else f"{min(math.floor(value * 1000) / 10, 99.9):.1f} %"
+
+
+def size_text(size: Iterable[int]) -> str:
+    """Return columns x rows."""
+    return " x ".join(str(side) for side in size)
+
+
+def plain_size(bytes_: float) -> str:
+    """Return a number of bytes."""
+    for unit in ("bytes", "kB", "MB"):
+        if bytes_ < 1000:
+            return f"{bytes_:.3g} {unit}"
+        bytes_ /= 1000
+    return f"{bytes_:.3g} GB"

@@ -1,0 +1,305 @@
+"""Search for gross errors among control points.
+
+Points that agree with each other are looked for first, in a way that bad ones cannot spoil: by least median of squares
+over minimal subsets for models with few parameters (linearised, and linearised again where that led), by taking out the
+worst point over and over for models with many. Every excluded point is then tested against the fit of the others and
+comes back if it agrees with them.
+
+What is never left out is tested too, and named: check points, and control points that stay in the fit (`outlying`).
+
+Source: Baarda 1968 (data snooping); Rousseeuw 1984 (LMedS).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
+from ortho_pipeline.estimation.problem import Problem, Solution
+from ortho_pipeline.estimation.regularisation import regularised
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.points import Points
+
+#: Chance that a good set of points loses any of its points to the search for gross errors.
+BLUNDER_RISK = 0.001
+#: Chance that a set of good points has any that is named as outlying, for control and for check points.
+OUTLYING_RISK = 0.01
+#: From so many check points on their own scatter counts, where it is larger than that of the control points.
+_OWN_SCATTER = 5
+#: Median of a chi-squared variable of two degrees of freedom.
+_MEDIAN_OF_TWO = 2 * math.log(2)
+#: More than this share of rejected control points is an error, not a clean-up.
+REJECTED_LIMIT = 0.3
+#: Residuals are never tested at a finer scale than this part of their stated sigma (noise-free simulations).
+_SCALE_FLOOR = 1e-3
+_SUBSETS = 500
+#: Bound on the residuals of all subsets that are in memory together.
+_RESIDUALS_AT_ONCE = 1_000_000
+#: Minimal subsets of models with more parameters hardly ever are without a bad point.
+_FEW_PARAMETERS = 14
+_ROUNDS = 4
+
+
+def find_blunders(problem: Problem, ridge: float | str | None = None) -> tuple[np.ndarray, dict[int, str]]:
+    """Return the mask of points to keep ``(n,)`` and the reason for each that is not.
+
+    A regularisation that is to be found is found once more when suspected points are out.
+    """
+    count = len(problem.rows)
+    keep = np.ones(count, dtype=bool)
+    few = len(problem.model.params) <= _FEW_PARAMETERS and not problem.ridge
+    solution = _common(problem) if few else problem.solve(keep, linear=True)
+    if solution.redundancy < 2 * 2:  # a single spare point can contradict, but not say who is wrong
+        return keep, {}
+    if few:
+        keep = _median_start(problem, solution)
+    else:
+        keep = _snooping_start(problem, solution, linear=True)
+        if ridge is not None:
+            problem, _ = regularised(problem, keep, ridge)
+        keep = _snooping_start(problem, problem.solve(keep), keep)
+    reasons: dict[int, str] = {}
+    # Suspicion first falls on too many: re-admit the excluded that agree with the others, until none is left that does.
+    while not keep.all():
+        chances, sizes = _chance(problem, keep)
+        agree = ~keep & (chances >= BLUNDER_RISK / count)
+        if not agree.any():
+            reasons = {int(i): _reason(sizes[i]) for i in np.flatnonzero(~keep)}
+            break
+        keep = keep | agree
+    return keep, reasons
+
+
+def _common(problem: Problem) -> Solution:
+    """Return the solution of all points, or one step towards it where gross errors keep it from converging."""
+    everything = np.ones(len(problem.rows), dtype=bool)
+    try:
+        return problem.solve(everything)
+    except NotConverged:
+        return problem.solve(everything, linear=True)
+
+
+def _reason(size: float) -> str:
+    if not math.isfinite(size):
+        return "gross error: the other points put it outside of the model"
+    return f"gross error: {size:.1f} px from where the other points put it"
+
+
+def _median_start(problem: Problem, solution: Solution) -> np.ndarray:
+    """Return a clean subset ``(n,)``, linearised anew until the linear prediction of its solution holds."""
+    keep = _median_subset(solution, len(problem.priors))
+    for _ in range(_ROUNDS):
+        try:
+            found = problem.started(solution.model).solve(keep)
+        except (DegeneratePoints, NotConverged):
+            return keep
+        step = found.model.params - solution.model.params
+        linear = solution.residuals - solution.jacobian @ step
+        residuals = problem.image - found.model.ground_to_image(problem.ground)
+        with np.errstate(invalid="ignore"):
+            bent = ~(np.abs(residuals - linear) / problem.sigma < 0.1).all(axis=1)
+        if not bent.any() or not np.isfinite(residuals).all():
+            return keep
+        # The common solution was so far off that the model is not linear on the way: look again from the clean one.
+        jacobian = found.model.param_partials(problem.ground)
+        solution = Solution(
+            found.model, jacobian, residuals, problem.sigma, found.cofactors, found.freedom, found.effective,
+            found.sigma0, found.condition,
+        )  # fmt: skip
+        again = _median_subset(solution, len(problem.priors))
+        if (again == keep).all():
+            return keep
+        keep = again
+    return keep
+
+
+def _median_subset(solution: Solution, priors: int) -> np.ndarray:
+    """Return a clean subset ``(n,)`` by least median of squares on the linearised problem."""
+    jacobian, residuals = solution.jacobian / solution.sigma[:, :, None], solution.residuals / solution.sigma
+    count, params = len(jacobian), jacobian.shape[2]
+    size = max(1, solution.model.minimum_points, math.ceil((params - priors) / 2))
+    if priors:
+        size = max(1, math.ceil((params - priors) / 2))
+    subsets = np.array(_minimal_subsets(count, size))
+    # Linear in a step from the common solution; a minimal subset with 2 * size > params is solved by least squares.
+    inverses = np.linalg.pinv(jacobian[subsets].reshape(len(subsets), 2 * size, params))
+    steps = (inverses @ residuals[subsets].reshape(len(subsets), 2 * size, 1))[:, :, 0]
+    half = (count + size + 1) // 2
+
+    def squares(some: np.ndarray) -> np.ndarray:
+        left = residuals[None] - (some @ jacobian.reshape(-1, params).T).reshape(len(some), count, 2)
+        return (left**2).sum(axis=2)
+
+    # All subsets at once are 500 residuals of every point: gigabytes where points are matched, not measured.
+    parts = np.array_split(steps, math.ceil(len(steps) * count / _RESIDUALS_AT_ONCE))
+    merit = np.concatenate([np.partition(squares(part), half - 1, axis=1)[:, half - 1].copy() for part in parts])
+    best = int(np.argmin(merit))
+    keep = np.zeros(count, dtype=bool)
+    keep[np.argsort(squares(steps[best : best + 1])[0], kind="stable")[: max(half, size + 1)]] = True
+    return keep
+
+
+def _minimal_subsets(count: int, size: int) -> list[list[int]]:
+    if math.comb(count, size) <= _SUBSETS:
+        return [list(subset) for subset in itertools.combinations(range(count), size)]
+    generator = np.random.default_rng(0)  # the same points give the same answer every time
+    return [sorted(generator.choice(count, size, replace=False).tolist()) for _ in range(_SUBSETS)]
+
+
+def _snooping_start(
+    problem: Problem, solution: Solution, keep: np.ndarray | None = None, *, linear: bool = False
+) -> np.ndarray:
+    """Return the points ``(n,)`` that are left when the one that fits the others worst is taken out, over and over."""
+    from scipy.special import fdtrc
+
+    count = len(problem.rows)
+    keep = np.ones(count, dtype=bool) if keep is None else keep.copy()
+    # One more than may be rejected: the caller then says that there are too many.
+    while (~keep).sum() <= REJECTED_LIMIT * count:
+        spare = solution.spare()
+        standardised = solution.residuals / solution.sigma
+        good = np.linalg.det(spare) > 1e-6
+        squares = np.zeros(len(spare))
+        solved = np.linalg.solve(spare[good], standardised[good][:, :, None])[:, :, 0]
+        squares[good] = (standardised[good] * solved).sum(axis=1)
+        freedom = solution.freedom - 2
+        if solution.sigma0 is None or freedom < 1:
+            break
+        others = np.maximum((solution.sigma0**2 * solution.freedom - squares) / freedom, _SCALE_FLOOR**2)
+        chances = fdtrc(2, freedom, squares / 2 / others)
+        # Where chances underflow to zero, the ratio still tells which is worst.
+        worst = int(np.argmax(squares / others))
+        if chances[worst] >= BLUNDER_RISK / count:
+            break
+        keep[np.flatnonzero(keep)[worst]] = False
+        try:
+            solution = problem.started(solution.model).solve(keep, linear=linear)
+        except (DegeneratePoints, NotConverged, TooFewPoints):
+            break
+    return keep
+
+
+def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
+    """Return for each point the chance of lying so far from the fit of the kept ones, and that distance in pixels."""
+    from scipy.special import fdtrc
+
+    try:
+        solution = problem.solve(keep)
+    except (DegeneratePoints, TooFewPoints):
+        return np.ones(len(keep)), np.zeros(len(keep))
+    miss = problem.image - solution.model.ground_to_image(problem.ground)
+    miss[~np.isfinite(miss).all(axis=1)] = np.inf
+    jacobian = solution.model.param_partials(problem.ground) / problem.sigma[:, :, None]
+    jacobian[~np.isfinite(jacobian).all(axis=(1, 2))] = 0.0
+    spread = np.eye(2) + jacobian @ solution.cofactors @ jacobian.transpose(0, 2, 1)
+    standardised = np.minimum(miss / problem.sigma, 1e150)
+    distance = (standardised * np.linalg.solve(spread, standardised[:, :, None])[:, :, 0]).sum(axis=1)
+    freedom = max(solution.freedom, 1.0)
+    scale = max(solution.sigma0 or 0.0, _SCALE_FLOOR)
+    return fdtrc(2, freedom, distance / 2 / scale**2), np.hypot(miss[:, 0], miss[:, 1])
+
+
+# -- what is not left out --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Outlying:
+    """A point that contradicts the others and still counts.
+
+    `distance` (px) is that from where the fit of the others puts it, `expected` the root mean square of such
+    distances for good points, `chance` that of so large a one for a good point. `leverage` is the share (0 to 1) of its
+    own residual that it takes away: 0 for check points, and little for control points among many.
+    """
+
+    id: str
+    role: str
+    distance: float
+    expected: float
+    chance: float
+    leverage: float
+
+    @property
+    def reason(self) -> str:
+        """What is to be said of it, without its name."""
+        said = f"{self.distance:.3g} px from where the others put it, {self.expected:.2g} px expected"
+        if self.role == "check":
+            return f"{said}: measure it again, for it counts in the RMSE of the check points all the same"
+        return f"{said}: measure it again, for it stays in the adjustment (leverage {self.leverage:.2f})"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the point as JSON values."""
+        return {**asdict(self), "reason": self.reason}
+
+
+def outlying(solution: Solution, points: Points, used: np.ndarray) -> tuple[Outlying, ...]:
+    """Return check points, and used control points, that contradict the fit; none without redundancy.
+
+    A check point is tested with its own uncertainty and that of the model there; from five check points on their own
+    (median) scatter is the scale where it is larger than sigma0, so that a model that is poor everywhere makes none of
+    them an outlier. A control point is tested by its residual had it taken no part, against the sigma0 of the others.
+    """
+    if solution.sigma0 is None:
+        return ()
+    return (*_outlying_control(solution, points, used), *_outlying_checks(solution, points, float(solution.sigma0)))
+
+
+def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> list[Outlying]:
+    from scipy.special import fdtrc
+
+    spare = solution.spare()
+    standardised = solution.residuals / solution.sigma
+    freedom = solution.freedom - 2
+    good = np.linalg.det(spare) > 1e-6
+    if freedom < 1 or not good.any():
+        return []
+    left = solution.leave_one_out()
+    rows = np.flatnonzero(used)
+    found = []
+    for i in np.flatnonzero(good).tolist():
+        square = float(standardised[i] @ np.linalg.solve(spare[i], standardised[i]))
+        others = max((float(solution.sigma0 or 0) ** 2 * solution.freedom - square) / freedom, _SCALE_FLOOR**2)
+        chance = float(fdtrc(2, freedom, square / 2 / others))
+        if chance < OUTLYING_RISK / len(rows):
+            spread = np.trace(np.linalg.inv(spare[i]) * np.outer(solution.sigma[i], solution.sigma[i]))
+            found.append(
+                Outlying(
+                    points.ids[rows[i]], "control", float(np.hypot(*left[i])), math.sqrt(others * spread), chance,
+                    float(1 - np.trace(spare[i]) / 2),
+                )
+            )  # fmt: skip
+    return found
+
+
+def _outlying_checks(solution: Solution, points: Points, sigma0: float) -> list[Outlying]:
+    from scipy.special import fdtrc
+
+    usable = points.check & np.isfinite(solution.model.ground_to_image(points.ground)).all(axis=1)
+    if not usable.any():
+        return []
+    problem = Problem.of(solution.model, points, usable, {})
+    miss = problem.image - solution.model.ground_to_image(problem.ground)
+    if len(solution.model.params):
+        jacobian = solution.model.param_partials(problem.ground) / problem.sigma[:, :, None]
+    else:
+        jacobian = np.zeros((len(miss), 2, 0))
+    spread = np.eye(2) + jacobian @ solution.cofactors @ jacobian.transpose(0, 2, 1)
+    standardised = miss / problem.sigma
+    squares = (standardised * np.linalg.solve(spread, standardised[:, :, None])[:, :, 0]).sum(axis=1)
+    scale, freedom = max(sigma0, _SCALE_FLOOR) ** 2, max(solution.freedom, 1.0)
+    own = float(np.median(squares)) / _MEDIAN_OF_TWO
+    if len(squares) >= _OWN_SCATTER and own > scale:
+        # The median of n is about as certain as a mean square of half as many.
+        scale, freedom = own, float(len(squares))
+    chances = fdtrc(2, freedom, squares / 2 / scale)
+    expected = np.sqrt(scale * (np.diagonal(spread, axis1=1, axis2=2) * problem.sigma**2).sum(axis=1))
+    return [
+        Outlying(
+            points.ids[problem.rows[i]], "check", float(np.hypot(*miss[i])), float(expected[i]), float(chances[i]), 0.0
+        )
+        for i in np.flatnonzero(chances < OUTLYING_RISK / len(chances)).tolist()
+    ]

@@ -1,0 +1,458 @@
+"""Adjustment of a sensor model to ground control, and the `Fit` that it results in.
+
+Beside it, `problem` has the mathematics, `blunders` the search for gross errors, `regularisation` that of rational
+functions, `statistics` the tests of parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.display.notebook import fit_html
+from ortho_pipeline.errors import DegeneratePoints, InputError, counted
+from ortho_pipeline.estimation.blunders import REJECTED_LIMIT, Outlying, find_blunders, outlying
+from ortho_pipeline.estimation.problem import Prior, Problem, Solution
+from ortho_pipeline.estimation.regularisation import regularised
+from ortho_pipeline.estimation.statistics import correlation_of, student_of, total_correlation_of
+from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.points import Points
+
+__all__ = ["Fit", "Prior", "fit", "root_mean_square"]
+
+#: Refuse where some corner of the image (of the model's domain without one) would be predicted so many times worse than
+#: a point is measured ...
+EXTRAPOLATION_LIMIT = 100.0
+#: ... and say so from here on.
+EXTRAPOLATION_WARNING = 10.0
+#: Beyond this condition without its regularisation a model is called unstable.
+_UNSTABLE = 1e4
+#: Chance of calling a parameter justified that is zero.
+SIGNIFICANCE = 0.05
+#: Two parameters correlated beyond this are listed as 1.000: they cannot be told apart.
+_INSEPARABLE = 0.9995
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Fit:
+    """Result of an adjustment.
+
+    Residuals are measured minus predicted, ``(N, 2)`` column and row in pixels, for all points whatever their role;
+    `raw_residuals` are those of the model before the adjustment, NaN where it is of the points alone. `loo_residuals`
+    are NaN for points that did not take part. `sigma0` is None without redundancy. Heights that a model of the plane
+    does not need, and that the points do not have, are its reference height in `points`. With a regularisation of the
+    strength `ridge`, the points determine `effective_parameters`, and `condition` is that of the design without it.
+    `corner_ratio` tells how many times less certain the model is at a corner of the scene than a measured point.
+    `outlying` are points that contradict the fit and were not left out: check points, and control points that the
+    search for gross errors does not take for such.
+    """
+
+    model: SensorModel
+    model_name: str
+    covariance: Array
+    points: Points
+    used: np.ndarray
+    predicted: Array
+    residuals: Array
+    loo_residuals: Array
+    raw_residuals: Array
+    redundancy: int
+    sigma0: float | None
+    rejected: tuple[tuple[str, str], ...] = ()
+    warnings: tuple[str, ...] = ()
+    condition: float = field(default=1.0)
+    degrees_of_freedom: float = 0.0
+    effective_parameters: float = 0.0
+    ridge: float | None = None
+    priors: Mapping[str, Prior] = field(default_factory=dict)
+    significance: float = SIGNIFICANCE
+    corner_ratio: float = 0.0
+    outlying: tuple[Outlying, ...] = ()
+
+    @property
+    def reservations(self) -> tuple[str, ...]:
+        """Why the model is not to be relied on, whatever its residuals: ``unstable``, ``uncertain at a corner``."""
+        found = []
+        if len(self.param_names) > 1 and self.condition > _UNSTABLE:
+            found.append("unstable")
+        if not self.corner_ratio <= EXTRAPOLATION_WARNING:
+            found.append("uncertain at a corner")
+        return tuple(found)
+
+    @property
+    def param_names(self) -> tuple[str, ...]:
+        """Names of the adjusted parameters."""
+        return self.model.param_names
+
+    @property
+    def values(self) -> Array:
+        """Adjusted parameters ``(P,)``."""
+        return self.model.params
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations of the parameters ``(P,)``."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def correlation(self) -> Array:
+        """Correlation matrix of the parameters ``(P, P)``."""
+        return correlation_of(self.covariance)
+
+    @property
+    def total_correlation(self) -> Array:
+        """Multiple correlation of each parameter with all others ``(P,)``."""
+        return total_correlation_of(self.covariance)
+
+    @property
+    def student(self) -> tuple[Array, Array]:
+        """Student's t and two-sided p of the hypotheses that parameters are zero, each ``(P,)``."""
+        return student_of(self.values, self.covariance, self.degrees_of_freedom if self.sigma0 is not None else 0.0)
+
+    @property
+    def not_justified(self) -> tuple[str, ...]:
+        """Parameters whose chance p of being zero is above `significance`: the points do not justify them."""
+        _, p = self.student
+        return tuple(name for name, chance in zip(self.param_names, p, strict=True) if not chance <= self.significance)
+
+    def rmse(self, which: str) -> dict[str, float | int] | None:
+        """Return root mean squares in pixels for 'control' (used), 'check' or 'loo'; None where there is no point.
+
+        'agreeing' is the check points without the outlying ones: never the accuracy, but what one wrong point hides.
+        """
+        if which == "loo":
+            residuals = self.loo_residuals[np.isfinite(self.loo_residuals).all(axis=1)]
+        elif which == "control":
+            residuals = self.residuals[self.used]
+        else:
+            checks = self.points.check
+            if which == "agreeing":
+                checks = checks & ~np.isin(np.array(self.points.ids), [one.id for one in self.outlying])
+            residuals = self.residuals[checks]
+            # A point that does not project has no residual; a warning names it.
+            residuals = residuals[np.isfinite(residuals).all(axis=1)]
+        return root_mean_square(residuals)
+
+    @property
+    def raw_bias(self) -> dict[str, float | int] | None:
+        """Mean and scatter (px) of measured minus predicted of the model as delivered, over the used points."""
+        raw = self.raw_residuals[self.used]
+        if not np.isfinite(raw).any():
+            return None
+        mean, spread = raw.mean(axis=0), raw.std(axis=0)
+        return {"col": mean[0], "row": mean[1], "std_col": spread[0], "std_row": spread[1], "n": len(raw)}
+
+    def image_sigma(self, ground: Array) -> Array:
+        """Return the standard deviation ``(N, 2)`` of predicted image points that comes from the parameters."""
+        partials = self.model.param_partials(ground)
+        return np.sqrt(((partials @ self.covariance) * partials).sum(axis=2))
+
+    def statistics(self) -> dict[str, Any]:
+        """Return the section ``statistics`` of the document: what is not finite is null."""
+        t, p = self.student
+        named = {"total_correlation": self.total_correlation, "t": t, "p": p}
+        return {
+            "correlation": [_numbers(row) for row in self.correlation],
+            **{key: dict(zip(self.param_names, _numbers(values), strict=True)) for key, values in named.items()},
+            "significance": self.significance,
+            "not_justified": list(self.not_justified),
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "effective_parameters": self.effective_parameters,
+            "ridge": self.ridge,
+            "condition": self.condition if math.isfinite(self.condition) else None,
+            "corner_ratio": self.corner_ratio if math.isfinite(self.corner_ratio) else None,
+        }
+
+    def __repr__(self) -> str:
+        total = {role: found["total"] for role in ("control", "check", "loo") if (found := self.rmse(role))}
+        said = ", ".join(f"{role} {value:.3f} px" for role, value in total.items())
+        return (
+            f"<fit of {self.model_name} to {counted(int(self.used.sum()), 'control point')}: RMSE {said or 'unknown'}>"
+        )
+
+    def _repr_html_(self) -> str:
+        return fit_html(self.to_json())
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of ``ortho fit --json`` (docs/formats.md)."""
+        points = self.points
+        return {
+            "model": self.model_name,
+            "parameters": {
+                name: {"value": float(value), "sigma": float(sigma)}
+                for name, value, sigma in zip(self.param_names, self.values, self.sigmas, strict=True)
+            },
+            "points": [
+                {
+                    "id": points.ids[i],
+                    "role": str(points.roles[i]),
+                    "used": bool(self.used[i]),
+                    "image": _numbers(points.image[i]),
+                    "predicted": _numbers(self.predicted[i]),
+                    "residual": _numbers(self.residuals[i]),
+                    "loo_residual": _numbers(self.loo_residuals[i]),
+                }
+                for i in range(len(points))
+            ],
+            "rmse": {which: self.rmse(which) for which in ("control", "check", "loo")},
+            "raw_bias": self.raw_bias,
+            "redundancy": self.redundancy,
+            "sigma0": self.sigma0,
+            "rejected": [{"id": name, "reason": reason} for name, reason in self.rejected],
+            "outlying": [one.to_json() for one in self.outlying],
+            "rmse_of_agreeing_checks": self.rmse("agreeing"),
+            "warnings": list(self.warnings),
+            "statistics": self.statistics(),
+        }
+
+
+def root_mean_square(residuals: Array) -> dict[str, float | int] | None:
+    """Return the root mean square per axis and in total of residuals ``(N, 2)``; None for no residuals."""
+    if not len(residuals):
+        return None
+    col, row = (residuals**2).mean(axis=0)
+    return {"col": math.sqrt(col), "row": math.sqrt(row), "total": math.sqrt(col + row), "n": len(residuals)}
+
+
+def fit(
+    model: SensorModel,
+    points: Points,
+    *,
+    priors: Mapping[str, Prior] | None = None,
+    robust: bool = True,
+    name: str | None = None,
+    ridge: float | str | None = None,
+    exclude: Mapping[str, str] | None = None,
+) -> Fit:
+    """Adjust the parameters of `model` to the control points; check points take no part.
+
+    Parameters
+    ----------
+    model : SensorModel
+        Start values; a model without parameters is only evaluated.
+    points : Points
+        In any CRS that can be brought to the model's.
+    priors : mapping of parameter name to Prior, optional
+        Soft constraints.
+    robust : bool
+        Look for gross errors and leave them out.
+    ridge : float or 'gcv' or 'lcurve', optional
+        Regularisation of a rational model: its strength, or how to find it.
+    exclude : mapping of id to reason, optional
+        Control points that are known to be wrong.
+
+    Raises
+    ------
+    TooFewPoints, DegeneratePoints
+        If the control points do not determine the parameters, or too many of them contradict the others.
+    InputError
+        If no point at all has an image.
+    """
+    points = _placed(points, model)
+    raw = points.image - model.ground_to_image(points.ground)
+    known_bad = {points.ids.index(name): reason for name, reason in (exclude or {}).items() if name in points.ids}
+    problem, warnings = _posed(model, points, raw, priors, known_bad)
+    keep, rejected, problem, strength = _searched(problem, points, ridge, robust=robust)
+    solution = problem.solve(keep)
+    ratio = _corner_ratio(solution, points.source, strength)
+    warnings += _uncertain_edge(ratio) + _unstable(solution, strength)
+    used = np.zeros(len(points), dtype=bool)
+    used[problem.rows[keep]] = True
+    found = _result(solution, points, used, raw, {**known_bad, **rejected}, warnings, name, strength, problem.priors)
+    return replace(found, corner_ratio=ratio, outlying=outlying(solution, points, used))
+
+
+def gross_errors(
+    model: SensorModel,
+    points: Points,
+    *,
+    priors: Mapping[str, Prior] | None = None,
+    ridge: float | str | None = None,
+) -> dict[str, str]:
+    """Return the control points that `fit` would leave out, with the reason of each.
+
+    Raises
+    ------
+    TooFewPoints, DegeneratePoints, InputError
+        As `fit`, but not for what the remaining points leave open.
+    """
+    points = _placed(points, model)
+    problem, _ = _posed(model, points, points.image - model.ground_to_image(points.ground), priors, {})
+    _, rejected, _, _ = _searched(problem, points, ridge, robust=True)
+    return {points.ids[i]: reason for i, reason in sorted(rejected.items())}
+
+
+def _posed(
+    model: SensorModel,
+    points: Points,
+    raw: Array,
+    priors: Mapping[str, Prior] | None,
+    without: Mapping[int, str],
+) -> tuple[Problem, list[str]]:
+    """Return the problem of the usable control points, and warnings about those that are not."""
+    projected = np.asarray(np.isfinite(raw).all(axis=1))
+    if len(points) and not projected.any():
+        raise InputError(
+            f"none of the {counted(len(points), 'point')} has an image by the model {model.kind!r}: no height, or "
+            "outside of "
+            "where the model is defined",
+            file=points.source or None,
+            remedy="check the CRS and the heights of the points, and that they and the model belong to this scene",
+        )
+    usable = points.control & projected
+    wrong = np.isin(np.arange(len(points)), list(without))
+    warnings = _unusable(points, usable | wrong, projected)
+    usable &= ~wrong
+    return Problem.of(model, points, usable, dict(priors or {})), warnings
+
+
+def _searched(
+    problem: Problem, points: Points, ridge: float | str | None, *, robust: bool
+) -> tuple[np.ndarray, dict[int, str], Problem, float | None]:
+    """Return the points to keep ``(n,)``, the rows that are not with the reason, and the regularised problem."""
+    keep = np.ones(len(problem.rows), dtype=bool)
+    strength = None
+    if ridge is not None:
+        problem, strength = regularised(problem, keep, ridge, linear=robust)
+    rejected: dict[int, str] = {}
+    if robust and len(problem.model.params):
+        keep, reasons = find_blunders(problem, ridge)
+        rejected = {int(problem.rows[i]): reason for i, reason in reasons.items()}
+        _refuse_many(points, rejected, len(keep))
+        if ridge is not None:
+            problem, strength = regularised(problem, keep, ridge)
+    return keep, rejected, problem, strength
+
+
+def _placed(points: Points, model: SensorModel) -> Points:
+    """Return the points in the CRS of the model, at its reference height if it knows of none."""
+    points = points.to_crs(model.crs)
+    missing = ~np.isfinite(points.ground[:, 2])
+    if model.uses_height or not missing.any():
+        return points
+    ground = points.ground.copy()
+    ground[missing, 2] = model.reference_height
+    return points.with_ground(ground)
+
+
+def _result(
+    solution: Solution,
+    points: Points,
+    used: np.ndarray,
+    raw: Array,
+    rejected: Mapping[int, str],
+    warnings: list[str],
+    name: str | None,
+    strength: float | None,
+    priors: Mapping[str, Prior],
+) -> Fit:
+    predicted = solution.model.ground_to_image(points.ground)
+    loo = np.full((len(points), 2), np.nan)
+    loo[used] = solution.leave_one_out()
+    sigma0 = solution.sigma0
+    return Fit(
+        model=solution.model,
+        model_name=str(name or getattr(solution.model, "family", solution.model.kind)),
+        covariance=solution.cofactors * (1.0 if sigma0 is None else sigma0**2),
+        points=points,
+        used=used,
+        predicted=predicted,
+        residuals=points.image - predicted,
+        loo_residuals=loo,
+        raw_residuals=raw,
+        redundancy=solution.redundancy,
+        sigma0=sigma0,
+        rejected=tuple((points.ids[i], reason) for i, reason in sorted(rejected.items())),
+        warnings=tuple(warnings),
+        condition=solution.condition,
+        degrees_of_freedom=solution.freedom,
+        effective_parameters=solution.effective,
+        ridge=strength,
+        priors=priors,
+    )
+
+
+def _unusable(points: Points, usable: np.ndarray, projected: np.ndarray) -> list[str]:
+    found = []
+    for role, mask in (("control", points.control & ~usable), ("check", points.check & ~projected)):
+        if mask.any():
+            names = ", ".join(points.ids[i] for i in np.flatnonzero(mask))
+            found.append(f"{role} points without a projection (no height, or outside the model's domain): {names}")
+    return found
+
+
+def _refuse_many(points: Points, rejected: dict[int, str], count: int) -> None:
+    if len(rejected) > REJECTED_LIMIT * count:
+        names = ", ".join(points.ids[i] for i in sorted(rejected))
+        raise DegeneratePoints(
+            f"{len(rejected)} of {counted(count, 'control point')} contradict the others ({names}): "
+            "which of them are wrong cannot be decided",
+            file=points.source,
+            remedy="measure these points again, or remove the wrong ones",
+        )
+
+
+def _corner_ratio(solution: Solution, source: str, strength: float | None) -> float:
+    """Return how many times less certain a model is at a corner of its image than a measured point.
+
+    One that is much less certain is refused, but never a regularised one: what the points leave open, the user has
+    decided.
+    """
+    if not len(solution.model.params) or not len(solution.sigma):
+        return 0.0
+    partials = solution.model.param_partials(solution.model.corners)
+    spread = np.sqrt(((partials @ solution.cofactors) * partials).sum(axis=2))
+    factor = float(np.nanmax(spread, initial=0.0) / np.median(solution.sigma))
+    if np.isnan(spread).all() and strength is None:
+        raise DegeneratePoints(
+            "how certain the model is cannot be said: no corner of the ground that it is meant for has an image",
+            file=source,
+            field="domain",
+            remedy="check the metadata of the scene; of a plugin, that domain is (centre, half-size) in units of crs",
+        )
+    if np.isnan(spread).all():
+        factor = math.inf
+    if factor > EXTRAPOLATION_LIMIT and strength is None:
+        raise DegeneratePoints(
+            f"the control points do not determine the whole scene: at a corner the model is {factor:.0f} times less "
+            "certain than a measured point",
+            file=source,
+            remedy="spread the points over the image (and over height, for 3D models), or take a simpler model",
+        )
+    return factor
+
+
+def _uncertain_edge(factor: float) -> list[str]:
+    if factor <= EXTRAPOLATION_WARNING:
+        return []
+    return [f"uncertain at the edge: at a corner of the scene {factor:.0f} times less certain than a measured point"]
+
+
+def _unstable(solution: Solution, strength: float | None) -> list[str]:
+    names = solution.model.param_names
+    if strength is not None:
+        if solution.condition <= _UNSTABLE:
+            return []
+        return [
+            f"unstable: the points determine {solution.effective:.1f} of {counted(len(names), 'parameter')} (condition "
+            f"{solution.condition:.0e}); regularisation ({strength:.1e}) decides the others: trust check points only"
+        ]
+    if solution.condition <= _UNSTABLE or len(names) < 2:
+        pairs = np.abs(np.triu(correlation_of(solution.cofactors), 1))
+        if not (pairs > _INSEPARABLE).any():
+            return []
+        first, second = np.unravel_index(int(np.argmax(pairs)), pairs.shape)
+        return [
+            f"{counted(int((pairs > _INSEPARABLE).sum()), 'pair of parameters is', 'pairs of parameters are')} "
+            f"correlated beyond {_INSEPARABLE} "
+            f"({names[first]} and {names[second]} the most): they cannot be told apart"
+        ]
+    return [f"unstable: the condition of the adjustment is {solution.condition:.0e}: a simpler model is safer"]
+
+
+def _numbers(values: Array) -> list[float | None]:
+    return [float(value) if math.isfinite(value) else None for value in values]

@@ -1,0 +1,123 @@
+"""Residuals as people feel them: in metres on the ground, and along or across the direction of view.
+
+An ortho shows a point where its ray meets the DEM. A wrong height moves it along the direction of view and nowhere
+else, so that residuals along it tell of heights, and those across it of the sensor model and of measuring.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.estimation.fit import Fit, root_mean_square
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.geodesy.ellipsoid import units_per_metre
+from ortho_pipeline.models.base import Array, SensorModel, solve_2x2
+
+#: An image that moves less than this (pixels per metre of height) has no direction of view to speak of.
+_NADIR = 1e-4
+
+
+def metre_partials(model: SensorModel, ground: Array) -> tuple[Array, Array]:
+    """Return d(image)/d(x, y in metres) ``(N, 2, 2)`` and d(image)/d(height) ``(N, 2)``."""
+    ground = with_reference_height(model, ground)
+    partials = model.ground_partials(ground)
+    units = units_per_metre(parse_crs(model.crs), ground)
+    return partials[:, :, :2] * units[:, None, :2], partials[:, :, 2]
+
+
+def viewing(model: SensorModel, width: int, height: int) -> dict[str, Any]:
+    """Return how the middle of an image is seen: pixel size on the ground, and the direction of view.
+
+    All are None where the middle has no ground. `view` has the angle at the ground between ray and vertical, the
+    azimuth (clockwise from the y axis of the model's CRS) in which the sensor stands, and the size of a pixel along and
+    across that direction: the length on level ground that one pixel of the image covers. For a square pixel of the size
+    p straight down, the paper's formula gives p / cos^2 along and p / cos across; the model gives what is so, also
+    where lines follow each other at another distance.
+
+    Returns
+    -------
+    dict
+        `ground_pixel_m` [along the row, along the column], `lean_m_per_m` and `lean_azimuth_deg` (how far and whereto
+        the ortho moves per metre of height), `view` {incidence_deg, sensor_azimuth_deg, pixel_m {along_view,
+        across_view}}; `sensor_azimuth_deg` is None straight down, where along is y and across is x.
+
+    Source: Bueyueksalih et al. (OrbView-3), formula 1.
+    """
+    centre = model.image_to_ground(np.array([[width / 2, height / 2]]), model.reference_height)
+    nothing = {"ground_pixel_m": None, "lean_m_per_m": None, "lean_azimuth_deg": None, "view": None}
+    if not np.isfinite(centre).all():
+        return nothing
+    plan, up = metre_partials(model, centre)
+    try:
+        inverse = np.linalg.inv(plan[0])
+    except np.linalg.LinAlgError:
+        return nothing
+    lean = inverse @ up[0]
+    tangent = float(np.hypot(*lean))
+    seen = np.hypot(*up[0]) > _NADIR
+    along = lean / tangent if seen else np.array([0.0, 1.0])
+    across = np.array([along[1], -along[0]])
+    return {
+        "ground_pixel_m": np.linalg.norm(inverse, axis=0).tolist(),
+        "lean_m_per_m": tangent,
+        "lean_azimuth_deg": float(np.degrees(np.arctan2(lean[0], lean[1])) % 360),
+        "view": {
+            "incidence_deg": float(np.degrees(np.arctan(tangent))),
+            "sensor_azimuth_deg": float(np.degrees(np.arctan2(-lean[0], -lean[1])) % 360) if seen else None,
+            "pixel_m": {
+                "along_view": float(1.0 / np.linalg.norm(plan[0] @ along)),
+                "across_view": float(1.0 / np.linalg.norm(plan[0] @ across)),
+            },
+        },
+    }
+
+
+def with_reference_height(model: SensorModel, ground: Array) -> Array:
+    """Return ground points with the model's reference height where they have none (2D models take such points)."""
+    missing = np.isnan(ground[:, 2])
+    if missing.any():
+        ground = ground.copy()
+        ground[missing, 2] = model.reference_height
+    return ground
+
+
+def in_metres(fit: Fit, residuals: Array) -> Array:
+    """Return residuals ``(N, 2)`` px as shifts of the ortho, metres along x and y of the model's ground CRS."""
+    if not len(residuals):
+        return np.zeros((0, 2))
+    plan, _ = metre_partials(fit.model, fit.points.ground)
+    return solve_2x2(plan, residuals)
+
+
+def rmse_metres(fit: Fit) -> dict[str, Any]:
+    """Return root mean squares in metres over control (used), check and left-out residuals; None for no points."""
+    shifts = in_metres(fit, fit.residuals)
+    values = {
+        "control": shifts[fit.used],
+        "check": shifts[fit.points.check],
+        "loo": in_metres(fit, fit.loo_residuals),
+    }
+    found = {}
+    for name, rows in values.items():
+        rmse = root_mean_square(rows[np.isfinite(rows).all(axis=1)])
+        found[name] = rmse and {"x": rmse["col"], "y": rmse["row"], "total": rmse["total"], "n": rmse["n"]}
+    return found
+
+
+def along_view(fit: Fit) -> Array:
+    """Return the residuals ``(N, 2)`` px along and across the direction of view; NaN for a view straight down.
+
+    Along is positive towards where a higher point appears in the image; across is 90 degrees further, from column
+    towards row.
+    """
+    if not len(fit.points):
+        return np.zeros((0, 2))
+    _, up = metre_partials(fit.model, fit.points.ground)
+    length = np.hypot(up[:, 0], up[:, 1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        axis = np.where((length > _NADIR)[:, None], up / length[:, None], np.nan)
+    residuals = fit.residuals
+    along = (residuals * axis).sum(axis=1)
+    return np.stack([along, axis[:, 0] * residuals[:, 1] - axis[:, 1] * residuals[:, 0]], axis=1)

@@ -1,0 +1,492 @@
+r"""Covariance analysis of residuals: do neighbouring points err alike, and how accurate are they to each other?
+
+Pairs of points are sorted into classes of distance. For each class and axis, with residuals :math:`r` of the variance
+:math:`s^2` about their mean :math:`m`,
+
+- correlation :math:`\overline{(r_i - m)(r_j - m)} / s^2`,
+- relative standard deviation :math:`\sqrt{\sum (r_i - r_j)^2 / (2 n)}`: below the RMSE of single points where
+  neighbours err alike. Its square is the semivariance, so that the covariance function
+  :math:`C(d) = \sigma_s^2 e^{-d / c}` of errors that neighbours share, beside noise :math:`\sigma_n^2` that they do
+  not, is fitted to it: :math:`\gamma(d) = \sigma_n^2 + \sigma_s^2 (1 - e^{-d / c})`.
+
+Whether residuals are more alike than chance makes them is tested by Moran's I over each point's nearest neighbours,
+against permutations of the residuals. Residuals of an adjustment are not independent even without systematic errors
+(they sum to zero, at the least), so each permutation is adjusted again.
+
+Source: section 3.3 and figure 7 of Bueyueksalih et al. (OrbView-3; the program BLAN); Moran 1950, Notes on continuous
+stochastic phenomena (I); Cliff and Ord 1981, Spatial processes, chapter 8 (residuals of an adjustment); Cressie 1993,
+Statistics for spatial data, section 2.6.2 (weighted fit to the semivariance).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.estimation.fit import Fit
+from ortho_pipeline.estimation.ground_residuals import in_metres, metre_partials, with_reference_height
+from ortho_pipeline.estimation.statistics import student_of
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.ellipsoid import horizon_from_geodetic
+from ortho_pipeline.models.base import Array
+
+Pair = tuple[float, float]
+
+#: Chance of calling residuals systematic that are not.
+SIGNIFICANCE = 0.05
+#: Below this number of points (and of degrees of freedom beyond the parameters) nothing is tested.
+FEWEST_POINTS = 8
+#: Neighbours of each point in Moran's I.
+NEIGHBOURS = 4
+#: With fewer points than this it is said that only strong systematic errors show.
+_SHARP = 30
+#: More points than this add time and no insight: so many are drawn from them.
+MOST_POINTS = 1000
+#: Classes of distance are made of at least so many pairs, and are at most so many.
+_PAIRS_PER_CLASS, _MOST_CLASSES = 30, 12
+
+
+@dataclass(frozen=True)
+class DistanceClass:
+    """Pairs of points between two distances: their mean distance, and correlation and relative accuracy per axis."""
+
+    low: float
+    high: float
+    distance: float
+    pairs: int
+    correlation: Pair
+    relative: Pair
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the class as JSON values."""
+        return {
+            "from_m": self.low,
+            "to_m": self.high,
+            "distance_m": self.distance,
+            "pairs": self.pairs,
+            "correlation": list(self.correlation),
+            "relative": list(self.relative),
+        }
+
+
+@dataclass(frozen=True)
+class CovarianceFunction:
+    """Standard deviations of noise and of what neighbours share, and the distance (m) at which 1/e of that is left."""
+
+    noise: float
+    systematic: float
+    range: float
+
+    def covariance(self, distance: ArrayLike) -> Array:
+        """Return the covariance of residuals at distances, noise not included."""
+        return np.asarray(self.systematic**2 * np.exp(-np.asarray(distance, dtype=np.float64) / self.range))
+
+    def relative(self, distance: ArrayLike) -> Array:
+        """Return the relative standard deviation at distances."""
+        return np.sqrt(self.noise**2 + self.systematic**2 - self.covariance(distance))
+
+    def to_json(self) -> dict[str, float]:
+        """Return the function as JSON values."""
+        return {"noise": self.noise, "systematic": self.systematic, "range_m": self.range}
+
+
+@dataclass(frozen=True)
+class CovarianceAnalysis:
+    """What residuals of one kind of points (control or check, never both) say about each other.
+
+    Pairs of numbers are per axis, in the unit of the residuals. `relative` and `correlation` are those of pairs closer
+    than `near` (m), None where there is none; `functions` are None for an axis without a covariance that falls with
+    distance. `moran`, its `p` per axis and `p_joint` of the larger one are of each point with its nearest neighbours;
+    `critical` is what chance exceeds one time in twenty. They are None for too few points.
+    """
+
+    unit: str
+    n: int
+    given: int
+    near: float | None
+    pairs_near: int
+    mean: Pair
+    mean_p: Pair | None
+    absolute: Pair
+    relative: Pair | None
+    correlation: Pair | None
+    classes: tuple[DistanceClass, ...]
+    functions: tuple[CovarianceFunction | None, CovarianceFunction | None]
+    moran: Pair | None
+    p: Pair | None
+    p_joint: float | None
+    critical: float | None
+
+    @property
+    def verdict(self) -> str:
+        """``systematic``, ``none found`` or ``too few points``."""
+        if self.p_joint is None:
+            return "too few points"
+        return "systematic" if self.p_joint < SIGNIFICANCE else "none found"
+
+    @property
+    def statement(self) -> str:
+        """The verdict in words, with what it rests on."""
+        return " ".join(_sentences(self))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the section of the report (docs/report.schema.json)."""
+        return {
+            "unit": self.unit,
+            "n": self.n,
+            "near_m": self.near,
+            "pairs_near": self.pairs_near,
+            "mean": list(self.mean),
+            "mean_p": self.mean_p and list(self.mean_p),
+            "absolute": list(self.absolute),
+            "relative": self.relative and list(self.relative),
+            "correlation": self.correlation and list(self.correlation),
+            "classes": [one.to_json() for one in self.classes],
+            "functions": [one and one.to_json() for one in self.functions],
+            "moran": self.moran and list(self.moran),
+            "p": self.p and list(self.p),
+            "p_joint": self.p_joint,
+            "critical": self.critical,
+            "verdict": self.verdict,
+            "statement": self.statement,
+        }
+
+
+def analyse(
+    xy: ArrayLike,
+    residuals: ArrayLike,
+    *,
+    near: float | None = None,
+    classes: Sequence[float] | None = None,
+    design: ArrayLike | None = None,
+    draws: int = 999,
+    unit: str = "m",
+) -> CovarianceAnalysis:
+    """Analyse the residuals ``(N, 2)`` of points at ``xy (N, 2)`` metres; rows with NaN are left out.
+
+    Parameters
+    ----------
+    near : float, optional
+        Distance (m) below which points are neighbours; by default that at which there are as many pairs as points.
+    classes : sequence of float, optional
+        Edges (m) of the classes of distance; by default 0, `near`, and on in classes of equally many pairs.
+    design : array (N, 2, P), optional
+        Partials of the residuals by the parameters that were adjusted to these points; a mean per axis without it.
+    unit : str
+        Unit of the residuals, for the words.
+
+    Raises
+    ------
+    InputError
+        If the arrays do not belong together, or a distance is not positive.
+    """
+    where, values, partials, given = _usable(xy, residuals, design)
+    absolute, mean = (np.sqrt((values**2).mean(axis=0)), values.mean(axis=0)) if given else (np.zeros(2), np.zeros(2))
+    i, j = np.triu_indices(len(values), 1)
+    distance = np.hypot(*(where[i] - where[j]).T)
+    near = _default_near(distance, len(values)) if near is None else _positive(near)
+    edges = _edges(distance, near) if classes is None else _checked_edges(classes)
+    products, halves = _pair_values(values, i, j)
+    variance = ((values - mean) ** 2).mean(axis=0) if given else np.ones(2)
+    close = distance <= near if near is not None else np.zeros(len(distance), dtype=bool)
+    some = bool(close.any())
+    tested = _test(where, values, partials, draws)
+    return CovarianceAnalysis(
+        unit=unit,
+        n=len(values),
+        given=given,
+        near=near,
+        pairs_near=int(close.sum()),
+        mean=_pair(mean),
+        mean_p=_mean_p(values),
+        absolute=_pair(absolute),
+        relative=_pair(np.sqrt(halves[close].mean(axis=0))) if some else None,
+        correlation=_pair(_ratio(products[close].mean(axis=0), variance)) if some else None,
+        classes=_classes(distance, products, halves, variance, edges),
+        functions=(_function(distance, halves[:, 0]), _function(distance, halves[:, 1])),
+        moran=tested and tested[0],
+        p=tested and tested[1],
+        p_joint=tested and tested[2],
+        critical=tested and tested[3],
+    )
+
+
+def analyse_fit(fit: Fit, *, near: float | None = None) -> dict[str, CovarianceAnalysis | None]:
+    """Analyse the residuals of a fit on the ground (m, x and y of the model's CRS), control and check apart.
+
+    Returns
+    -------
+    dict
+        ``control`` (points that were used) and ``check``, each None where there is no such point.
+    """
+    points = fit.points
+    if not len(points):
+        return {"control": None, "check": None}
+    shifts = in_metres(fit, fit.residuals)
+    where = _on_the_ground(fit)
+    return {
+        "control": analyse(where[fit.used], shifts[fit.used], near=near, design=_design(fit)[fit.used])
+        if fit.used.any()
+        else None,
+        "check": analyse(where[points.check], shifts[points.check], near=near) if points.check.any() else None,
+    }
+
+
+def _on_the_ground(fit: Fit) -> Array:
+    """Return east and north (m) of the points in the horizon of the first."""
+    ground = with_reference_height(fit.model, fit.points.ground)
+    geographic = ground_transform(fit.points.crs, "EPSG:4979")(ground)
+    known = np.isfinite(geographic).all(axis=1)
+    where = np.full((len(ground), 2), np.nan)
+    if known.any():
+        # The first point, for longitudes have no mean across the antimeridian.
+        where[known] = horizon_from_geodetic(geographic[known], geographic[known][0])[0][:, :2]
+    return where
+
+
+def _design(fit: Fit) -> Array:
+    """Return how the parameters move residuals on the ground (m), ``(N, 2, P)``."""
+    plan, _ = metre_partials(fit.model, fit.points.ground)
+    partials = fit.model.param_partials(with_reference_height(fit.model, fit.points.ground))
+    solved = np.full(partials.shape, np.nan)
+    regular = np.isfinite(plan).all(axis=(1, 2)) & (np.abs(np.linalg.det(np.nan_to_num(plan))) > 0)
+    solved[regular] = np.linalg.solve(plan[regular], partials[regular])
+    return solved
+
+
+def _usable(xy: ArrayLike, residuals: ArrayLike, design: ArrayLike | None) -> tuple[Array, Array, Array, int]:
+    """Return positions, residuals and design of the points that have all, at most `MOST_POINTS`, and how many had."""
+    where, values = np.asarray(xy, dtype=np.float64), np.asarray(residuals, dtype=np.float64)
+    if where.ndim != 2 or where.shape[1:] != (2,) or where.shape != values.shape:
+        raise InputError(f"positions and residuals are both (N, 2), not {where.shape} and {values.shape}")
+    mean = np.broadcast_to(np.eye(2), (len(values), 2, 2))
+    partials = mean if design is None else np.asarray(design, dtype=np.float64)
+    if partials.ndim != 3 or partials.shape[:2] != values.shape:
+        raise InputError(f"a design of {counted(len(values), 'point')} is (N, 2, P), not {partials.shape}")
+    whole = np.isfinite(where).all(axis=1) & np.isfinite(values).all(axis=1) & np.isfinite(partials).all(axis=(1, 2))
+    rows = np.flatnonzero(whole)
+    given = len(rows)
+    if given > MOST_POINTS:
+        rows = np.sort(np.random.default_rng(0).choice(rows, MOST_POINTS, replace=False))
+    return where[rows], values[rows], partials[rows], given
+
+
+def _positive(near: float) -> float:
+    if not (math.isfinite(near) and near > 0):
+        raise InputError(f"neighbours are closer than a positive distance, not {near!r}", field="near")
+    return float(near)
+
+
+def _checked_edges(classes: Sequence[float]) -> Array:
+    edges = np.asarray(classes, dtype=np.float64)
+    if edges.ndim != 1 or len(edges) < 2 or not np.isfinite(edges).all() or (np.diff(edges) <= 0).any() or edges[0] < 0:
+        raise InputError("the edges of classes are ascending distances from 0 on", field="classes")
+    return edges
+
+
+# -- pairs -----------------------------------------------------------------------------------------------------------
+
+
+def _pair_values(values: Array, i: NDArray[Any], j: NDArray[Any]) -> tuple[Array, Array]:
+    """Return of each pair the product about the mean and half the squared difference, both ``(pairs, 2)``."""
+    about = values - values.mean(axis=0) if len(values) else values
+    return about[i] * about[j], (values[i] - values[j]) ** 2 / 2
+
+
+def _default_near(distance: Array, count: int) -> float | None:
+    """Return the distance, rounded up to two digits, below which there are as many pairs as points (at least ten)."""
+    wanted = max(count, 10)
+    if len(distance) < wanted:
+        return None
+    reach = float(np.partition(distance, wanted - 1)[wanted - 1])
+    if reach <= 0:
+        return None
+    step = 10.0 ** (math.floor(math.log10(reach)) - 1)
+    # Rounded, for steps below one would leave 0.30000000000000004.
+    return float(f"{math.ceil(reach / step - 1e-9) * step:.6g}")
+
+
+def _edges(distance: Array, near: float | None) -> Array:
+    if near is None or not len(distance):
+        return np.zeros(0)
+    beyond = np.sort(distance[distance > near])
+    count = min(_MOST_CLASSES - 1, len(beyond) // _PAIRS_PER_CLASS)
+    cuts = beyond[np.linspace(0, len(beyond) - 1, count + 1).round().astype(int)[1:]] if count else beyond[-1:]
+    return np.unique(np.concatenate([[0.0, near], cuts]))
+
+
+def _classes(
+    distance: Array, products: Array, halves: Array, variance: Array, edges: Array
+) -> tuple[DistanceClass, ...]:
+    found: list[DistanceClass] = []
+    for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        # The first class has its lower edge: two points may lie at one place.
+        within = (distance <= high) & ((distance > low) if found or low > 0 else (distance >= low))
+        if within.any():
+            found.append(
+                DistanceClass(
+                    low, high, float(distance[within].mean()), int(within.sum()),
+                    _pair(_ratio(products[within].mean(axis=0), variance)), _pair(np.sqrt(halves[within].mean(axis=0))),
+                )
+            )  # fmt: skip
+    return tuple(found)
+
+
+def _ratio(products: Array, variance: Array) -> Array:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(variance > 0, products / variance, 0.0)
+
+
+def _pair(values: Array) -> Pair:
+    return float(values[0]), float(values[1])
+
+
+def _mean_p(values: Array) -> Pair | None:
+    """Return the chance per axis of so large a mean, were the errors independent and zero on average (t test)."""
+    count = len(values)
+    if count < FEWEST_POINTS:
+        return None
+    _, p = student_of(values.mean(axis=0), np.diag(values.var(axis=0, ddof=1) / count), count - 1)
+    return _pair(np.nan_to_num(p, nan=1.0))
+
+
+# -- the covariance function -----------------------------------------------------------------------------------------
+
+
+def _function(distance: Array, halves: Array) -> CovarianceFunction | None:
+    """Fit noise, shared part and range to the semivariances of pairs, in classes up to three quarters of the longest.
+
+    Weights are the number of pairs over the squared semivariance (Cressie). For a given range the model is linear in
+    both variances, so that only the range is searched for. Returns None where nothing falls with distance.
+    """
+    if len(distance) < 3 * _PAIRS_PER_CLASS or not halves.any():
+        return None
+    reach = 0.75 * float(distance.max())
+    order = np.argsort(distance)
+    order = order[distance[order] <= reach]
+    parts = np.array_split(order, min(30, max(len(order) // _PAIRS_PER_CLASS, 3)))
+    at, seen = (np.array([values[part].mean() for part in parts]) for values in (distance, halves))
+    pairs = np.array([len(part) for part in parts], dtype=np.float64)
+    weight = pairs / np.maximum(seen, 1e-12 * seen.max()) ** 2
+    best = None
+    for _ in range(4):
+        best = _best_range(at, seen, weight, reach)
+        model = best[0] + best[1] * -np.expm1(-at / best[2])
+        weight = pairs / np.maximum(model, 1e-9 * seen.max()) ** 2
+    noise, shared, length = best or (0.0, 0.0, 0.0)
+    return CovarianceFunction(math.sqrt(noise), math.sqrt(shared), length) if shared > 0 else None
+
+
+def _best_range(at: Array, seen: Array, weight: Array, reach: float) -> tuple[float, float, float]:
+    """Search the range on ever finer grids of its logarithm; return both variances and it."""
+    low, high = math.log(max(0.2 * at[0], 1e-4 * reach)), math.log(reach)
+    for _ in range(5):
+        grid = np.linspace(low, high, 25)
+        rise = -np.expm1(-at / np.exp(grid)[:, None])
+        noise, shared = _two_variances(rise, seen, weight)
+        misfit = (weight * (seen - noise[:, None] - shared[:, None] * rise) ** 2).sum(axis=1)
+        best = int(np.argmin(misfit))
+        low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+    return float(noise[best]), float(shared[best]), math.exp(grid[best])
+
+
+def _two_variances(rise: Array, seen: Array, weight: Array) -> tuple[Array, Array]:
+    """Solve ``seen = noise + shared * rise`` for rows of `rise`, by weighted least squares with both not negative."""
+    share = weight / weight.sum()
+    mean_rise, mean_seen = rise @ share, float(seen @ share)
+    about = rise - mean_rise[:, None]
+    spread = (about**2) @ share
+    shared = np.maximum(_ratio((about * (seen - mean_seen)) @ share, spread), 0.0)
+    noise = mean_seen - shared * mean_rise
+    alone = _ratio((rise * seen) @ share, (rise**2) @ share)
+    return np.maximum(noise, 0.0), np.where(noise < 0, alone, shared)
+
+
+# -- the test --------------------------------------------------------------------------------------------------------
+
+
+def _test(where: Array, values: Array, design: Array, draws: int) -> tuple[Pair, Pair, float, float] | None:
+    """Return Moran's I, its p per axis and of the larger one, and the critical value; None for too few points."""
+    count = len(values)
+    basis = _basis(design)
+    if count < FEWEST_POINTS or 2 * count - basis.shape[1] < FEWEST_POINTS:
+        return None
+    pairs = _nearest(where)
+    seen = _moran(_projected(values[None], basis), *pairs)[0]
+    random = np.random.default_rng(0)
+    drawn = [
+        _moran(_projected(values[random.permuted(np.tile(np.arange(count), (size, 1)), axis=1)], basis), *pairs)
+        for size in [len(part) for part in np.array_split(np.arange(draws), max(1, draws * count // 200_000))]
+    ]
+    null = np.concatenate(drawn)
+    hair = 1e-12
+    p = (1 + (null >= seen - hair).sum(axis=0)) / (1 + draws)
+    largest = null.max(axis=1)
+    joint = (1 + (largest >= seen.max() - hair).sum()) / (1 + draws)
+    return _pair(seen), _pair(p), float(joint), float(np.quantile(largest, 1 - SIGNIFICANCE))
+
+
+def _basis(design: Array) -> Array:
+    """Return orthonormal columns ``(2 N, rank)`` that span what the adjustment takes out of residuals."""
+    if not design.size:
+        return np.zeros((2 * len(design), 0))
+    rows = design.reshape(-1, design.shape[2])
+    scale = np.linalg.norm(rows, axis=0)
+    left, singular, _ = np.linalg.svd(rows / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    return np.asarray(left[:, singular > 1e-10 * singular[0]])
+
+
+def _projected(values: Array, basis: Array) -> Array:
+    """Return residuals ``(K, N, 2)`` as the adjustment would leave them."""
+    rows = values.reshape(len(values), -1)
+    return np.asarray((rows - (rows @ basis) @ basis.T).reshape(values.shape))
+
+
+def _nearest(where: Array) -> tuple[NDArray[Any], NDArray[Any]]:
+    from scipy.spatial import cKDTree
+
+    # With several points at one place, the nearest is not always the point itself.
+    _, found = cKDTree(where).query(where, k=NEIGHBOURS + 1)
+    first = np.repeat(np.arange(len(where)), NEIGHBOURS + 1)
+    second = np.asarray(found).ravel()
+    other = first != second
+    return first[other], second[other]
+
+
+def _moran(values: Array, first: NDArray[Any], second: NDArray[Any]) -> Array:
+    """Return Moran's I per axis ``(K, 2)`` of K sets of residuals ``(K, N, 2)``."""
+    about = values - values.mean(axis=1, keepdims=True)
+    return _ratio((about[:, first] * about[:, second]).mean(axis=1), (about**2).mean(axis=1))
+
+
+# -- words -----------------------------------------------------------------------------------------------------------
+
+
+def _sentences(found: CovarianceAnalysis) -> list[str]:
+    if found.moran is None or found.critical is None:
+        return [
+            f"{counted(found.n, 'point')}: too few to tell a systematic error from chance (it takes "
+            f"{FEWEST_POINTS} points, and {FEWEST_POINTS} observations more than parameters)."
+        ]
+    alike = "{:+.2f} in x and {:+.2f} in y".format(*found.moran)
+    chance = f"chance alone gives more than {found.critical:+.2f} one time in {round(1 / SIGNIFICANCE)}"
+    begin = "Systematic errors remain" if found.verdict == "systematic" else "No systematic error was found"
+    said = [f"{begin}: residuals are correlated with those of the {NEIGHBOURS} nearest points by {alike}; {chance}."]
+    if found.verdict != "systematic" and found.n < _SHARP:
+        said.append(f"With {found.n} points only a strong one would show.")
+    if found.relative is not None:
+        numbers = "{:.2f} and {:.2f}".format(*found.relative), "{:.2f} and {:.2f}".format(*found.absolute)
+        said.append(
+            f"Points closer than {found.near:g} m are accurate to each other to {numbers[0]} {found.unit} "
+            f"({counted(found.pairs_near, 'pair')}), all to {numbers[1]} {found.unit}."
+        )
+    if found.mean_p and min(found.mean_p) < SIGNIFICANCE / 2:
+        off = "{:+.2f} and {:+.2f}".format(*found.mean)
+        said.append(f"On average they are off by {off} {found.unit}, more than chance explains.")
+    return [text.replace(" -", " −") for text in said]

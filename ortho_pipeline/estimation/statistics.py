@@ -1,0 +1,51 @@
+r"""Statistics of estimated parameters, from their values and covariance.
+
+- total correlation of parameter k: :math:`\sqrt{1 - 1 / (C_{kk} (C^{-1})_{kk})}`, its multiple correlation with all
+  others; 1 is a parameter whose effect the group of the others can take over;
+- Student test of the hypothesis that the parameter is zero: :math:`t_k = x_k / \sigma_k`, two-sided.
+
+Source: section 3.3 of Bueyueksalih et al. (OrbView-3), after Jacobsen (RAPORIO).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ortho_pipeline.geodesy.ellipsoid import Array
+
+
+def correlation_of(covariance: Array) -> Array:
+    """Return the correlation matrix ``(P, P)`` of a covariance matrix; NaN for what has no variance."""
+    sigma = np.sqrt(np.diag(covariance))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        correlation = covariance / sigma / sigma[:, None]
+    np.fill_diagonal(correlation, 1.0)
+    return np.clip(correlation, -1.0, 1.0)
+
+
+def total_correlation_of(covariance: Array) -> Array:
+    """Return the multiple correlation ``(P,)`` of each parameter with all others; NaN for what has no variance."""
+    correlation = correlation_of(covariance)
+    if not len(correlation):
+        return np.zeros(0)
+    if not np.isfinite(correlation).all():
+        return np.full(len(correlation), np.nan)
+    # Correlation matrices of poor solutions are singular to working precision: their total correlations are 1.
+    values, vectors = np.linalg.eigh(correlation)
+    inverse = (vectors**2 / np.maximum(values, 1e-15)) @ np.ones(len(values))
+    return np.sqrt(np.clip(1.0 - 1.0 / np.maximum(inverse, 1.0), 0.0, 1.0))
+
+
+def student_of(values: Array, covariance: Array, degrees_of_freedom: float) -> tuple[Array, Array]:
+    """Return t and two-sided p ``(P,)`` of the hypotheses that parameters are zero.
+
+    Without redundancy (0 degrees of freedom) the covariance is a priori, and the normal distribution is taken.
+    """
+    if not len(values):
+        return np.zeros(0), np.zeros(0)
+    from scipy.special import ndtr, stdtr  # scipy.stats would take most of the start-up of a command
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = values / np.sqrt(np.diag(covariance))
+    tail = stdtr(degrees_of_freedom, -np.abs(ratio)) if degrees_of_freedom > 0 else ndtr(-np.abs(ratio))
+    return ratio, np.asarray(2 * tail)

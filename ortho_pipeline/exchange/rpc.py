@@ -1,0 +1,505 @@
+"""RPC in and out: side-cars, tags, GDAL's metadata domain, and RPC fitted to any model.
+
+GDAL's transformer and this package agree to rounding: an RPC at its own offsets gives (SAMP_OFF + 0.5, LINE_OFF + 0.5).
+The text formats are in `ortho_pipeline.exchange.rpc_files`.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+import os
+import re
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from osgeo import gdal
+
+from ortho_pipeline import files
+from ortho_pipeline.errors import InputError, ModelError
+from ortho_pipeline.exchange.rpc_files import (
+    TEXT_SUFFIXES,
+    read_rpc_text,
+    rpc_metadata,
+    rpc_of_fields,
+    write_rpb,
+    write_rpc_txt,
+)
+from ortho_pipeline.files.locations import VsiPath, place
+from ortho_pipeline.geodesy.crs import GroundTransform
+from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.models.correction import ImageCorrection
+from ortho_pipeline.models.rational import RPC, rpc_terms
+from ortho_pipeline.models.rpc_box import has_pole
+from ortho_pipeline.raster.output import close, raster_output
+from ortho_pipeline.raster.source import open_dataset
+
+__all__ = [
+    "RpcExport",
+    "export_rpc",
+    "fit_rpc",
+    "has_rpc",
+    "name_sources_relatively",
+    "read_rpc",
+    "rpc_metadata",
+    "rpc_of_dataset",
+    "write_rpb",
+    "write_rpc_txt",
+    "write_tagged_copy",
+    "write_vrt",
+]
+
+#: Tag and side-car that differ by more than this at the centre (pixels) are not the same model.
+DISAGREEMENT = 1.0
+#: A fitted RPC that is off by more than the first is reported, by more than the second refused (pixels).
+WARN_ERROR, REFUSE_ERROR = 0.02, 0.1
+#: Weight of the penalty on the size of the normalised coefficients in `fit_rpc`, relative to one observation.
+TIKHONOV = 1e-7
+log = logging.getLogger(__name__)
+
+
+# -- reading ---------------------------------------------------------------------------------------------------------
+
+
+def read_rpc(path: str | PathLike[str]) -> RPC:
+    """Read the RPC in a file: RPC text, RPB, DIMAP or DigitalGlobe XML, OTB keyword list, or a raster that has one.
+
+    Raises
+    ------
+    InputError
+        If there is none in it, or a field is missing or wrong.
+    """
+    path = path if isinstance(path, VsiPath) else Path(path)
+    if path.suffix.lower() in TEXT_SUFFIXES or _begins_like_rpc(path):
+        return read_rpc_text(path)
+    return rpc_of_dataset(open_dataset(path))[0]
+
+
+def has_rpc(dataset: gdal.Dataset) -> bool:
+    """Tell whether GDAL found an RPC for this dataset, in it or beside it, readable or not."""
+    try:
+        return bool(dataset.GetMetadata("RPC"))
+    except RuntimeError:
+        return True
+
+
+def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = None) -> tuple[RPC, str]:
+    """Return the RPC of an open dataset and the name of the file or tag that it comes from.
+
+    Parameters
+    ----------
+    dataset : gdal.Dataset
+    choice : {None, 'tag', 'sidecar'} or path
+        Which RPC to take where there are several. GDAL takes a side-car before a tag without a word; here that is so
+        only if they agree within a pixel at the centre of the scene.
+
+    Raises
+    ------
+    InputError
+        If there is no RPC, it is damaged, the chosen one is absent, or tag and side-car disagree.
+    """
+    name = dataset.GetDescription()
+    if choice is not None and str(choice) not in ("tag", "sidecar"):
+        return read_rpc(choice), os.fspath(choice)
+    tag, sidecar = _own_fields(dataset), None
+    fields = _fields_beside(dataset)
+    beside = _sidecar_files(dataset)
+    if fields and (fields != tag or any(_is_rpc_file(file) for file in beside)):
+        sidecar = fields, _sidecar_source(fields, beside, name)
+    if choice == "sidecar":
+        tag = {}
+    elif choice == "tag":
+        sidecar = None
+    if sidecar and tag:
+        _check_agreement(rpc_of_fields(sidecar[0], sidecar[1]), rpc_of_fields(tag, name), sidecar[1], name)
+    if sidecar:
+        return rpc_of_fields(*sidecar), sidecar[1]
+    if tag:
+        return rpc_of_fields(tag, name), f"{name} ({_own_kind(dataset)})"
+    what = "RPC" if choice is None else {"tag": "RPC tag", "sidecar": "RPC side-car file"}[str(choice)]
+    damaged = ", ".join(_unreadable_beside(place(name))) if choice != "tag" else ""
+    raise InputError(
+        f"there is no {what}" + (f" that can be read: {damaged} is damaged or encrypted" if damaged else ""),
+        file=name, field="--rpc", remedy="give the RPC file with --rpc FILE",
+    )  # fmt: skip
+
+
+def _begins_like_rpc(path: Path | VsiPath) -> bool:
+    head = files.read_bounded(path, 20_000).lower()
+    return b"\0" not in head and b"<vrtdataset" not in head and (b"line_off" in head or b"lineoffset" in head)
+
+
+def _fields_beside(dataset: gdal.Dataset) -> dict[str, str]:
+    """Return the RPC domain as GDAL has it, which prefers side-cars; nothing where one is damaged or encrypted."""
+    try:
+        return dict(dataset.GetMetadata("RPC") or {})
+    except RuntimeError:
+        return {}
+
+
+def _unreadable_beside(path: Path) -> list[str]:
+    """Return the names of files that ought to hold the RPC of an image, by their names."""
+    if not path.parent.is_dir():
+        return []
+    return sorted(file.name for file in path.parent.iterdir() if file.stem.startswith(path.stem) and _is_rpc_file(file))
+
+
+def _own_fields(dataset: gdal.Dataset) -> dict[str, str]:
+    """Return the RPC domain of the file itself, without what lies beside it."""
+    name = dataset.GetDescription()
+    if not place(name).is_file() or dataset.GetDriver().ShortName == "VRT":
+        return dict(dataset.GetMetadata("RPC") or {})
+    return dict(open_dataset(place(name), siblings=False).GetMetadata("RPC") or {})
+
+
+def _own_kind(dataset: gdal.Dataset) -> str:
+    driver = dataset.GetDriver().ShortName
+    return {"GTiff": "TIFF tag", "COG": "TIFF tag", "VRT": "VRT metadata"}.get(driver, f"{driver} metadata")
+
+
+def files_of(dataset: gdal.Dataset) -> list[str]:
+    """Return the files that GDAL takes a dataset to consist of: itself alone where a side-car cannot be read."""
+    try:
+        return list(dataset.GetFileList() or [])
+    except RuntimeError:
+        return [dataset.GetDescription()]
+
+
+def _sidecar_files(dataset: gdal.Dataset) -> list[Path]:
+    if dataset.GetDriver().ShortName == "VRT":
+        return []
+    own = os.path.normpath(dataset.GetDescription())
+    return [place(file) for file in files_of(dataset) if os.path.normpath(file) != own]
+
+
+def _is_rpc_file(path: Path) -> bool:
+    return bool(re.search(r"rpc[^/]*\.(txt|xml)$|\.rpb$|\.rpc$", path.name, re.IGNORECASE))
+
+
+def _sidecar_source(fields: dict[str, str], beside: list[Path], name: str) -> str:
+    for path in sorted(beside, key=lambda path: not _is_rpc_file(path)):
+        if path.suffix.lower() in TEXT_SUFFIXES:
+            try:
+                found, used = read_rpc_text(path), rpc_of_fields(fields, name)
+            except InputError:
+                continue
+            # GDAL moves the RPC of a tile of a mosaic, so only what it leaves alone is compared.
+            if np.allclose(found.row_num, used.row_num, rtol=1e-12, atol=0.0):
+                return os.fspath(path)
+    likely = [path for path in beside if _is_rpc_file(path) or path.name.endswith(".aux.xml")] or beside
+    return ", ".join(map(os.fspath, likely)) or f"{name} (metadata)"
+
+
+def _check_agreement(sidecar: RPC, tag: RPC, sidecar_name: str, name: str) -> None:
+    centre = np.array([[tag.lon_off, tag.lat_off, tag.h_off]])
+    difference = float(np.abs(sidecar.ground_to_image(centre) - tag.ground_to_image(centre)).max())
+    if not difference <= DISAGREEMENT:
+        apart = f"by {difference:.1f} px" if np.isfinite(difference) else "completely"
+        raise InputError(
+            f"the RPC of the file and that of {sidecar_name} differ {apart} at the centre of the scene",
+            file=name,
+            field="--rpc",
+            remedy="choose one: --rpc tag, --rpc sidecar, or --rpc FILE",
+        )
+
+
+# -- writing ---------------------------------------------------------------------------------------------------------
+
+
+def write_vrt(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> None:
+    """Write a VRT of `dataset` that carries `rpc`, so that any GDAL program uses it.
+
+    GCPs are left out, because GDAL prefers them to an RPC. The source is named relative to the VRT.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written.
+    ModelError
+        If the file does not give the same RPC again.
+    """
+    with raster_output(path) as temporary:
+        copy = gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), dataset)
+        copy.SetGCPs([], "")
+        copy.SetMetadata(rpc_metadata(rpc), "RPC")
+        close(copy)
+        name_sources_relatively(temporary, Path(path))
+        _check_written(gdal.OpenEx(os.fspath(temporary), gdal.OF_RASTER, allowed_drivers=["VRT"]), rpc, path)
+
+
+def name_sources_relatively(vrt: Path, final: Path) -> None:
+    """Let a VRT, whose final place is `final`, name its sources relative to itself."""
+    from defusedxml import ElementTree
+
+    root = ElementTree.fromstring(vrt.read_bytes())
+    folder = final.resolve().parent
+    for source in root.iter("SourceFilename"):
+        if source.get("relativeToVRT") != "1" and source.text and Path(source.text).is_file():
+            source.text = os.path.relpath(Path(source.text).resolve(), folder)
+            source.set("relativeToVRT", "1")
+    vrt.write_bytes(ElementTree.tostring(root))
+
+
+def write_tagged_copy(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> None:
+    """Write a lossless GeoTIFF copy of `dataset` with `rpc` in its TIFF tag.
+
+    Bands, nodata, mask, palette and colour interpretation are kept; GCPs are left out, because GDAL prefers them to
+    an RPC.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written, or an RPC side-car lies there that would override the tag.
+    ModelError
+        If the copy does not give the same RPC again.
+    """
+    stale = [file for file in _sidecar_names(Path(path)) if file.exists()]
+    if stale:
+        raise InputError("this RPC file would override the tag of the copy", file=stale[0], remedy="remove it")
+    with raster_output(path) as temporary:
+        view = gdal.GetDriverByName("VRT").CreateCopy("", dataset)
+        view.SetGCPs([], "")
+        view.SetMetadata(rpc_metadata(rpc), "RPC")
+        options = ["COMPRESS=DEFLATE", "TILED=YES", "BIGTIFF=IF_SAFER"]
+        close(gdal.GetDriverByName("GTiff").CreateCopy(os.fspath(temporary), view, options=options))
+        _check_written(open_dataset(temporary, siblings=False), rpc, path)
+
+
+def _sidecar_names(path: Path) -> list[Path]:
+    return [path.with_name(path.stem + end) for end in ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", ".RPC", ".rpc")]
+
+
+def _check_written(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> None:
+    written = rpc_of_fields(dataset.GetMetadata("RPC") or {}, path)
+    ground = _box_grid(*_domain_box(rpc), (5, 5, 3))
+    worst = np.nanmax(np.abs(written.ground_to_image(ground) - rpc.ground_to_image(ground)))
+    if not worst < 1e-6 or dataset.GetGCPCount():
+        raise ModelError(f"the RPC that was written is off by {worst:g} px when it is read again", file=path)
+
+
+# -- RPC of any model ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RpcExport:
+    """An RPC that stands for another model.
+
+    Parameters
+    ----------
+    rpc : RPC
+    exact : bool
+        Whether it is the same function of the ground, up to rounding.
+    max_error_px : float
+        Largest difference of the two on an independent grid; 0 where exact.
+    warnings : tuple of str
+    """
+
+    rpc: RPC
+    exact: bool
+    max_error_px: float
+    warnings: tuple[str, ...] = ()
+
+
+def export_rpc(
+    model: SensorModel,
+    *,
+    box: tuple[float, float, float, float] | None = None,
+    height_range: tuple[float, float] | None = None,
+    force: bool = False,
+) -> RpcExport:
+    """Return `model` as an RPC: exactly where that can be, fitted where not.
+
+    A shift and a scale per axis enter the offsets and scales of an RPC exactly. A cross term (column into row) enters
+    the numerators exactly where both denominators are equal. Everything else is fitted (`fit_rpc`).
+
+    Parameters
+    ----------
+    model : SensorModel
+    box : (xmin, ymin, xmax, ymax), optional
+        Longitudes and latitudes (degrees) of the region to fit; the domain of the model if not given.
+    height_range : (lo, hi), optional
+        Ellipsoidal heights (m) of the same.
+    force : bool
+        Accept a fit that is off by more than 0.1 px.
+
+    Raises
+    ------
+    InputError, ModelError
+        As `fit_rpc`.
+    """
+    exact = _folded(model)
+    if exact is not None:
+        return RpcExport(exact, True, 0.0)
+    default_box, default_range = _domain_box(model)
+    return fit_rpc(model, box or default_box, height_range or default_range, force=force)
+
+
+def _folded(model: SensorModel) -> RPC | None:
+    """Return the RPC that equals `model`, None if there is none."""
+    if isinstance(model, RPC):
+        return model
+    inner = _folded(model.model) if isinstance(model, ImageCorrection) else None
+    if inner is None or not isinstance(model, ImageCorrection):
+        return None
+    matrix, offset = model.matrix, model.offset
+    crossed = matrix[0, 1] != 0.0 or matrix[1, 0] != 0.0
+    if crossed and not np.array_equal(inner.col_den, inner.row_den):
+        return None
+    off = matrix @ [inner.col_off, inner.row_off] + offset
+    changes: dict[str, Any] = {"col_off": float(off[0]), "row_off": float(off[1])}
+    if crossed:
+        ratio = inner.row_scale / inner.col_scale
+        changes["col_num"] = matrix[0, 0] * inner.col_num + matrix[0, 1] * ratio * inner.row_num
+        changes["row_num"] = matrix[1, 0] / ratio * inner.col_num + matrix[1, 1] * inner.row_num
+    else:
+        changes["col_scale"] = float(matrix[0, 0]) * inner.col_scale
+        changes["row_scale"] = float(matrix[1, 1]) * inner.row_scale
+    return inner._replace(**changes)
+
+
+def fit_rpc(
+    model: SensorModel,
+    box: tuple[float, float, float, float],
+    height_range: tuple[float, float],
+    *,
+    grid: tuple[int, int, int] = (15, 15, 7),
+    force: bool = False,
+) -> RpcExport:
+    """Fit the 80 coefficients of an RPC to any model, on a grid of ground points at several heights.
+
+    The linearised equations ``num - v den = 0`` are iterated with the weight ``1 / den`` (Sanathanan and Koerner 1963)
+    and a small penalty, then verified on a grid of other points.
+
+    Parameters
+    ----------
+    model : SensorModel
+    box : (xmin, ymin, xmax, ymax)
+        Longitudes and latitudes in degrees; xmax beyond 180 for a scene across the antimeridian.
+    height_range : (lo, hi)
+        Ellipsoidal metres.
+    grid : (int, int, int)
+        Points along longitude, latitude and height.
+    force : bool
+        Accept an error of more than 0.1 px.
+
+    Raises
+    ------
+    InputError
+        If the box is empty or mostly outside of the model, or the fit is off by more than 0.1 px without `force`.
+    """
+    centre, half = _centre_and_half(box, height_range)
+    ground, image = _samples(model, box, height_range, grid)
+    middle = (image.min(axis=0) + image.max(axis=0)) / 2
+    scale = np.maximum((image.max(axis=0) - image.min(axis=0)) / 2, 1.0)
+    terms = rpc_terms(*((ground - centre) / half).T).T
+    names = ("col_off", "row_off", "lon_off", "lat_off", "h_off", "col_scale", "row_scale", "lon_scale", "lat_scale")
+    numbers = dict(zip((*names, "h_scale"), map(float, (*middle, *centre, *scale, *half)), strict=True))
+    # A box across the antimeridian may be given beyond 180 degrees; readers of RPCs want the offset within.
+    numbers["lon_off"] = math.remainder(numbers["lon_off"], 360.0)
+    (col_num, col_den), (row_num, row_den) = (_fit_ratio(terms, (image - middle)[:, k] / scale[k]) for k in (0, 1))
+    rpc = RPC(**numbers, col_num=col_num, col_den=col_den, row_num=row_num, row_den=row_den)
+    nx, ny, nh = grid
+    ground, image = _samples(model, box, height_range, (nx + 1, ny + 1, nh + 1))
+    worst = float(np.abs(rpc.ground_to_image(ground) - image).max())
+    if not worst <= REFUSE_ERROR and not force:
+        raise InputError(
+            f"an RPC stands for this model only to {worst:.3g} px",
+            remedy="fit it over a smaller box or height range, or accept the error (force)",
+        )
+    message = f"the RPC stands for the model only to {worst:.3g} px"
+    if worst > WARN_ERROR:
+        log.warning("%s", message)
+    return RpcExport(rpc, False, worst, (message,) if worst > WARN_ERROR else ())
+
+
+def _fit_ratio(terms: Array, values: Array) -> tuple[Array, Array]:
+    """Fit numerator and denominator ``(20,)`` of ``values (N,)`` on ``terms (N, 20)``.
+
+    Where the denominator gets a pole within the points, its coefficients are penalised more, in the end to a plain
+    polynomial: what a ratio cannot follow should not be followed by a ratio with a pole.
+    """
+    for damping in (TIKHONOV, 1e-4, 1e-2):
+        fitted = _iterate_ratio(terms, values, damping)
+        if fitted is not None:
+            return fitted
+    num = np.asarray(np.linalg.lstsq(terms, values, rcond=None)[0], dtype=np.float64)
+    den: Array = np.eye(20)[0]
+    return num, den
+
+
+def _iterate_ratio(terms: Array, values: Array, damping: float, iterations: int = 5) -> tuple[Array, Array] | None:
+    """Return the best of some iterations, None if the first of them has a pole in the box of the terms."""
+    system = np.column_stack([terms, -values[:, None] * terms[:, 1:], values])
+    penalty = np.sqrt(len(terms)) * np.repeat([TIKHONOV, damping], [20, 19])
+    denominator = np.ones(len(terms))
+    best: tuple[float, Array, Array] | None = None
+    for _ in range(iterations):
+        # The right side is the last column, so that R alone holds all that is needed. The penalty enters through the
+        # singular values of R: as more rows of the system it would fill the reflections with denormal numbers.
+        r: Array = np.asarray(np.linalg.qr(system / denominator[:, None], mode="r"))
+        u, size, vt = np.linalg.svd(r[:39, :39] / penalty)
+        solution: Array = vt.T @ (size / (size**2 + 1.0) * (u.T @ r[:39, 39])) / penalty
+        num, den = solution[:20], np.concatenate([[1.0], solution[20:]])
+        denominator = terms @ den
+        if has_pole(den):
+            break
+        worst = float(np.abs(terms @ num / denominator - values).max())
+        if best is None or worst < best[0]:
+            best = worst, num, den
+    return None if best is None else (best[1], best[2])
+
+
+def _samples(
+    model: SensorModel,
+    box: tuple[float, float, float, float],
+    height_range: tuple[float, float],
+    grid: tuple[int, int, int],
+) -> tuple[Array, Array]:
+    ground = _box_grid(box, height_range, grid)
+    with np.errstate(all="ignore"):
+        image = model.ground_to_image(_transform("EPSG:4979", model.crs)(ground))
+    good = np.isfinite(image).all(axis=1)
+    if good.mean() < 0.5:
+        raise InputError(
+            f"the model maps only {good.mean():.0%} of the box to be fitted into the image",
+            field="box",
+            remedy="give a box within the scene",
+        )
+    return ground[good], image[good]
+
+
+@functools.lru_cache(maxsize=8)
+def _transform(source: str, target: str) -> GroundTransform:
+    return GroundTransform(source, target)
+
+
+def _centre_and_half(box: tuple[float, float, float, float], height_range: tuple[float, float]) -> tuple[Array, Array]:
+    low = np.array([box[0], box[1], height_range[0]], dtype=np.float64)
+    high = np.array([box[2], box[3], height_range[1]], dtype=np.float64)
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and (high >= low).all() and (high > low)[:2].all()):
+        raise InputError(f"the box {box} with heights {height_range} is empty", field="box")
+    # A flat box would leave the terms in height undetermined.
+    return (low + high) / 2, np.maximum((high - low) / 2, [0.0, 0.0, 1.0])
+
+
+def _box_grid(
+    box: tuple[float, float, float, float], height_range: tuple[float, float], grid: tuple[int, int, int]
+) -> Array:
+    centre, half = _centre_and_half(box, height_range)
+    axes = [middle + reach * np.linspace(-1.0, 1.0, n) for middle, reach, n in zip(centre, half, grid, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _domain_box(model: SensorModel) -> tuple[tuple[float, float, float, float], tuple[float, float]]:
+    """Return the domain of a model as a box in longitude and latitude, and its heights."""
+    centre, half = model.domain
+    signs = np.stack(np.meshgrid(*[(-1.0, 0.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    ground = _transform(model.crs, "EPSG:4979")(centre + signs * half)
+    # Unwrapped about the middle: a scene across the antimeridian is one box.
+    lon = ground[13, 0] + np.remainder(ground[:, 0] - ground[13, 0] + 180.0, 360.0) - 180.0
+    lat = ground[:, 1]
+    return (float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())), model.height_range

@@ -1,0 +1,39 @@
+"""Files: on disk, in archives and behind URLs; read within limits, written whole or not at all.
+
+Also where compiled kernels are kept. Imports nothing above `errors`.
+"""
+
+from __future__ import annotations
+
+from ortho_pipeline.files.reading import decoded, parse_json, read_bounded, read_json, sha256, states
+from ortho_pipeline.files.whole import (
+    Outputs,
+    allowed,
+    append_line,
+    clear_up,
+    confined,
+    retire,
+    staged,
+    together,
+    whole_or_nothing,
+    write_text,
+)
+
+__all__ = [
+    "Outputs",
+    "allowed",
+    "append_line",
+    "clear_up",
+    "confined",
+    "decoded",
+    "parse_json",
+    "read_bounded",
+    "read_json",
+    "retire",
+    "sha256",
+    "staged",
+    "states",
+    "together",
+    "whole_or_nothing",
+    "write_text",
+]

@@ -1,0 +1,402 @@
+"""Files that appear whole or not at all, and files of strangers, of which no more is read than they may have.
+
+The outputs of a command appear together: each is written under a temporary name in its folder, and all get their names
+when the last is complete (`together`). The names are given by renames whose list stands in a journal, so that the next
+command for the same outputs completes what a killed one had begun, and removes what one left that had not got so far.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+import secrets
+from collections.abc import Iterable, Iterator
+from contextvars import ContextVar
+from pathlib import Path
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.reading import read_bounded
+
+#: What a temporary name has between its random part and its suffix.
+_PART = ".part"
+
+
+class Outputs:
+    """Files of one command in one folder, written under temporary names until all of them are complete.
+
+    Parameters
+    ----------
+    folder : Path
+    name : str
+        What the outputs are called together (the stem of a scene); two commands do not write outputs of one name at
+        the same time, and the next one clears up after one that was killed.
+    """
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self.folder, self.name = folder, name
+        # Temporary names are as long for every output: a final name may have all that a file system allows.
+        self.prefix = f".{hashlib.sha256(name.encode(errors='surrogateescape')).hexdigest()[:12]}."
+        self.staged: dict[Path, Path] = {}
+        #: Files of an earlier command that no longer belong to the outputs: removed when these get their names.
+        self.obsolete: list[Path] = []
+        #: Whether something else than plain text was written, beside which a driver may have put files of its own.
+        self.side_cars = False
+        self._made: list[Path] = []
+        self._lock: int | None = None
+
+    @property
+    def journal(self) -> Path:
+        """List of renames that are under way."""
+        return self.folder / f"{self.prefix}journal{_PART}"
+
+    @property
+    def _lock_path(self) -> Path:
+        return self.folder / f"{self.prefix}lock{_PART}"
+
+    # -- begin and end -----------------------------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Make the folder, lock the name, and clear up after a command that was killed."""
+        try:
+            missing = [path for path in (self.folder, *self.folder.parents) if not path.exists()]
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._made = missing
+            self._lock, killed = self._locked()
+            if killed:
+                self._recover()
+        except OSError as error:
+            self.end()
+            raise _unwritable(self.folder, error) from error
+        except InputError:
+            self.end()
+            raise
+
+    def end(self, *, failed: bool = True) -> None:
+        """Remove what is left under temporary names, and unlock; folders that were made for nothing go too."""
+        if self._lock is not None:
+            with contextlib.suppress(OSError):
+                if failed or self.side_cars:
+                    self._clear()
+                self._lock_path.unlink(missing_ok=True)
+            os.close(self._lock)
+            self._lock = None
+        for path in self._made:
+            with contextlib.suppress(OSError):
+                path.rmdir()
+
+    def _locked(self) -> tuple[int, bool]:
+        """Return a descriptor that holds the lock of this name, and whether a killed command has left its own.
+
+        The system releases a lock however the process ends; its file stays when the process is killed.
+        """
+        path = self._lock_path
+        while True:
+            killed = os.path.lexists(path)
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                os.close(descriptor)
+                raise InputError(
+                    f"another command is writing {self.name!r} in this folder", file=self.folder, field="-o",
+                    remedy="wait for its end, or choose another output folder",
+                ) from error  # fmt: skip
+            except OSError:
+                # A file system without locks: two commands on one folder do not notice each other there.
+                return descriptor, False
+            # The one that held it may have removed the file between our opening and our locking.
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(descriptor), os.stat(path, follow_symlinks=False)):
+                    return descriptor, killed
+            os.close(descriptor)
+
+    def _recover(self) -> None:
+        """Complete the renames that a killed command had begun, and remove its other temporary files."""
+        try:
+            listed = json.loads(read_bounded(self.journal, 1_000_000))
+            renames, obsolete = listed["renames"], listed["obsolete"]
+            names = [name for pair in renames for name in pair] + obsolete
+            # A journal of somebody else cannot lead out of the folder.
+            sound = all(isinstance(name, str) and Path(name).name == name for name in names) and all(
+                name.startswith(self.prefix) for name, _ in renames
+            )
+        except (InputError, ValueError, KeyError, TypeError, RecursionError):
+            sound = False
+        if sound:
+            for name, final in renames:
+                if (self.folder / name).is_file():
+                    os.replace(self.folder / name, self.folder / final)
+            for name in obsolete:
+                (self.folder / name).unlink(missing_ok=True)
+        self._clear()
+
+    def _clear(self) -> None:
+        with os.scandir(self.folder) as entries:
+            left = [entry.path for entry in entries
+                    if entry.name.startswith(self.prefix) and not entry.name.endswith(f"lock{_PART}")]  # fmt: skip
+        for path in left:
+            Path(path).unlink(missing_ok=True)
+
+    # -- one file ----------------------------------------------------------------------------------------------------
+
+    def holds(self, final: Path) -> bool:
+        """Tell whether a file belongs to these outputs."""
+        return final.parent == self.folder
+
+    def temporary(self, final: Path) -> Path:
+        """Return a new temporary path for `final`; drivers go by its suffix."""
+        suffix = final.suffix if len(final.suffix) < 40 else ""
+        if final.is_dir() or not final.name:
+            raise InputError("a folder lies where this file would be written", file=final, remedy="remove or rename it")
+        try:
+            if len(os.fsencode(final.name)) > os.pathconf(final.parent, "PC_NAME_MAX"):
+                raise InputError("this name is too long for the file system", file=final, remedy="rename the image")
+            path = self.folder / f"{self.prefix}{secrets.token_hex(4)}{_PART}{suffix}"
+            # Made at once, so that a folder that cannot be written is known before the work.
+            os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666))
+        except OSError as error:
+            raise _unwritable(self.folder, error) from error
+        return path
+
+    def put(self, temporary: Path, final: Path) -> None:
+        """Take a complete file into the outputs; a later one for the same path takes its place."""
+        _sync(temporary)
+        before = self.staged.pop(final, None)
+        if before is not None:
+            before.unlink(missing_ok=True)
+        self.staged[final] = temporary
+
+    def drop(self, temporary: Path) -> None:
+        """Remove a temporary file and the side-cars that a driver put beside it."""
+        for left in self.folder.iterdir():
+            if left.name.startswith(temporary.name):
+                left.unlink(missing_ok=True)
+
+    # -- all files ---------------------------------------------------------------------------------------------------
+
+    def commit(self) -> None:
+        """Give all files their names, and remove those that no longer belong to them."""
+        obsolete = [path for path in self.obsolete if path not in self.staged and os.path.lexists(path)]
+        renames = [(temporary.name, final.name) for final, temporary in self.staged.items()]
+        try:
+            if len(renames) + len(obsolete) > 1:
+                journal = self.journal.with_name(f"{self.prefix}{secrets.token_hex(4)}{_PART}")
+                text = json.dumps({"renames": renames, "obsolete": [path.name for path in obsolete]})
+                journal.write_text(text, encoding="utf-8", errors="surrogateescape")
+                _sync(journal)
+                os.replace(journal, self.journal)
+            for final, temporary in self.staged.items():
+                os.replace(temporary, final)
+            for path in obsolete:
+                path.unlink(missing_ok=True)
+            _sync_folder(self.folder)
+            self.journal.unlink(missing_ok=True)
+        except OSError as error:
+            raise _unwritable(self.folder, error) from error
+        if self.staged:
+            self._made = []
+
+
+#: The outputs of the command that is under way in this context.
+_under_way: ContextVar[Outputs | None] = ContextVar("_under_way", default=None)
+
+
+#: The folder that all outputs have to lie in, in this context.
+_confined: ContextVar[Path | None] = ContextVar("_confined", default=None)
+
+
+@contextlib.contextmanager
+def confined(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Let nothing be written outside of `folder` within the block, wherever symbolic links in it lead."""
+    token = _confined.set(Path(folder).resolve())
+    try:
+        yield
+    finally:
+        _confined.reset(token)
+
+
+def allowed(path: Path) -> Path:
+    """Return a path that may be written.
+
+    Raises
+    ------
+    InputError
+        If it lies outside of the folder that outputs are `confined` to, or its links lead nowhere.
+    """
+    folder = _confined.get()
+    try:
+        if folder is None or path.resolve().is_relative_to(folder):
+            return path
+    except (OSError, RuntimeError) as error:
+        raise InputError("this path leads nowhere", file=path, remedy="check its links") from error
+    raise InputError(
+        f"a symbolic link leads outside of the output folder {folder}", file=path,
+        remedy="remove the link, or choose an output folder without links",
+    )  # fmt: skip
+
+
+@contextlib.contextmanager
+def together(folder: str | os.PathLike[str], name: str) -> Iterator[Outputs]:
+    """Let all files that are written into `folder` within the block appear at once, when it ends well.
+
+    On an exception nothing appears, and files that were there before are untouched. Within a block for the same
+    folder, this is a part of it.
+
+    Parameters
+    ----------
+    name : str
+        What the outputs are called together, see `Outputs`.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written, or another command is writing outputs of this name there.
+    """
+    place = Path(folder).resolve()
+    outer = _under_way.get()
+    if outer is not None and outer.folder == place:
+        yield outer
+        return
+    outputs = Outputs(allowed(place), name)
+    outputs.begin()
+    token, failed = _under_way.set(outputs), True
+    try:
+        yield outputs
+        outputs.commit()
+        failed = False
+    finally:
+        _under_way.reset(token)
+        outputs.end(failed=failed)
+
+
+@contextlib.contextmanager
+def whole_or_nothing(path: str | os.PathLike[str], *, side_cars: bool = True) -> Iterator[Path]:
+    """Yield a temporary path beside `path`, whose file gets that name when the block ends well.
+
+    Within a block of `together` it gets its name with the others; `staged` finds it until then. The temporary file has
+    the same suffix and lies in the same folder (a rename is atomic only within a file system). On an exception it is
+    removed and a file that was at `path` before is untouched.
+
+    Parameters
+    ----------
+    side_cars : bool
+        Whether a driver may put files of its own beside the temporary one; they are removed.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written, or the disk is full.
+    """
+    final = _place(path)
+    outer = _under_way.get()
+    with contextlib.ExitStack() as stack:
+        if outer is not None and outer.holds(final):
+            outputs = outer
+        else:
+            outputs = stack.enter_context(together(final.parent, final.name))
+        outputs.side_cars |= side_cars
+        temporary = outputs.temporary(final)
+        try:
+            yield temporary
+            outputs.put(temporary, final)
+        except OSError as error:
+            outputs.drop(temporary)
+            if error.filename in (None, os.fspath(temporary)):
+                raise _unwritable(final, error) from error
+            raise
+        except BaseException:
+            outputs.drop(temporary)
+            raise
+
+
+def retire(paths: Iterable[str | os.PathLike[str]]) -> None:
+    """Let files of an earlier command go when the outputs that are under way get their names."""
+    outer = _under_way.get()
+    if outer is not None:
+        outer.obsolete += [place for place in map(_place, paths) if outer.holds(place)]
+
+
+def staged(path: str | os.PathLike[str]) -> Path:
+    """Return where the content of an output is to be found now: before it has its name, under its temporary one."""
+    outer = _under_way.get()
+    return Path(path) if outer is None else outer.staged.get(_place(path), Path(path))
+
+
+def _place(path: str | os.PathLike[str]) -> Path:
+    """Return the absolute path that a file is written to."""
+    final = Path(path)
+    try:
+        # A rename onto a symbolic link would replace the link, not what it points to.
+        return allowed(final.resolve() if final.is_symlink() else final.parent.resolve() / final.name)
+    except (OSError, RuntimeError) as error:
+        # Links that point at each other are a RuntimeError before Python 3.13.
+        raise InputError(
+            f"this path leads nowhere ({getattr(error, 'strerror', None) or error})",
+            file=path,
+            remedy="check its links",
+        ) from error
+
+
+def _unwritable(path: Path, error: OSError) -> InputError:
+    return InputError(
+        f"cannot write here ({error.strerror or error})", file=path,
+        remedy="choose a folder that you may write to and that has room",
+    )  # fmt: skip
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write `text` as UTF-8 to `path`, whole or not at all."""
+    with whole_or_nothing(path, side_cars=False) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def append_line(path: str | os.PathLike[str], line: str) -> None:
+    """Append a line to a file to which several processes may do so at once; on a full disk nothing of it is left.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    allowed(Path(path))
+    data = (line + "\n").encode("utf-8", errors="backslashreplace")
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            size = os.fstat(descriptor).st_size
+            try:
+                while data:
+                    data = data[os.write(descriptor, data) :]
+            except OSError:
+                os.ftruncate(descriptor, size)
+                raise
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise _unwritable(Path(path), error) from error
+
+
+def clear_up(path: str | os.PathLike[str]) -> None:
+    """Remove what a killed command left of a file that it was writing alone."""
+    final = _place(path)
+    if final.parent.is_dir():
+        with together(final.parent, final.name):
+            pass
+
+
+def _sync(path: Path) -> None:
+    with open(path, "rb+") as written:
+        os.fsync(written.fileno())
+
+
+def _sync_folder(folder: Path) -> None:
+    # Without this a power cut after the rename can lose the new name.
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

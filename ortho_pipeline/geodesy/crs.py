@@ -1,0 +1,590 @@
+"""Coordinate systems, height datums and the ways between them.
+
+Heights inside the package are metres above the WGS84 ellipsoid, whatever the horizontal system is: a point in the
+Belgian Lambert grid carries the same height as in WGS84. Only a vertical datum (`Vertical`) changes a height, and only
+where a file is read.
+
+Every transformation is asked for with ``only_best`` and without ballpark: PROJ otherwise leaves heights unchanged, with
+no error, where a geoid grid is not installed. PROJ's network access stays off, so that results depend on files only.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+import re
+import sys
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+from numpy.typing import ArrayLike, NDArray
+from pyproj.exceptions import CRSError, ProjError
+from pyproj.transformer import AreaOfInterest, Transformer, TransformerGroup
+
+from ortho_pipeline.errors import CrsError, DatumError, OrthoError
+from ortho_pipeline.geodesy.geoid_grid import header_fault
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+#: Where systems keep PROJ's grids; wheels of pyproj look into none of these.
+SYSTEM_FOLDERS = ("/usr/share/proj", "/usr/local/share/proj", "/opt/homebrew/share/proj", f"{sys.prefix}/share/proj")
+#: Short names of height datums on the command line.
+VERTICAL_NAMES = {"ellipsoid": "ellipsoid", "egm96": "EPSG:5773", "egm2008": "EPSG:3855", "egm84": "EPSG:5798"}
+VERTICAL_FORMS = "ellipsoid, egm96, egm2008, EPSG:n of a vertical CRS, or a geoid grid file (.gtx, .tif)"
+_GRID_SUFFIXES = {".gtx", ".tif", ".tiff", ".byn", ".isg", ".gri"}
+_WGS84_SEMI_MAJOR = 6378137.0
+#: How WKT, PROJJSON and PROJ strings begin. PROJ seeks anything else by its name, for a quarter of a second.
+_STATED = re.compile(
+    r"\s*(?:\{|[A-Za-z]\w{0,40}\s*[\[(]|\+?\s*(?:proj|init|title)\s*=|\+?\w+\s*=.*\bproj\s*=)", re.DOTALL
+)
+#: Codes, URNs and names: the longest name in PROJ's database has 106 characters.
+_NAME = re.compile(r"\s*[\w ,.:/&@'()\[\]+–-]{1,200}( = \w+)?\s*")
+
+
+def add_system_grids() -> tuple[str, ...]:
+    """Append the system's PROJ data folders to pyproj's search path; return the whole path.
+
+    The folders named by ``PROJ_DATA`` and ``PROJ_LIB`` come first, and the folder of the wheel, which holds the
+    matching ``proj.db``, stays ahead of all. Calling it again changes nothing.
+    """
+    present = pyproj.datadir.get_data_dir().split(os.pathsep)
+    named = [os.environ.get(key, "") for key in ("PROJ_DATA", "PROJ_LIB")]
+    for folder in [*os.pathsep.join(named).split(os.pathsep), *SYSTEM_FOLDERS]:
+        if folder and folder not in present and Path(folder).is_dir():
+            pyproj.datadir.append_data_dir(folder)
+            present.append(folder)
+    pyproj.network.set_network_enabled(False)
+    return tuple(present)
+
+
+add_system_grids()
+
+
+# -- coordinate systems ----------------------------------------------------------------------------------------------
+
+
+def parse_crs(text: str | pyproj.CRS) -> pyproj.CRS:
+    """Return the CRS that `text` states: ``EPSG:n``, WKT, PROJ string or a `pyproj.CRS`.
+
+    Raises
+    ------
+    CrsError
+        If it is not a coordinate system.
+    """
+    if isinstance(text, pyproj.CRS):
+        return text
+    try:
+        if isinstance(text, str) and not _STATED.match(text) and not _NAME.fullmatch(text):
+            raise ValueError("neither a name nor a form of a coordinate system")
+        return pyproj.CRS.from_user_input(text)
+    except (CRSError, ProjError, ValueError, TypeError, RecursionError) as error:
+        shown = str(text) if len(str(text)) < 80 else f"{str(text)[:80]}..."
+        raise CrsError(
+            f"{shown!r} is not a coordinate system", field="CRS", remedy="give EPSG:n, WKT or a PROJ string"
+        ) from error
+
+
+def horizontal(crs: str | pyproj.CRS) -> pyproj.CRS:
+    """Return the two-dimensional part of a compound or 3D system.
+
+    Raises
+    ------
+    CrsError
+        If the system has no horizontal part (vertical or geocentric).
+    """
+    crs = parse_crs(crs)
+    if crs.is_compound:
+        crs = crs.sub_crs_list[0]
+    if crs.is_vertical or crs.is_geocentric:
+        raise CrsError(
+            f"{crs.name!r} has no horizontal coordinates", field="CRS", remedy="give a geographic or a projected CRS"
+        )
+    return crs.to_2d() if len(crs.axis_info) > 2 else crs
+
+
+def map_crs(text: str | pyproj.CRS) -> pyproj.CRS:
+    """Return the CRS that `text` states for a map that is written to a GeoTIFF.
+
+    Raises
+    ------
+    CrsError
+        If it has no horizontal coordinates, or only PROJ knows it, so that no file could say it.
+    """
+    crs = parse_crs(text)
+    remedy = "give a geographic or a projected CRS, such as EPSG:n"
+    try:
+        plain = horizontal(crs)
+    except CrsError as error:
+        raise CrsError(error.message, field="--output-crs", remedy=remedy) from error
+    operation = plain.coordinate_operation
+    if "Derived" in plain.type_name or (operation is not None and operation.method_name.startswith("PROJ ")):
+        raise CrsError(f"a GeoTIFF cannot hold {plain.to_string()!r}", field="--output-crs", remedy=remedy)
+    return crs
+
+
+def utm_crs(lon: float, lat: float) -> pyproj.CRS:
+    """Return the WGS84 UTM zone of a position in degrees; polar stereographic (UPS) beyond 84 N and 80 S."""
+    if not (np.isfinite(lon) and np.isfinite(lat) and abs(lat) <= 90 and abs(lon) <= 540):
+        raise CrsError(f"longitude {lon}, latitude {lat} is not on Earth", field="position")
+    if lat > 84 or lat < -80:
+        return pyproj.CRS.from_epsg(5041 if lat > 0 else 5042)
+    zone = int(((lon + 180) % 360) // 6) + 1
+    return pyproj.CRS.from_epsg((32600 if lat >= 0 else 32700) + zone)
+
+
+def same_crs(first: pyproj.CRS, second: pyproj.CRS) -> bool:
+    """Tell whether two systems are one, whatever the order of their axes (x is always first here)."""
+    return bool(first == second or first.equals(second, ignore_axis_order=True))
+
+
+# -- heights ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Vertical:
+    """A height datum: ``ellipsoid``, a vertical CRS (``EPSG:n``), or a geoid grid file.
+
+    Parameters
+    ----------
+    name : str
+        One of these; make it with `parse`, which checks it.
+    """
+
+    name: str
+
+    @classmethod
+    def parse(cls, text: str | Vertical) -> Vertical:
+        """Return the height datum that `text` names (see `VERTICAL_FORMS`).
+
+        Raises
+        ------
+        DatumError
+            If it names none, or a grid file that cannot be read.
+        """
+        if isinstance(text, Vertical):
+            return text
+        plain = text.strip()
+        if plain.lower() in VERTICAL_NAMES:
+            return cls(VERTICAL_NAMES[plain.lower()])
+        if re.fullmatch(r"(?i)[a-z]+:[\d+]+", plain):
+            return _vertical_of_code(plain.upper())
+        if Path(plain).suffix.lower() in _GRID_SUFFIXES:
+            path = Path(plain)
+            found = cls(str(path.resolve()) if path.is_file() else plain)
+            _vertical_transformer(found.name)
+            return found
+        raise DatumError(f"{plain!r} is not a height datum", field="vertical", remedy=f"give {VERTICAL_FORMS}")
+
+    @property
+    def is_ellipsoid(self) -> bool:
+        """True if heights are above the ellipsoid already."""
+        return self.name == "ellipsoid"
+
+    @property
+    def label(self) -> str:
+        """Name for people."""
+        if self.is_ellipsoid:
+            return "WGS84 ellipsoid"
+        if self.name.startswith("EPSG:"):
+            return f"{pyproj.CRS.from_user_input(self.name).name} ({self.name})"
+        return f"geoid grid {Path(self.name).name}"
+
+    def undulation(self, lon: ArrayLike, lat: ArrayLike) -> Array:
+        """Return the height (m) of the datum's zero above the WGS84 ellipsoid: ``h = H + undulation``.
+
+        Parameters
+        ----------
+        lon, lat : array_like, shape (N,)
+            Position in degrees; longitude may run over 180.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            NaN where the position is NaN or outside the grid.
+
+        Raises
+        ------
+        DatumError
+            If the grid is not installed; the message names it and says how to get it.
+        """
+        lon, lat = np.broadcast_arrays(np.asarray(lon, dtype=float), np.asarray(lat, dtype=float))
+        if self.is_ellipsoid:
+            return np.where(np.isfinite(lon) & np.isfinite(lat), 0.0, np.nan)
+        transformer = _vertical_transformer(self.name)
+        try:
+            shift = np.array(transformer.transform(lon, lat, np.zeros(lon.shape))[2], dtype=float)
+        except ProjError as error:
+            raise _grid_error(self, str(error)) from error
+        shift[~np.isfinite(shift)] = np.nan
+        asked = np.isfinite(lon) & np.isfinite(lat)
+        if asked.any() and not np.isfinite(shift).any() and self.name.startswith("EPSG:"):
+            # PROJ picks among several operations per point, and answers inf, not an error, where none has its grid.
+            missing = _unavailable_grids(_compound(self.name), "EPSG:4979")
+            if missing:
+                raise _grid_error(self, f"Grid {missing[0]} is not available")
+        return shift
+
+
+def _vertical_of_code(code: str) -> Vertical:
+    try:
+        crs = pyproj.CRS.from_user_input(code)
+    except CRSError as error:
+        raise DatumError(f"{code} does not exist", field="vertical", remedy=f"give {VERTICAL_FORMS}") from error
+    if crs.is_geographic and len(crs.axis_info) == 3:
+        return Vertical("ellipsoid")
+    part = crs.sub_crs_list[1] if crs.is_compound else crs
+    authority = part.to_authority()
+    if not part.is_vertical or authority is None:
+        raise DatumError(
+            f"{code} ({crs.name}) is not a vertical CRS", field="vertical", remedy=f"give {VERTICAL_FORMS}"
+        )
+    if part.axis_info[0].direction.lower() != "up":
+        raise DatumError(f"{code} ({crs.name}) counts depths, not heights", field="vertical")
+    return Vertical(":".join(authority))
+
+
+def _compound(name: str) -> str:
+    return f"EPSG:4326+{name.removeprefix('EPSG:')}"
+
+
+@functools.lru_cache(maxsize=32)
+def _vertical_transformer(name: str) -> Transformer:
+    """Return the transformation of heights from a datum to the ellipsoid (pyproj keeps one per thread inside)."""
+    try:
+        if name.startswith("EPSG:"):
+            return Transformer.from_crs(
+                _compound(name), "EPSG:4979", always_xy=True, only_best=True, allow_ballpark=False
+            )
+        if fault := header_fault(Path(name)):
+            raise _grid_error(Vertical(name), fault)
+        if set(name) & {",", '"'}:
+            raise DatumError(
+                "PROJ cannot read a grid whose path holds a comma or a quotation mark", file=name, remedy="rename it"
+            )
+        return Transformer.from_pipeline(
+            "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
+            f'+step +proj=vgridshift +grids="{name}" +multiplier=1 '
+            "+step +proj=unitconvert +xy_in=rad +xy_out=deg"
+        )
+    except (ProjError, CRSError) as error:
+        raise _grid_error(Vertical(name), str(error)) from error
+
+
+def _grid_error(vertical: Vertical, message: str) -> DatumError:
+    if not vertical.name.startswith("EPSG:"):
+        exists = Path(vertical.name).exists()
+        return DatumError(
+            "is not a geoid grid that PROJ reads" if exists else "this geoid grid does not exist",
+            file=vertical.name,
+            field="vertical",
+            remedy="give a .gtx or GeoTIFF geoid grid, or its name if it lies in PROJ's search path",
+        )
+    grid = _grid_of_message(message)
+    if grid is None:
+        return DatumError(
+            f"there is no transformation from {vertical.label} to the ellipsoid",
+            field="vertical",
+            remedy="give the geoid grid file of this datum instead",
+        )
+    return DatumError(
+        f"heights in {vertical.label} need the geoid grid {grid}, which is not installed",
+        field="vertical",
+        remedy=_grid_remedy(grid, "or give a geoid grid file (.gtx, .tif) in place of the datum's name"),
+    )
+
+
+def _grid_of_message(message: str) -> str | None:
+    found = re.search(r"Grid (\S+) is not available", message)
+    return found.group(1) if found else None
+
+
+def _grid_remedy(grid: str, otherwise: str) -> str:
+    sync = f"`pyproj sync --file {grid}` (or `projsync --file {grid}`, both from PROJ's network)"
+    # Of the worldwide geoids Debian's package has this one alone.
+    debian = " or install Debian's proj-data," if "egm96" in grid else ""
+    return f"run {sync},{debian} {otherwise}"
+
+
+def _unavailable_grids(source: Any, target: Any) -> list[str]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
+    return [
+        grid.short_name for operation in group.unavailable_operations for grid in operation.grids if not grid.available
+    ]
+
+
+@dataclass(frozen=True)
+class DeclaredVertical:
+    """What a CRS says about heights.
+
+    Parameters
+    ----------
+    name : str
+        As written there.
+    vertical : Vertical or None
+        The datum, None if the name says nothing that is known.
+    certain : bool
+        True if an authority code or a grid identifies it, False if only its name does.
+    metres_per_unit : float
+        Length of the unit of the vertical axis.
+    """
+
+    name: str
+    vertical: Vertical | None
+    certain: bool
+    metres_per_unit: float
+
+
+def declared_vertical(crs: pyproj.CRS) -> DeclaredVertical | None:
+    """Return what a system declares about heights; None if it is two-dimensional.
+
+    A 3D geographic, projected or geocentric system declares the ellipsoid; a compound system its vertical part, known
+    by its authority code, by the geoid grid bound to it, or (not certain) by a name such as ``EGM96 height``.
+
+    Raises
+    ------
+    DatumError
+        If the vertical axis points down.
+    """
+    if not crs.is_compound:
+        if len(crs.axis_info) < 3:
+            return None
+        return DeclaredVertical(crs.name, Vertical("ellipsoid"), True, crs.axis_info[2].unit_conversion_factor)
+    part = crs.sub_crs_list[1]
+    plain = part.source_crs if part.is_bound and part.source_crs is not None else part
+    axis = plain.axis_info[0]
+    if axis.direction.lower() == "down":
+        raise DatumError(f"{plain.name!r} counts depths, not heights", field="vertical CRS")
+    authority = plain.to_authority(min_confidence=90)
+    if authority is not None and authority[0] == "EPSG":
+        # PROJ also finds a code by comparing names; only a code that is written there is certain.
+        certain = "id" in plain.to_json_dict()
+        return DeclaredVertical(plain.name, Vertical(":".join(authority)), certain, axis.unit_conversion_factor)
+    bound = list(part.coordinate_operation.grids) if part.is_bound and part.coordinate_operation is not None else []
+    if bound:
+        grid = Vertical(bound[0].short_name)
+        return DeclaredVertical(plain.name, grid, True, axis.unit_conversion_factor)
+    return DeclaredVertical(plain.name, _vertical_of_name(plain.name), False, axis.unit_conversion_factor)
+
+
+def _vertical_of_name(name: str) -> Vertical | None:
+    plain = re.sub(r"[^a-z0-9]", "", name.lower())
+    for pattern, vertical in (
+        (r"(wgs84)?egm(19)?96.*", "EPSG:5773"),
+        (r"(wgs84)?egm(20)?08.*", "EPSG:3855"),
+        (r".*ellipsoid.*", "ellipsoid"),
+    ):
+        if re.fullmatch(pattern, plain):
+            return Vertical(vertical)
+    return None
+
+
+# -- ground to ground ------------------------------------------------------------------------------------------------
+
+
+class GroundTransform:
+    """Map ground points ``(N, 3)`` of one system to another; heights are ellipsoidal metres on both sides.
+
+    Systems on a modern ellipsoid are promoted to 3D, so small differences between realisations enter the height.
+    Systems on a classical ellipsoid (Bessel, Airy, Hayford ...) are transformed in plan and keep the WGS84 height,
+    since nobody measures heights above those. Geocentric systems are allowed on either side.
+
+    Instances can be pickled, and shared between threads.
+
+    Parameters
+    ----------
+    source, target : str or pyproj.CRS
+        Compound and 3D systems stand for their horizontal part.
+
+    Raises
+    ------
+    CrsError
+        If there is no transformation, or the grid of the best one is not installed.
+    """
+
+    def __init__(self, source: str | pyproj.CRS, target: str | pyproj.CRS) -> None:
+        self.source, self.target = parse_crs(source), parse_crs(target)
+        first, last = _ground_crs(self.source), _ground_crs(self.target)
+        self._legs: list[tuple[Transformer, bool]] = []
+        self._checked = False
+        if same_crs(first, last):
+            return
+        modern = _is_modern(first), _is_modern(last)
+        if all(modern):
+            stops = [(_promoted(first), _promoted(last), True)]
+        elif first.is_geocentric or last.is_geocentric:
+            middle = pyproj.CRS.from_epsg(4326)
+            stops = [
+                (_promoted(first), _promoted(middle), True) if modern[0] else (first, middle, False),
+                (_promoted(middle), _promoted(last), True) if modern[1] else (middle, last, False),
+            ]
+        else:
+            stops = [(first, last, False)]
+        self._legs = [(_transformer(one, other), spatial) for one, other, spatial in stops]
+
+    def __reduce__(self):
+        return GroundTransform, (self.source, self.target)
+
+    def __repr__(self) -> str:
+        return f"GroundTransform({self.source.name!r} -> {self.target.name!r})"
+
+    @property
+    def is_identity(self) -> bool:
+        """True if points come back unchanged."""
+        return not self._legs
+
+    def __call__(self, ground: ArrayLike) -> Array:
+        """Transform points ``(N, 3)``; rows that are not finite or cannot be transformed come back as NaN."""
+        out = np.array(ground, dtype=float, ndmin=2)
+        out[~np.isfinite(out).all(axis=1)] = np.nan
+        for transformer, spatial in self._legs:
+            before = out
+            out = self._leg(transformer, spatial, before)
+            self._check(transformer, spatial, before, out)
+        return out
+
+    @staticmethod
+    def _leg(transformer: Transformer, spatial: bool, ground: Array, errcheck: bool = False) -> Array:
+        x, y, h = (np.ascontiguousarray(column) for column in ground.T)
+        if spatial:
+            out = np.column_stack(transformer.transform(x, y, h, errcheck=errcheck))
+        else:
+            out = np.column_stack([*transformer.transform(x, y, errcheck=errcheck), h])
+        out[~np.isfinite(out).all(axis=1)] = np.nan
+        return out
+
+    def _check(self, transformer: Transformer, spatial: bool, before: Array, after: Array) -> None:
+        """Tell a missing grid from points out of range, once, on the first finite point."""
+        finite = np.isfinite(before).all(axis=1)
+        if self._checked or not finite.any():
+            return
+        arrived = np.isfinite(after).all(axis=1)
+        if arrived.any():
+            self._checked = True
+            if not self.target.is_geocentric and transformer.accuracy < 0:
+                _warn_of_better(transformer, self.source, self.target, after[arrived][0])
+            return
+        sample = before[finite][:1]
+        try:
+            self._leg(transformer, spatial, sample, errcheck=True)
+        except ProjError as error:
+            grid = _grid_of_message(str(error))
+            if grid is None and "No operation" in str(error):
+                grid = next(iter(_unavailable_grids(self.source, self.target)), None)
+            if grid is not None:
+                raise _way_error(self.source, self.target, grid) from error
+
+
+def _ground_crs(crs: pyproj.CRS) -> pyproj.CRS:
+    return crs if crs.is_geocentric else horizontal(crs)
+
+
+def _is_modern(crs: pyproj.CRS) -> bool:
+    return crs.ellipsoid is not None and abs(crs.ellipsoid.semi_major_metre - _WGS84_SEMI_MAJOR) < 1.0
+
+
+def _promoted(crs: pyproj.CRS) -> pyproj.CRS:
+    return crs if crs.is_geocentric else crs.to_3d()
+
+
+def _transformer(source: pyproj.CRS, target: pyproj.CRS) -> Transformer:
+    try:
+        return Transformer.from_crs(source, target, always_xy=True, only_best=True, allow_ballpark=False)
+    except (ProjError, CRSError) as error:
+        grid = _grid_of_message(str(error))
+        raise _way_error(source, target, grid) from error
+
+
+def _way_error(source: pyproj.CRS, target: pyproj.CRS, grid: str | None) -> OrthoError:
+    if grid is None:
+        return CrsError(
+            f"there is no transformation from {source.name!r} to {target.name!r}",
+            field="CRS",
+            remedy="choose systems of known datum, such as UTM on WGS84",
+        )
+    return CrsError(
+        f"the transformation from {source.name!r} to {target.name!r} needs the grid {grid}, which is not installed",
+        field="CRS",
+        remedy=_grid_remedy(grid, "or choose a system on WGS84"),
+    )
+
+
+def _warn_of_better(used: Transformer, source: pyproj.CRS, target: pyproj.CRS, sample: Array) -> None:
+    """Log that a more exact transformation exists whose grid is not installed (``only_best`` lets some of them pass).
+
+    A negative accuracy of `used` says that PROJ chooses among several operations by position.
+    """
+    lon, lat = Transformer.from_crs(target.to_2d(), 4326, always_xy=True).transform(*sample[:2])
+    if not (abs(lon) <= 180 and abs(lat) <= 90):
+        return
+    area = AreaOfInterest(lon, lat, lon, lat)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        group = TransformerGroup(source, target, always_xy=True, area_of_interest=area, allow_ballpark=False)
+    if not group.best_available and group.unavailable_operations:
+        better = group.unavailable_operations[0]
+        grid = ", ".join(grid.short_name for grid in better.grids if not grid.available)
+        log.warning(
+            "%s -> %s: used %.1f m, a transformation of %.1f m needs the grid %s, which is not installed",
+            source.name,
+            target.name,
+            used.get_last_used_operation().accuracy,
+            better.accuracy,
+            grid,
+        )
+
+
+@functools.lru_cache(maxsize=64)
+def ground_transform(source: str | pyproj.CRS, target: str | pyproj.CRS) -> GroundTransform:
+    """Return a `GroundTransform`, the same one for the same pair."""
+    return GroundTransform(source, target)
+
+
+# -- what is installed -----------------------------------------------------------------------------------------------
+
+
+def proj_info() -> dict[str, Any]:
+    """Return PROJ's and pyproj's versions, the search path of grids, and that the network is off."""
+    return {
+        "proj": pyproj.proj_version_str,
+        "pyproj": pyproj.__version__,
+        "search_path": list(add_system_grids()),
+        "network": bool(pyproj.network.is_network_enabled()),
+    }
+
+
+def grids() -> list[dict[str, Any]]:
+    """Return the geoid grids of the common height datums: name, CRS, grid file, whether found and where."""
+    folders = [*add_system_grids(), pyproj.datadir.get_user_data_dir()]
+    rows: list[dict[str, Any]] = []
+    for name, code in VERTICAL_NAMES.items():
+        if name == "ellipsoid":
+            continue
+        row: dict[str, Any] = {"datum": name, "crs": code, "found": True, "grid": None, "path": None}
+        try:
+            definition = _vertical_transformer(code).definition
+            found = re.search(r"grids=(\S+)", definition)
+            row["grid"] = found.group(1) if found else None
+        except DatumError as error:
+            grid = re.search(r"geoid grid (\S+),", error.message)
+            row.update(found=False, grid=grid.group(1) if grid else None, remedy=error.remedy)
+        row["path"] = _grid_path(row["grid"], folders) if row["found"] and row["grid"] else None
+        rows.append(row)
+    return rows
+
+
+def _grid_path(name: str, folders: list[str]) -> str | None:
+    # PROJ's database gives the same grid two names: the GeoTIFF of its network, and the older file of proj-data.
+    older = {"us_nga_egm96_15.tif": "egm96_15.gtx"}
+    for folder in folders:
+        for candidate in (name, older.get(name, name)):
+            if (Path(folder) / candidate).is_file():
+                return str(Path(folder) / candidate)
+    return None

@@ -1,0 +1,105 @@
+"""What the heights of a DEM are measured above, and in which unit: what it declares against what the user says."""
+
+from __future__ import annotations
+
+from ortho_pipeline.errors import DatumError
+from ortho_pipeline.geodesy.crs import VERTICAL_FORMS, DeclaredVertical, Vertical
+
+_SURVEY_FOOT = 1200 / 3937
+#: Length in metres of the units of heights, by name without blanks and punctuation.
+UNITS = (
+    dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0)
+    | dict.fromkeys(("cm", "centimetre", "centimeter"), 0.01)
+    | dict.fromkeys(("ft", "foot", "feet", "internationalfoot"), 0.3048)
+    | dict.fromkeys(("ussurveyfoot", "ussurveyfeet", "usft", "ftus", "footus"), _SURVEY_FOOT)
+)
+
+
+def dem_vertical_remedy(first: str = "") -> str:
+    """Return the advice to state the height datum by option, after another advice if there is one."""
+    option = f"say what the heights are measured above with --dem-vertical ({VERTICAL_FORMS})"
+    return f"{first}; or {option}" if first else option
+
+
+def dem_vertical(
+    path: str, declared: DeclaredVertical | None, option: Vertical | None, override: bool
+) -> tuple[Vertical, list[str]]:
+    """Return the height datum to use for a DEM, and what the user ought to know about it.
+
+    Parameters
+    ----------
+    declared : DeclaredVertical or None
+        What the CRS of the DEM says.
+    option : Vertical or None
+        What the user says.
+    override : bool
+        Let the user be right against an authority code.
+
+    Raises
+    ------
+    DatumError
+        If nobody says it, or both do and differ.
+    """
+    if declared is None:
+        if option is None:
+            raise DatumError(
+                "this DEM does not say what its heights are measured above",
+                file=path,
+                field="--dem-vertical",
+                remedy=dem_vertical_remedy(),
+            )
+        return option, []
+    if option is None:
+        if declared.vertical is None:
+            raise DatumError(
+                f"the heights of this DEM are in {declared.name!r}, which is not a datum that is known here",
+                file=path,
+                field="--dem-vertical",
+                remedy=dem_vertical_remedy(),
+            )
+        by_name = f"the height datum {declared.vertical.label} of the DEM is known by its name {declared.name!r} only"
+        return declared.vertical, [] if declared.certain else [by_name]
+    if option == declared.vertical:
+        return option, []
+    warning = f"the DEM declares its heights as {declared.name!r}; {option.label} was used as --dem-vertical says"
+    # A grid file is how a user brings the geoid of a declared datum whose own grid is not installed.
+    realises = declared.vertical is not None and not declared.vertical.is_ellipsoid and ":" not in option.name[:5]
+    realises = realises and not option.is_ellipsoid
+    if declared.certain and not override and not realises:
+        raise DatumError(
+            f"the DEM declares its heights as {declared.name!r}, --dem-vertical says {option.label}",
+            file=path,
+            field="--dem-vertical",
+            remedy="leave the option out, or override what the file declares with --override-dem-vertical",
+        )
+    return option, [warning]
+
+
+def dem_unit(path: str, text: str, declared: DeclaredVertical | None) -> float:
+    """Return the length in metres of the unit of a DEM's heights.
+
+    Parameters
+    ----------
+    text : str
+        Unit type of the band, as GDAL gives it; may be empty.
+
+    Raises
+    ------
+    DatumError
+        If the unit is not known, or the band and the CRS say different ones.
+    """
+    stated = UNITS.get("".join(c for c in text.lower() if c.isalpha())) if text else None
+    if text and stated is None:
+        raise DatumError(
+            f"the unit {text!r} of the heights is not known", file=path, field="unit", remedy="use metres or feet"
+        )
+    # Two-dimensional systems say nothing; 3D ones made by promotion say metre whatever the band holds.
+    axis = declared.metres_per_unit if declared else None
+    if stated is not None and axis is not None and abs(stated - axis) > 1e-3:
+        raise DatumError(
+            f"the band says {text!r}, the CRS a unit of {axis:.6g} m",
+            file=path,
+            field="unit",
+            remedy="state the unit of the heights once (gdal_edit.py -units m, or another CRS)",
+        )
+    return axis or stated or 1.0

@@ -1,0 +1,231 @@
+r"""Scenes that the vendor projected onto a plane of one height, in a map projection: IKONOS Geo and its like.
+
+A line of sight that meets the plane at height :math:`h_0` passes through all ground points :math:`(X, Y, h)` whose
+
+.. math::
+    X_0 &= X + r_x (h - h_0) + s_x \\
+    Y_0 &= Y + r_y (h - h_0) + s_y
+
+are the map coordinates of the pixel: relief is displaced along one direction by so much per metre of height. With the
+azimuth :math:`\alpha` (in which the satellite stands, from true north) and its elevation :math:`\epsilon`,
+:math:`(r_x, r_y) = -(\sin\alpha', \cos\alpha') / \tan\epsilon` in the map: away from the satellite, with
+:math:`\alpha'` reckoned from the north of the grid. All four parameters are linear.
+
+Source: Grodecki and Dial 2003 (the product); Fraser and Yamakawa 2004 (parallel projection of narrow scenes).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import pyproj
+from numpy.typing import ArrayLike
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
+from ortho_pipeline.models.base import Array, SensorModel, as_ground, as_image
+
+PARAMETERS = ("shift_x", "shift_y", "relief_x", "relief_y")
+#: Length (m) over which a direction on the ellipsoid is carried into the map.
+_STEP = 1000.0
+_EARTH_RADIUS = 6371000.0
+#: A line of sight lower than this above the horizon is a wrong angle.
+LOWEST_ELEVATION = math.radians(5.0)
+
+
+@dataclass(frozen=True, eq=False)
+class MapPlane(SensorModel):
+    """An image that is a map of the lines of sight where they meet a plane of constant height.
+
+    Parameters
+    ----------
+    map_crs : str
+        Projected CRS in metres, of the image and of the ground points.
+    corner : (float, float)
+        Map coordinates of the outer corner of the first pixel.
+    pixel : (float, float)
+        Size of a pixel in metres, both positive; columns go east, rows south.
+    size : (int, int)
+        Columns and rows.
+    plane : float
+        Ellipsoidal height (m) of the plane.
+    relief : (float, float)
+        Displacement in x and y of the map for one metre of height above the plane.
+    heights : (float, float)
+        Lowest and highest ground that the model is meant for.
+    shift : (float, float)
+        Displacement of all points in metres of the map.
+    """
+
+    kind: ClassVar[str] = "geo"
+
+    map_crs: str
+    corner: tuple[float, float]
+    pixel: tuple[float, float]
+    size: tuple[int, int]
+    plane: float
+    relief: tuple[float, float]
+    heights: tuple[float, float]
+    shift: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("corner", "pixel", "relief", "heights", "shift"):
+            pair = tuple(float(value) for value in getattr(self, name))
+            if len(pair) != 2 or not all(map(math.isfinite, pair)):
+                raise InputError("two finite numbers are needed", field=name)
+            object.__setattr__(self, name, pair)
+        object.__setattr__(self, "size", tuple(int(value) for value in self.size))
+        object.__setattr__(self, "plane", float(self.plane))
+        if not (self.pixel[0] > 0 and self.pixel[1] > 0 and len(self.size) == 2 and min(self.size) > 0):
+            raise InputError("pixels and images have a positive size", field="pixel, size")
+        if not self.heights[0] < self.heights[1]:
+            raise InputError("the lower height comes first", field="heights", remedy="give low,high in metres")
+        if not self.heights[0] <= self.plane <= self.heights[1]:
+            raise InputError(f"the plane at {self.plane} m does not lie within the heights", field="heights")
+        _check_map(self.map_crs)
+
+    @classmethod
+    def from_view(
+        cls,
+        map_crs: str,
+        corner: tuple[float, float],
+        pixel: tuple[float, float],
+        size: tuple[int, int],
+        plane: float,
+        azimuth: float,
+        elevation: float,
+        heights: tuple[float, float],
+    ) -> Self:
+        """Return the model of a scene of which only the direction to the satellite is known.
+
+        Parameters
+        ----------
+        azimuth, elevation : float
+            Of the satellite as seen from the middle of the scene, radians; from true north clockwise, and above the
+            tangent plane of the ellipsoid.
+
+        Raises
+        ------
+        InputError
+            If the line of sight does not come from above.
+        """
+        if not (math.isfinite(azimuth) and LOWEST_ELEVATION < elevation <= math.pi / 2):
+            raise InputError(
+                f"a satellite {math.degrees(elevation):.3g} degrees above the horizon takes no such image",
+                field="elevation", remedy="it is an angle from 5 to 90 degrees",
+            )  # fmt: skip
+        middle = np.array([[corner[0] + pixel[0] * size[0] / 2, corner[1] - pixel[1] * size[1] / 2, plane]])
+        away = _along(map_crs, middle, azimuth) / -math.tan(elevation)
+        return cls(map_crs, corner, pixel, size, plane, (float(away[0]), float(away[1])), heights)
+
+    @property
+    def view(self) -> tuple[float, float]:
+        """Azimuth (from true north) and elevation of the satellite, radians, from the middle of the scene."""
+        middle = np.array([[*self._map_of(np.array(self.size) / 2), self.plane]])
+        basis = np.column_stack([_along(self.map_crs, middle, angle) for angle in (0.0, math.pi / 2)])
+        north, east = -np.linalg.solve(basis, self.relief)
+        return math.atan2(east, north) % (2 * math.pi), math.atan2(1.0, math.hypot(north, east))
+
+    @property
+    def crs(self) -> str:
+        return self.map_crs
+
+    @property
+    def domain(self) -> tuple[Array, Array]:
+        corners = self.corners
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        return (low + high) / 2, (high - low) / 2
+
+    @property
+    def corners(self) -> Array:
+        width, height = self.size
+        frame = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
+        return np.concatenate([self.image_to_ground(frame, level) for level in self.heights])
+
+    @property
+    def height_range(self) -> tuple[float, float]:
+        return self.heights
+
+    def with_heights(self, low: float, high: float) -> Self:
+        return self._replace(heights=(min(low, self.plane), max(high, self.plane)))
+
+    @property
+    def reference_height(self) -> float:
+        return self.plane
+
+    @property
+    def param_names(self) -> tuple[str, ...]:
+        return PARAMETERS
+
+    @property
+    def params(self) -> Array:
+        return np.array([*self.shift, *self.relief])
+
+    def with_params(self, params: ArrayLike) -> Self:
+        values = np.asarray(params, dtype=np.float64)
+        return self._replace(shift=(values[0], values[1]), relief=(values[2], values[3]))
+
+    def ground_to_image(self, ground: ArrayLike) -> Array:
+        ground = as_ground(ground)
+        at = ground[:, :2] + np.outer(ground[:, 2] - self.plane, self.relief) + self.shift
+        # A height that is no number would leave the other axis alone where the relief is zero.
+        at[~np.isfinite(ground).all(axis=1)] = np.nan
+        return (at - self.corner) / self._steps
+
+    def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
+        image = as_image(image)
+        ground = np.empty((len(image), 3))
+        ground[:, 2] = height
+        ground[:, :2] = self._map_of(image) - np.outer(ground[:, 2] - self.plane, self.relief) - self.shift
+        ground[~(np.isfinite(image).all(axis=1) & np.isfinite(ground[:, 2]))] = np.nan
+        return ground
+
+    def ground_partials(self, ground: ArrayLike) -> Array:
+        across, down = self._steps
+        one = np.array([[1.0 / across, 0.0, self.relief[0] / across], [0.0, 1.0 / down, self.relief[1] / down]])
+        return np.tile(one, (len(as_ground(ground)), 1, 1))
+
+    def param_partials(self, ground: ArrayLike) -> Array:
+        above = as_ground(ground)[:, 2] - self.plane
+        partials = np.zeros((len(above), 2, 4))
+        for axis, step in enumerate(self._steps):
+            partials[:, axis, axis] = 1.0 / step
+            partials[:, axis, 2 + axis] = above / step
+        return partials
+
+    @property
+    def _steps(self) -> Array:
+        """Metres of the map from pixel to pixel; rows count to the south."""
+        return np.array([self.pixel[0], -self.pixel[1]])
+
+    def _map_of(self, image: Array) -> Array:
+        return np.asarray(self.corner + image * self._steps, dtype=np.float64)
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        pairs = ("corner", "pixel", "size", "relief", "heights", "shift")
+        return super().from_dict({**data, **{name: tuple(data[name]) for name in pairs if name in data}})
+
+
+def _along(map_crs: str, place: Array, azimuth: float) -> Array:
+    """Return how far ``(2,)`` the map moves for one metre at the height of a place, in a direction from true north."""
+    to_geographic = ground_transform(map_crs, "EPSG:4979")
+    lon, lat, height = to_geographic(place)[0]
+    if not math.isfinite(lon):
+        raise InputError("the scene does not lie in the domain of its map projection", field="corner")
+    lon2, lat2, _ = pyproj.Geod(ellps="WGS84").fwd(lon, lat, math.degrees(azimuth), _STEP)
+    there = ground_transform("EPSG:4979", map_crs)(np.array([[lon2, lat2, height]]))[0]
+    # A metre up there is shorter on the ellipsoid, to which maps belong.
+    step = _STEP * (1.0 + height / _EARTH_RADIUS)
+    return np.asarray((there - place[0])[:2] / step, dtype=np.float64)
+
+
+def _check_map(text: str) -> None:
+    crs = parse_crs(text)
+    if not crs.is_projected or any(abs(axis.unit_conversion_factor - 1.0) > 1e-12 for axis in crs.axis_info[:2]):
+        raise InputError(
+            f"{crs.name!r} is no map projection in metres", field="map_crs", remedy="for example a UTM zone"
+        )

@@ -1,0 +1,105 @@
+"""One image that was delivered in pieces, each with a sensor model in its own pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.models.base import Array, SensorModel, as_ground
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces(SensorModel):
+    """The models of the pieces of one image as one model, in the pixels of the first piece.
+
+    A ground point belongs to the piece in which, or the least far outside of which, it is seen. The seams are as good
+    as the models agree there, so this is for adjusting a correction that all pieces share, not for resampling.
+
+    Parameters
+    ----------
+    models : tuple of SensorModel
+        Of one CRS; each in the pixels of its piece.
+    offsets : tuple of (float, float)
+        Column and row of the first corner of each piece in the pixels of the first.
+    sizes : tuple of (int, int)
+        Columns and rows of each piece.
+    """
+
+    kind: ClassVar[str] = "pieces"
+
+    models: tuple[SensorModel, ...]
+    offsets: tuple[tuple[float, float], ...]
+    sizes: tuple[tuple[int, int], ...]
+
+    def __post_init__(self) -> None:
+        for name in ("models", "offsets", "sizes"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        if not self.models or not len(self.models) == len(self.offsets) == len(self.sizes):
+            raise InputError("each piece has a model, an offset and a size", field="models, offsets, sizes")
+        if len({model.crs for model in self.models}) != 1:
+            raise InputError("the models of the pieces are in different systems", field="models")
+
+    @property
+    def first(self) -> SensorModel:
+        """The model of the first piece."""
+        return self.models[0]
+
+    @property
+    def crs(self) -> str:
+        return self.first.crs
+
+    @property
+    def domain(self) -> tuple[Array, Array]:
+        boxes = [model.domain for model in self.models]
+        if parse_crs(self.crs).is_geographic:
+            # Beside the antimeridian a piece may count its longitudes from the other side.
+            turn = np.array([360.0, 0.0, 0.0])
+            boxes = [(at - turn * np.round((at - boxes[0][0])[0] / 360.0), half) for at, half in boxes]
+        low = np.min([centre - half for centre, half in boxes], axis=0)
+        high = np.max([centre + half for centre, half in boxes], axis=0)
+        return (low + high) / 2, (high - low) / 2
+
+    def with_heights(self, low: float, high: float) -> Self:
+        return self._replace(models=tuple(model.with_heights(low, high) for model in self.models))
+
+    @property
+    def corners(self) -> Array:
+        return np.concatenate([model.corners for model in self.models])
+
+    def ground_to_image(self, ground: ArrayLike) -> Array:
+        return self._seen(as_ground(ground))[0]
+
+    def ground_partials(self, ground: ArrayLike) -> Array:
+        ground = as_ground(ground)
+        # Of the piece that each point belongs to: differences across a seam are no slope.
+        owner = self._seen(ground)[1]
+        partials = np.full((len(ground), 2, 3), np.nan)
+        for k, model in enumerate(self.models):
+            partials[owner == k] = model.ground_partials(ground[owner == k])
+        return partials
+
+    def _seen(self, ground: Array) -> tuple[Array, NDArray[np.intp]]:
+        """Return image points ``(N, 2)`` and the number of the piece ``(N,)``, -1 where none sees the point."""
+        image = np.full((len(ground), 2), np.nan)
+        owner = np.full(len(ground), -1)
+        nearest = np.full(len(ground), np.inf)
+        for k, (model, offset, size) in enumerate(zip(self.models, self.offsets, self.sizes, strict=True)):
+            seen = model.ground_to_image(ground)
+            outside = np.maximum(-seen, seen - size).max(axis=1, initial=0.0)
+            better = outside < nearest  # NaN is no number, and not less than any
+            image[better] = seen[better] + offset
+            nearest[better], owner[better] = outside[better], k
+        return image, owner
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        from ortho_pipeline.models import model_from_dict
+
+        models = tuple(map(model_from_dict, data.get("models", ())))
+        pairs = {name: tuple(map(tuple, data.get(name, ()))) for name in ("offsets", "sizes")}
+        return super().from_dict({**data, "models": models, **pairs})

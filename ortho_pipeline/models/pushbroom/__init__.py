@@ -1,0 +1,7 @@
+"""The line scanner: orbit and attitude as splines, lines of the camera, start from metadata, constraints."""
+
+from __future__ import annotations
+
+from ortho_pipeline.models.pushbroom.scanner import Pushbroom
+
+__all__ = ["Pushbroom"]

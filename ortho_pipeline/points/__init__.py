@@ -1,0 +1,34 @@
+"""Control, check and tie points: one table, a reader for every format, and which of them control.
+
+Imports `geodesy` and what is below. A new point format is a module here and a line in `formats`.
+"""
+
+from __future__ import annotations
+
+from ortho_pipeline.points.table import (
+    DEFAULT_SIGMA_IMAGE,
+    AnyPoints,
+    HasGround,
+    Point,
+    Points,
+    assign_roles,
+    gcps_of_dataset,
+    marks_warning,
+    one_mark,
+    read_points,
+    write_points,
+)
+
+__all__ = [
+    "DEFAULT_SIGMA_IMAGE",
+    "AnyPoints",
+    "HasGround",
+    "Point",
+    "Points",
+    "assign_roles",
+    "gcps_of_dataset",
+    "marks_warning",
+    "one_mark",
+    "read_points",
+    "write_points",
+]

@@ -1,0 +1,244 @@
+"""Points as CSV or TSV with a header: our own columns, and those that surveyors and other programs write."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.points.rows import (
+    CSV_IMAGE,
+    OF_IMAGE,
+    Layout,
+    Line,
+    Row,
+    Table,
+    cells_of,
+    lines_of,
+    number,
+    role_of,
+    short,
+    sigma_of,
+)
+
+#: Columns of a CSV that are for people.
+CSV_IGNORED = frozenset(
+    ["info", "note", "notes", "comment", "comments", "remark", "remarks", "description", "desc", "code", "date", "time"]
+)
+#: What a column is called elsewhere (without blanks, punctuation and the unit of the inside) -> what it is called here.
+_ALIASES = {
+    alias: name
+    for name, aliases in {
+        "id": "name point pointid pointname label gcp gcpid marker no nr number ptid",
+        "col": "column pixel sample samp xpix xpixel pixelx px p imagex ximage imgx",
+        "row": "line ypix ypixel pixely py l imagey yimage imgy",
+        "x": "easting east e longitude long lon lng mapx xmap",
+        "y": "northing north n latitude lat mapy ymap",
+        "h": "z height elevation elev alt altitude",
+        "image": "filename file photo imagename imagefile",
+        "status": "s",
+        "sigma_image": "sigmaimage",
+        "sigma_xy": "sigmaxy",
+        "sigma_h": "sigmah",
+    }.items()
+    for alias in aliases.split()
+}
+#: Names of ground columns that say which kind of system they are in.
+_GEOGRAPHIC = frozenset(["longitude", "long", "lon", "lng", "latitude", "lat"])
+_PROJECTED = frozenset(["easting", "east", "northing", "north"])
+#: Units in brackets that are those of the inside; any other unit is not known here.
+_OWN_UNIT = re.compile(r"[\[(](m|metres?|meters?|px|pixels?|deg|degrees?|°)[\])]$")
+#: Status of a point as PCI's programs write it; an inactive one is left out.
+_STATUS = {"g": "control", "c": "check"}
+_UNDERSTOOD = "Name, Pixel, Line, Easting, Northing, Lat, Lon, Elev, alt, xPix, yPix and their like are understood"
+
+
+@dataclass(frozen=True)
+class Header:
+    """The columns of a file: their names as written, and where each of ours is.
+
+    Parameters
+    ----------
+    names : sequence of str
+    place : mapping of str to int
+        Ours -> index among `names`; columns for people are not in it.
+    delimiter : str
+        A blank stands for any white space.
+    """
+
+    names: Sequence[str]
+    place: Mapping[str, int]
+    delimiter: str
+
+    @property
+    def of_ground(self) -> str | None:
+        """Return ``geographic`` or ``projected`` where the names of x and y say so."""
+        said = {_plain(self.names[self.place[axis]]) for axis in ("x", "y") if axis in self.place}
+        if said & _GEOGRAPHIC:
+            return "geographic"
+        return "projected" if said & _PROJECTED else None
+
+
+def is_header(text: str) -> bool:
+    """Tell whether a line is a header rather than numbers: at least three of its words name an id or coordinates."""
+    names = {_ours(name) for name in text.replace('"', "").split(None if _delimiter(text) == " " else _delimiter(text))}
+    return len(names & {"id", "image", "col", "row", "x", "y", "h"}) >= 3
+
+
+def read_csv(path: str | os.PathLike[str], text: str, layout: Layout = OF_IMAGE) -> Table:
+    """Read a table with a header: ``id,col,row,x,y,h[,role][,sigma_image][,sigma_xy][,sigma_h][,image]`` or their like.
+
+    The delimiter (comma, semicolon, tab, bar, else blanks) is that of the header; where it is not a comma, numbers may
+    have a decimal comma, in the whole file. Lines that start with ``#`` are comments; of these ``#CRS: ...`` and
+    ``#vertical: ...`` state what the coordinates are. An empty `h` is a height that is not given.
+    """
+    table = Table("CSV", origin_allowed=True)
+    header: Header | None = None
+    marks: set[str] = set()
+    for line in lines_of(path, text):
+        comment = re.match(r"#\s*(\w+)\s*:\s*(.+)", line.text)
+        if comment and comment.group(1).lower() == "crs":
+            table.crs = comment.group(2).strip()
+        elif comment and comment.group(1).lower() == "vertical":
+            table.vertical = comment.group(2).strip()
+        if line.text.startswith("#"):
+            continue
+        if header is None:
+            header = _header(path, line, layout)
+            table.of_ground = header.of_ground
+            continue
+        row = _row(path, line, header, layout, marks)
+        if row is not None:
+            table.rows.append(row)
+    return table
+
+
+# -- the header ------------------------------------------------------------------------------------------------------
+
+
+def _delimiter(header: str) -> str:
+    found = max("\t;,|", key=header.count)
+    return found if found in header else " "
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", _OWN_UNIT.sub("", name.strip().lower()))
+
+
+def _ours(name: str) -> str:
+    """Return what we call a column; of one that is not known its own name."""
+    own = name.strip().lower()
+    return own if own in ("id", "col", "row", "x", "y", "h", "role") else _ALIASES.get(_plain(name), own)
+
+
+def _header(path: str | os.PathLike[str], line: Line, layout: Layout) -> Header:
+    delimiter = _delimiter(line.text)
+    names = cells_of(path, line, delimiter)
+    ours = _our_names(names)
+    place: dict[str, int] = {}
+
+    def refuse(message: str) -> InputError:
+        own = f"name them {','.join(layout.columns)}; {_UNDERSTOOD}"
+        digits = all(re.fullmatch(r"[+-]?[\d.,]+", name) for name in names[1:])
+        remedy = f"put a header above the numbers: {own}" if digits else own
+        found = ", ".join(name or "(no name)" for name in names)
+        shown = found if len(found) <= 300 else f"{found[:300]}..."
+        return InputError(f"{message}; the columns are: {shown}", file=path, field=f"line {line.number}", remedy=remedy)
+
+    for index, name in enumerate(ours):
+        if name in CSV_IGNORED or (not name and index in (0, len(names) - 1)):
+            continue
+        if name not in (*layout.columns, "status"):
+            raise refuse(f"the column {short(names[index])} is not known")
+        if name in place:
+            raise refuse(f"the columns {short(names[place[name]])} and {short(names[index])} both mean {name}")
+        place[name] = index
+    missing = [name for name in layout.needed if name not in place]
+    if missing:
+        raise refuse(f"no column {', '.join(missing)}")
+    return Header(names, place, delimiter)
+
+
+def _our_names(names: Sequence[str]) -> list[str]:
+    """Return what we call each column; some names mean something by what stands beside them."""
+    ours, plain = [_ours(name) for name in names], [_plain(name) for name in names]
+    # A table that was saved with its index has a first column without a name.
+    if re.fullmatch(r"(unnamed:\s*0)?", names[0].strip().lower()):
+        ours[0] = "" if "id" in ours else "id"
+    # In PCI's layouts (IDPLXYE) E is the elevation; beside N it is the easting.
+    return ["h" if one == "e" and {"x", "y"} <= set(plain) else name for one, name in zip(plain, ours, strict=True)]
+
+
+# -- a line ----------------------------------------------------------------------------------------------------------
+
+
+def _row(
+    path: str | os.PathLike[str], line: Line, header: Header, layout: Layout, marks: set[str]
+) -> Row | None:  # fmt: skip
+    """Return the point of a line, None where it is inactive; `marks` are the decimal marks of the file until here."""
+    cells, where = cells_of(path, line, header.delimiter), f"line {line.number}"
+    if len(cells) != len(header.names):
+        comma = header.delimiter == "," and len(cells) > len(header.names)
+        remedy = "a decimal comma splits numbers: write decimal points, or ; between the columns" if comma else None
+        raise InputError(
+            f"{counted(len(cells), 'cell')} under {counted(len(header.names), 'column name')} "
+            f"({', '.join(header.names)[:120]})",
+            file=path, field=where, remedy=remedy,
+        )  # fmt: skip
+    if not header.names[-1] and cells[-1]:
+        raise InputError(f"{short(cells[-1])} stands under no column name", file=path, field=where)
+
+    def text(name: str) -> str:
+        return cells[header.place[name]] if name in header.place else ""
+
+    def column(name: str) -> str:
+        return f"{where}, column {header.names[header.place[name]] or name}"
+
+    def value(name: str) -> float:
+        if not text(name) and name not in layout.needed:
+            return math.nan
+        return number(_decimal(text(name), header, marks, path, column(name)), path, column(name))
+
+    def sigma(name: str, zero: bool) -> float | None:
+        if not text(name):
+            return None
+        return sigma_of(_decimal(text(name), header, marks, path, column(name)), path, column(name), zero=zero)
+
+    for name, what in (("id", "an id"), (CSV_IMAGE, "an image")):
+        if (name in layout.needed or (name == "id" and "id" in header.place)) and not text(name):
+            raise InputError(f"a point without {what}", file=path, field=column(name))
+    role = role_of(text("role"), path, column("role")) if text("role") else layout.role
+    if text("status"):
+        found = _STATUS.get(text("status").lower(), text("status").lower())
+        if found == "i":
+            return None
+        role = role_of(found, path, column("status"))
+    return Row(
+        where=where,
+        id=text("id") or None,
+        image=(value("col"), value("row")),
+        ground=(value("x"), value("y"), value("h")),
+        role=role,
+        sigma_image=sigma("sigma_image", False),
+        sigma_xy=sigma("sigma_xy", True),
+        sigma_h=sigma("sigma_h", True),
+        image_name=text(CSV_IMAGE) or None,
+    )
+
+
+def _decimal(cell: str, header: Header, marks: set[str], path: str | os.PathLike[str], where: str) -> Any:
+    """Return a number with a decimal point, from one with a decimal comma where commas do not part columns."""
+    comma, point = "," in cell, "." in cell
+    if not (comma or point) or (header.delimiter == "," and comma):
+        return cell
+    marks.update(mark for mark, there in ((",", comma), (".", point)) if there)
+    if len(marks) > 1:
+        raise InputError(
+            f"{short(cell)}: commas and points both stand in the numbers of this file", file=path, field=where,
+            remedy="write all decimals alike, and no separators of thousands",
+        )  # fmt: skip
+    return re.sub(r",(?=\d*(?:[eE][+-]?\d+)?$)", ".", cell, count=1) if comma else cell

@@ -1,0 +1,151 @@
+"""Point files as they are written: which reader a file is for, and which of its points belong to an image."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from ortho_pipeline.errors import InputError, completed
+from ortho_pipeline.points.delimited import is_header, read_csv
+from ortho_pipeline.points.geojson import read_geojson
+from ortho_pipeline.points.link_lists import LINK_TABLE, odm_crs, read_asp, read_envi, read_links, read_odm, read_qgis
+from ortho_pipeline.points.rows import OF_BLOCK, OWN_IMAGE, Layout, Piece, Row, Table, load_text, short
+
+_FORMATS = (
+    "CSV/TSV (id,col,row,x,y,h,...), GeoJSON with 'ji', QGIS .points, ODM gcp_list.txt, ENVI .pts, ASP .gcp, "
+    "ArcGIS link table"
+)
+
+
+def read_table(
+    path: str | os.PathLike[str],
+    image_name: str | None = None,
+    pieces: Mapping[str, Piece] | None = None,
+) -> Table:
+    """Read a point file; its format is known by its content, then by its suffix.
+
+    Parameters
+    ----------
+    image_name : str, optional
+        Keep the points of this image, where a file holds points of several.
+    pieces : mapping of str to (float, float, float), optional
+        Further images whose points are kept: column and row of their first corner in this image, and the width of one
+        of their pixels.
+
+    Raises
+    ------
+    InputError
+        For anything that is not a table of finite numbers; names file, line and column.
+    """
+    text = load_text(path)
+    table = _read(_reader(path, text), path, text)
+    if not table.rows:
+        raise InputError("this file holds no points", file=path, remedy=f"give one of: {_FORMATS}")
+    return _of_image(path, table, image_name, pieces or {})
+
+
+def read_block_table(path: str | os.PathLike[str], layout: Layout = OF_BLOCK) -> Table:
+    """Read the rays of a block, or ground alone (`OF_GROUND`, `OF_HEIGHTS`): CSV, GeoJSON; rays as ODM or ASP too.
+
+    Raises
+    ------
+    InputError
+        As `read_table`; also for a line that does not say which image it is of.
+    """
+    text = load_text(path)
+    reader = _reader(path, text)
+    if reader is read_csv or reader is read_geojson:
+        table = _read(reader, path, text, layout)
+    elif (reader is read_odm or reader is read_asp) and layout is OF_BLOCK:
+        table = _read(reader, path, text)
+    else:
+        raise InputError(
+            "points of several images do not stand in this format", file=path,
+            remedy="give CSV (id,image,col,row[,x,y,h,...]), GeoJSON with 'ji' by image, ODM gcp_list.txt or ASP .gcp",
+        )  # fmt: skip
+    if not table.rows:
+        raise InputError("this file holds no points", file=path, remedy="add points to it")
+    return table
+
+
+#: What a file of each format has to hold, for errors whose own place knows no better remedy.
+_WANTED: dict[Callable[..., Table], str] = {
+    read_csv: "write one point a line, its numbers under a header such as id,col,row,x,y,h",
+    read_geojson: "write a FeatureCollection of Points [lon, lat, height] with the property 'ji' = [column, row]",
+    read_qgis: "write mapX,mapY,sourceX,sourceY,enable and so on, as the georeferencer of QGIS does",
+    read_odm: "write x y z column row image [label], under a line with the CRS",
+    read_envi: "write numbers in the order of the comment 'Map (x,y,elev), Image (x,y)'",
+    read_asp: "write id lat lon height and three sigmas, then name column row and two sigmas of each image",
+    read_links: "write [id] from-x from-y to-x to-y",
+}
+
+
+def _read(reader: Callable[..., Table], path: str | os.PathLike[str], text: str, *layout: Layout) -> Table:
+    """Read a file; an error without a remedy gets that of the format."""
+    with completed(path, remedy=_WANTED[reader]):
+        return reader(path, text, *layout)
+
+
+def _reader(path: str | os.PathLike[str], text: str) -> Callable[[str | os.PathLike[str], str], Table]:
+    suffix, start = Path(path).suffix.lower(), text.lstrip()[:4096]
+    lines = [line for line in start.splitlines() if line.strip() and not line.startswith("#")]
+    first = lines[0].strip() if lines else ""
+    for reader, known in (
+        (read_geojson, start.startswith(("{", "[")) or suffix in (".geojson", ".json")),
+        (read_qgis, suffix == ".points" or re.search(r"(?mi)^mapX\s*,", start)),
+        (read_envi, suffix == ".pts" or start.startswith(";")),
+        (read_asp, suffix == ".gcp" or re.match(r"#\s*WKT\s*:", start)),
+        (read_csv, suffix in (".csv", ".tsv") or is_header(first)),
+        (read_odm, odm_crs(first) is not None),
+        (read_links, LINK_TABLE.match(first)),
+    ):
+        if known:
+            return reader
+    if re.search(r"\d", first) and re.fullmatch(r"[-+.,;\deE\s]+", first):
+        raise InputError(
+            f"numbers without names: it is not said what the columns are; the first line is {short(first)}", file=path,
+            field="line 1",
+            remedy="put a line with their names above them, such as ID P L X Y Z (PCI), or 'link table' (ArcGIS: "
+            "from-x from-y to-x to-y)",
+        )  # fmt: skip
+    raise InputError(
+        f"the format of this point file is not known; its first line is {short(first)}", file=path, field="line 1",
+        remedy=f"give one of: {_FORMATS}",
+    )  # fmt: skip
+
+
+def _of_image(path: str | os.PathLike[str], table: Table, image_name: str | None, pieces: Mapping[str, Piece]) -> Table:
+    named = {row.image_name for row in table.rows if row.image_name}
+    if image_name is None and len({Path(name).stem.lower() for name in named}) > 1:
+        some = ", ".join(sorted(map(str, named))[:5])
+        raise InputError(
+            f"there are points of several images ({some})", file=path, field="image",
+            remedy="say which with image_name, or read them as a block (read_block_points)",
+        )  # fmt: skip
+    if image_name is None or not named:
+        return table
+    kept: list[Row] = []
+    for name, piece in {image_name: OWN_IMAGE, **pieces}.items():
+        wanted, ids = Path(name).stem.lower(), {row.id for row in kept} - {None}
+        # A point that was measured in several of the images counts once: where it was measured first, this image ahead.
+        kept += [
+            replace(row, piece=piece)
+            for row in table.rows
+            if row.image_name and Path(row.image_name).stem.lower() == wanted and row.id not in ids
+        ]
+    if not kept and table.format == "GeoJSON" and len(named) == 1:
+        # The 'filename' of a GeoJSON is a remark; a renamed image still has these points.
+        return table
+    if not kept:
+        some = ", ".join(sorted(map(str, named))[:5])
+        raise InputError(
+            f"no point belongs to the image {image_name!r}; there are points of {some}",
+            file=path,
+            field="image",
+            remedy="use the name of the image that the points were measured in",
+        )
+    table.rows = kept
+    return table

@@ -1,0 +1,118 @@
+"""Points as GeoJSON, with the property ``ji`` = [column, row]."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+from ortho_pipeline.errors import CrsError, InputError
+from ortho_pipeline.files import parse_json
+from ortho_pipeline.points.rows import (
+    OF_BLOCK,
+    OF_IMAGE,
+    Layout,
+    Row,
+    Table,
+    number,
+    role_of,
+    short,
+    sigma_of,
+)
+
+
+def read_geojson(path: str | os.PathLike[str], text: str, layout: Layout = OF_IMAGE) -> Table:
+    """Read points with a property ``ji`` = [column, row] from the *centre* of the first pixel; lon, lat, height.
+
+    Further properties: ``id``, ``role``, ``sigma_image``, ``sigma_xy``, ``sigma_h``, ``filename`` (the image).
+    Heights are ellipsoidal, as the format says. In a block ``ji`` may be a mapping of images to [column, row], and the
+    geometry of a tie point is null; where only ground is wanted, ``ji`` is ignored.
+    """
+    document = parse_json(text, path, "write a FeatureCollection of Points")
+    features = document.get("features") if isinstance(document, dict) else None
+    if not isinstance(features, list):
+        raise InputError("this is not a GeoJSON FeatureCollection", file=path, field="features")
+    table = Table("GeoJSON", crs=_geojson_crs(path, document), assumed_vertical="ellipsoid")
+    for count, feature in enumerate(features):
+        table.rows += _feature(path, f"features[{count}]", feature, layout)
+    return table
+
+
+def _geojson_crs(path: str | os.PathLike[str], document: dict[str, Any]) -> str:
+    stated = document.get("crs")
+    if stated is None:
+        return "EPSG:4979"
+    properties = stated.get("properties") if isinstance(stated, dict) else None
+    name = str(properties.get("name", "")) if isinstance(properties, dict) else ""
+    if not re.search(r"(CRS84h?|:4326|:4979)$", name):
+        raise CrsError(
+            f"the CRS {short(name)} of this GeoJSON is not WGS84", file=path, field="crs", remedy="write EPSG:4979"
+        )
+    return "EPSG:4979"
+
+
+def _feature(path: str | os.PathLike[str], where: str, feature: Any, layout: Layout) -> list[Row]:
+    """Return a row for each image that the point of a feature was measured in."""
+    properties = feature.get("properties") if isinstance(feature, dict) else None
+    geometry = feature.get("geometry") if isinstance(feature, dict) else None
+    tie = geometry is None and layout is OF_BLOCK
+    if not isinstance(properties, dict) or not (
+        tie or (isinstance(geometry, dict) and geometry.get("type") == "Point")
+    ):
+        raise InputError("this feature is not a Point with properties", file=path, field=where)
+    ground = (math.nan,) * 3 if geometry is None else _place(path, where, geometry)
+
+    def sigma(name: str, zero: bool) -> float | None:
+        value = properties.get(name)
+        return None if value is None else sigma_of(value, path, f"{where}.properties.{name}", zero=zero)
+
+    name = properties.get("id", feature.get("id"))
+    if name is not None and not isinstance(name, str | int):
+        raise InputError(f"{short(name)} is not an id", file=path, field=f"{where}.properties.id")
+    role = properties.get("role") or layout.role
+    row = Row(
+        where=where,
+        id=" ".join(str(name).split()) or None if name is not None else None,
+        image=(math.nan, math.nan),
+        ground=ground,
+        role=role_of(role, path, f"{where}.properties.role") if role else "",
+        sigma_image=sigma("sigma_image", False),
+        sigma_xy=sigma("sigma_xy", True),
+        sigma_h=sigma("sigma_h", True),
+    )
+    if "col" not in layout.needed:
+        return [row]
+    return [replace(row, image=at, image_name=image) for image, at in _measured(path, where, properties, layout)]
+
+
+def _place(path: str | os.PathLike[str], where: str, geometry: dict[str, Any]) -> tuple[float, float, float]:
+    place = geometry.get("coordinates")
+    if not isinstance(place, list) or len(place) not in (2, 3):
+        raise InputError("not [lon, lat, height]", file=path, field=f"{where}.geometry.coordinates")
+    ground = [number(value, path, f"{where}.geometry.coordinates[{k}]") for k, value in enumerate(place)]
+    return ground[0], ground[1], ground[2] if len(ground) == 3 else math.nan
+
+
+def _measured(
+    path: str | os.PathLike[str], where: str, properties: dict[str, Any], layout: Layout
+) -> Iterator[tuple[str | None, tuple[float, float]]]:
+    """Yield image and column, row from the corner of the first pixel, for each image that a point was measured in."""
+    ji, file_name = properties.get("ji"), properties.get("filename")
+    field = f"{where}.properties.ji"
+    pairs = [(file_name if isinstance(file_name, str) else None, ji)]
+    if isinstance(ji, dict) and layout is OF_BLOCK:
+        pairs = list(ji.items())
+    elif layout is OF_BLOCK and not isinstance(file_name, str):
+        raise InputError(
+            "it is not said in which image this point was measured", file=path, field=field,
+            remedy="give 'ji' as {image: [column, row]}, or 'filename' beside [column, row]",
+        )  # fmt: skip
+    for image, pair in pairs:
+        if not isinstance(pair, list) or len(pair) != 2:
+            raise InputError("no property 'ji' = [column, row]", file=path, field=field, remedy="measure the points")
+        column, row = (number(pair[k], path, f"{field}[{k}]") for k in range(2))
+        # From the centre of the first pixel to its corner.
+        yield image, (column + 0.5, row + 0.5)

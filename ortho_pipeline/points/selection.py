@@ -1,0 +1,107 @@
+"""Selection of control points: the rest become check points. This is how the tables of papers are made."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ortho_pipeline.errors import InputError, TooFewPoints, counted
+from ortho_pipeline.points.table import Array, Points
+
+_FORMS = "even:N, cluster:N[:K] (K 1-4: corners clockwise from the upper left, 5: middle), ids:a,b,c or random:N:seed"
+#: Groups of `cluster` as places in the box of the points, (column, row) from 0 to 1.
+_REGIONS = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (0.5, 0.5)])
+
+
+def select_control(points: Points, spec: str) -> Points:
+    """Keep some of the control points and make check points of the others; what is no control point stays as it is.
+
+    Parameters
+    ----------
+    spec : str
+        ``even:N`` for N points as far apart in the image as can be; ``cluster:N`` for the N points nearest to the
+        upper left, ``cluster:N:K`` for group K of 1 to 5 (corners clockwise, middle); ``ids:a,b,c`` for these;
+        ``random:N:seed`` for a draw that is the same every time.
+
+    Raises
+    ------
+    InputError, TooFewPoints
+        If the text is none of these, an id does not exist, or there are not so many control points.
+    """
+    kind, _, rest = spec.strip().partition(":")
+    # By id, so that the order of the file does not matter.
+    rows = np.array(sorted(np.flatnonzero(points.control), key=lambda i: points.ids[i]), dtype=int)
+    if kind == "ids":
+        chosen = np.array(_named(points, rest))
+    elif kind in ("even", "cluster", "random"):
+        count, other = _numbers(rest, spec)
+        if count > len(rows):
+            raise TooFewPoints(
+                f"{spec!r} asks for {count} of {counted(len(rows), 'control point')}",
+                file=points.source or None,
+                field="--select",
+            )
+        places = points.image[rows]
+        if kind == "even":
+            if other is not None:
+                raise _unknown(spec)
+            chosen = rows[_spread(places, count)]
+        elif kind == "cluster":
+            chosen = rows[_nearest(places, count, 1 if other is None else other, spec)]
+        else:
+            chosen = rows[np.random.default_rng(other or 0).permutation(len(rows))[:count]]
+    else:
+        raise _unknown(spec)
+    roles = points.roles.copy()
+    roles[rows] = "check"
+    roles[chosen] = "control"
+    return points.with_roles(roles)
+
+
+def _unknown(spec: str) -> InputError:
+    return InputError(f"{spec!r} does not select points", field="--select", remedy=f"give {_FORMS}")
+
+
+def _numbers(text: str, spec: str) -> tuple[int, int | None]:
+    parts = text.split(":")
+    if len(parts) > 2 or not all(part.strip().isascii() and part.strip().isdigit() for part in parts):
+        raise _unknown(spec)
+    values = [int(part) for part in parts]
+    if values[0] < 1 or max(values) > 2**32:
+        raise _unknown(spec)
+    return values[0], values[1] if len(values) > 1 else None
+
+
+def _named(points: Points, text: str) -> list[int]:
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    unknown = [name for name in names if name not in points.ids]
+    if unknown or not names:
+        raise InputError(
+            f"there is no point {', '.join(unknown)}" if unknown else "no point is named",
+            file=points.source or None,
+            field="--select",
+            remedy=f"the ids are {', '.join(points.ids[:12])}{' ...' if len(points) > 12 else ''}",
+        )
+    wrong = [name for name in names if points.roles[points.ids.index(name)] != "control"]
+    if wrong:
+        raise InputError(f"{', '.join(wrong)}: no control point", file=points.source or None, field="--select")
+    return [points.ids.index(name) for name in names]
+
+
+def _spread(places: Array, count: int) -> list[int]:
+    """Return the point farthest from the middle, then again and again the one farthest from those chosen."""
+    middle = (places.min(axis=0) + places.max(axis=0)) / 2
+    chosen = [int(np.argmax(((places - middle) ** 2).sum(axis=1)))]
+    nearest = ((places - places[chosen[0]]) ** 2).sum(axis=1)
+    while len(chosen) < count:
+        nearest[chosen] = -1.0
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, ((places - places[chosen[-1]]) ** 2).sum(axis=1))
+    return chosen
+
+
+def _nearest(places: Array, count: int, group: int, spec: str) -> list[int]:
+    if not 1 <= group <= len(_REGIONS):
+        raise _unknown(spec)
+    low, high = places.min(axis=0), places.max(axis=0)
+    seed = low + _REGIONS[group - 1] * (high - low)
+    return np.argsort(((places - seed) ** 2).sum(axis=1), kind="stable")[:count].tolist()

@@ -1,0 +1,499 @@
+"""Control, check and tie points: one table type, read from and written to every common format.
+
+Whatever a file's convention is, points have image coordinates (column, row) from the outer corner of the first pixel,
+and ground coordinates x, y in a stated CRS with heights in metres above the WGS84 ellipsoid (NaN: not given).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, Self, TypeVar
+
+import numpy as np
+import pyproj
+from numpy.typing import ArrayLike, NDArray
+
+from ortho_pipeline.errors import InputError, counted, reads
+from ortho_pipeline.files import write_text
+from ortho_pipeline.geodesy.crs import (
+    Vertical,
+    ground_transform,
+    horizontal,
+    parse_crs,
+)
+from ortho_pipeline.points.formats import read_table
+from ortho_pipeline.points.ground import ground_of
+from ortho_pipeline.points.rows import CSV_COLUMNS, ROLES, Piece, Row, Table, origin_shift
+
+Array = NDArray[np.float64]
+
+#: Standard deviation (px) of an image measurement whose file gives none.
+DEFAULT_SIGMA_IMAGE = 0.5
+
+
+class Point(NamedTuple):
+    """One of the points of a table, in its units; `image` and `sigma_image` in px, sigmas of the ground in metres."""
+
+    id: str
+    image: tuple[float, float]
+    ground: tuple[float, float, float]
+    role: str
+    sigma_image: float
+    sigma_ground: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Points:
+    """Points that were measured in an image and on the ground.
+
+    Parameters
+    ----------
+    ids : tuple of str
+        All different.
+    image : ndarray (N, 2)
+        Column, row in pixels.
+    ground : ndarray (N, 3)
+        x, y in `crs`, height in metres above the ellipsoid; NaN is a height that is not given.
+    roles : ndarray (N,) of str
+        ``control``, ``check`` or ``tie``.
+    sigma_image : ndarray (N,)
+        Standard deviation of the image measurement, px.
+    sigma_ground : ndarray (N, 3)
+        Standard deviation of the ground coordinates in metres; 0 is perfect.
+    crs : pyproj.CRS
+        Horizontal CRS, x first.
+    source : str
+        Where they come from, for people.
+    """
+
+    ids: tuple[str, ...]
+    image: Array
+    ground: Array
+    roles: NDArray[np.str_]
+    sigma_image: Array
+    sigma_ground: Array
+    crs: pyproj.CRS
+    source: str
+
+    def __post_init__(self) -> None:
+        count = len(self.ids)
+        for name, shape in (
+            ("image", (count, 2)),
+            ("ground", (count, 3)),
+            ("sigma_image", (count,)),
+            ("sigma_ground", (count, 3)),
+        ):
+            array = np.asarray(getattr(self, name), dtype=float)
+            if array.shape != shape:
+                raise InputError(f"{name} has the shape {array.shape}, not {shape}", field=name)
+            object.__setattr__(self, name, array)
+        roles = np.asarray(self.roles, dtype="<U7")
+        if roles.shape != (count,) or not np.isin(roles, ROLES).all():
+            raise InputError(f"each point has one role of {', '.join(ROLES)}", field="roles")
+        object.__setattr__(self, "roles", roles)
+        if len(set(self.ids)) != count:
+            twice = sorted({name for name in self.ids if self.ids.count(name) > 1})
+            raise InputError(f"the id {twice[0]!r} stands twice", file=self.source or None, field="id")
+
+    def __repr__(self) -> str:
+        roles = ", ".join(f"{(self.roles == role).sum()} {role}" for role in ROLES if (self.roles == role).any())
+        return f"<{counted(len(self.ids), 'point')}: {roles or 'none'}; {self.crs.name}; {self.source}>"
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __iter__(self) -> Iterator[Point]:
+        columns = self.image.tolist(), self.ground.tolist(), self.roles.tolist()
+        sigmas = self.sigma_image.tolist(), self.sigma_ground.tolist()
+        for name, image, ground, role, sigma, sigma_ground in zip(self.ids, *columns, *sigmas, strict=True):
+            yield Point(name, tuple(image), tuple(ground), role, sigma, tuple(sigma_ground))
+
+    @property
+    def __geo_interface__(self) -> dict[str, Any]:
+        """The points as GeoJSON values in longitude, latitude (WGS84) and ellipsoidal height, as files have them.
+
+        `ji` are column and row from the centre of the first pixel. A point without a place has no geometry. shapely,
+        GeoPandas (``GeoDataFrame.from_features(points, crs=4326)``) and others read it.
+        """
+        return {"type": "FeatureCollection", "features": [_feature(point) for point in self.to_crs("EPSG:4979")]}
+
+    @property
+    def control(self) -> NDArray[np.bool_]:
+        """Which points are control ``(N,)``."""
+        return self.roles == "control"
+
+    @property
+    def check(self) -> NDArray[np.bool_]:
+        """Which points are check points ``(N,)``."""
+        return self.roles == "check"
+
+    def select(self, mask: ArrayLike) -> Points:
+        """Return the points of a mask ``(N,)`` or of indices, in their order."""
+        index = np.arange(len(self))[np.asarray(mask)]
+        return replace(
+            self,
+            ids=tuple(self.ids[i] for i in index),
+            image=self.image[index],
+            ground=self.ground[index],
+            roles=self.roles[index],
+            sigma_image=self.sigma_image[index],
+            sigma_ground=self.sigma_ground[index],
+        )
+
+    def with_roles(self, roles: ArrayLike) -> Points:
+        """Return these points with other roles ``(N,)``."""
+        return replace(self, roles=np.asarray(roles))
+
+    def with_ground(self, ground: ArrayLike) -> Points:
+        """Return these points at another place ``(N, 3)`` of the same CRS."""
+        return replace(self, ground=np.asarray(ground, dtype=float))
+
+    def to_crs(self, target: str | pyproj.CRS) -> Points:
+        """Return these points in another CRS; heights that are not given stay so.
+
+        Raises
+        ------
+        CrsError
+            If there is no transformation.
+        """
+        target = parse_crs(target)
+        missing = ~np.isfinite(self.ground[:, 2])
+        ground = self.ground.copy()
+        ground[missing, 2] = 0.0
+        ground = ground_transform(self.crs, target)(ground)
+        if not target.is_geocentric:
+            ground[missing, 2] = np.nan
+            target = horizontal(target)
+        elif missing.any():
+            ground[missing] = np.nan
+        return replace(self, ground=ground, crs=target)
+
+
+# -- reading ---------------------------------------------------------------------------------------------------------
+
+
+@reads("see docs/formats.md for what stands in a file of points")
+def read_points(
+    path: str | os.PathLike[str],
+    *,
+    crs: str | pyproj.CRS | None = None,
+    vertical: str | Vertical | None = None,
+    pixel_origin: str = "corner",
+    image_name: str | None = None,
+    pieces: Mapping[str, Piece] | None = None,
+) -> Points:
+    """Read points of any known format (docs/formats.md).
+
+    Parameters
+    ----------
+    crs, vertical : optional
+        What the coordinates and the heights are in, where the file does not say it.
+    pixel_origin : 'corner', 'center', 'corner-1' or 'center-1'
+        What CSV, ODM and link files call the outer corner, or the centre, of the first pixel: (0, 0) or (1, 1). The
+        other formats have a convention of their own.
+    image_name : str, optional
+        Keep the points of this image, where a file holds points of several.
+    pieces : mapping of str to (float, float, float), optional
+        Further images whose points are kept: column and row of their first corner in this image, and the width of one
+        of their pixels.
+
+    Raises
+    ------
+    InputError, CrsError, DatumError
+        Names file, line and column, and what to do.
+    """
+    table = read_table(path, image_name, pieces)
+    ids = _ids(path, table.rows)
+    image = np.array([row.image for row in table.rows]) + origin_shift(path, table, pixel_origin)
+    pieces_of = np.array([row.piece for row in table.rows])
+    image = image * pieces_of[:, 2:] + pieces_of[:, :2]
+    ground, plane = ground_of(path, table, crs, vertical)
+    _refuse_duplicates(path, [row.where for row in table.rows], image, ground, [row.role for row in table.rows])
+    return Points(
+        ids=ids,
+        image=image,
+        ground=ground,
+        roles=np.array([row.role for row in table.rows], dtype="<U7"),
+        sigma_image=np.array([_or(row.sigma_image, DEFAULT_SIGMA_IMAGE) * row.piece[2] for row in table.rows]),
+        sigma_ground=np.array([[_or(row.sigma_xy, 0.0)] * 2 + [_or(row.sigma_h, 0.0)] for row in table.rows]),
+        crs=plane,
+        source=os.fspath(path),
+    )
+
+
+def gcps_of_dataset(
+    dataset: Any, *, crs: str | pyproj.CRS | None = None, vertical: str | Vertical | None = None
+) -> Points:
+    """Return the ground control points that an open GDAL dataset carries.
+
+    Heights that are all zero are GDAL's way to say that there are none: they are NaN here.
+
+    Raises
+    ------
+    InputError, CrsError, DatumError
+        If there are none, or the CRS or the height datum is not known.
+    """
+    path = dataset.GetDescription()
+    gcps = dataset.GetGCPs()
+    if not gcps:
+        raise InputError("this raster carries no ground control points", file=path, remedy="give a point file")
+    named = all(gcp.Id for gcp in gcps) and len({gcp.Id for gcp in gcps}) == len(gcps)
+    flat = all(gcp.GCPZ == 0 for gcp in gcps)
+    rows = [
+        Row(
+            where=f"GCP {count}",
+            id=gcp.Id if named else str(count),
+            image=(float(gcp.GCPPixel), float(gcp.GCPLine)),
+            ground=(float(gcp.GCPX), float(gcp.GCPY), math.nan if flat else float(gcp.GCPZ)),
+        )
+        for count, gcp in enumerate(gcps, start=1)
+    ]
+    image, ground = np.array([row.image for row in rows]), np.array([row.ground for row in rows])
+    if not (np.isfinite(image).all() and np.isfinite(ground[:, :2]).all()):
+        raise InputError("a ground control point is not finite", file=path, field="GCP")
+    table = Table("GCPs", rows, crs=dataset.GetGCPProjection() or None)
+    placed, plane = ground_of(path, table, crs, vertical)
+    _refuse_duplicates(path, [row.where for row in rows], image, placed, [row.role for row in rows])
+    return Points(
+        ids=tuple(str(row.id) for row in rows),
+        image=image,
+        ground=placed,
+        roles=np.full(len(rows), "control", dtype="<U7"),
+        sigma_image=np.full(len(rows), DEFAULT_SIGMA_IMAGE),
+        sigma_ground=np.zeros((len(rows), 3)),
+        crs=plane,
+        source=path,
+    )
+
+
+def _or(value: float | None, default: float) -> float:
+    return default if value is None else value
+
+
+def _ids(path: str | os.PathLike[str], rows: Sequence[Row]) -> tuple[str, ...]:
+    """Number the points without an id by their place in the file; refuse an id that stands twice."""
+    first: dict[str, str] = {}
+    for count, row in enumerate(rows, start=1):
+        row.id = row.id if row.id is not None else str(count)
+        if row.id in first:
+            raise InputError(
+                f"the id {row.id!r} stands twice, first in {first[row.id]}",
+                file=path,
+                field=row.where,
+                remedy="give each point an id of its own",
+            )
+        first[row.id] = row.where
+    return tuple(str(row.id) for row in rows)
+
+
+def _refuse_duplicates(
+    path: str | os.PathLike[str], wheres: Sequence[str], image: Array, ground: Array, roles: Sequence[str]
+) -> None:
+    """Refuse points that stand twice: the same ground or the same pixel, to all digits that can matter."""
+    # A millimetre in degrees and in metres; pixels to a millionth.
+    digits = 8 if np.abs(ground[:, :2]).max(initial=0) <= 360 else 3
+    for what, keys in (("ground", np.round(ground, digits)), ("image", np.round(image, 6))):
+        first: dict[tuple[float, ...], int] = {}
+        for count, key in enumerate(map(tuple, np.nan_to_num(keys, nan=-1e9).tolist())):
+            other = first.setdefault(key, count)
+            if other != count:
+                both = sorted({roles[other], roles[count]})
+                as_both = f", as {' and '.join(both)}" if len(both) > 1 else ""
+                raise InputError(
+                    f"the same {what} coordinates as in {wheres[other]}{as_both}",
+                    file=path,
+                    field=wheres[count],
+                    remedy="remove one of the two",
+                )
+
+
+#: Two points closer than this (m) are one mark; the targets of no survey stand so close together.
+_ONE_MARK = 0.01
+
+
+class HasGround(Protocol):
+    """A table of points with ground: of one image, or of a block."""
+
+    @property
+    def ids(self) -> tuple[str, ...]: ...
+    @property
+    def ground(self) -> Array: ...
+    @property
+    def crs(self) -> pyproj.CRS: ...
+
+
+def one_mark(points: HasGround) -> list[tuple[str, str]]:
+    """Return pairs of ids of points that are within a centimetre on the ground: one mark that was measured twice.
+
+    Of a crowd each point stands in one pair, with its nearest neighbour.
+    """
+    from scipy.spatial import cKDTree
+
+    plan = np.isfinite(points.ground[:, :2]).all(axis=1)
+    place = np.nan_to_num(points.ground[plan])
+    if len(place) < 2:
+        return []
+    place = ground_transform(points.crs, "EPSG:4978")(place)
+    index = np.flatnonzero(plan)[np.isfinite(place).all(axis=1)]
+    place = place[np.isfinite(place).all(axis=1)]
+    distance, neighbour = cKDTree(place).query(place, k=2, distance_upper_bound=_ONE_MARK)
+    # Of points at one place the first neighbour may be the other.
+    other = np.where(neighbour[:, 0] == np.arange(len(place)), neighbour[:, 1], neighbour[:, 0])
+    near = np.flatnonzero(np.isfinite(distance).all(axis=1))
+    pairs = {(min(index[k], index[other[k]]), max(index[k], index[other[k]])) for k in near}
+    return [(points.ids[one], points.ids[two]) for one, two in sorted(pairs)]
+
+
+def marks_warning(control: HasGround) -> list[str]:
+    """Return a warning of control points that are one mark: they add no knowledge of its place."""
+    pairs = one_mark(control)
+    if not pairs:
+        return []
+    shown = ", ".join(f"{one} and {two}" for one, two in pairs[:5]) + (" ..." if len(pairs) > 5 else "")
+    return [
+        f"control points within a centimetre of each other ({shown}): one mark that was measured twice counts as two, "
+        "and redundancy and sigmas are too good by that; keep one of them"
+    ]
+
+
+# -- roles -----------------------------------------------------------------------------------------------------------
+
+
+class HasRoles(Protocol):
+    """A table of points with roles: of one image, or of a block."""
+
+    @property
+    def ids(self) -> tuple[str, ...]: ...
+    @property
+    def roles(self) -> NDArray[np.str_]: ...
+    @property
+    def control(self) -> NDArray[np.bool_]: ...
+    @property
+    def source(self) -> str: ...
+    def with_roles(self, roles: ArrayLike) -> Self: ...
+
+
+AnyPoints = TypeVar("AnyPoints", bound=HasRoles)
+
+
+def assign_roles(points: AnyPoints, spec: str) -> AnyPoints:
+    """Make check points of some control points.
+
+    Parameters
+    ----------
+    spec : str
+        ``every:N`` for each N-th control point (the N-th first), or ``ids:a,b,c`` for these points.
+
+    Raises
+    ------
+    InputError
+        If the text is neither, or an id does not exist.
+    """
+    kind, _, rest = spec.partition(":")
+    roles = points.roles.copy()
+    if kind == "every" and rest.strip().isascii() and rest.strip().isdigit() and 0 < int(rest) <= 1_000_000:
+        roles[np.flatnonzero(points.control)[int(rest) - 1 :: int(rest)]] = "check"
+        return points.with_roles(roles)
+    names = [name.strip() for name in rest.split(",") if name.strip()]
+    if kind == "ids" and names:
+        unknown = [name for name in names if name not in points.ids]
+        if unknown:
+            raise InputError(
+                f"there is no point {', '.join(unknown)}",
+                file=points.source or None,
+                field="--check",
+                remedy=f"the ids are {', '.join(points.ids[:12])}{' ...' if len(points.ids) > 12 else ''}",
+            )
+        roles[np.isin(np.array(points.ids), names)] = "check"
+        return points.with_roles(roles)
+    raise InputError(f"{spec!r} does not choose check points", field="--check", remedy="give every:N or ids:a,b,c")
+
+
+# -- writing ---------------------------------------------------------------------------------------------------------
+
+
+def write_points(
+    points: Points, path: str | os.PathLike[str], *, images: Sequence[str] | None = None
+) -> None:  # fmt: skip
+    """Write points as ``.csv``/``.tsv``, ``.geojson`` (lon, lat, EPSG:4979) or QGIS ``.points``; whole or not at all.
+
+    CSV and GeoJSON read back as they were; a QGIS file has no ids, heights, roles or sigmas.
+
+    Parameters
+    ----------
+    images : sequence of str, optional
+        Name of the file that each point was measured in, where they are several: CSV and TSV alone can say it.
+
+    Raises
+    ------
+    InputError
+        For another suffix, or a folder that cannot be written.
+    """
+    writers = {".csv": _csv_text, ".tsv": _csv_text, ".geojson": _geojson_text, ".points": _qgis_text}
+    suffix = Path(path).suffix.lower()
+    if suffix not in writers:
+        raise InputError("points are not written in this format", file=path, remedy=f"one of {', '.join(writers)}")
+    if images is not None and writers[suffix] is not _csv_text:
+        raise InputError(f"{suffix} does not say in which file a point was measured", file=path, remedy="write .csv")
+    write_text(path, _csv_text(points, suffix, images) if images is not None else writers[suffix](points, suffix))
+
+
+def _csv_text(points: Points, suffix: str, images: Sequence[str] | None = None) -> str:
+    out = io.StringIO()
+    out.write(f"#CRS: {_crs_text(points.crs)}\n#vertical: ellipsoid\n")
+    # An id that starts with '#' would read as a comment without quotation marks.
+    hidden = any(name.startswith("#") for name in points.ids)
+    writer = csv.writer(
+        out,
+        delimiter="\t" if suffix == ".tsv" else ",",
+        lineterminator="\n",
+        quoting=csv.QUOTE_ALL if hidden else csv.QUOTE_MINIMAL,
+    )
+    writer.writerow(CSV_COLUMNS if images is None else (*CSV_COLUMNS, "image"))
+    # One column holds both plan components: the larger one is the careful choice.
+    sigma_xy = points.sigma_ground[:, :2].max(axis=1)
+    numbers = np.column_stack([points.image, points.ground])
+    sigmas = np.column_stack([points.sigma_image, sigma_xy, points.sigma_ground[:, 2]])
+    for k, name in enumerate(points.ids):
+        cells = ["" if math.isnan(value) else repr(value) for value in numbers[k].tolist()]
+        measured_in = [] if images is None else [images[k]]
+        writer.writerow([name, *cells, str(points.roles[k]), *map(repr, sigmas[k].tolist()), *measured_in])
+    return out.getvalue()
+
+
+def _geojson_text(points: Points, suffix: str) -> str:
+    return json.dumps(points.__geo_interface__, indent=1, allow_nan=False) + "\n"
+
+
+def _feature(point: Point) -> dict[str, Any]:
+    """Return the GeoJSON feature of a point whose ground is longitude, latitude and height."""
+    place = list(point.ground if math.isfinite(point.ground[2]) else point.ground[:2])
+    properties = {
+        "id": point.id,
+        "ji": [value - 0.5 for value in point.image],
+        "role": point.role,
+        "sigma_image": point.sigma_image,
+        "sigma_xy": max(point.sigma_ground[:2]),
+        "sigma_h": point.sigma_ground[2],
+    }
+    geometry = {"type": "Point", "coordinates": place} if all(map(math.isfinite, place)) else None
+    return {"type": "Feature", "id": point.id, "properties": properties, "geometry": geometry}
+
+
+def _qgis_text(points: Points, suffix: str) -> str:
+    lines = [f"#CRS: {_crs_text(points.crs)}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
+    for (column, row), (x, y, _) in zip(points.image.tolist(), points.ground.tolist(), strict=True):
+        lines.append(f"{x!r},{y!r},{column!r},{-row!r},1,0,0,0")
+    return "\n".join(lines) + "\n"
+
+
+def _crs_text(crs: pyproj.CRS) -> str:
+    authority = crs.to_authority(min_confidence=100)
+    return ":".join(authority) if authority else crs.to_wkt().replace("\n", " ")

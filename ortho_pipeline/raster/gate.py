@@ -1,0 +1,526 @@
+"""The gate before GDAL: a raster is opened once every file that it leads to has been seen.
+
+GDAL follows what headers and side-cars say of other files, with every driver that is registered and some of it while it
+opens. So each file is looked at before GDAL is: what it is (by GDAL's own test, among all drivers), which files its
+header names (read by GDAL's own XML parser) and which side-cars GDAL takes up as rasters. Those are seen to in the same
+way, down to the last one. A name that leads out of the allowed folders, or a driver that is not on the list, ends it.
+What GDAL alone can tell (`GetFileList`, overviews in metadata) is asked of the open dataset before a pixel is read.
+
+`locations.close_network` says what a process of the command line adds.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.locations import AnyPath, VsiPath, in_local_archive, network_is_closed, place, within
+
+gdal.UseExceptions()
+
+#: Raster drivers that only read pixels out of the file they are given (and its side-cars).
+_PLAIN = (
+    "GTiff", "COG", "NITF", "JP2OpenJPEG", "JP2KAK", "JPEG", "PNG", "HFA", "ENVI", "PCRaster", "DTED",
+    "SRTMHGT", "AAIGrid", "GTX", "NTv2", "EHdr", "BMP", "USGSDEM", "SGI", "BYN", "MEM",
+)  # fmt: skip
+#: Drivers whose headers name other files: each is used for a file whose names have been seen.
+_REFERRING = ("VRT", "DIMAP", "ERS", "ISIS3", "PCIDSK")
+DRIVERS = _PLAIN + _REFERRING
+#: Raster drivers that send requests; a process of the command line does without them.
+_FETCHING = (
+    "WMS", "WMTS", "WCS", "HTTP", "OGCAPI", "PLMOSAIC", "PLSCENES", "STACTA", "STACIT", "EEDAI", "DAAS", "NGW", "MRF",
+    "PostGISRaster", "GeoRaster", "Rasterlite", "RASDAMAN", "TileDB", "GTI", "Zarr", "netCDF", "JPIPKAK", "DODS",
+)  # fmt: skip
+#: Side-cars that GDAL opens as rasters, by their ending after the whole name of an image or after its stem.
+_RASTER_SIDE_CAR = re.compile(r"\.(ovr|msk|aux|rrd|r[0-9])$")
+#: Headers beyond this are not read.
+_MAX_HEADER = 5_000_000
+_MANY = 10_000
+_OVERVIEWS = "OVERVIEWS"
+_OUTSIDE = (
+    "name a folder that holds both with --root {root}, put the files into one folder, or make one file of them "
+    "(gdal_translate in out.tif)"
+)
+
+#: What a plain VRT consists of, attributes and elements alike, in lower case as GDAL compares them.
+_VRT_NAMES = frozenset(
+    re.findall(
+        r"\S+",
+        """
+        vrtdataset rasterxsize rasterysize subclass srs dataaxistosrsaxismapping coordinateepoch geotransform metadata
+        gcplist vrtrasterband datatype band blockxsize blockysize description unittype offset scale nodatavalue
+        hidenodatavalue colorinterp colortable categorynames histograms gdalrasterattributetable maskband overview
+        overviewlist resampling simplesource complexsource averagedsource kernelfilteredsource name sourcefilename
+        relativetovrt shared sourceband sourceproperties srcrect dstrect xoff yoff xsize ysize nodata usemaskband lut
+        scaleoffset scaleratio exponent srcmin srcmax dstmin dstmax clamp colortablecomponent kernel normalized size
+        coefs imageoffset pixeloffset lineoffset byteorder ?xml version encoding standalone
+        """,
+    )
+)
+#: Parts of a VRT that hold text only, whatever is in them.
+_VRT_TEXTS = frozenset(
+    {"srs", "metadata", "gcplist", "histograms", "gdalrasterattributetable", "colortable", "categorynames",
+     "description"}
+)  # fmt: skip
+_VRT_CLASSES = frozenset({"vrtdataset", "vrtrasterband", "vrtsourcedrasterband", "vrtrawrasterband"})
+_PLAIN_VRT = "make a file of it first (gdal_translate in.vrt out.tif)"
+
+
+def open_seen(
+    path: AnyPath, roots: Sequence[AnyPath], drivers: Sequence[str], siblings: bool
+) -> tuple[gdal.Dataset, Block]:
+    """Open a raster for reading if all files that it leads to lie in its own folder or in `roots`.
+
+    Parameters
+    ----------
+    path : path or VsiPath
+        A file, or a folder with a product, as the user named it.
+    drivers : sequence of str
+        Those of `DRIVERS` that may read it.
+    siblings : bool
+        Whether GDAL may look at side-car files.
+
+    Returns
+    -------
+    gdal.Dataset, Block
+        The raster, and the largest block of it and of all that it leads to.
+
+    Raises
+    ------
+    InputError
+        If a file would be read that lies elsewhere, or by another driver; naming it and who names it.
+    RuntimeError
+        If GDAL cannot open the file.
+    """
+    _without_fetching_drivers()
+    gate = _Gate(path, roots)
+    dataset = gate.open(path, drivers, siblings)
+    return dataset, gate.block
+
+
+@functools.cache
+def _without_fetching_drivers() -> None:
+    if network_is_closed():
+        for name in _FETCHING:
+            driver = gdal.GetDriverByName(name)
+            if driver is not None:
+                driver.Deregister()
+
+
+@dataclass(frozen=True)
+class Block:
+    """What GDAL decodes at once to give one pixel: its `size` in bytes, and the `path` of the file that it is in."""
+
+    size: int
+    path: str
+
+
+@dataclass(frozen=True)
+class _Named:
+    """A file that the header of another one names; `raw` if GDAL reads its bytes, not a raster."""
+
+    name: str
+    field: str
+    relative: bool = True
+    raw: bool = False
+
+
+class _Gate:
+    """The files of one raster that have been seen, and the folders in which they may lie."""
+
+    def __init__(self, path: AnyPath, roots: Sequence[AnyPath]) -> None:
+        if isinstance(path, VsiPath):
+            self._roots: list[AnyPath] = [path.parent]
+        else:
+            # A link's own side-cars may lie where it lies or where it leads.
+            here = Path(path)
+            folders = [here, here.resolve()] if here.is_dir() else [here.parent, here.resolve().parent]
+            self._roots = [folder.resolve() for folder in (*folders, *map(Path, roots))]
+        self._seen: set[str] = set()
+        self.block = Block(0, os.fspath(path))
+        self._folders: dict[str, list[str]] = {}
+
+    def open(self, path: AnyPath, drivers: Sequence[str], siblings: bool = True) -> gdal.Dataset:
+        """Open a file that the user named, with the files that it leads to seen."""
+        name = os.fspath(path)
+        there = place(name)
+        if there.is_dir():
+            self._see_folder(there)
+            allowed = ["DIMAP"]
+        else:
+            kind = _identified(name, drivers)
+            if kind in _REFERRING:
+                self._see_named(there, kind, frozenset())
+            if siblings:
+                self._see_side_cars(there)
+            allowed = [kind] if kind in _REFERRING else [one for one in drivers if one in _PLAIN]
+        options: dict[str, Any] = {} if siblings else {"sibling_files": [name.rpartition("/")[2]]}
+        dataset = gdal.OpenEx(name, gdal.OF_RASTER | gdal.OF_READONLY, allowed_drivers=allowed, **options)
+        self._see_open(dataset, there)
+        return dataset
+
+    # -- files that are named or found -------------------------------------------------------------------------------
+
+    def _see(self, path: Any, by: Any, field: str, chain: frozenset[str]) -> None:
+        """See to a raster that another file leads to: GDAL opens it with any driver, lazily or at once."""
+        key = str(path.resolve())
+        if key in chain:
+            raise InputError("this VRT is a source of itself", file=path, remedy="take one of the two out of the other")
+        if key in self._seen:
+            return
+        self._seen.add(key)
+        if len(self._seen) > _MANY:
+            raise InputError(f"this leads to more than {_MANY} files", file=by, remedy=_PLAIN_VRT)
+        name = str(path)
+        kind = _identified(name, DRIVERS)
+        first = None if kind is None else _identified(name, None)
+        if kind is None or first not in DRIVERS or (kind == "VRT" and isinstance(path, VsiPath)):
+            raise InputError(
+                f"{path.name!r} is no raster of an allowed format, and GDAL would open it "
+                f"({first or kind or 'by whatever driver takes it'})",
+                file=by, field=field, remedy="take it away, or make a GeoTIFF of it (gdal_translate)",
+            )  # fmt: skip
+        if kind in _REFERRING:
+            self._see_named(path, kind, chain | {key})
+        self._see_side_cars(path)
+        allowed = [kind] if kind in _REFERRING else list(_PLAIN)
+        try:
+            dataset = gdal.OpenEx(name, gdal.OF_RASTER | gdal.OF_READONLY, allowed_drivers=allowed)
+        except (RuntimeError, UnicodeDecodeError) as error:
+            # GDAL would go on with its other drivers.
+            raise InputError(
+                f"{path.name!r} cannot be opened ({str(error).strip().partition(chr(10))[0]})",
+                file=by, field=field, remedy="the file is damaged: copy it again, or take it away",
+            ) from error  # fmt: skip
+        self._see_open(dataset, path)
+
+    def _see_folder(self, folder: Any) -> None:
+        """See to the product in a folder that the user named."""
+        for name in self._names(folder):
+            if re.fullmatch(r"metadata\.dim|vol_.*\.xml", name.lower()):
+                self._must_be_inside(folder / name, folder, name)
+                self._see_named(folder / name, "DIMAP", frozenset())
+
+    def _see_side_cars(self, path: Any) -> None:
+        """See to what GDAL takes up as overviews and masks because of its name."""
+        name, stem = path.name.lower(), path.stem.lower()
+        for other in self._names(path.parent, path.name):
+            lower = other.lower()
+            if not lower.startswith(stem) or lower == name:
+                continue
+            rest = lower.removeprefix(name) if lower.startswith(name) else lower.removeprefix(stem)
+            if rest == ".aux.xml":
+                self._must_be_inside(path.parent / other, path, other)
+            elif _RASTER_SIDE_CAR.fullmatch(rest):
+                side_car = path.parent / other
+                self._must_be_inside(side_car, path, other)
+                if _identified(str(side_car), None) not in _PLAIN:
+                    raise InputError(
+                        f"the side-car {other!r} is no plain raster", file=path, field=other,
+                        remedy="take it away; gdaladdo makes new overviews",
+                    )  # fmt: skip
+                # Overviews of an HFA file in .rrd are read by that driver alone, and are no raster of their own.
+                if rest != ".rrd":
+                    self._see(side_car, path, other, frozenset())
+
+    def _see_named(self, path: Any, kind: str, chain: frozenset[str]) -> None:
+        """See to the files that a header names."""
+        chain = chain | {str(path.resolve())}
+        for named in _NAMES[kind](path):
+            for target in self._targets(named, path):
+                if kind == "DIMAP" and target.is_file() and named.field == "COMPONENT_PATH":
+                    if str(target.resolve()) not in chain:
+                        self._see_named(target, "DIMAP", chain)
+                elif target.exists() and not named.raw:
+                    self._see(target, path, named.field, chain)
+
+    def _targets(self, named: _Named, by: Any) -> Iterator[Any]:
+        """Yield the places that a name may stand for, all of them inside."""
+        # With and without what some drivers strip or turn.
+        for name in {named.name, named.name.strip(), named.name.strip().replace("\\", "/")}:
+            if not name or name.startswith("/vsi") or re.search(r"[<>{}:\x00-\x1f]", name.strip()):
+                self._outside(name, by, named.field, None)
+            if isinstance(by, VsiPath):
+                # Names in archives and behind URLs are text.
+                inside = VsiPath(f"{by.parent}/{name.removeprefix('./')}")
+                if not _is_below(inside, self._roots[0]):
+                    self._outside(name, by, named.field, None)
+                yield inside
+                continue
+            folders = {by.parent, by.resolve().parent} if named.relative else {Path()}
+            # GDAL shortens "..", the system follows links.
+            short = {Path(os.path.normpath(folder.absolute() / name)) for folder in folders}
+            for target in {folder / name for folder in folders} | short:
+                self._must_be_inside(target, by, named.field, name)
+                yield target
+
+    def _must_be_inside(self, path: Any, by: Any, field: str, name: str | None = None) -> None:
+        if isinstance(path, VsiPath):
+            if not _is_below(path, self._roots[0]):
+                self._outside(name or str(path), by, field, None)
+        elif not within(path, self._roots):
+            self._outside(name or str(path), by, field, path.resolve())
+        try:
+            plain = path.is_file() or not path.exists()
+        except OSError as error:
+            # Longer than a file system takes, or in a folder that may not be read.
+            raise InputError(
+                f"{(name or path.name)[:80]!r} cannot be a file here ({error.strerror})", file=by, field=field,
+                remedy="correct the name, or take it away",
+            ) from error  # fmt: skip
+        if not plain:
+            raise InputError(
+                f"{name or path.name!r} is no file", file=by, field=field, remedy="put a file there, or take it away"
+            )
+
+    def _outside(self, name: str, by: Any, field: str, path: Path | None) -> None:
+        root = "DIR" if path is None else os.path.commonpath([path.parent, Path(by).resolve().parent])
+        raise InputError(
+            f"this file reads {name[:200]!r}, which is outside of its own folder",
+            file=by, field=field, remedy=_OUTSIDE.format(root=root),
+        )  # fmt: skip
+
+    def _names(self, folder: Any, image: str = "") -> list[str]:
+        """Return the names of the files in a folder; behind a URL, those of the side-cars that are there."""
+        key = str(folder)
+        if isinstance(folder, VsiPath) and not (in_local_archive(key) and folder.is_dir()):
+            endings = (".ovr", ".msk", ".aux", ".aux.xml")
+            return [image + ending for ending in endings if (folder / (image + ending)).exists()]
+        if key not in self._folders:
+            names = (one.name for one in folder.iterdir()) if isinstance(folder, VsiPath) else os.listdir(folder)
+            self._folders[key] = list(names)
+        return self._folders[key]
+
+    # -- what GDAL tells ---------------------------------------------------------------------------------------------
+
+    def _see_open(self, dataset: gdal.Dataset, path: Any) -> None:
+        """See to the files that an open dataset goes on to read, before it does."""
+        for key, value in (dataset.GetMetadata(_OVERVIEWS) or {}).items():
+            if key.upper() == "OVERVIEW_FILE":
+                named = _Named(str(value).removeprefix(":::BASE:::"), "OVERVIEW_FILE")
+                for target in self._targets(named, path):
+                    if target.exists():
+                        self._see(target, path, named.field, frozenset())
+        kind = dataset.GetDriver().ShortName
+        for name in _listed(dataset):
+            file = place(name)
+            if str(file) == str(path):
+                continue
+            self._must_be_inside(file, path, kind, name)
+        self.block = max(self.block, Block(_decoded_at_once(dataset), str(path)), key=lambda block: block.size)
+
+
+def _decoded_at_once(dataset: gdal.Dataset) -> int:
+    """Return the bytes of the largest block of a raster: all bands if they are interleaved, or its mask."""
+    if dataset.RasterCount == 0:
+        return 0
+    band = dataset.GetRasterBand(1)
+    together = dataset.RasterCount if dataset.GetMetadataItem("INTERLEAVE", "IMAGE_STRUCTURE") == "PIXEL" else 1
+    pixels = band.XSize * band.YSize if _is_sequential(dataset, band) else math.prod(band.GetBlockSize())
+    size = pixels * max(1, gdal.GetDataTypeSize(band.DataType) // 8) * together
+    try:
+        masked = band.GetMaskFlags() & gdal.GMF_PER_DATASET
+        return max(size, math.prod(band.GetMaskBand().GetBlockSize()) if masked else 0)
+    except RuntimeError:
+        # Who needs the mask is told by its reader.
+        return size
+
+
+def _is_sequential(dataset: gdal.Dataset, band: gdal.Band) -> bool:
+    """Tell whether a row is found by decoding all rows before it, whatever GDAL says of blocks.
+
+    So it is with PNG and JPEG, and with a compressed TIFF that is one strip, which GDAL gives row by row.
+    """
+    kind = dataset.GetDriver().ShortName
+    if kind != "GTiff":
+        return kind in ("PNG", "JPEG")
+    if band.GetBlockSize() != [band.XSize, 1] or dataset.GetMetadataItem("COMPRESSION", "IMAGE_STRUCTURE") is None:
+        return False
+    first, *others = (band.GetMetadataItem(f"BLOCK_OFFSET_0_{row}", "TIFF") for row in (0, 1, band.YSize - 1))
+    return first is not None and others == [None, None]
+
+
+def _listed(dataset: gdal.Dataset) -> list[str]:
+    """Return the files that GDAL knows of a dataset."""
+    try:
+        return list(dataset.GetFileList() or [])
+    except RuntimeError:
+        # Of a side-car that it cannot read GDAL complains once; who needs what stands in it is told by its reader.
+        return list(dataset.GetFileList() or [])
+
+
+def _is_below(path: VsiPath, folder: AnyPath) -> bool:
+    """Tell whether a path lies in a folder by its text, in which dots lead nowhere."""
+    rest = str(path).removeprefix(f"{os.fspath(folder)}/")
+    return rest != str(path) and not {"", ".", ".."} & set(rest.split("/"))
+
+
+def _identified(name: str, drivers: Sequence[str] | None) -> str | None:
+    """Return the driver that takes a file first, among some or among all; GDAL reads its beginning only."""
+    allowed = {} if drivers is None else {"allowed_drivers": list(drivers)}
+    try:
+        driver = gdal.IdentifyDriverEx(name, gdal.OF_RASTER, **allowed)
+    except (RuntimeError, UnicodeDecodeError):
+        return None
+    return None if driver is None else str(driver.ShortName)
+
+
+# -- headers -----------------------------------------------------------------------------------------------------------
+
+
+def _header(path: Any, limit: int = _MAX_HEADER) -> str:
+    """Return a header as C reads it: up to the first NUL."""
+    if not path.is_file():
+        raise InputError("this is no file", file=path, remedy="put a file there, or take it away")
+    if path.stat().st_size > limit:
+        raise InputError(
+            "a header of more than 5 MB is not opened", file=path, remedy="make one file of it (gdal_translate)"
+        )
+    data = path.read_bytes().partition(b"\0")[0]
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def _xml(path: Any) -> Any:
+    """Return XML as GDAL understands it: nodes ``[kind, name, *children]``, whether well-formed or not."""
+    try:
+        return gdal.ParseXMLString(_header(path))
+    except (RuntimeError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"this is no well-formed XML ({str(error).strip()})", file=path, remedy="copy the file again"
+        ) from error
+
+
+_ELEMENT, _TEXT, _ATTRIBUTE = 0, 1, 2
+
+
+def _parts(node: Any) -> Iterator[tuple[str, Any]]:
+    """Yield attributes and elements of a node, which GDAL does not tell apart, by their names in lower case."""
+    for child in node[2:]:
+        if child[0] in (_ELEMENT, _ATTRIBUTE):
+            yield str(child[1]).lower(), child
+
+
+def _value(node: Any) -> list[str]:
+    return [str(child[1]) for child in node[2:] if child[0] == _TEXT]
+
+
+def _names_of_vrt(path: Any) -> Iterator[_Named]:
+    """Yield the sources of a plain VRT; refuse any other one."""
+    pending: list[tuple[Any, str]] = [([_ELEMENT, "", _xml(path)], "")]
+    while pending:
+        node, band = pending.pop()
+        for name, child in _parts(node):
+            if name == "" or name in _VRT_TEXTS:
+                if name == "":
+                    pending.append((child, band))
+                continue
+            values = [text.lower() for text in _value(child)]
+            if name not in _VRT_NAMES or (name == "subclass" and not _VRT_CLASSES.issuperset(values)):
+                raise InputError(
+                    f"only plain VRTs are opened, and {child[1]} {' '.join(values)[:40]} is none", file=path,
+                    field=child[1][:80], remedy=_PLAIN_VRT,
+                )  # fmt: skip
+            if name == "sourcefilename":
+                yield _source(child, path, band)
+            kinds = [text.lower() for part, one in _parts(child) if part == "subclass" for text in _value(one)]
+            raw = name == "vrtrasterband" and kinds == ["vrtrawrasterband"]
+            pending.append((child, "raw" if raw else ""))
+
+
+def _source(node: Any, path: Any, band: str) -> _Named:
+    texts = _value(node)
+    relative = [text.strip() for name, one in _parts(node) if name == "relativetovrt" for text in _value(one)]
+    if len(texts) != 1 or len(relative) > 1 or not set(relative) <= {"0", "1"}:
+        raise InputError("a source of this VRT has no plain name", file=path, field="SourceFilename", remedy=_PLAIN_VRT)
+    return _Named(texts[0], "SourceFilename", relative=relative == ["1"], raw=band == "raw")
+
+
+def _names_of_dimap(path: Any) -> Iterator[_Named]:
+    """Yield the images and the parts of a product that DIMAP metadata name: what is called ``..._PATH``."""
+    pending = [[_ELEMENT, "", _xml(path)]]
+    while pending:
+        node = pending.pop()
+        for name, child in _parts(node):
+            pending.append(child)
+            if name in ("data_file_path", "component_path"):
+                hrefs = [text for part, one in _parts(child) if part == "href" for text in _value(one)]
+                for text in hrefs or _value(child):
+                    yield _Named(text, name.upper())
+
+
+def _names_of_ers(path: Any) -> Iterator[_Named]:
+    """Yield the data file of an ERS header: raw pixels, or any raster where it is "Translated"."""
+    text = _header(path)
+    raw = "translated" not in text.lower()
+    for match in re.finditer(r"datafile", text, re.IGNORECASE):
+        named = re.compile(r"""[ \t]*=[ \t]*("[^"'\r\n]*"|[^"'\s]+)[ \t]*(?=[\r\n]|$)""").match(text, match.end())
+        if named is None:
+            raise InputError(
+                "DataFile has no plain value",
+                file=path,
+                field="DataFile",
+                remedy="make one file of it (gdal_translate)",
+            )
+        yield _Named(named[1].strip('"'), "DataFile", raw=raw)
+    yield _Named(Path(path.name).stem, "DataFile", raw=raw)
+
+
+def _names_of_isis3(path: Any) -> Iterator[_Named]:
+    """Yield the file that holds the pixels of a detached ISIS3 label."""
+    data = _beginning(path, _MAX_HEADER)
+    end = re.search(rb"\r?\n(END|End)\r?\n", data + (b"\n" if len(data) < _MAX_HEADER else b""))
+    if end is None and len(data) >= _MAX_HEADER:
+        raise InputError("a label of more than 5 MB is not opened", file=path, remedy="make a GeoTIFF of it")
+    text = data.decode("latin-1")
+    raw = "geotiff" not in text.lower()
+    for match in re.finditer(r"\^core", text, re.IGNORECASE):
+        named = re.compile(r"""\s*=\s*("[^"'\r\n]*"|(?!/\*)[^"'\s(#]+)\s""").match(text + "\n", match.end())
+        if named is None:
+            raise InputError(
+                "^Core has no plain value", file=path, field="^Core", remedy="make a GeoTIFF of it (gdal_translate)"
+            )
+        yield _Named(named[1].strip('"'), "^Core", raw=raw)
+
+
+def _names_of_pcidsk(path: Any) -> Iterator[_Named]:
+    """Refuse a PCIDSK file whose channels lie in other files, which GDAL does not list; yield nothing."""
+    start = _beginning(path, 512)
+    try:
+        headers, count = (int(start[336:352]) - 1) * 512, int(start[376:384])
+        images = (
+            _beginning(path, headers + 1024 * count)[headers:] if 0 <= headers + 1024 * count < _MAX_HEADER else b""
+        )
+    except ValueError:
+        images, count = b"", 1
+    names = [images[k + 64 : k + 128].strip(b" \0") for k in range(0, len(images), 1024)]
+    if len(images) < 1024 * count or any(name and not name.startswith(b"/SIS=") for name in names):
+        raise InputError(
+            "the channels of this PCIDSK file lie in other files", file=path, field="IHi.2",
+            remedy="make one file of it (gdal_translate in.pix out.tif)",
+        )  # fmt: skip
+    yield from ()
+
+
+def _beginning(path: Any, size: int) -> bytes:
+    if isinstance(path, VsiPath):
+        return path.read(size)
+    with path.open("rb") as file:
+        return bytes(file.read(size))
+
+
+_NAMES: dict[str, Any] = {
+    "VRT": _names_of_vrt, "DIMAP": _names_of_dimap, "ERS": _names_of_ers, "ISIS3": _names_of_isis3,
+    "PCIDSK": _names_of_pcidsk,
+}  # fmt: skip

@@ -1,0 +1,260 @@
+"""Orthos as files: what one takes over from its source, and the writer that leaves a whole file or none."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import whole_or_nothing
+from ortho_pipeline.raster.output import abandon, check_written, checked_options, close, gdal_errors
+from ortho_pipeline.raster.source import Grid, RasterSource, holds, pixel_type
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What an output raster takes over from its source."""
+
+    count: int
+    dtype: np.dtype[Any]
+    validity: str
+    nodata: float | None = None
+    descriptions: tuple[str, ...] = ()
+    interpretations: tuple[int, ...] = ()
+    color_table: Any = None
+    scales: tuple[tuple[float, float, str], ...] = ()
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, source: RasterSource, dtype: str | None = None, nodata: float | str | None = None) -> Profile:
+        """Return the profile of an ortho of `source`.
+
+        Nodata stays nodata (one value for all bands, as GeoTIFF has it), alpha stays alpha; everything else gets a
+        mask, because no pixel value may be given a meaning that it did not have. Under a mask, bands of floating point
+        without a value are NaN; integers cannot say that, so there a pixel is valid only if all of its bands are.
+
+        Parameters
+        ----------
+        dtype : str, optional
+            GDAL's name of the type of the pixels; that of the source without.
+        nodata : float or 'nan', optional
+            Value of pixels without an image, whatever the source has.
+
+        Raises
+        ------
+        InputError
+            If the type cannot hold the nodata value, or the source says by an alpha band what is valid.
+        """
+        kind = source.dtype if dtype is None else pixel_type(dtype)
+        # NaN is not equal to itself, and would make a set of several.
+        bands = source.bands
+        values = {"nan" if value is not None and math.isnan(value) else value for value in source.nodata}
+        validity: str
+        empty: float | None
+        if nodata is not None:
+            validity, empty = "nodata", _given_nodata(float(nodata), kind, source)
+        elif source.validity == "nodata" and len(values) == 1:
+            validity, empty = "nodata", _kept_nodata(source.nodata[0], kind, source)
+        else:
+            validity, empty = ("alpha" if source.validity == "alpha" else "mask"), None
+        return cls(
+            count=source.count,
+            dtype=kind,
+            validity=validity,
+            nodata=empty,
+            descriptions=source.descriptions,
+            interpretations=tuple(band.GetColorInterpretation() for band in bands),
+            color_table=bands[0].GetColorTable() if kind in (np.uint8, np.uint16) else None,
+            scales=tuple((band.GetScale() or 1.0, band.GetOffset() or 0.0, band.GetUnitType()) for band in bands),
+        )
+
+
+def _given_nodata(value: float, dtype: np.dtype[Any], source: RasterSource) -> float:
+    if source.validity == "alpha":
+        raise InputError(
+            "the image says by its alpha band which pixels are valid", file=source.path, field="--nodata",
+            remedy="leave out --nodata, or choose the other bands (-b 1 -b 2 -b 3)",
+        )  # fmt: skip
+    if not holds(dtype, value):
+        raise InputError(
+            f"pixels of the type {dtype} cannot have the value {value:g}", field="--nodata",
+            remedy="give another value, or another type with --output-type",
+        )  # fmt: skip
+    return value
+
+
+def _kept_nodata(value: float | None, dtype: np.dtype[Any], source: RasterSource) -> float | None:
+    if value is not None and not holds(dtype, value):
+        raise InputError(
+            f"the image's nodata value {value:g} does not fit into {dtype}", file=source.path, field="--output-type",
+            remedy="say with --nodata what pixels without an image shall be",
+        )  # fmt: skip
+    return value
+
+
+def as_written(pixels: NDArray[Any], valid: NDArray[np.bool_], dtype: np.dtype[Any], fill: float) -> NDArray[Any]:
+    """Return pixels ``(count, h, w)`` in the type of the output: rounded and clamped, `fill` where not valid."""
+    if pixels.dtype == dtype:
+        return pixels
+    if dtype.kind in "iu":
+        limits = np.iinfo(dtype)
+        pixels = np.clip(np.floor(np.where(valid, pixels, 0) + 0.5), limits.min, limits.max)
+    with np.errstate(over="ignore"):
+        written = pixels.astype(dtype)
+    written[~valid] = fill
+    return written
+
+
+def refuse_empty(valid_pixels: int, path: str | os.PathLike[str]) -> None:
+    """Refuse an ortho none of whose pixels has a value.
+
+    Raises
+    ------
+    InputError
+        Inside of a `RasterWriter`, so that no file is left.
+    """
+    if not valid_pixels:
+        raise InputError(
+            "no pixel of this ortho has a value", file=path,
+            remedy="check the extent, the heights (--height, or the DEM's place, datum and unit), and the nodata value "
+            "and mask of the image",
+        )  # fmt: skip
+
+
+class RasterWriter:
+    """A GeoTIFF or COG that is written in windows and appears at its path when it is complete.
+
+    Use as a context manager: an exception inside leaves nothing behind, and a file that was there before untouched.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        grid: Grid,
+        profile: Profile,
+        *,
+        driver: str = "COG",
+        creation_options: Mapping[str, str] | None = None,
+        threads: int = 1,
+    ) -> None:
+        if driver not in ("COG", "GTiff"):
+            raise InputError(f"orthos are not written as {driver!r}", field="format", remedy="COG or GTiff")
+        self.path, self.grid, self.profile, self.driver = Path(path), grid, profile, driver
+        self.options = checked_options(driver, dict(creation_options or {}), threads)
+        self._lock = threading.Lock()
+        self._written = 0
+        self._open = contextlib.ExitStack()
+
+    def __enter__(self) -> RasterWriter:
+        with contextlib.ExitStack() as stack:
+            self._temporary = stack.enter_context(whole_or_nothing(self.path))
+            if self.driver == "COG":
+                # The COG driver copies a finished raster: overviews come before the pixels in the file.
+                self._work = self.scratch("work")
+                options = {"TILED": "YES", "BIGTIFF": "IF_SAFER", "BLOCKXSIZE": "512", "BLOCKYSIZE": "512"}
+            else:
+                self._work, options = self._temporary, self.options
+            self._dataset = self._create(self._work, options)
+            self._open = stack.pop_all()
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        # What is written last is left first: the pixels are complete before the file gets its name.
+        with self._open:
+            if error is not None:
+                abandon(self._dataset)
+                raise error
+            self._finish()
+
+    def write(self, left: int, top: int, pixels: NDArray[Any], valid: NDArray[np.bool_] | None) -> None:
+        """Write a window ``(count, h, w)``; `valid` ``(h, w)`` goes to the mask, if the profile has one."""
+        with self._lock, gdal_errors(self.path):
+            self._written += pixels.shape[1] * pixels.shape[2]
+            self._dataset.WriteArray(pixels, left, top)
+            if self.profile.validity == "mask" and valid is not None:
+                mask = valid.view(np.uint8) * np.uint8(255)
+                self._dataset.GetRasterBand(1).GetMaskBand().WriteArray(mask, left, top)
+
+    def _create(self, path: Path, options: Mapping[str, str]) -> gdal.Dataset:
+        from osgeo import gdal_array
+
+        profile, grid = self.profile, self.grid
+        code = gdal_array.NumericTypeCodeToGDALTypeCode(profile.dtype.type)
+        with gdal_errors(self.path):
+            dataset = gdal.GetDriverByName("GTiff").Create(
+                str(path), grid.width, grid.height, profile.count, code, [f"{k}={v}" for k, v in options.items()]
+            )
+        dataset.SetProjection(grid.crs.to_wkt())
+        dataset.SetGeoTransform(grid.geotransform)
+        dataset.SetMetadataItem("AREA_OR_POINT", "Area")
+        for key, value in profile.metadata.items():
+            dataset.SetMetadataItem(key, value)
+        for i in range(profile.count):
+            _describe(dataset.GetRasterBand(i + 1), profile, i)
+        if profile.validity == "mask":
+            gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", "YES")
+            try:
+                dataset.CreateMaskBand(gdal.GMF_PER_DATASET)
+            finally:
+                gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", None)
+        return dataset
+
+    def _finish(self) -> None:
+        with gdal_errors(self.path):
+            close(self._dataset)
+            self._dataset = None
+            if self.driver == "COG":
+                source = gdal.OpenEx(str(self._work), gdal.OF_RASTER, allowed_drivers=["GTiff"])
+                options = [f"{k}={v}" for k, v in self.options.items()]
+                close(gdal.GetDriverByName("COG").CreateCopy(str(self._temporary), source, options=options))
+        # GDAL leaves out blocks of a file beyond 4 GB into which nothing was written.
+        partly = self._written < self.grid.width * self.grid.height
+        sparse = partly or self.options.get("SPARSE_OK", "NO").upper() in ("YES", "TRUE", "ON")
+        check_written(self._temporary, self.path, size=(self.grid.width, self.grid.height), sparse=sparse)
+
+    def scratch(self, name: str) -> Path:
+        """Return the path of a temporary raster beside the output, which is removed with the output's own."""
+        return self._temporary.with_name(f"{self._temporary.name}.{name}.tif")
+
+    def copy(self, path: Path) -> int:
+        """Fill the raster from another of its size, whose last band is the mask; return the count of valid pixels."""
+        dataset, count, step = gdal.OpenEx(str(path), gdal.OF_RASTER, allowed_drivers=["GTiff"]), 0, 2048
+        for top in range(0, self.grid.height, step):
+            for left in range(0, self.grid.width, step):
+                size = min(step, self.grid.width - left), min(step, self.grid.height - top)
+                pixels = dataset.ReadAsArray(left, top, *size).reshape(-1, size[1], size[0])
+                if self.profile.validity == "nodata":
+                    nodata = self.profile.nodata
+                    empty = np.isnan(pixels) if nodata is not None and math.isnan(nodata) else pixels == nodata
+                    valid = ~empty.all(axis=0)
+                else:
+                    valid = pixels[-1] > 0
+                self.write(left, top, pixels[: self.profile.count].astype(self.profile.dtype, copy=False), valid)
+                count += int(np.count_nonzero(valid))
+        return count
+
+
+def _describe(band: gdal.Band, profile: Profile, index: int) -> None:
+    if profile.nodata is not None:
+        band.SetNoDataValue(profile.nodata)
+    if profile.descriptions:
+        band.SetDescription(profile.descriptions[index])
+    if profile.interpretations:
+        band.SetColorInterpretation(profile.interpretations[index])
+    if profile.color_table is not None and index == 0:
+        band.SetColorTable(profile.color_table)
+    if profile.scales and profile.scales[index] != (1.0, 0.0, ""):
+        scale, offset, unit = profile.scales[index]
+        band.SetScale(scale)
+        band.SetOffset(offset)
+        band.SetUnitType(unit)

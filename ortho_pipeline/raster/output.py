@@ -1,0 +1,216 @@
+"""Writing rasters: every file of pixels is closed, opened again and looked through before it gets its name.
+
+GDAL tells of a full disk late, some of it only when a dataset is closed, where Python would swallow it, and a GeoTIFF
+whose end is missing opens like any other. So a dataset is closed by `close`, which raises, and `check_written` asks for
+the place of every block in the file and reads some of them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import whole_or_nothing
+from ortho_pipeline.raster.source import first_line
+
+#: Blocks of a file that are read again before it gets its name.
+_SAMPLES = 12
+
+
+# -- any raster ------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def raster_output(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a temporary path for a raster that is written by GDAL and appears at `path` when it is whole.
+
+    What is written has to be closed by `close` within the block. Masks go into the file itself.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written, or cannot be read again.
+    """
+    with whole_or_nothing(path) as temporary:
+        with gdal_errors(path):
+            yield temporary
+        if temporary.suffix.lower() != ".vrt":
+            check_written(temporary, path)
+
+
+@contextlib.contextmanager
+def gdal_errors(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn GDAL's complaints about writing `path` into an `InputError`; masks go into the file itself."""
+    previous = gdal.GetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK")
+    gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", "YES")
+    try:
+        yield
+    except RuntimeError as error:
+        raise InputError(
+            f"the output cannot be written ({first_line(error)})", file=path,
+            remedy="check the free disk space and the creation options",
+        ) from error  # fmt: skip
+    finally:
+        gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", previous)
+
+
+def close(dataset: gdal.Dataset | None) -> None:
+    """Close a dataset that was written; it cannot be used afterwards.
+
+    Raises
+    ------
+    RuntimeError
+        If GDAL could not write the rest of it, which Python would ignore where a dataset is only deleted; or could not
+        make it, which some of its drivers say by returning none.
+    """
+    if dataset is None:
+        raise RuntimeError(gdal.GetLastErrorMsg() or "GDAL could not make the file")
+    try:
+        dataset.FlushCache()
+    except RuntimeError:
+        abandon(dataset)
+        raise
+    _destroy(dataset)
+
+
+def abandon(dataset: gdal.Dataset | None) -> None:
+    """Close a dataset whose file is thrown away: what GDAL cannot write any more is nothing to tell."""
+    if dataset is not None:
+        with contextlib.suppress(RuntimeError):
+            _destroy(dataset)
+
+
+def _destroy(dataset: gdal.Dataset) -> None:
+    if hasattr(dataset, "Close"):  # GDAL 3.8
+        dataset.Close()
+    else:
+        gdal.Dataset.__swig_destroy__(dataset)
+
+
+def check_written(
+    written: Path, path: str | os.PathLike[str], *, size: tuple[int, int] | None = None, sparse: bool = False
+) -> None:
+    """Check that a GeoTIFF holds every block that it says it has: place within the file, and some of them by reading.
+
+    Parameters
+    ----------
+    written, path : path
+        Where it lies now, and what an error names.
+    size : (int, int), optional
+        Columns and rows that it has to have.
+    sparse : bool
+        Whether blocks without a value may be absent.
+
+    Raises
+    ------
+    InputError
+        If it was not written whole.
+    """
+    told: dict[str, Any] = {"file": path, "remedy": "check the free disk space"}
+    try:
+        dataset = gdal.OpenEx(os.fspath(written), gdal.OF_RASTER, allowed_drivers=["GTiff"], sibling_files=[])
+        if size is not None and (dataset.RasterXSize, dataset.RasterYSize) != size:
+            raise InputError("the output was not written whole", **told)
+        end = written.stat().st_size
+        for band in _images(dataset):
+            blocks = _blocks(band)
+            if any(offset + count > end or not (count or sparse) for offset, count, _, _ in blocks):
+                raise InputError("the output was not written whole", **told)
+            # The last in the file, and some from everywhere.
+            sample = {max(blocks), *blocks[:: max(1, len(blocks) // _SAMPLES)]}
+            width, height = band.GetBlockSize()
+            for _, count, column, row in sample:
+                if count:
+                    left, top = column * width, row * height
+                    band.ReadRaster(left, top, min(width, band.XSize - left), min(height, band.YSize - top))
+    except RuntimeError as error:
+        raise InputError(f"the output cannot be read again ({first_line(error)})", **told) from error
+
+
+def _images(dataset: gdal.Dataset) -> Iterator[gdal.Band]:
+    """Yield a band of every image in a file: bands that are stored apart, overviews, mask."""
+    apart = dataset.GetMetadataItem("INTERLEAVE", "IMAGE_STRUCTURE") == "BAND"
+    for index in range(dataset.RasterCount if apart else 1):
+        band = dataset.GetRasterBand(index + 1)
+        yield band
+        yield from (band.GetOverview(k) for k in range(band.GetOverviewCount()))
+    if dataset.GetRasterBand(1).GetMaskFlags() == gdal.GMF_PER_DATASET:
+        mask = dataset.GetRasterBand(1).GetMaskBand()
+        yield mask
+        yield from (mask.GetOverview(k) for k in range(mask.GetOverviewCount()))
+
+
+def _blocks(band: gdal.Band) -> list[tuple[int, int, int, int]]:
+    """Return offset and count of bytes, column and row of each block; an absent one has 0 bytes at 0."""
+    width, height = band.GetBlockSize()
+    found = []
+    for row in range(math.ceil(band.YSize / height)):
+        for column in range(math.ceil(band.XSize / width)):
+            place = f"{column}_{row}"
+            offset, count = (band.GetMetadataItem(f"BLOCK_{what}_{place}", "TIFF") for what in ("OFFSET", "SIZE"))
+            found.append((int(offset or 0), int(count or 0), column, row))
+    return found
+
+
+# -- creation options --------------------------------------------------------------------------------------------------
+
+
+def checked_options(driver: str, given: dict[str, str], threads: int) -> dict[str, str]:
+    """Return lossless defaults under what the user gave; what the driver does not know is an error."""
+    given = {key.upper(): value for key, value in given.items()}
+    known = _known_options(driver)
+    for key, value in given.items():
+        if key not in known:
+            raise InputError(
+                f"the {driver} driver has no creation option {key}", field="creation option",
+                remedy=f"see the page of the {driver} driver in GDAL's documentation",
+            )  # fmt: skip
+        if not _fits(known[key], value):
+            values = ", ".join(choice.text or "" for choice in known[key].findall("Value")) or known[key].get("type")
+            raise InputError(
+                f"{value[:60]!r} is not a value of the creation option {key}", field="creation option",
+                remedy=f"{key} takes: {values}",
+            )  # fmt: skip
+    defaults = {"BIGTIFF": "IF_SAFER"}
+    if driver == "GTiff":
+        defaults |= {"TILED": "YES", "BLOCKXSIZE": "512", "BLOCKYSIZE": "512"}
+        if given.get("TILED", "YES").upper() == "NO":
+            defaults = {"BIGTIFF": "IF_SAFER"}
+    else:
+        defaults |= {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "LEVEL": "6", "NUM_THREADS": str(max(1, threads))}
+        if given.get("COMPRESS", "DEFLATE").upper() not in ("DEFLATE", "ZSTD", "LZW"):
+            defaults.pop("PREDICTOR")
+            defaults.pop("LEVEL")
+    return defaults | given
+
+
+def _known_options(driver: str) -> dict[str, Any]:
+    """Return the creation options that a driver of this GDAL tells of, as XML elements, by their names."""
+    from defusedxml import ElementTree
+
+    listed = gdal.GetDriverByName(driver).GetMetadataItem("DMD_CREATIONOPTIONLIST") or "<CreationOptionList/>"
+    return {option.get("name", "").upper(): option for option in ElementTree.fromstring(listed).iter("Option")}
+
+
+def _fits(option: Any, value: str) -> bool:
+    """Tell whether a value is one that a creation option takes; GDAL itself only warns, and takes its default."""
+    kind = (option.get("type") or "string").lower()
+    if kind == "string-select":
+        names = {name for one in option.findall("Value") for name in (one.text, one.get("alias")) if name}
+        return not names or value.upper() in {name.upper() for name in names}
+    if kind == "boolean":
+        return value.upper() in ("YES", "NO", "TRUE", "FALSE", "ON", "OFF", "1", "0")
+    if kind in ("int", "integer", "unsigned int", "float"):
+        try:
+            number = float(value) if kind == "float" else int(value)
+        except ValueError:
+            return False
+        return float(option.get("min", "-inf")) <= number <= float(option.get("max", "inf"))
+    return True

@@ -1,0 +1,520 @@
+"""Rasters that are read: what may be opened, grids, and windows of pixels.
+
+Files are opened through the `gate`: by a list of drivers, and with every file that they lead to seen before. One
+`gdal.Dataset` is used by one thread only; `RasterSource` opens one per thread.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import os
+import stat
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.files.allowance import require_memory
+from ortho_pipeline.files.locations import VsiPath, archive_of, in_local_archive, located, members
+from ortho_pipeline.options import PIXEL_TYPES
+from ortho_pipeline.raster.gate import DRIVERS, Block, open_seen
+
+gdal.UseExceptions()
+log = logging.getLogger(__name__)
+
+#: A raster side beyond this is taken for a damaged header.
+MAX_SIDE = 4_000_000
+#: GDAL reads whole blocks: one larger than this is refused before it is allocated (bytes).
+MAX_BLOCK = 1 << 30
+#: Bytes that reading and warping may take where nobody says how many.
+MEMORY = 512_000_000
+#: What GDAL's cache has to hold beside large blocks of an image (bytes).
+_OTHER_BLOCKS = 64_000_000
+#: Endings of files beside an image that GDAL's readers of metadata look for.
+_SIDE_CARS = (".xml", ".txt", ".imd", ".rpb", ".pvl", ".met", ".att", ".eph", ".tfw", ".wld", ".prj", ".hdr", ".ovr",
+              ".msk", ".rpc", ".dim")  # fmt: skip
+
+
+_WHOLE = "give a whole raster of a format that GDAL reads ('ortho doctor' lists the allowed ones); copy it again"
+
+
+def open_dataset(
+    path: str | os.PathLike[str],
+    *,
+    allow_network: bool = False,
+    roots: Sequence[str | os.PathLike[str]] = (),
+    siblings: bool = True,
+) -> gdal.Dataset:
+    """Open a raster for reading.
+
+    Parameters
+    ----------
+    path : path
+        A file, also in an archive; URLs and GDAL's network file systems only with `allow_network`.
+    roots : sequence of path
+        Folders that the files may lie in that this one leads to, besides its own.
+    siblings : bool
+        Whether GDAL may look at side-car files. Without them RPC metadata are those of the file itself.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, of no allowed format, damaged, or leads outside of its own folder and `roots`.
+    OrthoError
+        If there is too little memory for any work.
+    """
+    return _opened(path, allow_network, roots, siblings)[0]
+
+
+def open_pixels(
+    path: str | os.PathLike[str],
+    *,
+    allow_network: bool = False,
+    roots: Sequence[str | os.PathLike[str]] = (),
+    memory: int = MEMORY,
+) -> tuple[gdal.Dataset, int]:
+    """Open a raster whose pixels are going to be read; return it, and the bytes of its largest block.
+
+    GDAL decodes whole blocks (a strip, a tile), and again and again what its cache cannot hold: a megabyte that unpacks
+    to a strip of a gigabyte would keep it busy for minutes. So a block has to fit into `memory` (bytes), and the cache
+    is made to hold it.
+
+    Raises
+    ------
+    InputError
+        As for `open_dataset`; and if a block of it, of its mask or of a file that it leads to does not fit.
+    """
+    dataset, block = _opened(path, allow_network, roots, True)
+    if block.size > memory:
+        raise InputError(
+            f"one block of this raster is {block.size / 1e6:,.0f} MB when it is unpacked, which is beyond the "
+            f"{memory / 1e6:,.0f} MB of memory allowed",
+            file=block.path, field="block size",
+            remedy="tile it (gdal_translate -co TILED=YES in.tif out.tif), or for an image give a larger --memory MB",
+        )  # fmt: skip
+    keep_blocks(block.size)
+    return dataset, block.size
+
+
+@reads(_WHOLE)
+def _opened(
+    path: str | os.PathLike[str], allow_network: bool, roots: Sequence[str | os.PathLike[str]], siblings: bool
+) -> tuple[gdal.Dataset, Block]:
+    require_memory()
+    place = located(path, allow_network=allow_network)
+    name, drivers = os.fspath(place), list(DRIVERS)
+    if isinstance(place, VsiPath):
+        drivers.remove("VRT")
+        if in_local_archive(name) and not place.exists():
+            raise InputError("there is no such file in an archive", file=name, remedy=_in_archive(name))
+    elif not Path(name).is_file() and not (Path(name).is_dir()):
+        raise InputError("there is no such file", file=name, remedy="check the path")
+    elif Path(name).suffix.lower() in (".zip", ".tar", ".tgz"):
+        raise InputError("this is an archive, not an image", file=name, remedy=_in_archive(name))
+    elif Path(name).suffix.lower() != ".vrt":
+        drivers.remove("VRT")
+    if siblings and not isinstance(place, VsiPath):
+        _refuse_pipes(Path(name))
+    try:
+        dataset, block = open_seen(place, roots, drivers, siblings)
+    except (RuntimeError, UnicodeDecodeError) as error:
+        # What GDAL quotes of a damaged file need not be UTF-8.
+        raise InputError(
+            f"GDAL cannot open this as a raster ({first_line(error)})",
+            file=name,
+            remedy="give a raster of a format that GDAL reads; 'ortho doctor' lists the allowed ones",
+        ) from error
+    _check_size(dataset, name)
+    log.info("%s: opened by %s", name, dataset.GetDriver().ShortName)
+    return dataset, block
+
+
+def _refuse_pipes(path: Path) -> None:
+    """Refuse an image beside whose metadata or side-cars lies a pipe or a device: GDAL would wait for it for ever."""
+    folder = path if path.is_dir() else path.parent
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            related = path.stem in entry.name or Path(entry.name).suffix.lower() in _SIDE_CARS
+            if related and not entry.is_file() and not entry.is_dir() and entry.name != path.name:
+                try:
+                    kind = stat.S_IFMT(entry.stat().st_mode)
+                except OSError:
+                    # A link that leads nowhere: there is nothing to read.
+                    continue
+                if kind in (stat.S_IFIFO, stat.S_IFCHR, stat.S_IFBLK):
+                    raise InputError(
+                        "a pipe or a device lies beside this image where its metadata would be", file=path,
+                        field=entry.name, remedy="remove it",
+                    )  # fmt: skip
+
+
+def _check_size(dataset: gdal.Dataset, name: str) -> None:
+    width, height = dataset.RasterXSize, dataset.RasterYSize
+    if dataset.RasterCount == 0:
+        raise InputError("this file has no raster band", file=name)
+    band = dataset.GetRasterBand(1)
+    block = math.prod(band.GetBlockSize()) * gdal.GetDataTypeSize(band.DataType) // 8
+    if max(width, height) > MAX_SIDE or block > MAX_BLOCK:
+        raise InputError(
+            f"the header claims {width} x {height} pixels in blocks of {block} bytes",
+            file=name,
+            remedy="the file is damaged, or has to be tiled first (gdal_translate -co TILED=YES)",
+        )
+
+
+def _in_archive(name: str) -> str:
+    archive = archive_of(name) if name.startswith("/vsi") else Path(name)
+    found = members(archive) if archive is not None else []
+    return f"name the image in it: {', '.join(found)}" if found else "name the image in it: /vsizip/FILE.zip/IMAGE"
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of what an error says."""
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """North-up pixel grid of an output raster.
+
+    `left` and `top` are the map coordinates of the outer corner of the first pixel, `dx` and `dy` the (positive) size
+    of a pixel, in units of `crs`.
+    """
+
+    crs: pyproj.CRS
+    left: float
+    top: float
+    dx: float
+    dy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if not (self.dx > 0 and self.dy > 0 and math.isfinite(self.left) and math.isfinite(self.top)):
+            raise InputError("a pixel has a positive size", field="resolution")
+        if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
+            raise InputError(
+                f"the output would have {self.width} x {self.height} pixels",
+                field="extent",
+                remedy="check the extent and the resolution, which are in units of the output CRS",
+            )
+
+    @classmethod
+    def of_extent(
+        cls, crs: pyproj.CRS, extent: Sequence[float], resolution: tuple[float, float], *, align: bool = False
+    ) -> Grid:
+        """Return the grid of an extent (xmin, ymin, xmax, ymax), widened to multiples of the resolution if `align`."""
+        xmin, ymin, xmax, ymax = (float(value) for value in extent)
+        dx, dy = resolution
+        if not all(map(math.isfinite, (xmin, ymin, xmax, ymax, dx, dy))) or not (xmin < xmax and ymin < ymax):
+            raise InputError(
+                f"{xmin:.12g} {ymin:.12g} {xmax:.12g} {ymax:.12g} is no extent",
+                field="extent",
+                remedy="give xmin ymin xmax ymax",
+            )
+        if not (dx > 0 and dy > 0):
+            raise InputError("a pixel has a positive size", field="resolution")
+        if align:
+            # A hair of tolerance keeps an extent that is already aligned from growing by a pixel of rounding.
+            xmin, ymin = math.floor(xmin / dx + 1e-6) * dx, math.floor(ymin / dy + 1e-6) * dy
+            xmax, ymax = math.ceil(xmax / dx - 1e-6) * dx, math.ceil(ymax / dy - 1e-6) * dy
+        # As GDAL rounds; Python's round() takes halves to even numbers.
+        width, height = max(1, int((xmax - xmin) / dx + 0.5)), max(1, int((ymax - ymin) / dy + 0.5))
+        return cls(crs, xmin, ymax, dx, dy, width, height)
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """xmin, ymin, xmax, ymax."""
+        return self.left, self.top - self.height * self.dy, self.left + self.width * self.dx, self.top
+
+    @property
+    def geotransform(self) -> tuple[float, float, float, float, float, float]:
+        """GDAL's six numbers."""
+        return self.left, self.dx, 0.0, self.top, 0.0, -self.dy
+
+    def xy(self, columns: NDArray[Any], rows: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return map coordinates of pixel positions (corner convention: the centre of the first pixel is 0.5, 0.5)."""
+        return self.left + np.asarray(columns) * self.dx, self.top - np.asarray(rows) * self.dy
+
+
+class _RasterFile:
+    """Some or all bands of one file of a `RasterSource`, with a GDAL handle for each thread."""
+
+    def __init__(
+        self, path: str | os.PathLike[str], access: Mapping[str, Any], numbers: Sequence[int] | None = None
+    ) -> None:
+        self.path = os.fspath(path)
+        self._access = access
+        self._local = threading.local()
+        dataset = self.dataset
+        self.width, self.height = dataset.RasterXSize, dataset.RasterYSize
+        self.numbers = tuple(numbers or range(1, dataset.RasterCount + 1))
+        self.count = len(self.numbers)
+        bands = self.bands
+        if any(gdal.DataTypeIsComplex(band.DataType) for band in bands):
+            raise InputError(
+                "complex pixels are not resampled", file=self.path, remedy="split them into real bands first"
+            )
+        if any(band.GetMetadataItem("PIXELTYPE", "IMAGE_STRUCTURE") == "SIGNEDBYTE" for band in bands):
+            # GDAL before 3.7 gives bytes with a sign as bytes without one.
+            raise InputError(
+                "these pixels are bytes with a sign, which this GDAL reads as 0 to 255", file=self.path,
+                remedy="make 16 bit of them (gdal_calc.py, or gdal_translate -ot Int16 with GDAL 3.7)",
+            )  # fmt: skip
+        self.dtype = np.result_type(*(_numpy_type(band.DataType) for band in bands))
+        self.nodata = tuple(_nodata(band, self.dtype) for band in bands)
+        self.palette = any(band.GetColorTable() is not None for band in bands)
+        flags = self._io(bands[0].GetMaskFlags)
+        # GDAL's own order: a mask of the dataset stands beside nodata.
+        self._masked = bool(flags & gdal.GMF_PER_DATASET and not flags & (gdal.GMF_NODATA | gdal.GMF_ALPHA))
+        if any(value is not None for value in self.nodata):
+            self.validity = "nodata"
+        elif flags & gdal.GMF_ALPHA:
+            # Without its alpha band the ortho needs a mask.
+            kept = any(band.GetColorInterpretation() == gdal.GCI_AlphaBand for band in bands)
+            self.validity = "alpha" if kept else "mask"
+        else:
+            self.validity = "mask" if flags & gdal.GMF_PER_DATASET else "all"
+
+    @property
+    def dataset(self) -> gdal.Dataset:
+        """The GDAL dataset of the calling thread."""
+        if not hasattr(self._local, "dataset"):
+            self._local.dataset, self.block = open_pixels(self.path, **self._access)
+        return self._local.dataset
+
+    @property
+    def bands(self) -> list[gdal.Band]:
+        """The GDAL bands of the calling thread."""
+        return [self.dataset.GetRasterBand(number) for number in self.numbers]
+
+    def read(self, left: int, top: int, out: NDArray[Any]) -> None:
+        """Fill `out` ``(count, height, width)`` with a window that lies inside the raster."""
+        given = {"buf_obj": out, "band_list": list(self.numbers)}
+        self._io(self.dataset.ReadAsArray, left, top, out.shape[2], out.shape[1], **given)
+
+    def read_valid(self, left: int, top: int, pixels: NDArray[Any]) -> NDArray[np.bool_] | None:
+        """Return which of the `pixels` of a window ``(count, h, w)`` are valid; None where all are."""
+        _, height, width = pixels.shape
+        valid = None
+        if self.validity == "nodata":
+            valid = np.ones(pixels.shape, dtype=bool)
+            for band, value in enumerate(self.nodata):
+                if value is not None and not math.isnan(value):
+                    np.not_equal(pixels[band], pixels.dtype.type(value), out=valid[band])
+        if self._masked or self.validity in ("mask", "alpha"):
+            mask = self._io(self.bands[0].GetMaskBand().ReadAsArray, left, top, width, height) != 0
+            valid = np.broadcast_to(mask, pixels.shape).copy() if valid is None else valid & mask
+        if pixels.dtype.kind == "f":
+            numbers = ~np.isnan(pixels)
+            if not numbers.all():
+                valid = numbers if valid is None else valid & numbers
+        return None if valid is None or valid.all() else valid
+
+    def _io(self, read: Any, *window: int, **options: Any) -> Any:
+        try:
+            return read(*window, **options)
+        except RuntimeError as error:
+            raise InputError(
+                f"the pixels cannot be read ({first_line(error)})",
+                file=self.path,
+                remedy="the file is cut off or damaged: copy it again",
+            ) from error
+
+
+class RasterSource:
+    """A raster that several threads read windows of; it may lie in several files, a band or some in each.
+
+    Images of one scene that have the same size (a file for each band, as vendors deliver them) are one source: their
+    bands share one pass through the geometry.
+
+    Parameters
+    ----------
+    path, *others : path
+        The files, in the order of their bands.
+    bands : sequence of int, optional
+        Which bands, counted from 1 over all files, in the order wanted.
+    dtype : str, optional
+        GDAL's name of the type that an ortho shall have. Pixels of another type are read as floating point that
+        holds both, so that interpolated values are rounded and clamped once, when they are written.
+    memory : int
+        Bytes that one of its blocks may take; see `open_pixels`.
+
+    Attributes
+    ----------
+    width, height, count : int
+    dtype : numpy.dtype
+        Common type of all bands, as they are read.
+    nodata : tuple of float or None, per band
+    validity : {'all', 'nodata', 'mask', 'alpha'}
+        How the raster says which of its pixels are valid. NaN is never valid.
+    block : int
+        Bytes of the blocks that GDAL holds at once to read a pixel of all bands.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be used, is not as large as the first, or has no such band.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *others: str | os.PathLike[str],
+        allow_network: bool = False,
+        roots: Sequence[str | os.PathLike[str]] = (),
+        bands: Sequence[int] | None = None,
+        dtype: str | None = None,
+        memory: int = MEMORY,
+    ) -> None:
+        access = {"allow_network": allow_network, "roots": roots, "memory": memory}
+        self._files = [_RasterFile(name, access) for name in (path, *others)]
+        first = self._files[0]
+        self.paths = tuple(file.path for file in self._files)
+        self.path, self.width, self.height = first.path, first.width, first.height
+        for file in self._files:
+            if (file.width, file.height) != (self.width, self.height):
+                raise InputError(
+                    f"{file.width} x {file.height} pixels, but {self.path} has {self.width} x {self.height}",
+                    file=file.path,
+                    remedy="rectify images of different sizes one by one",
+                )
+        if bands is not None:
+            self._files = [_RasterFile(name, access, numbers) for name, numbers in self._chosen(bands)]
+        self.count = sum(file.count for file in self._files)
+        self.dtype = _read_as(np.result_type(*(file.dtype for file in self._files)), dtype)
+        self.nodata = tuple(value for file in self._files for value in file.nodata)
+        self.palette = any(file.palette for file in self._files)
+        self.block = sum(file.block for file in self._files)
+        kinds = {file.validity for file in self._files}
+        self.validity = kinds.pop() if len(kinds) == 1 else "mask"
+
+    def _chosen(self, bands: Sequence[int]) -> list[tuple[str, list[int]]]:
+        """Return the files, in the order wanted, with the numbers of their bands; a file may come twice."""
+        places = [(file.path, number) for file in self._files for number in file.numbers]
+        chosen: list[tuple[str, list[int]]] = []
+        for band in bands:
+            if not 1 <= band <= len(places):
+                raise InputError(
+                    f"there is no band {band}: the image has {len(places)}", file=self.path, field="--band",
+                    remedy=f"give one from 1 to {len(places)}",
+                )  # fmt: skip
+            path, number = places[band - 1]
+            if chosen and chosen[-1][0] == path:
+                chosen[-1][1].append(number)
+            else:
+                chosen.append((path, [number]))
+        return chosen
+
+    @property
+    def dataset(self) -> gdal.Dataset:
+        """The GDAL dataset of the first file for the calling thread."""
+        return self._files[0].dataset
+
+    @property
+    def bands(self) -> list[gdal.Band]:
+        """The GDAL bands of the calling thread."""
+        return [band for file in self._files for band in file.bands]
+
+    @property
+    def band_numbers(self) -> tuple[int, ...]:
+        """Numbers of the bands in the first file."""
+        return self._files[0].numbers
+
+    @property
+    def descriptions(self) -> tuple[str, ...]:
+        """Names of the bands; of several files, bands without one have the name of their file."""
+        several = len(self.paths) > 1
+        return tuple(
+            band.GetDescription() or (Path(file.path).stem if several else "")
+            for file in self._files
+            for band in file.bands
+        )
+
+    def read(self, left: int, top: int, width: int, height: int) -> NDArray[Any]:
+        """Return the pixels ``(count, height, width)`` of a window that lies inside the raster."""
+        pixels, start = np.empty((self.count, height, width), dtype=self.dtype), 0
+        for file in self._files:
+            file.read(left, top, pixels[start : start + file.count])
+            start += file.count
+        return pixels
+
+    def read_valid(self, left: int, top: int, pixels: NDArray[Any]) -> NDArray[np.bool_] | None:
+        """Return which of the `pixels` of a window ``(count, h, w)`` are valid; None where all are."""
+        if len(self._files) == 1:
+            return self._files[0].read_valid(left, top, pixels)
+        valid, start = None, 0
+        for file in self._files:
+            stop = start + file.count
+            part = file.read_valid(left, top, pixels[start:stop])
+            if part is not None:
+                valid = np.ones(pixels.shape, dtype=bool) if valid is None else valid
+                valid[start:stop] = part
+            start = stop
+        return valid
+
+
+def _numpy_type(gdal_type: int) -> np.dtype[Any]:
+    from osgeo import gdal_array
+
+    return np.dtype(gdal_array.GDALTypeCodeToNumericTypeCode(gdal_type))
+
+
+def _nodata(band: gdal.Band, dtype: np.dtype[Any]) -> float | None:
+    value = band.GetNoDataValue()
+    # A value that the type cannot hold marks nothing.
+    return value if value is not None and holds(dtype, value) else None
+
+
+def holds(dtype: np.dtype[Any], value: float) -> bool:
+    """Tell whether a pixel of this type can have a value (of floating point: nearly)."""
+    if dtype.kind == "f":
+        return math.isnan(value) or math.isinf(value) or abs(value) <= np.finfo(dtype).max
+    limits = np.iinfo(dtype)
+    return float(value).is_integer() and bool(limits.min <= value <= limits.max)
+
+
+def pixel_type(name: str) -> np.dtype[Any]:
+    """Return the type of pixels that GDAL calls `name`."""
+    code = gdal.GetDataTypeByName(name)
+    if name.lower() not in {one.lower() for one in PIXEL_TYPES}:
+        raise InputError(f"no pixels are of the type {name!r}", field="--output-type", remedy=", ".join(PIXEL_TYPES))
+    return _numpy_type(code)
+
+
+def _read_as(own: np.dtype[Any], wanted: str | None) -> np.dtype[Any]:
+    """Return the type in which pixels are read that are written as `wanted`."""
+    if wanted is None or pixel_type(wanted) == own:
+        return own
+    return np.promote_types(np.promote_types(own, pixel_type(wanted)), np.float32)
+
+
+def limit_cache(memory: int, threads: int, *blocks: int) -> int:
+    """Limit GDAL's block cache to a quarter of `memory` (at least 16 MB), or to what holds the blocks of each thread.
+
+    Returns
+    -------
+    int
+        How many threads that allows, at most `threads`: each decodes blocks (of `blocks` bytes) of its own.
+    """
+    held = sum(blocks)
+    threads = max(1, min(threads, memory // max(held, 1)))
+    gdal.SetCacheMax(max(memory // 4, 16_000_000))
+    keep_blocks(threads * held)
+    return threads
+
+
+def keep_blocks(size: int) -> None:
+    """Raise GDAL's block cache to what holds blocks of `size` bytes beside those of the output."""
+    if size > gdal.GetCacheMax() // 2:
+        gdal.SetCacheMax(max(gdal.GetCacheMax(), size + _OTHER_BLOCKS))

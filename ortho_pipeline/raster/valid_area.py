@@ -1,0 +1,114 @@
+"""Where a raster has values: the outline of its valid pixels, on the map and as GeoJSON.
+
+GeoJSON knows no longitude beyond 180 degrees: what crosses the antimeridian is cut there, what holds a pole reaches it
+(RFC 7946, sections 3.1.9 and 5.2).
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import pyproj
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.raster.source import Grid, open_dataset, open_pixels
+
+#: Pixels per side at which the mask is looked at.
+_SIDE = 512
+#: Points per side of the outline, so that straight lines of the map stay where they are in degrees.
+_STEPS = 32
+#: Decimals of a degree: a centimetre.
+_DECIMALS = 7
+
+
+def grid_of(path: str | PathLike[str]) -> Grid:
+    """Return the grid of an orthoimage."""
+    dataset = open_dataset(path)
+    left, dx, _, top, _, dy = dataset.GetGeoTransform()
+    crs = pyproj.CRS.from_wkt(dataset.GetProjection())
+    return Grid(crs, left, top, dx, -dy, dataset.RasterXSize, dataset.RasterYSize)
+
+
+def valid_outline(path: str | PathLike[str], *, side: int = _SIDE) -> BaseGeometry:
+    """Return the outline of the valid pixels of an orthoimage in its CRS: a polygon, or several; empty without any.
+
+    The mask is looked at in at most `side` pixels per side, and the outline is true to one of these.
+    """
+    dataset, grid = open_pixels(path)[0], grid_of(path)
+    columns, rows = min(side, grid.width), min(side, grid.height)
+    mask = dataset.GetRasterBand(1).GetMaskBand().ReadAsArray(buf_xsize=columns, buf_ysize=rows) > 0
+    edges = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    # In reading order beginnings and ends of the runs of a row belong together.
+    (row, begin), (_, end) = np.nonzero(edges == 1), np.nonzero(edges == -1)
+    x_scale, y_scale = grid.width / columns, grid.height / rows
+    left, top = grid.xy(begin * x_scale, row * y_scale)
+    right, bottom = grid.xy(end * x_scale, (row + 1) * y_scale)
+    outline = shapely.union_all(shapely.box(left, bottom, right, top))
+    coarse = max(x_scale * grid.dx, y_scale * grid.dy)
+    return shapely.make_valid(outline.simplify(coarse)) if columns * rows > 1 else outline
+
+
+def to_geojson(outline: BaseGeometry, crs: pyproj.CRS) -> tuple[dict[str, Any], list[float]]:
+    """Return the outline as a GeoJSON geometry in lon, lat (WGS 84), and its box west, south, east, north.
+
+    Exterior rings run counterclockwise. A box that crosses the antimeridian has a west beyond its east.
+    """
+    to_degrees = ground_transform(crs, "EPSG:4979")
+    parts = []
+    for polygon in _polygons(outline):
+        step = max(polygon.bounds[2] - polygon.bounds[0], polygon.bounds[3] - polygon.bounds[1]) / _STEPS
+        # What is within counts as valid: holes of a mask are no part of a footprint.
+        ring = shapely.get_coordinates(shapely.segmentize(polygon.exterior, step))
+        degrees = to_degrees(np.column_stack([ring, np.zeros(len(ring))]))[:, :2]
+        parts += _polygons(shapely.make_valid(shapely.Polygon(_unwrapped(degrees))))
+    centre = np.mean([polygon.centroid.x for polygon in parts])
+    # All parts to one side of the world before they are cut.
+    moved = [shapely.transform(p, lambda xy, p=p: xy - [360 * round((p.centroid.x - centre) / 360), 0]) for p in parts]
+    whole = shapely.union_all(moved)
+    west, south, east, north = whole.bounds
+    cut = _cut(whole, west, east)
+    box = [-180.0, south, 180.0, north] if east - west >= 360 else [_in_range(west), south, _in_range(east), north]
+    return _listed(shapely.geometry.mapping(cut)), [round(float(value), _DECIMALS) for value in box]
+
+
+def _polygons(geometry: BaseGeometry) -> list[Any]:
+    parts = shapely.get_parts(geometry)
+    return [part for one in parts for part in shapely.get_parts(one) if part.geom_type == "Polygon" and part.area > 0]
+
+
+def _unwrapped(ring: Array) -> Array:
+    """Return a closed ring of lon, lat with longitudes that do not jump; one around a pole goes by way of it."""
+    lon = np.degrees(np.unwrap(np.radians(ring[:, 0])))
+    ring = np.column_stack([lon, ring[:, 1]])
+    if abs(lon[-1] - lon[0]) < 180:
+        return ring
+    pole = np.copysign(90.0, ring[:, 1].mean())
+    return np.vstack([ring, [[lon[-1], pole], [lon[0], pole]], ring[:1]])
+
+
+def _cut(whole: BaseGeometry, west: float, east: float) -> BaseGeometry:
+    """Return parts with longitudes of -180 to 180 degrees."""
+    parts = []
+    for turn in range(int(np.floor((west + 180) / 360)), int(np.floor((east + 180) / 360)) + 1):
+        strip = shapely.box(360.0 * turn - 180, -90, 360.0 * turn + 180, 90)
+        inside = shapely.intersection(whole, strip)
+        parts += [shapely.transform(p, lambda xy, turn=turn: xy - [360.0 * turn, 0]) for p in _polygons(inside)]
+    rounded = _polygons(shapely.set_precision(shapely.MultiPolygon(parts), 10.0**-_DECIMALS))
+    oriented = [shapely.geometry.polygon.orient(part) for part in rounded]
+    return oriented[0] if len(oriented) == 1 else shapely.MultiPolygon(oriented)
+
+
+def _in_range(lon: float) -> float:
+    return float((lon + 180) % 360 - 180)
+
+
+def _listed(geometry: Any) -> dict[str, Any]:
+    def lists(value: Any) -> Any:
+        return [lists(item) for item in value] if isinstance(value, tuple | list) else round(float(value), _DECIMALS)
+
+    return {"type": geometry["type"], "coordinates": lists(geometry["coordinates"])}

@@ -1,0 +1,4 @@
+"""The pages that people read, their plots and words, and the STAC item.
+
+Imports `warp` and what is below. A new plot is a function in `plots` and a line in its list.
+"""

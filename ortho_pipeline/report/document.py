@@ -1,0 +1,393 @@
+"""The accuracy report: one dict, shown as JSON, as a page, as plots, as GeoJSON and as text for the terminal.
+
+`build_report` collects everything; the other functions only show what is in its dict. A residual is measured minus
+predicted, in pixels. In metres it is where the ortho shows a point minus where the point belongs, east and north, on
+the assumption that the DEM is right there.
+"""
+
+from __future__ import annotations
+
+import base64
+import functools
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_pipeline.display.drawing import round_down, style_sheet
+from ortho_pipeline.display.numbers import fixed, flat, metres, plain_size, px, share, short, signed
+from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.estimation.fit import Fit, root_mean_square
+from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rmse_metres, viewing
+from ortho_pipeline.estimation.spatial_correlation import analyse_fit
+from ortho_pipeline.files import read_json, whole_or_nothing, write_text
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform
+from ortho_pipeline.points.control_hull import control_hull
+from ortho_pipeline.raster.quicklook import preview_png
+from ortho_pipeline.report.delivered import accuracy_before
+from ortho_pipeline.report.map_scale import map_scale
+from ortho_pipeline.report.plots import analysed_role, kind_of, plots
+from ortho_pipeline.report.wording import headline, summary_text
+
+if TYPE_CHECKING:
+    import pyproj
+
+    from ortho_pipeline.exchange.rpc import RpcExport
+    from ortho_pipeline.hookspecs import Scene
+    from ortho_pipeline.raster.source import Grid
+    from ortho_pipeline.surface.dem import Surface
+    from ortho_pipeline.warp.engine import WarpResult
+
+Array = NDArray[np.float64]
+
+SCHEMA_VERSION = 1
+DOCUMENT = "ortho-pipeline report"
+#: Median of control height minus DEM height from which a difference of datums is suspected, metres.
+_SUSPICIOUS_HEIGHT = 5.0
+_MAX_BYTES = 50_000_000
+#: In the pipeline's warning about check points, which the headline repeats in its own words.
+_FEW = "check points: fewer than"
+
+__all__ = [
+    "build_report",
+    "headline",
+    "plots",
+    "preview_png",
+    "read_report_json",
+    "residuals_geojson",
+    "residuals_style",
+    "summary_text",
+    "write_plots",
+    "write_report_html",
+    "write_report_json",
+]
+
+# -- collecting ------------------------------------------------------------------------------------------------------
+
+
+def build_report(
+    *,
+    scene: Scene,
+    fit: Fit,
+    exported: RpcExport | None = None,
+    surface: Surface | None = None,
+    coverage: float | None = None,
+    grid: Grid | None = None,
+    warp: WarpResult | None = None,
+    comparison: Mapping[str, Any] | None = None,
+    near: float | None = None,
+    provenance: Mapping[str, Any] | None = None,
+    warnings: Iterable[str] = (),
+) -> dict[str, Any]:
+    """Collect scene, adjustment, heights, ortho and provenance as plain data that JSON holds (no NaN).
+
+    Parameters
+    ----------
+    exported : RpcExport, optional
+        The adjusted model as RPC.
+    coverage : float, optional
+        Share (0 to 1) of the scene for which the DEM has a height.
+    comparison : mapping, optional
+        The document of ``ortho compare``.
+    near : float, optional
+        Distance (m) below which points are neighbours; as `covariance.analyse` chooses it without one.
+    warnings : iterable of str
+        What the reader ought to know; a suspicious difference between control and DEM heights is added to them.
+    """
+    seen = viewing(fit.model, scene.width, scene.height)
+    heights = None if surface is None else _heights_of_points(fit, surface, seen)
+    noted = [*warnings, *([heights["warning"]] if heights and heights["warning"] else [])]
+    adjustment = {**fit.to_json(), "warnings": noted}
+    shifts, views = in_metres(fit, fit.residuals), along_view(fit)
+    for i, point in enumerate(adjustment["points"]):
+        point["raw_residual"] = _numbers(fit.raw_residuals[i])
+        point["residual_m"] = _numbers(shifts[i])
+        point["view_residual"] = _numbers(views[i])
+        point["height_m"] = _number(fit.points.ground[i, 2])
+    report = {
+        "document": DOCUMENT,
+        "schema_version": SCHEMA_VERSION,
+        "scene": {
+            "name": Path(scene.path).name,
+            "size": [scene.width, scene.height],
+            "sensor": scene.sensor,
+            "model_source": scene.model_source,
+            "facts": {str(key): _plain(value) for key, value in scene.facts.items()},
+            **seen,
+        },
+        "adjustment": adjustment,
+        "rmse_m": rmse_metres(fit),
+        "view_rmse": _view_rmse(fit, views),
+        "covariance": {role: found and found.to_json() for role, found in analyse_fit(fit, near=near).items()},
+        "map_scale": _map_scale(fit, seen),
+        "control_hull": control_hull(fit.points.image[fit.used], (scene.width, scene.height)),
+        "comparison": None if comparison is None else _plain(comparison),
+        "heights": heights,
+        "surface": None if surface is None else {"coverage": coverage, **_plain(surface.provenance)},
+        "rpc": None if exported is None else {"exact": exported.exact, "max_error_px": exported.max_error_px},
+        "ortho": None if grid is None else _ortho(grid, warp),
+        "warp": None if warp is None else _warped(warp),
+        "provenance": _plain(provenance or {}),
+        "warnings": noted,
+    }
+    report["headline"] = headline(report, accuracy_before(scene), adjusted=scene.adjusted is not None)
+    return report
+
+
+def _map_scale(fit: Fit, seen: Mapping[str, Any]) -> dict[str, Any] | None:
+    pixels = seen["ground_pixel_m"]
+    found = map_scale(fit, max(pixels) if pixels else None)
+    return None if found is None else found.to_json()
+
+
+def _view_rmse(fit: Fit, views: Array) -> dict[str, Any]:
+    """Return root mean squares (px) along and across the direction of view, over control (used) and check points."""
+    found: dict[str, Any] = {}
+    for name, mask in (("control", fit.used), ("check", fit.points.check)):
+        rows = views[mask]
+        rmse = root_mean_square(rows[np.isfinite(rows).all(axis=1)])
+        found[name] = rmse and {"along": rmse["col"], "across": rmse["row"], "n": rmse["n"]}
+    return found
+
+
+def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Compare the heights of the points with the DEM's: a difference of datums shows here and nowhere else."""
+    points = fit.points
+    if surface.constant_height is not None or not len(points):
+        return None
+    difference = points.ground[:, 2] - surface.heights(points.ground[:, :2], points.crs)
+    difference = difference[np.isfinite(difference)]
+    if not len(difference):
+        return None
+    median = float(np.median(difference))
+    spread = float(1.4826 * np.median(np.abs(difference - median)))
+    warning = None
+    if len(difference) >= 3 and abs(median) > max(_SUSPICIOUS_HEIGHT, 3 * spread):
+        lean = seen["lean_m_per_m"]
+        moved = "" if lean is None else f"; that moves the ortho by {metres(abs(median) * lean)}"
+        side = "above" if median > 0 else "below"
+        warning = (
+            f"the points lie {metres(abs(median))} {side} the DEM (median; spread {metres(spread)}): their heights "
+            f"probably have another datum than the DEM's{_undulation_there(points.ground, points.crs)}{moved}"
+        )
+    return {"median_m": median, "spread_m": spread, "n": len(difference), "warning": warning}
+
+
+def _undulation_there(ground: Array, crs: pyproj.CRS) -> str:
+    try:
+        there = ground_transform(crs, "EPSG:4979")(ground)
+        undulation = float(np.nanmean(Vertical.parse("egm96").undulation(there[:, 0], there[:, 1])))
+    except OrthoError:
+        return ""
+    return f" (the geoid is {undulation:+.1f} m from the ellipsoid there)"
+
+
+def _ortho(grid: Grid, warp: WarpResult | None) -> dict[str, Any]:
+    authority, unit = grid.crs.to_authority(), grid.crs.axis_info[0].unit_name
+    return {
+        "crs": ":".join(authority) if authority else grid.crs.name,
+        "crs_name": grid.crs.name,
+        "unit": {"metre": "m", "degree": "°"}.get(unit, unit),
+        "extent": [float(value) for value in grid.extent],
+        "resolution": [float(grid.dx), float(grid.dy)],
+        "size": [grid.width, grid.height],
+        "valid_share": None if warp is None else warp.valid_pixels / max(warp.pixels, 1),
+    }
+
+
+def _warped(warp: WarpResult) -> dict[str, Any]:
+    """Return what the warp did without how long it took: the same inputs make the same report, byte by byte."""
+    return {name: value for name, value in asdict(warp).items() if name != "seconds"}
+
+
+def residuals_geojson(fit: Fit) -> dict[str, Any]:
+    """Return the points as GeoJSON in lon, lat (WGS 84), one flat property per number, as GIS want them.
+
+    ``res_*`` are residuals in pixels, ``raw_*`` those of the model as delivered, ``loo_*`` leave-one-out; ``east_m``
+    and ``north_m`` the shift of the ortho in metres along the axes of the ground, for a vector field symbol.
+    """
+    points = fit.points
+    where = ground_transform(points.crs, "EPSG:4979")(points.ground) if len(points) else np.zeros((0, 3))
+    metres = in_metres(fit, fit.residuals)
+    reasons, doubts = dict(fit.rejected), {one.id: one.reason for one in fit.outlying}
+    features = []
+    for i, name in enumerate(points.ids):
+        pairs = {
+            "": points.image[i], "res_": fit.residuals[i], "raw_": fit.raw_residuals[i], "loo_": fit.loo_residuals[i],
+        }  # fmt: skip
+        numbers = {f"{key}{axis}": pair[k] for key, pair in pairs.items() for k, axis in enumerate(("col", "row"))}
+        numbers |= {"res_px": float(np.hypot(*fit.residuals[i])), "east_m": metres[i, 0], "north_m": metres[i, 1]}
+        numbers["length_m"] = float(np.hypot(*metres[i]))
+        properties = {
+            "id": name,
+            "role": str(points.roles[i]),
+            "used": bool(fit.used[i]),
+            **{key: _number(value) for key, value in numbers.items()},
+            "rejected": reasons.get(name),
+            "outlying": doubts.get(name),
+        }
+        # A position without a height is legal GeoJSON, NaN is not.
+        position = [float(value) for value in where[i] if np.isfinite(value)]
+        geometry = {"type": "Point", "coordinates": position} if len(position) >= 2 else None
+        features.append({"type": "Feature", "geometry": geometry, "properties": properties})
+    return {"type": "FeatureCollection", "features": features}
+
+
+def residuals_style(report: Mapping[str, Any]) -> str:
+    """Return a QGIS style (QML) for the residuals: marks by role, and arrows that are exaggerated in length.
+
+    QGIS takes it by itself, as it has the name of the GeoJSON file with the ending ``.qml``.
+    """
+    template = page_environment().get_template("residuals.qml.j2")
+    # Points that were left out have no arrow: a gross error would shrink those of all others to dots.
+    lengths = [
+        math.hypot(*point["residual_m"])
+        for point in report["adjustment"]["points"]
+        if point["residual_m"] and kind_of(point) != "out"
+    ]
+    ground = report["scene"]["ground_pixel_m"]
+    extent = max(report["scene"]["size"]) * (max(ground) if ground else 1.0)
+    longest = max(lengths, default=0.0)
+    # The longest arrow spans about a twelfth of the scene.
+    return str(template.render(exaggeration=round_down(extent / 12 / longest) if longest > 0 else 1.0))
+
+
+# -- showing ---------------------------------------------------------------------------------------------------------
+
+
+def write_report_json(report: Mapping[str, Any], path: str | PathLike[str]) -> None:
+    """Write the report as JSON, whole or not at all."""
+    write_text(path, json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def read_report_json(path: str | PathLike[str]) -> dict[str, Any]:
+    """Read a report again.
+
+    Raises
+    ------
+    InputError
+        If the file is no report of this version.
+    """
+    document = read_json(path, _MAX_BYTES, "give a <stem>_report.json")
+    if not isinstance(document, dict) or document.get("document") != DOCUMENT:
+        raise InputError("this is no report of ortho-pipeline", file=path, remedy="give a <stem>_report.json")
+    if document.get("schema_version") != SCHEMA_VERSION:
+        raise InputError(
+            f"schema version {document.get('schema_version')!r} is not known here (this version reads "
+            f"{SCHEMA_VERSION})", file=path, field="schema_version", remedy="make the report again",
+        )  # fmt: skip
+    return document
+
+
+def write_plots(report: Mapping[str, Any], folder: Path, stem: str, kind: str = "svg") -> dict[str, Path]:
+    """Write each plot as a picture of its own: ``<stem>_<plot>.svg`` or ``.png``.
+
+    Raises
+    ------
+    InputError
+        If PNG is asked for and matplotlib is not installed, or the report does not hold what its schema says.
+    """
+    try:
+        drawings = plots(report)
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        # What a report holds is the business of report.schema.json; here it is used as it was written.
+        raise InputError(
+            f"the report is damaged ({type(error).__name__}: {str(error)[:120]})", field="plots",
+            remedy="make the report again",
+        ) from error  # fmt: skip
+    files = {}
+    for name, drawing in drawings.items():
+        files[name] = folder / f"{stem}_{name}.{kind}"
+        if kind == "svg":
+            write_text(files[name], drawing.svg(alone=True) + "\n")
+            continue
+        with whole_or_nothing(files[name]) as temporary:
+            temporary.write_bytes(drawing.png())
+    return files
+
+
+def write_report_html(
+    report: Mapping[str, Any], path: str | PathLike[str], *, ortho: str | PathLike[str] | bytes | None = None
+) -> None:
+    """Write the report as one page that needs no other file and no network.
+
+    Parameters
+    ----------
+    ortho : path or bytes, optional
+        The orthoimage, of which a preview is made, or the PNG of a preview.
+    """
+    png = ortho if isinstance(ortho, bytes) or ortho is None else preview_png(ortho)
+    page = (
+        page_environment()
+        .get_template("report.html.j2")
+        .render(
+            report=report,
+            adjustment=report["adjustment"],
+            head=report["headline"],
+            # The headline's notes have said these already.
+            warnings=[text for text in report["warnings"] if not text.startswith("no redundancy") and _FEW not in text],
+            rejected={entry["id"]: entry["reason"] for entry in report["adjustment"]["rejected"]},
+            outlying={entry["id"]: entry["reason"] for entry in report["adjustment"]["outlying"]},
+            has_loo=any(point["loo_residual"] for point in report["adjustment"]["points"]),
+            provenance=list(flat({**report["scene"]["facts"], **_brief(report["provenance"])})),
+            inputs=report["provenance"].get("inputs") or [],
+            plots={name: drawing.svg() for name, drawing in plots(report).items()},
+            plotted_role=analysed_role(report),
+            plot_style=style_sheet(),
+            preview=base64.b64encode(png).decode() if png else None,
+        )
+    )
+    write_text(path, page)
+
+
+@functools.cache
+def page_environment() -> Any:
+    """Return the templates of pages, with the filters that write numbers as people read them."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("ortho_pipeline.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "px": px, "m": metres, "signed": signed, "share": share, "fixed": fixed, "number": short, "plain": plain_size,
+    }  # fmt: skip
+    return environment
+
+
+def _brief(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the provenance without what the page shows in tables of its own."""
+    return {key: value for key, value in provenance.items() if key not in ("inputs", "surface", "model_source")}
+
+
+# -- plain data ------------------------------------------------------------------------------------------------------
+
+
+def _numbers(values: Array) -> list[float] | None:
+    return [float(value) for value in values] if np.isfinite(values).all() else None
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _plain(value: Any) -> Any:
+    """Return nested values as what JSON holds; the rest as text."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float):
+        return _number(value)
+    return value if value is None or isinstance(value, bool | int | str) else str(value)

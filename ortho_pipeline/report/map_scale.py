@@ -1,0 +1,137 @@
+"""What maps the accuracy is good for: a rule of the OrbView-3 paper, ASPRS 2023, and NMAS.
+
+All three take the errors on the ground (where the ortho shows a point minus where it belongs, on the assumption that
+the DEM is right there) of points that took no part in the adjustment. Points that contradict the others count.
+
+- The paper: a position to 0.25 mm in the map (2.5 m for 1 : 10,000), and pixels of at most 0.1 mm in it (1 m).
+- ASPRS 2023: the horizontal accuracy class is the RMSE of both axes together, with that of the check points' own
+  coordinates, in whole centimetres; no class may be claimed with fewer than 30 check points.
+- NMAS: of the points tested at most one in ten is off by more than 1/30 inch in the map, or 1/50 inch at 1 : 20,000 and
+  smaller scales. So the largest such scale is asked for among the usual ones: the rule has a step.
+
+Source: Bueyueksalih et al. (OrbView-3), conclusion; ASPRS Positional Accuracy Standards for Digital Geospatial Data,
+edition 2 (2023), horizontal accuracy; United States National Map Accuracy Standards (1947), paragraph 1.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.errors import counted
+from ortho_pipeline.estimation.fit import Fit
+from ortho_pipeline.estimation.ground_residuals import in_metres
+from ortho_pipeline.models.base import Array
+
+#: Denominators of the usual scales of maps.
+SCALES = tuple(int(step * 10**power) for power in range(2, 7) for step in (1, 2, 2.5, 5))
+#: ASPRS 2023: fewer check points support no claim.
+ENOUGH_CHECK_POINTS = 30
+#: In the map, metres: what the paper asks of positions and of pixels.
+_POSITION, _PIXEL = 0.25e-3, 0.1e-3
+#: NMAS: 1/30 inch at scales larger than 1 : 20,000, 1/50 inch from there on.
+_INCH, _STEP = 0.0254, 20_000
+
+
+@dataclass(frozen=True)
+class MapScale:
+    """The verdicts; a scale is its denominator, None where even 1 : 5,000,000 is too large.
+
+    `evidence` is ``check`` (check points), ``delivered`` (any points, of a model that was not adjusted) or ``loo``
+    (control points left out in turn); only the first two are independent of the adjustment. `ce90` (m) is the distance
+    that at most one point in ten exceeds. `class_cm` is that of ASPRS 2023, `survey` (m) the RMSE of the check points
+    themselves in it (0: not stated), `claim` whether it may be claimed.
+    """
+
+    evidence: str
+    n: int
+    rmse: float
+    ce90: float
+    pixel: float | None
+    paper_scale: int | None
+    limited_by: str | None
+    class_cm: int
+    survey: float
+    claim: bool
+    nmas_scale: int | None
+
+    @property
+    def statement(self) -> str:
+        """The verdicts in words, with what they rest on."""
+        base = {
+            "check": counted(self.n, "check point"),
+            "delivered": f"{counted(self.n, 'point')} of the model as delivered",
+            "loo": f"{counted(self.n, 'control point')} left out in turn",
+        }[self.evidence]
+        by = "" if self.limited_by is None else f" (limited by the {self.limited_by})"
+        said = f"{base}: {_scale(self.paper_scale)}{by} by 0.25 mm in the map; "
+        claim = "ASPRS 2023 class" if self.claim else "it would be ASPRS 2023 class"
+        said += f"{claim} {self.class_cm} cm; NMAS {_scale(self.nmas_scale)}."
+        if self.evidence == "loo":
+            said += " No check points were kept apart: an indication, no claim."
+        elif not self.claim:
+            said += f" Fewer than {ENOUGH_CHECK_POINTS} points: an indication, no claim."
+        if self.claim and not self.survey:
+            said += " The accuracy of the check points is not stated and not in it."
+        return said
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the verdicts as JSON values."""
+        return {**asdict(self), "statement": self.statement}
+
+
+def map_scale(fit: Fit, pixel: float | None) -> MapScale | None:
+    """Return what maps a fit is good for; None where nothing tests it.
+
+    Parameters
+    ----------
+    pixel : float, optional
+        Width of a pixel on the ground, metres.
+    """
+    for evidence, residuals in _evidence(fit).items():
+        errors = in_metres(fit, residuals)
+        tested = np.isfinite(errors).all(axis=1)
+        if tested.any():
+            sigmas = fit.points.sigma_ground[tested, :2] if evidence != "loo" else np.zeros((1, 2))
+            return judge(errors[tested], evidence, pixel, float(np.sqrt((sigmas**2).sum(axis=1).mean())))
+    return None
+
+
+def _evidence(fit: Fit) -> dict[str, Array]:
+    """Return residuals (px) by what they are evidence of, the best first; NaN for points that are none."""
+    if not len(fit.points):
+        return {}
+    found = {"check": np.where(fit.points.check[:, None], fit.residuals, np.nan)}
+    if not len(fit.param_names):
+        found["delivered"] = np.where(fit.used[:, None], fit.residuals, np.nan)
+    elif fit.redundancy > 0:
+        found["loo"] = fit.loo_residuals
+    return found
+
+
+def judge(errors: Array, evidence: str, pixel: float | None, survey: float = 0.0) -> MapScale:
+    """Return the verdicts on errors ``(N, 2)`` in metres of at least one point."""
+    squares = (errors**2).sum(axis=1)
+    count, rmse = len(squares), float(np.sqrt(squares.mean()))
+    ce90 = float(np.sqrt(np.sort(squares)[count - 1 - count // 10]))
+    smallest = max(rmse / _POSITION, (pixel or 0.0) / _PIXEL)
+    limited = None if pixel is None else ("pixel" if pixel / _PIXEL > rmse / _POSITION else "accuracy")
+    # A hair, so that an RMSE of 2.5 m serves 1 : 10,000.
+    paper = next((scale for scale in SCALES if scale >= smallest * (1 - 1e-9)), None)
+    nmas = next((scale for scale in SCALES if ce90 <= nmas_limit(scale) * (1 + 1e-9)), None)
+    return MapScale(
+        evidence, count, rmse, ce90, pixel, paper, limited, math.ceil(100 * math.hypot(rmse, survey) - 1e-9), survey,
+        evidence != "loo" and count >= ENOUGH_CHECK_POINTS, nmas,
+    )  # fmt: skip
+
+
+def nmas_limit(scale: float) -> float:
+    """Return how far (m) nine of ten points may be off in a map of a scale (its denominator) by NMAS."""
+    return scale * _INCH / (30 if scale < _STEP else 50)
+
+
+def _scale(denominator: int | None) -> str:
+    return "no usual map scale" if denominator is None else f"1 : {denominator:,}"

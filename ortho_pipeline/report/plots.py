@@ -1,0 +1,356 @@
+"""The plots of the report, each drawn from the report's own document."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.display.drawing import Axes, Drawing, number, round_down
+from ortho_pipeline.errors import counted
+
+#: Drawing area of the plot of vectors in CSS pixels, and the space around it.
+_PLOT_WIDTH, _PLOT_HEIGHT, _PAD = 452.0, 460.0, 19.0
+#: The longest arrow, as a share of the drawing area.
+_LONGEST = 0.13
+#: With more points than this, their ids would hide the arrows.
+_MAX_LABELS = 60
+#: With more parameters than this, a matrix of correlations cannot be read.
+_MAX_PARAMETERS = 80
+
+Point = Mapping[str, Any]
+
+
+def plots(report: Mapping[str, Any]) -> dict[str, Drawing]:
+    """Return every plot for which the report has data, by name."""
+    makers: dict[str, Callable[[Mapping[str, Any]], Drawing | None]] = {
+        "residuals": plot_residuals,
+        "directions": plot_directions,
+        "heights": plot_heights,
+        "correlation": plot_correlation,
+        "neighbours": plot_neighbours,
+        "relative": plot_relative,
+        "comparison": plot_comparison,
+    }
+    made = {name: make(report) for name, make in makers.items()}
+    return {name: drawing for name, drawing in made.items() if drawing is not None}
+
+
+def kind_of(point: Point) -> str:
+    """Return what a point is drawn as: control, check or out."""
+    if point["role"] == "control" and not point["used"]:
+        return "out"
+    return "check" if point["role"] == "check" else "control"
+
+
+def _shown(report: Mapping[str, Any]) -> list[Point]:
+    return [p for p in report["adjustment"]["points"] if p["residual"] and p["image"] and p["role"] != "tie"]
+
+
+# -- vectors ---------------------------------------------------------------------------------------------------------
+
+
+def plot_residuals(report: Mapping[str, Any]) -> Drawing | None:
+    """Draw the residual vectors over the frame of the image, with the hull of the control points.
+
+    Used control points are dots, check points squares, points that were left out crosses without an arrow. Points
+    outside of the image are drawn where they are, tie points not at all.
+    """
+    points = _shown(report)
+    if not points:
+        return None
+    width, height = report["scene"]["size"]
+    image = np.array([point["image"] for point in points])
+    low, high = np.minimum(image.min(axis=0), 0.0), np.maximum(image.max(axis=0), (width, height))
+    scale = min(_PLOT_WIDTH / (high[0] - low[0]), _PLOT_HEIGHT / (high[1] - low[1]))
+    wide, tall = (high - low) * scale + 2 * _PAD
+    wide = max(float(wide), 340.0)
+    shift = np.array([(wide - (high[0] - low[0]) * scale) / 2, _PAD]) - low * scale
+    lengths = [math.hypot(*point["residual"]) for point in points if kind_of(point) != "out"]
+    longest = max(lengths, default=0.0)
+    arrow = _LONGEST * min(_PLOT_WIDTH, max(tall - 2 * _PAD, wide / 2)) / longest if longest > 0 else 0.0
+    label = f"Residual vectors of {counted(len(points), 'point')} over the frame of the image"
+    drawing = Drawing(wide, float(tall) + 36, label, "residuals")
+    x0, y0 = shift
+    hull = report.get("control_hull") or {}
+    if hull.get("outline"):
+        drawing.path("hull", [tuple(np.array(corner) * scale + shift) for corner in hull["outline"]], closed=True)
+    drawing.rect("frame", x0, y0, width * scale, height * scale)
+    drawing.text(x0, y0 - 8, "0, 0", quiet=True)
+    drawing.text(x0 + width * scale, y0 + height * scale + 15, f"{width}, {height}", quiet=True, anchor="end")
+    for point in points:
+        _draw_point(drawing, point, np.array(point["image"]) * scale + shift, arrow, len(points) <= _MAX_LABELS)
+    _legend(drawing, points, float(tall) + 20)
+    if longest > 0:
+        size = round_down(longest)
+        bar = size * arrow
+        drawing.arrow("bar", wide - _PAD - bar, float(tall) + 20, bar, 0.0)
+        drawing.text(wide - _PAD - 8 - bar, float(tall) + 24, f"{size:g} px", anchor="end")
+    return drawing
+
+
+def _draw_point(drawing: Drawing, point: Point, at: Any, arrow: float, label: bool) -> None:
+    x, y = (float(value) for value in at)
+    dx, dy = (value * arrow for value in point["residual"])
+    kind = kind_of(point)
+    with drawing.titled(_title(point)):
+        if kind != "out":
+            drawing.arrow(kind, x, y, dx, dy)
+        drawing.mark(kind, x, y)
+        if label:
+            # Beside the point, on the side that the arrow does not go to.
+            side, anchor = (-9, "end") if dx > 0 else (9, "start")
+            if x + side * 6 > drawing.width:
+                side, anchor = -9, "end"
+            down = 4 if abs(dx) > abs(dy) else (-5 if dy > 0 else 12)
+            drawing.text(x + side, y + down, str(point["id"]), anchor=anchor, quiet=kind == "out")
+
+
+def _title(point: Point) -> str:
+    column, row = point["residual"]
+    lines = [f"{point['id']} ({point['role']}{', left out' if kind_of(point) == 'out' else ''})"]
+    lines.append(f"residual {column:+.3f}, {row:+.3f} px")
+    if point.get("residual_m") and None not in point["residual_m"]:
+        lines.append("on the ground {:+.2f}, {:+.2f} m".format(*point["residual_m"]))
+    if point.get("loo_residual") and None not in point["loo_residual"]:
+        lines.append("left out {:+.3f}, {:+.3f} px".format(*point["loo_residual"]))
+    return "\n".join(lines)
+
+
+def _legend(drawing: Drawing, points: Sequence[Point], y: float) -> None:
+    names = {"control": "control", "check": "check", "out": "left out"}
+    present = {kind_of(point) for point in points}
+    x = _PAD + 4.0
+    for kind, name in names.items():
+        if kind in present:
+            drawing.mark(kind, x, y)
+            drawing.text(x + 11, y + 4, name)
+            x += 32 + 6.6 * len(name)
+
+
+# -- scatter ---------------------------------------------------------------------------------------------------------
+
+
+def plot_directions(report: Mapping[str, Any]) -> Drawing | None:
+    """Draw residuals along the direction of view against those across it, on equal axes."""
+    points = [p for p in _shown(report) if p.get("view_residual")]
+    kept = [p for p in points if kind_of(p) != "out"]
+    if not kept:
+        return None
+    reach = 1.12 * max(max(abs(value) for value in p["view_residual"]) for p in kept) or 1.0
+    inside = [p for p in points if max(abs(value) for value in p["view_residual"]) <= reach]
+    drawing = Drawing(420, 420, "Residuals along and across the direction of view", "directions")
+    axes = Axes(drawing, (52.0, 14.0, 354.0, 316.0), (-reach, reach), (-reach, reach))
+    axes.draw("along the direction of view, px", "across, px")
+    for point in inside:
+        with drawing.titled(_title(point)):
+            drawing.mark(kind_of(point), *axes.at(*point["view_residual"]))
+    _legend(drawing, inside, 406)
+    return drawing
+
+
+def plot_heights(report: Mapping[str, Any]) -> Drawing | None:
+    """Draw residuals along the direction of view (in rows, for a view straight down) against height."""
+    points = [p for p in _shown(report) if p.get("height_m") is not None]
+    kept = [p for p in points if kind_of(p) != "out"]
+    heights = [p["height_m"] for p in kept]
+    if len(kept) < 3 or max(heights) - min(heights) < 1.0:
+        return None
+    viewed = all(p.get("view_residual") for p in kept)
+    value = (lambda p: p["view_residual"][0]) if viewed else (lambda p: p["residual"][1])
+    reach = 1.12 * max(abs(value(p)) for p in kept) or 1.0
+    margin = 0.06 * (max(heights) - min(heights))
+    low, high = min(heights) - margin, max(heights) + margin
+    inside = [p for p in points if (kind_of(p) != "out" or (abs(value(p)) <= reach and low <= p["height_m"] <= high))]
+    drawing = Drawing(420, 420, "Residuals against the height of the points", "heights")
+    axes = Axes(drawing, (52.0, 14.0, 354.0, 316.0), (low, high), (-reach, reach))
+    axes.draw("height above the ellipsoid, m", "along the view, px" if viewed else "row, px")
+    for point in inside:
+        with drawing.titled(f"{_title(point)}\nheight {point['height_m']:.1f} m"):
+            drawing.mark(kind_of(point), *axes.at(point["height_m"], value(point)))
+    _legend(drawing, inside, 406)
+    return drawing
+
+
+# -- correlations ----------------------------------------------------------------------------------------------------
+
+
+def plot_correlation(report: Mapping[str, Any]) -> Drawing | None:
+    """Draw the correlations of the parameters as a matrix of cells, the stronger the darker."""
+    adjustment = report["adjustment"]
+    names = list(adjustment["parameters"])
+    matrix = (adjustment.get("statistics") or {}).get("correlation") or []
+    if not 2 <= len(names) <= _MAX_PARAMETERS or len(matrix) != len(names):
+        return None
+    room = 10 + 6.6 * max(map(len, names))
+    cell = min(34.0, 380.0 / len(names))
+    written = cell >= 11
+    size = cell * len(names)
+    room = room if written else 14.0
+    drawing = Drawing(max(room + size + 12, 340.0), size + room + 34, "Correlations of the parameters", "correlation")
+    for i, row in enumerate(matrix):
+        y = 8 + i * cell
+        if written:
+            drawing.text(room - 6, y + cell / 2 + 4, names[i], anchor="end")
+            drawing.text(room + (i + 0.5) * cell + 4, 8 + size + 6, names[i], anchor="end", turn=True)
+        for j, value in enumerate(row):
+            if value is None:
+                continue
+            with drawing.titled(f"{names[i]}, {names[j]}: {value:+.3f}"):
+                kind = "plus" if value >= 0 else "minus"
+                # A floor, so that the pointer finds also the cells of no correlation.
+                strength = max(abs(value), 0.02)
+                drawing.rect(kind, room + j * cell + 0.5, y + 0.5, cell - 1, cell - 1, strength)
+    drawing.rect("frame", room, 8, size, size)
+    base = size + room + 26
+    for k, value in enumerate((-1.0, -0.5, 0.0, 0.5, 1.0)):
+        x = room + k * 44
+        drawing.rect("plus" if value >= 0 else "minus", x, base - 10, 12, 12, max(abs(value), 0.02))
+        drawing.text(x + 15, base, number(value), quiet=True)
+    return drawing
+
+
+# -- distances -------------------------------------------------------------------------------------------------------
+
+
+def analysed_role(report: Mapping[str, Any]) -> str | None:
+    """Return which points' covariance analysis is drawn: check points where they could be tested, else control."""
+    found = report.get("covariance") or {}
+    for role in ("check", "control"):
+        if found.get(role) and found[role]["p_joint"] is not None and len(found[role]["classes"]) > 1:
+            return role
+    return None
+
+
+def plot_neighbours(report: Mapping[str, Any]) -> Drawing | None:
+    """Draw the correlation of residuals against the distance of points, with what chance does to each class."""
+    role = analysed_role(report)
+    if role is None:
+        return None
+    found = report["covariance"][role]
+    classes = found["classes"]
+    reach = max(abs(value) for one in classes for value in (*one["correlation"], 2 / math.sqrt(one["pairs"])))
+    reach = max(1.08 * reach, 0.3)
+    drawing, axes = _distance_axes(found, (-reach, reach), "correlation of residuals", "neighbours")
+    # Products of independent residuals are uncorrelated among pairs: two standard deviations of their mean.
+    for one in classes:
+        chance = min(2 / math.sqrt(one["pairs"]), reach)
+        (left, top), (right, low) = axes.at(one["from_m"], chance), axes.at(one["to_m"], -chance)
+        drawing.rect("chance", left, top, right - left, low - top)
+    _series(axes, found, "correlation", role)
+    drawing.rect("chance", 236, 396, 14, 12)
+    drawing.text(256, 406, "chance (95 %)")
+    return drawing
+
+
+def plot_relative(report: Mapping[str, Any]) -> Drawing | None:
+    """Draw the relative standard deviation against the distance of points, and the fitted covariance function."""
+    role = analysed_role(report)
+    if role is None:
+        return None
+    found = report["covariance"][role]
+    high = 1.12 * max(max(one["relative"]) for one in found["classes"]) or 1.0
+    drawing, axes = _distance_axes(found, (0.0, high), f"relative standard deviation, {found['unit']}", "relative")
+    fitted = found["verdict"] == "systematic"
+    if fitted:
+        at = np.linspace(0.0, axes.x[1], 60)
+        for function, p in zip(found["functions"], found["p"], strict=True):
+            if function is None or p >= 0.05:
+                continue
+            shared = function["systematic"] ** 2 * -np.expm1(-at / function["range_m"])
+            curve = [axes.at(x, y) for x, y in zip(at, np.sqrt(function["noise"] ** 2 + shared), strict=True)]
+            for start, end in itertools.pairwise(curve):
+                drawing.line("axis", *start, *end)
+    _series(axes, found, "relative", role)
+    if fitted:
+        drawing.line("axis", 236, 402, 256, 402)
+        drawing.text(262, 406, "covariance function")
+    return drawing
+
+
+def _distance_axes(found: Mapping[str, Any], y: tuple[float, float], y_name: str, name: str) -> tuple[Drawing, Axes]:
+    """Return a drawing with axes for values of classes of distance."""
+    drawing = Drawing(420, 420, f"{y_name} against the distance of points", name)
+    axes = Axes(drawing, (52.0, 14.0, 354.0, 316.0), (0.0, found["classes"][-1]["to_m"]), y)
+    axes.draw("distance of points, m", y_name)
+    return drawing, axes
+
+
+def _series(axes: Axes, found: Mapping[str, Any], key: str, role: str) -> None:
+    """Draw the values of all classes, one line per axis of the ground: x filled and solid, y hollow and dashed."""
+    looks = {
+        "control": (("control", "control"), ("control-dash", "loo")),
+        "check": (("check-line", "check-head"), ("check-dash", "check")),
+    }  # fmt: skip
+    drawing = axes.drawing
+    for k, (line, mark) in enumerate(looks[role]):
+        at = [axes.at(one["distance_m"], one[key][k]) for one in found["classes"]]
+        for start, end in itertools.pairwise(at):
+            drawing.line(line, *start, *end)
+        for (x, y), one in zip(at, found["classes"], strict=True):
+            title = (
+                f"{'xy'[k]}: {one[key][k]:.2f}, {one['from_m']:.0f} to {one['to_m']:.0f} m, "
+                f"{counted(one['pairs'], 'pair')}"
+            )
+            with drawing.titled(title):
+                drawing.circle(mark, x, y, 3.4)
+        left = 58 + 84 * k
+        drawing.line(line, left - 12, 402, left + 12, 402)
+        drawing.circle(mark, left, 402, 3.4)
+        drawing.text(left + 18, 406, ("x (east)", "y (north)")[k])
+
+
+# -- comparison ------------------------------------------------------------------------------------------------------
+
+
+def plot_comparison(report: Mapping[str, Any]) -> Drawing | None:
+    """Draw the RMSE of every compared model on a logarithmic axis: the fit, left out in turn, check points."""
+    rows = [row for row in (report.get("comparison") or {}).get("rows", []) if not row["error"]]
+    kinds = {"control": "control", "loo": "loo", "check": "check"}
+    values = [row["rmse"][key]["total"] for row in rows for key in kinds if row["rmse"][key]]
+    values = [value for value in values if value > 1e-6]
+    if not rows or not values:
+        return None
+    low, high = min(values) / 1.25, max(values) * 1.25
+    room = 14 + 6.6 * max(len(row["model"]) for row in rows)
+    wide, step = 700.0, 24.0
+    tall = step * len(rows)
+    drawing = Drawing(wide, tall + 70, "RMSE of the compared models", "comparison")
+    span = math.log(high / low)
+
+    def across(value: float) -> float:
+        return room + (wide - room - 20) * math.log(max(value, low) / low) / span
+
+    for value in _log_ticks(low, high):
+        drawing.line("grid", across(value), 6, across(value), tall + 6)
+        drawing.text(across(value), tall + 22, f"{value:g}", anchor="middle", quiet=True)
+    chosen = report["comparison"]["recommendation"]["model"]
+    for k, row in enumerate(rows):
+        y = 6 + step * (k + 0.5)
+        if row["model"] == chosen:
+            drawing.rect("chosen", 0, y - step / 2, wide, step)
+        drawing.text(room - 10, y + 4, row["model"], anchor="end")
+        said = [f"{key} {row['rmse'][key]['total']:.3g} px" for key in kinds if row["rmse"][key]]
+        with drawing.titled(f"{row['model']}, {counted(row['parameters'], 'parameter')}\n" + "\n".join(said)):
+            found = {key: across(row["rmse"][key]["total"]) for key in kinds if row["rmse"][key]}
+            drawing.line("axis", min(found.values()), y, max(found.values()), y)
+            for key, x in found.items():
+                drawing.mark(kinds[key], x, y)
+    x = room
+    for kind, name in (("control", "control (the fit)"), ("loo", "each left out in turn"), ("check", "check")):
+        drawing.mark(kind, x, tall + 48)
+        drawing.text(x + 11, tall + 52, name)
+        x += 34 + 6.4 * len(name)
+    drawing.text(wide - 20, tall + 52, "RMSE, px", anchor="end", quiet=True)
+    return drawing
+
+
+def _log_ticks(low: float, high: float) -> list[float]:
+    steps = (1, 2, 5) if math.log10(high / low) < 3 else (1,)
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    return [
+        float(f"{step * 10.0**power:.3g}") for power in powers for step in steps if low <= step * 10.0**power <= high
+    ]

@@ -1,0 +1,217 @@
+"""A STAC item for an orthoimage: where and when it is, how it was seen, how accurate it is, and a checksum.
+
+Extensions: projection 2.0, raster 1.1, view 1.0, file 2.1, accuracy 1.0 beta 1 (its only published version). Accuracy
+comes from check points, or from leave-one-out residuals; that of control points is no accuracy, and is left out.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import sha256, staged, whole_or_nothing, write_text
+from ortho_pipeline.raster.quicklook import preview_png
+from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.raster.valid_area import grid_of, to_geojson, valid_outline
+
+if TYPE_CHECKING:
+    from ortho_pipeline.raster.source import Grid
+
+_EXTENSIONS = "https://stac-extensions.github.io"
+_URIS = {
+    "proj": f"{_EXTENSIONS}/projection/v2.0.0/schema.json",
+    "raster": f"{_EXTENSIONS}/raster/v1.1.0/schema.json",
+    "view": f"{_EXTENSIONS}/view/v1.0.0/schema.json",
+    "file": f"{_EXTENSIONS}/file/v2.1.0/schema.json",
+    "accuracy": f"{_EXTENSIONS}/accuracy/v1.0.0-beta.1/schema.json",
+}
+#: Multihash: the code of SHA-256 and its length in bytes.
+_SHA256 = "1220"
+#: Longer side in pixels of the pictures of an item, by their key among the files.
+_PICTURES = {"thumbnail": 256, "overview": 1024}
+#: Files beside the ortho: key, title, media type, roles.
+_ASSETS = (
+    ("thumbnail", "Orthoimage, small", "image/png", ["thumbnail"]),
+    ("overview", "Orthoimage, reduced", "image/png", ["overview", "visual"]),
+    ("report", "Accuracy report", "application/json", ["metadata"]),
+    ("html", "Accuracy report as a page", "text/html", ["metadata"]),
+    ("model", "Adjusted sensor model", "application/json", ["metadata"]),
+    ("residuals", "Residuals of the points", "application/geo+json", ["metadata"]),
+)
+
+
+def acquisition_time(facts: Mapping[str, Any], given: str | None = None) -> datetime:
+    """Return the time at which a scene was taken, UTC where nothing else is said.
+
+    Parameters
+    ----------
+    facts : mapping
+        What the sensor says of the scene; ``acquired`` counts.
+    given : str, optional
+        What the user says, which counts more.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it is no time: STAC has no item without one.
+    """
+    text = given if given is not None else facts.get("acquired")
+    if not text:
+        raise InputError(
+            "a STAC item needs the time of acquisition, and the metadata of this scene have none", field="--acquired",
+            remedy="give it, for example --acquired 2005-08-03T08:12:31Z (in a pipeline file output: acquired:)",
+        )  # fmt: skip
+    try:
+        time = datetime.fromisoformat(str(text).strip())
+        return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
+    except (ValueError, OverflowError) as error:
+        # Overflow: the last hours of the last year, in a zone in which they are the next year in UTC.
+        raise InputError(
+            f"{str(text)[:40]!r} is no time of acquisition",
+            field="--acquired",
+            remedy="for example 2005-08-03T08:12:31Z",
+        ) from error
+
+
+def write_item(
+    path: Path, report: Mapping[str, Any], files: Mapping[str, Path], acquired: datetime, name: str
+) -> None:  # fmt: skip
+    """Write the STAC item of an ortho, and its pictures.
+
+    Parameters
+    ----------
+    path : Path
+        Beside the ortho, to which it refers by relative links.
+    report : mapping
+        The accuracy report of the ortho.
+    files : mapping of str to Path
+        Outputs by what they are; ``ortho`` has to be there, ``thumbnail`` and ``overview`` are made of it (PNG,
+        8 bits, stretched for the eye), the others become assets where they are.
+    name : str
+        Id of the item.
+
+    Raises
+    ------
+    InputError
+        If the ortho has no valid pixel, and therefore no place.
+    """
+    import pystac
+
+    ortho = staged(files["ortho"])
+    grid, outline = grid_of(ortho), valid_outline(ortho)
+    if outline.is_empty:
+        raise InputError("no pixel of the ortho is valid: it has no place", file=files["ortho"])
+    geometry, box = to_geojson(outline, grid.crs)
+    properties = {**_projection(grid, outline), **_view(report["scene"]), **_accuracy(report)}
+    prefixes = {"file", "raster", *(name.partition(":")[0] for name in properties)}
+    facts = report["scene"]["facts"]
+    if isinstance(facts.get("satellite"), str):
+        properties["platform"] = facts["satellite"].lower()
+    pixel = report["scene"]["ground_pixel_m"]
+    if pixel is not None:
+        properties["gsd"] = round(float(np.mean(pixel)), 4)
+    item = pystac.Item(
+        name, geometry, box, acquired, properties, stac_extensions=[_URIS[key] for key in _URIS if key in prefixes]
+    )
+    item.add_asset("ortho", _ortho_asset(files["ortho"], report, path.parent))
+    for key, side in _PICTURES.items():
+        if key in files:
+            with whole_or_nothing(files[key]) as temporary:
+                temporary.write_bytes(preview_png(ortho, side=side))
+    for key, title, media, roles in _ASSETS:
+        if key in files and staged(files[key]).is_file():
+            item.add_asset(key, pystac.Asset(_href(files[key], path.parent), title, media_type=media, roles=roles))
+    document = item.to_dict(include_self_link=False, transform_hrefs=False)
+    write_text(path, json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def write_catalog(path: Path, items: Sequence[Path], title: str) -> None:
+    """Write a catalog of items, with relative links to them."""
+    import pystac
+
+    catalog = pystac.Catalog(path.parent.name, f"Orthoimages of {title}", title=title)
+    for item in items:
+        catalog.add_link(pystac.Link("item", _href(item, path.parent), "application/geo+json"))
+    document = catalog.to_dict(include_self_link=False, transform_hrefs=False)
+    document["links"] = [{"rel": "root", "href": f"./{path.name}", "type": "application/json"},
+                         *(link for link in document["links"] if link["rel"] == "item")]  # fmt: skip
+    write_text(path, json.dumps(document, indent=1, ensure_ascii=False) + "\n")
+
+
+def _href(path: Path, folder: Path) -> str:
+    return f"./{path.relative_to(folder).as_posix()}"
+
+
+def _ortho_asset(path: Path, report: Mapping[str, Any], folder: Path) -> Any:
+    import pystac
+
+    content = staged(path)
+    source = RasterSource(content)
+    band: dict[str, Any] = {"data_type": source.dtype.name, "sampling": "area"}
+    if report["ortho"]["unit"] == "m":
+        band["spatial_resolution"] = float(np.mean(report["ortho"]["resolution"]))
+    bands = []
+    for nodata in source.nodata:
+        value = {} if nodata is None else {"nodata": "nan" if math.isnan(nodata) else nodata}
+        bands.append({**band, **value})
+    layout = source.dataset.GetMetadata("IMAGE_STRUCTURE").get("LAYOUT")
+    return pystac.Asset(
+        _href(path, folder),
+        "Orthoimage",
+        media_type=pystac.MediaType.COG if layout == "COG" else pystac.MediaType.GEOTIFF,
+        roles=["data"],
+        extra_fields={
+            "raster:bands": bands,
+            "file:size": content.stat().st_size,
+            "file:checksum": _SHA256 + sha256(content),
+        },
+    )
+
+
+def _projection(grid: Grid, outline: Any) -> dict[str, Any]:
+    authority = grid.crs.to_authority()
+    known = {"proj:code": ":".join(authority)} if authority else {"proj:wkt2": grid.crs.to_wkt()}
+    return {
+        **known,
+        "proj:bbox": [float(value) for value in grid.extent],
+        "proj:shape": [grid.height, grid.width],
+        "proj:transform": [grid.dx, 0.0, grid.left, 0.0, -grid.dy, grid.top],
+        "proj:geometry": json.loads(shapely.to_geojson(outline)),
+    }
+
+
+def _view(scene: Mapping[str, Any]) -> dict[str, Any]:
+    """Return incidence and azimuth at the scene: as the extension has it, from the point below the sensor onwards."""
+    view = scene.get("view")
+    if view is None:
+        return {}
+    angles: dict[str, Any] = {"view:incidence_angle": round(view["incidence_deg"], 4)}
+    if view["sensor_azimuth_deg"] is not None:
+        angles["view:azimuth"] = round((view["sensor_azimuth_deg"] + 180) % 360, 4)
+    return angles
+
+
+def _accuracy(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what points that took no part say: a radial RMSE in metres, bias and spread of check points."""
+    found: dict[str, Any] = {}
+    for role, what in (("check", "check points"), ("loo", "leave-one-out residuals")):
+        rmse = report["rmse_m"].get(role)
+        if rmse:
+            found = {"accuracy:geometric_rmse": round(rmse["total"], 4), "ortho:accuracy_from": what,
+                     "ortho:accuracy_points": rmse["n"]}  # fmt: skip
+            break
+    shifts = np.array([point["residual_m"] for point in report["adjustment"]["points"]
+                       if point["role"] == "check" and point["residual_m"]])  # fmt: skip
+    if len(shifts) > 1:
+        for axis, values in zip("xy", shifts.T, strict=True):
+            found[f"accuracy:geometric_{axis}_bias"] = round(float(values.mean()), 4)
+            found[f"accuracy:geometric_{axis}_stddev"] = round(float(values.std(ddof=1)), 4)
+    return found

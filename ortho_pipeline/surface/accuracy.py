@@ -1,0 +1,207 @@
+"""How good a DEM is: its heights against check heights, by the slope of the terrain.
+
+The error of a DEM moves a point of an ortho along the line of sight, so it belongs into every budget of accuracy. It
+grows with the slope, because a shift in plan is an error in height there.
+
+Source: Höhle and Höhle 2009, "Accuracy assessment of digital elevation models by means of robust statistical methods"
+(median, NMAD, quantiles beside mean and RMSE, because errors of DEMs have long tails).
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
+from ortho_pipeline.points.formats import read_block_table
+from ortho_pipeline.points.ground import ground_of
+from ortho_pipeline.points.rows import OF_HEIGHTS
+from ortho_pipeline.surface.dem import Surface
+
+Array = NDArray[np.float64]
+
+#: Limits (degrees) between the classes of slope.
+SLOPES = (5.0, 10.0, 20.0, 30.0)
+#: NMAD of a normal distribution is its standard deviation.
+_NMAD = 1.4826
+#: A difference so many NMAD away from the median is named.
+_GROSS = 5.0
+#: The 90 % quantile of fewer differences is one of the largest of them, and is not given.
+_ENOUGH = 10
+
+
+@dataclass(frozen=True)
+class HeightErrors:
+    """Differences DEM minus check height, in metres; None where there are too few.
+
+    `le90` is the 90 % quantile of their absolute values, which assumes no distribution.
+    """
+
+    count: int
+    mean: float | None
+    rmse: float | None
+    median: float | None
+    nmad: float | None
+    le90: float | None
+    largest: float | None
+
+    @classmethod
+    def of(cls, differences: Array) -> HeightErrors:
+        """Return the statistics of differences ``(N,)``."""
+        count = len(differences)
+        if not count:
+            return cls(0, None, None, None, None, None, None)
+        median = float(np.median(differences))
+        return cls(
+            count=count,
+            mean=float(differences.mean()),
+            rmse=float(np.sqrt((differences**2).mean())),
+            median=median,
+            nmad=float(_NMAD * np.median(np.abs(differences - median))) if count > 2 else None,
+            le90=float(np.quantile(np.abs(differences), 0.9)) if count >= _ENOUGH else None,
+            largest=float(differences[np.argmax(np.abs(differences))]),
+        )
+
+
+@dataclass(frozen=True)
+class DemAccuracy:
+    """A DEM against check heights.
+
+    Parameters
+    ----------
+    ids : sequence of str
+    differences : (N,)
+        DEM minus check height (m); NaN where one of them has no height.
+    slopes : (N,)
+        Of the DEM at the points, degrees.
+    """
+
+    ids: Sequence[str]
+    differences: Array
+    slopes: Array
+
+    @property
+    def overall(self) -> HeightErrors:
+        """All points with a height."""
+        return HeightErrors.of(self.differences[np.isfinite(self.differences)])
+
+    def by_slope(self) -> list[tuple[float, float | None, HeightErrors]]:
+        """Return lower and upper limit (degrees, None: no limit) and the differences of each class of slope."""
+        edges = [0.0, *SLOPES, np.inf]
+        found = []
+        for low, high in itertools.pairwise(edges):
+            inside = (self.slopes >= low) & (self.slopes < high) & np.isfinite(self.differences)
+            found.append((low, None if np.isinf(high) else high, HeightErrors.of(self.differences[inside])))
+        return found
+
+    def gross(self) -> list[str]:
+        """Return the points whose difference is far from all others."""
+        errors = self.overall
+        if errors.nmad is None or errors.median is None:
+            return []
+        far = np.abs(self.differences - errors.median) > _GROSS * max(errors.nmad, 1e-6)
+        return [name for name, out in zip(self.ids, far, strict=True) if out]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of ``ortho dem-check --json`` (docs/formats.md)."""
+        points = [
+            {"id": name, "difference_m": _number(difference), "slope_deg": _number(slope)}
+            for name, difference, slope in zip(self.ids, self.differences, self.slopes, strict=True)
+        ]
+        classes = [{"slope_deg": [low, high], **vars(errors)} for low, high, errors in self.by_slope()]
+        return {
+            "overall": vars(self.overall), "by_slope": classes, "gross": self.gross(),
+            "without_height": int((~np.isfinite(self.differences)).sum()), "points": points,
+        }  # fmt: skip
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def check_dem(surface: Surface, ground: Array, crs: str | pyproj.CRS, ids: Sequence[str]) -> DemAccuracy:
+    """Compare a DEM with check heights.
+
+    Parameters
+    ----------
+    ground : (N, 3)
+        x, y in `crs` and ellipsoidal height (m) of the check points.
+
+    Returns
+    -------
+    DemAccuracy
+        NaN at points where the DEM has no height: they are counted and take no part.
+    """
+    lonlat = ground_transform(parse_crs(crs), "EPSG:4979")(ground)
+    surface = surface.with_fill("mask").around(float(np.nanmedian(lonlat[:, 0])))
+    heights = surface.heights(lonlat[:, :2], "EPSG:4979")
+    return DemAccuracy(tuple(ids), heights - ground[:, 2], slopes_at(surface, lonlat[:, :2]))
+
+
+def slopes_at(surface: Surface, lonlat: Array) -> Array:
+    """Return the slope (degrees) ``(N,)`` of a DEM at longitudes and latitudes ``(N, 2)``, over two of its samples."""
+    step, geod, count = surface.sample_size, pyproj.Geod(ellps="WGS84"), len(lonlat)
+
+    def away(azimuth: float) -> Array:
+        lon, lat, _ = geod.fwd(lonlat[:, 0], lonlat[:, 1], np.full(count, azimuth), np.full(count, step))
+        return surface.heights(np.column_stack([lon, lat]), "EPSG:4979")
+
+    rise = np.hypot(away(90.0) - away(270.0), away(0.0) - away(180.0)) / (2 * step)
+    return np.degrees(np.arctan(rise))
+
+
+def read_check_heights(
+    path: str | os.PathLike[str], crs: str | None = None, vertical: str | None = None
+) -> tuple[Array, pyproj.CRS, tuple[str, ...]]:
+    """Read check heights: CSV or GeoJSON with x, y, h; what else stands there (image coordinates) is not used.
+
+    Returns
+    -------
+    ground : (N, 3)
+        With ellipsoidal heights.
+    crs : pyproj.CRS
+    ids : tuple of str
+
+    Raises
+    ------
+    InputError, CrsError, DatumError
+        As `points.read_points`; also where no point has a height.
+    """
+    table = read_block_table(path, OF_HEIGHTS)
+    ground, plane = ground_of(
+        path, table, None if crs is None else parse_crs(crs), None if vertical is None else Vertical.parse(vertical)
+    )
+    if not np.isfinite(ground[:, 2]).any():
+        raise InputError("no point has a height", file=path, field="h", remedy="give the heights of the points")
+    return ground, plane, tuple(row.id or row.where for row in table.rows)
+
+
+def summary(document: dict[str, Any]) -> str:
+    """Return the document as text for people."""
+
+    def cells(errors: dict[str, Any]) -> str:
+        values = (errors[key] for key in ("mean", "rmse", "median", "nmad", "le90", "largest"))
+        return f"{errors['count']:>6}" + "".join(f"{'-' if v is None else f'{v:.2f}':>9}" for v in values)
+
+    lines = [f"{'slope':<12}{'points':>6}{'mean':>9}{'RMSE':>9}{'median':>9}{'NMAD':>9}{'LE90':>9}{'largest':>9}  (m)"]
+    for one in document["by_slope"]:
+        low, high = one["slope_deg"]
+        if one["count"]:
+            name = f"over {low:g}°" if high is None else f"{low:g}-{high:g}°"
+            lines.append(f"{name:<12}{cells(one)}")
+    lines.append(f"{'all':<12}{cells(document['overall'])}")
+    lines.append("DEM minus check height; of slopes without points there is no line")
+    if document["without_height"]:
+        lines.append(f"without a height in the DEM, or of their own: {document['without_height']}")
+    if document["gross"]:
+        shown = ", ".join(document["gross"][:10])
+        lines.append(f"far from all others (they count all the same): {shown}")
+    return "\n".join(lines)

@@ -1,0 +1,406 @@
+"""Where a scene lies: its footprint on the surface, how much of it the DEM covers, and the output grid that follows.
+
+Heights come from the surface under the scene. The extent never comes from the DEM alone: where the ray of a border
+pixel leaves the DEM, both ends of the range of heights there stand in, so a DEM that covers half the scene cannot cut
+the ortho in half.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+
+from ortho_pipeline.display.numbers import share
+from ortho_pipeline.errors import CoverageError, InputError, counted
+from ortho_pipeline.geodesy.crs import GroundTransform, ground_transform, utm_crs
+from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.rays import intersect
+
+#: Points per side of the image at which the DEM is asked for.
+_COVERAGE_SIDE = 33
+_BORDER_SIDE = 65
+#: Samples of the DEM per side of the blocks in which voids are counted.
+_BLOCK = 1024
+#: A model is meant for the heights under its scene and this part of their range beyond, or so many metres.
+_MARGIN, _LEAST_MARGIN = 0.1, 10.0
+_SOUND = (
+    "give the metadata of this very image (--rpc FILE, --model FILE), and points that were measured in it; if they "
+    "are, its plugin reads them wrongly (docs/plugins.md)"
+)
+
+
+def image_grid(width: int, height: int, side: int) -> Array:
+    """Return ``(side * side, 2)`` image points spread over the image, its border included."""
+    columns, rows = np.meshgrid(np.linspace(0, width, side), np.linspace(0, height, side))
+    return np.column_stack([columns.ravel(), rows.ravel()])
+
+
+def border(width: int, height: int, side: int = _BORDER_SIDE) -> Array:
+    """Return the border of the image as a closed ring of image points ``(4 * side + 1, 2)``."""
+    step = np.arange(side) / side
+    zero, one = np.zeros(side), np.ones(side)
+    ring = np.concatenate(
+        [
+            np.column_stack([step, zero]),
+            np.column_stack([one, step]),
+            np.column_stack([1 - step, one]),
+            np.column_stack([zero, 1 - step]),
+            np.zeros((1, 2)),
+        ]
+    )
+    return ring * (float(width), float(height))
+
+
+def facing(model: SensorModel, surface: Surface, width: int, height: int) -> Surface:
+    """Return the surface with the seam of a global DEM opposite to the scene; any other surface unchanged."""
+    if surface.constant_height is not None:
+        return surface
+    centre = ground_transform(model.crs, "EPSG:4979")(_centre(model, width, height))
+    return surface.around(float(centre[0, 0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Footprint:
+    """Where a scene lies on a surface, and what heights it has there; from `lay`.
+
+    Parameters
+    ----------
+    ring : (N, 3)
+        The border of the image on the ground, in the model's CRS: on the surface, and where a ray leaves the DEM, at
+        the height `middle`. Rays that do not meet the ground are left out.
+    reach : (M, 3)
+        Ground that the image may reach: `ring`, and the lost rays at both ends of `heights`.
+    heights : (float, float)
+        Lowest and highest ellipsoidal height (m) of the surface under the scene; the model's own range where no ray
+        meets the surface.
+    middle : float
+        Height (m) at which the middle of the image is seen.
+    coverage : float
+        Share (0 to 1) of the scene for which the surface has heights of its own, filled ones not counted.
+    complete : bool
+        Whether every ray met the surface at a height of its own; small voids between the rays may still be there.
+    voids : int
+        Samples of the DEM within the scene that have no height.
+    unmet : bool
+        Whether a ray that meets the ground somewhere met no height of the surface, not even a filled one.
+    beyond : str
+        Heights of the surface at which the model does not project, as a sentence; empty if there are none.
+    """
+
+    ring: Array
+    reach: Array
+    heights: tuple[float, float]
+    middle: float
+    coverage: float = 1.0
+    complete: bool = True
+    voids: int = 0
+    unmet: bool = False
+    beyond: str = ""
+
+    def require_coverage(self, surface: Surface) -> None:
+        """Raise a `CoverageError` if the surface does not cover the scene and nothing was said about the rest.
+
+        Raises
+        ------
+        CoverageError
+            If a ray found no height and the surface has no fill rule.
+        """
+        file, wanted = surface.provenance.get("path"), "say what the rest shall be: --dem-fill mask (no pixels there)"
+        if self.beyond and ((surface.fill == "error" and not self.complete) or not self.coverage):
+            raise CoverageError(
+                self.beyond, file=file, field="--dem",
+                remedy=f"check datum and unit of the DEM (--dem-vertical) and the place of the scene, or {wanted}",
+            )  # fmt: skip
+        if not self.complete and surface.fill == "error":
+            raise CoverageError(
+                f"the DEM covers {share(self.coverage)} of the scene", file=file,
+                remedy=f"give a DEM that covers it all, or {wanted}, nearest, or an ellipsoidal height in metres",
+            )  # fmt: skip
+        if self.coverage == 0.0 and surface.fill == "mask":
+            raise CoverageError(
+                "the DEM covers nothing of the scene: the ortho would have no pixels", file=file, field="--dem",
+                remedy="give the DEM of this place",
+            )  # fmt: skip
+        if self.unmet and surface.fill == "nearest":
+            raise CoverageError(
+                f"parts of the scene are more than {surface.nearest_reach * surface.sample_size / 1000:.3g} km from "
+                "the next height of the DEM",
+                file=file, field="--dem-fill", remedy=f"give a DEM that reaches farther, or {wanted}",
+            )  # fmt: skip
+
+    def notes(self, surface: Surface) -> list[str]:
+        """Return what is to be said of a scene that the DEM does not cover as a whole."""
+        said = [f"{self.beyond}: such places have no pixels"] if self.beyond else []
+        if self.coverage >= 1.0:
+            return said
+        what = "have no pixels in the ortho" if surface.fill in ("error", "mask") else "were filled"
+        inside = f" ({counted(self.voids, 'sample')} without a height within it)" if self.voids else ""
+        return [*said, f"the DEM covers {share(self.coverage)} of the scene{inside}: the other places {what}"]
+
+    def fitted(self, model: SensorModel) -> SensorModel:
+        """Return the model, meant for the heights here and a margin, where its own range is no more than a guess."""
+        if self.heights == model.height_range:
+            return model
+        low, high = self.heights
+        margin = max(_LEAST_MARGIN, _MARGIN * (high - low))
+        return model.with_heights(low - margin, high + margin)
+
+
+def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footprint:
+    """Lay a scene on a surface.
+
+    Raises
+    ------
+    InputError
+        If no border pixel meets the ground.
+    """
+    surface = facing(model, surface, width, height)
+    ring = border(width, height)
+    image = np.concatenate([image_grid(width, height, _COVERAGE_SIDE), ring])
+    ground = intersect(model, image, surface)
+    met = np.asarray(np.isfinite(ground).all(axis=1), dtype=bool)
+    heights, middle = _heights_under(model, surface, ground, met)
+    inner, outer = slice(len(image) - len(ring)), slice(len(image) - len(ring), None)
+    lost = outer.start + np.flatnonzero(~met[outer])
+    ground[lost] = model.image_to_ground(image[lost], middle)
+    closed = ground[outer]
+    ends = [model.image_to_ground(image[lost], level) for level in heights] if len(lost) else []
+    reach = np.concatenate([closed, *ends])
+    found = Footprint(_finite(closed), _finite(reach), heights, middle)
+    if not len(found.reach):
+        raise _nowhere(model, surface)
+    found = replace(found, beyond=_beyond(model, surface, found))
+    if surface.constant_height is not None:
+        return found
+    projects = met[inner] | np.isfinite(model.image_to_ground(image[inner], middle)).all(axis=1)
+    own = surface.coverage(ground[inner][met[inner], :2], model.crs) * met[inner].sum() / max(projects.sum(), 1)
+    voids, area, sampled = _voids(model, surface, found.ring, whole=len(found.ring) == len(ring))
+    # Whichever looks closer has the say; where a ray finds no height, the DEM does not cover all.
+    fine = area > _COVERAGE_SIDE**2 and (sampled < 1.0 or own >= 1.0)
+    covered = sampled if fine else min(own, sampled)
+    unmet = bool((projects & ~met[inner]).any())
+    return replace(found, coverage=float(covered), complete=bool(own >= 1.0), voids=voids, unmet=unmet)
+
+
+def _nowhere(model: SensorModel, surface: Surface) -> InputError:
+    """Return the error of a scene none of whose pixels meets the ground."""
+    low, high = model.height_range
+    if surface.constant_height is None or low <= surface.constant_height <= high:
+        return InputError(
+            "no border pixel meets the ground: the model does not belong to this image", field="model", remedy=_SOUND
+        )
+    return InputError(
+        f"the scene does not meet the ground at a height of {surface.constant_height:g} m", field="--height",
+        remedy=f"give an ellipsoidal height of the terrain; the model is meant for {low:.0f} to {high:.0f} m",
+    )  # fmt: skip
+
+
+def _beyond(model: SensorModel, surface: Surface, found: Footprint) -> str:
+    """Say that the surface has heights under a scene at which its model does not project; nothing if it has not."""
+    low, high = model.height_limits
+    if not (math.isfinite(low) or math.isfinite(high)):
+        return ""
+    lowest, highest = found.heights
+    if surface.constant_height is None:
+        samples = surface.samples_at(ground_transform(model.crs, surface.crs)(found.reach)[:, :2])
+        size = surface.shape[::-1]
+        first = np.clip(np.floor(np.nanmin(samples, axis=0)), 0, size).astype(int)
+        last = np.clip(np.ceil(np.nanmax(samples, axis=0)) + 1, 0, size).astype(int)
+        with contextlib.suppress(CoverageError):
+            lowest, highest = surface.range_within(*first.tolist(), *(last - first).tolist())
+    if low <= lowest and highest <= high:
+        return ""
+    return (
+        f"heights under the scene are {lowest:.0f} to {highest:.0f} m above the ellipsoid, its model is good for "
+        f"{low:.0f} to {high:.0f} m"
+    )
+
+
+def _finite(ground: Array) -> Array:
+    return ground[np.isfinite(ground).all(axis=1)]
+
+
+def _heights_under(
+    model: SensorModel, surface: Surface, ground: Array, met: NDArray[np.bool_]
+) -> tuple[tuple[float, float], float]:
+    """Return the range of heights under a scene, and the height at which the middle of the image is seen."""
+    if surface.constant_height is not None:
+        return (surface.constant_height, surface.constant_height), surface.constant_height
+    if not met.any():
+        return model.height_range, model.reference_height
+    seen = ground[met]
+    low, high = float(seen[:, 2].min()), float(seen[:, 2].max())
+    # Peaks and hollows between the rays count too.
+    samples = surface.samples_at(ground_transform(model.crs, surface.crs)(seen)[:, :2])
+    first, last = np.floor(samples.min(axis=0)).astype(int), np.ceil(samples.max(axis=0)).astype(int) + 1
+    with contextlib.suppress(CoverageError):  # all of it filled
+        lowest, highest = surface.range_within(*first.tolist(), *(last - first).tolist())
+        low, high = min(low, lowest), max(high, highest)
+    centre = _COVERAGE_SIDE**2 // 2
+    return (low, high), float(ground[centre, 2] if met[centre] else np.median(seen[:, 2]))
+
+
+def _voids(model: SensorModel, surface: Surface, ring: Array, *, whole: bool) -> tuple[int, float, float]:
+    """Count the samples of the DEM within a footprint that have no height of their own, whatever the fill rule.
+
+    Returns
+    -------
+    (int, float, float)
+        Their number, the area of the footprint in samples, and its share that has heights: none beyond the DEM.
+    """
+    import shapely
+
+    surface = surface.with_fill("mask")
+    rows, columns = surface.shape
+    samples = surface.samples_at(ground_transform(model.crs, surface.crs)(ring)[:, :2])
+    outline = shapely.Polygon(samples)
+    if not whole or not outline.is_valid:
+        outline = shapely.MultiPoint(samples).convex_hull
+    inside = shapely.intersection(outline, shapely.box(0, 0, columns - 1, rows - 1))
+    if inside.is_empty or outline.area == 0:
+        return 0, 0.0, 1.0  # the rays have the only say
+    beyond = 0.0 if shapely.equals(inside, outline) else 1.0 - inside.area / outline.area
+    shapely.prepare(inside)
+    left, top, right, bottom = (int(value) for value in (*np.floor(inside.bounds[:2]), *np.ceil(inside.bounds[2:])))
+    void = total = 0
+    for v in range(top, bottom + 1, _BLOCK):
+        for u in range(left, right + 1, _BLOCK):
+            nu, nv = min(_BLOCK, right + 1 - u), min(_BLOCK, bottom + 1 - v)
+            heights = surface.window(u, v, nu, nv)
+            empty, within = np.isnan(heights), np.ones((nv, nu), dtype=bool)
+            if not shapely.contains(inside, shapely.box(u, v, u + nu - 1, v + nv - 1)):
+                across, down = np.meshgrid(np.arange(u, u + nu), np.arange(v, v + nv))
+                within = shapely.contains_xy(inside, across, down)
+            void, total = void + int((empty & within).sum()), total + int(within.sum())
+    return void, float(outline.area), (1.0 - beyond) * (1.0 - void / max(total, 1))
+
+
+def output_crs(model: SensorModel, width: int, height: int) -> pyproj.CRS:
+    """Return the WGS84 UTM zone of the scene's centre."""
+    centre = _centre(model, width, height)
+    geographic = ground_transform(model.crs, "EPSG:4979")(centre)[0]
+    return utm_crs(float(geographic[0]), float(geographic[1]))
+
+
+def ground_sample_distance(
+    model: SensorModel, crs: pyproj.CRS, width: int, height: int, level: float | None = None
+) -> float:
+    """Return the side of a pixel on the ground, in units of `crs`: geometric mean of both axes, middle of the image.
+
+    At the ellipsoidal height `level` (m), the model's reference height if there is none.
+    """
+    level = model.reference_height if level is None else level
+    middle = np.array([width, height]) / 2
+    image = middle + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
+    ground = ground_transform(model.crs, crs)(model.image_to_ground(image, level))
+    across, down = ground[1, :2] - ground[0, :2], ground[3, :2] - ground[2, :2]
+    area = abs(across[0] * down[1] - across[1] * down[0])
+    if not (np.isfinite(area) and area > 0):
+        raise InputError(
+            "a pixel in the middle of the image has no size on the ground: this model is none of an image",
+            field="model", remedy=_SOUND,
+        )  # fmt: skip
+    return math.sqrt(area)
+
+
+def two_digits(value: float) -> float:
+    """Round to two significant digits."""
+    return float(f"{value:.1e}")
+
+
+def choose_grid(
+    model: SensorModel,
+    found: Footprint,
+    size: tuple[int, int],
+    *,
+    crs: pyproj.CRS | None = None,
+    resolution: float | Sequence[float] | None = None,
+    extent: Sequence[float] | None = None,
+    align: bool = False,
+) -> Grid:
+    """Return the output grid of a scene.
+
+    Parameters
+    ----------
+    found : Footprint
+        Where the scene lies.
+    size : (int, int)
+        Columns and rows of the image.
+    crs : pyproj.CRS, optional
+        Default: the UTM zone of the scene's centre.
+    resolution : float or (float, float), optional
+        In units of `crs`, one number or x and y. Default: the ground sample distance at the height of the middle of the
+        image, to two significant digits.
+    extent : xmin, ymin, xmax, ymax, optional
+        Taken as it is, or widened to whole multiples of the resolution with `align`. Default: the footprint, widened.
+
+    Raises
+    ------
+    InputError
+        If extent or resolution make no grid.
+    """
+    width, height = size
+    crs = crs or output_crs(model, width, height)
+    if resolution is None:
+        resolution = two_digits(ground_sample_distance(model, crs, width, height, found.middle))
+    step = (resolution, resolution) if isinstance(resolution, int | float) else (resolution[0], resolution[1])
+    if extent is not None:
+        return Grid.of_extent(crs, extent, step, align=align)
+    ground = _continuous(GroundTransform(model.crs, crs)(found.reach), crs)
+    if not np.isfinite(ground).any():
+        raise InputError(
+            f"the scene does not lie in the domain of {crs.name!r}", field="--output-crs", remedy="choose another CRS"
+        )
+    low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
+    return Grid.of_extent(crs, (low[0], low[1], high[0], high[1]), step, align=True)
+
+
+def scene_pixels(model: SensorModel, found: Footprint, grid: Grid) -> float:
+    """Return how many pixels of a grid the scene covers, or a few more: those within the hull of what it may reach.
+
+    Raises
+    ------
+    InputError
+        If there are none: the extent lies beside the scene.
+    """
+    import shapely
+
+    ground = _continuous(GroundTransform(model.crs, grid.crs)(found.reach), grid.crs)
+    ground = ground[np.isfinite(ground).all(axis=1), :2]
+    xmin, ymin, xmax, ymax = grid.extent
+    if grid.crs.is_geographic and len(ground):
+        ground[:, 0] += 360.0 * round(((xmin + xmax) / 2 - (ground[:, 0].min() + ground[:, 0].max()) / 2) / 360.0)
+    hull = shapely.MultiPoint(ground).convex_hull
+    if not len(ground) or not hull.intersects(shapely.box(xmin, ymin, xmax, ymax)):
+        place = " ".join(f"{value:.10g}" for value in hull.bounds) if len(ground) else "outside of this CRS"
+        raise InputError(
+            f"the extent lies beside the scene, which reaches over {place}", field="--extent",
+            remedy="give xmin ymin xmax ymax in units of the output CRS, or leave --extent out",
+        )  # fmt: skip
+    return float(hull.intersection(shapely.box(xmin, ymin, xmax, ymax)).area) / (grid.dx * grid.dy)
+
+
+def _continuous(ground: Array, crs: pyproj.CRS) -> Array:
+    """Unwrap longitudes across the antimeridian about the first point."""
+    if crs.is_geographic and len(ground):
+        ground = ground.copy()
+        ground[:, 0] = ground[0, 0] + np.remainder(ground[:, 0] - ground[0, 0] + 180.0, 360.0) - 180.0
+    return ground
+
+
+def _centre(model: SensorModel, width: int, height: int) -> Array:
+    centre = model.image_to_ground(np.array([[width / 2, height / 2]]), model.reference_height)
+    if not np.isfinite(centre).all():
+        raise InputError(
+            "the middle of the image does not meet the ground: the model does not belong to this image", field="model",
+            remedy=_SOUND,
+        )  # fmt: skip
+    return centre

@@ -1,0 +1,242 @@
+"""Where the rays of image points meet a surface.
+
+Few points are followed one step after the other with the exact model. Many points share a lattice over the image that
+gives DEM coordinates as polynomials in height, verified against the exact model; compiled code marches along it, and
+the exact model has the last word: it gives the ground point at the height found.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ortho_pipeline.errors import CoverageError
+from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
+from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.surface.dem import Surface
+
+Array = NDArray[np.float64]
+
+#: From this many points on the lattice is worth its making.
+MANY = 20_000
+#: Spacings (px) of the lattice, tried one after the other.
+_SPACINGS = (128, 64, 32, 16)
+_LEVELS = 5
+#: More DEM samples under the points than this are not held in memory at once.
+_MOST_SAMPLES = 64_000_000
+_PROBES = 500
+
+
+def intersect(model: SensorModel, image: ArrayLike, surface: Surface, *, tolerance: float = 1e-3) -> Array:
+    """Intersect the rays of image points with a surface.
+
+    The ray comes down from above the highest terrain in steps of at most one DEM sample in plan, so that the first,
+    visible, intersection is found also where a ridge hides the slope behind it; then the bracket is narrowed.
+
+    Parameters
+    ----------
+    image : array_like, shape (N, 2)
+        Column, row.
+    tolerance : float
+        Greatest difference (m) in height between ray and surface.
+
+    Returns
+    -------
+    ndarray, shape (N, 3)
+        Ground in the model's CRS; NaN where the ray meets no terrain of the surface, or a void first.
+    """
+    image = np.asarray(image, dtype=float)
+    if surface.constant_height is not None:
+        return model.image_to_ground(image, surface.constant_height)
+    ray = _Ray(model, image, surface)
+    reach = ray.reach()
+    if reach is None:
+        return np.full((len(image), 3), np.nan)
+    window, (lowest, highest) = reach
+    limits = model.height_limits
+    low, high = max(lowest - 1.0, limits[0]), min(highest + 1.0, limits[1])
+    if not low < high:
+        return np.full((len(image), 3), np.nan)
+    # The window ends where the DEM does; a fill rule goes on beyond.
+    many = len(image) >= MANY and surface.fill in ("error", "mask")
+    height = _march_many(ray, window, low, high, tolerance) if many else None
+    if height is None:
+        height = _narrow(ray, *_bracket(ray, low, high), tolerance)
+    ground = model.image_to_ground(image, height)
+    ground[np.isnan(height)] = np.nan
+    return ground
+
+
+class _Ray:
+    """Image points as functions of height."""
+
+    def __init__(self, model: SensorModel, image: Array, surface: Surface) -> None:
+        self.model, self.image, self.surface = model, image, surface
+        self._transform = ground_transform(parse_crs(model.crs), surface.crs)
+        # The box of the finite points; per column, which is much faster than along the first axis.
+        columns = [column[np.isfinite(column)] for column in image.T]
+        self.any = all(len(column) for column in columns)
+        self.low = np.array([column.min(initial=np.inf) for column in columns])
+        self.high = np.array([column.max(initial=-np.inf) for column in columns])
+
+    def plan(self, index: NDArray[np.intp], height: Array) -> Array:
+        """Positions in the surface's CRS ``(n, 2)``."""
+        return self._transform(self.model.image_to_ground(self.image[index], height))[:, :2]
+
+    def samples(self, image: Array, height: Array) -> Array:
+        """Sample coordinates ``(n, 2)`` in the DEM of image points at heights."""
+        return self.surface.samples_at(self._transform(self.model.image_to_ground(image, height))[:, :2])
+
+    def clearance(self, index: NDArray[np.intp], height: Array) -> Array:
+        """Height of the ray above the terrain; NaN off the DEM."""
+        return height - self.surface.heights(self.plan(index, height))
+
+    def reach(self) -> tuple[tuple[int, int, int, int], tuple[float, float]] | None:
+        """Samples (column, row, columns, rows) of the DEM that the rays may meet, and the range of heights there.
+
+        The window follows from a range of heights and the range from a window: from the model's own range on, until
+        the terrain lies within it. None if the rays miss the DEM.
+        """
+        low, high = self.model.height_range
+        found = None
+        for _ in range(4):
+            window = self._window(low, high)
+            if window is None:
+                return None
+            try:
+                lowest, highest = self.surface.range_within(*window)
+            except CoverageError:
+                return None
+            found = window, (lowest, highest)
+            if low <= lowest and highest <= high:
+                break
+            low, high = min(low, lowest - 1.0), max(high, highest + 1.0)
+        return found
+
+    def _window(self, low: float, high: float) -> tuple[int, int, int, int] | None:
+        """Samples under the rays between two heights; a frame around the points stands for all of them."""
+        if not self.any:
+            return None
+        steps = self.low + (self.high - self.low) * np.linspace(0, 1, 9)[:, None]
+        columns, rows = np.meshgrid(steps[:, 0], steps[:, 1])
+        frame = np.column_stack([columns.ravel(), rows.ravel()])
+        uv = np.concatenate([self.samples(frame, np.full(len(frame), height)) for height in (low, high)])
+        uv = uv[np.isfinite(uv).all(axis=1)]
+        size = np.array(self.surface.shape[::-1])
+        filled = self.surface.fill not in ("error", "mask")
+        # A fill rule goes on beyond the DEM, and what it takes may come from there.
+        beyond = self.surface.nearest_reach if self.surface.fill == "nearest" else 0
+        first = np.clip(np.floor(uv.min(axis=0, initial=np.inf)) - 2 - beyond, 0, size - 2 if filled else size)
+        last = np.clip(np.ceil(uv.max(axis=0, initial=-np.inf)) + 3 + beyond, first + 2 if filled else 0, size)
+        if (last - first < 2).any():
+            return None
+        return int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1])
+
+
+def _march_many(
+    ray: _Ray, window: tuple[int, int, int, int], low: float, high: float, tolerance: float
+) -> Array | None:
+    """Return the heights of the first intersections ``(N,)`` by way of a lattice; None if none is good enough."""
+    from ortho_pipeline.surface import ray_kernel
+
+    if window[2] * window[3] > _MOST_SAMPLES:
+        return None
+    heights = ray.surface.window(*window)
+    steepest = max(float(np.nanmax(np.abs(np.diff(heights, axis=axis)), initial=0.0)) for axis in (0, 1))
+    image = np.ascontiguousarray(ray.image)
+    origin = np.floor(ray.low)
+    extent = ray.high - origin
+    middle, half = (low + high) / 2, (high - low) / 2
+    for spacing in _SPACINGS:
+        size = (extent // spacing).astype(int) + 2
+        if size.prod() * _LEVELS > len(image):
+            return None  # the lattice would cost more than it saves
+        nodes = _ray_lattice(ray, origin, size, spacing, middle, half)
+        if _lattice_error(ray, nodes, origin, extent, spacing, middle, half) * 2 * steepest <= tolerance:
+            found = np.empty(len(image))
+            ray_kernel.march(
+                image, nodes, origin, float(spacing), heights, window[0], window[1], middle, half, tolerance, found
+            )
+            return found
+    return None
+
+
+def _levels() -> Array:
+    return -np.cos(np.pi * np.arange(_LEVELS) / (_LEVELS - 1))
+
+
+def _ray_lattice(ray: _Ray, origin: Array, size: NDArray[np.int_], spacing: int, middle: float, half: float) -> Array:
+    """Return the coefficients ``(rows, columns, levels, 2)`` of DEM coordinates as polynomials in height."""
+    columns, rows = np.meshgrid(origin[0] + spacing * np.arange(size[0]), origin[1] + spacing * np.arange(size[1]))
+    image = np.repeat(np.column_stack([columns.ravel(), rows.ravel()]), _LEVELS, axis=0)
+    uv = ray.samples(image, np.tile(middle + half * _levels(), columns.size))
+    polynomial = np.linalg.inv(np.vander(_levels(), increasing=True))
+    return np.einsum("kl,nla->nka", polynomial, uv.reshape(-1, _LEVELS, 2)).reshape(size[1], size[0], _LEVELS, 2)
+
+
+def _lattice_error(
+    ray: _Ray, nodes: Array, origin: Array, extent: Array, spacing: int, middle: float, half: float
+) -> float:
+    """Return the largest error of the lattice in DEM samples, at points spread over image and heights."""
+    random = np.random.default_rng(0)  # the same points in every run
+    image, t = origin + extent * random.uniform(size=(_PROBES, 2)), random.uniform(-1, 1, _PROBES)
+    place = (image - origin) / spacing
+    i, j = place.astype(int).T
+    fx, fy = (place - np.floor(place)).T[:, :, None, None]
+    upper = nodes[j, i] * (1 - fx) + nodes[j, i + 1] * fx
+    lower = nodes[j + 1, i] * (1 - fx) + nodes[j + 1, i + 1] * fx
+    found = np.einsum("nk,nka->na", t[:, None] ** np.arange(_LEVELS), upper * (1 - fy) + lower * fy)
+    error = np.abs(found - ray.samples(image, middle + half * t)).max(axis=1)
+    return float(np.where(np.isnan(error), np.inf, error).max())
+
+
+def _bracket(ray: _Ray, low: float, high: float) -> tuple[Array, Array]:
+    """Return heights above and below the first intersection; NaN where there is none."""
+    count = len(ray.image)
+    every = np.arange(count)
+    ends = [ray.surface.samples_at(ray.plan(every, np.full(count, height))) for height in (low, high)]
+    length = np.hypot(*(ends[1] - ends[0]).T)
+    # A ray whose ends are not known (beyond the model) is still worth a try, at the pace of the others.
+    typical = float(np.nanmax(length)) if np.isfinite(length).any() else 1.0
+    steps = np.clip(np.ceil(np.where(np.isfinite(length), length, typical)), 1, 2000).astype(int)
+    above, below = np.full(count, np.nan), np.full(count, np.nan)
+    last = np.full(count, high)
+    last_clear = ray.clearance(every, last)
+    active = every
+    for step in range(1, int(steps.max(initial=0)) + 1):
+        height = high + (low - high) * np.minimum(step / steps[active], 1.0)
+        clear = ray.clearance(active, height)
+        with np.errstate(invalid="ignore"):
+            under = clear <= 0
+            met = under & (last_clear[active] > 0)
+        above[active[met]], below[active[met]] = last[active[met]], height[met]
+        last[active], last_clear[active] = height, clear
+        active = active[~under & (step < steps[active])]
+        if not len(active):
+            break
+    return above, below
+
+
+def _narrow(ray: _Ray, above: Array, below: Array, tolerance: float) -> Array:
+    """Return the heights where the rays meet the terrain, between `above` and `below` (NaN rows stay)."""
+    out = np.full(len(above), np.nan)
+    active = np.flatnonzero(np.isfinite(above))
+    a, b = above.copy(), below.copy()
+    fa, fb = np.full(len(a), np.nan), np.full(len(a), np.nan)
+    fa[active], fb[active] = ray.clearance(active, a[active]), ray.clearance(active, b[active])
+    for step in range(60):
+        if not len(active):
+            break
+        with np.errstate(invalid="ignore", divide="ignore"):
+            secant = a[active] - fa[active] * (b[active] - a[active]) / (fb[active] - fa[active])
+        # Every third step halves: false position alone creeps where the terrain is steep and bent.
+        height = 0.5 * (a[active] + b[active]) if step % 3 == 2 else secant
+        clear = ray.clearance(active, height)
+        done = np.abs(clear) <= tolerance
+        out[active[done]] = height[done]
+        with np.errstate(invalid="ignore"):
+            over, under = active[clear > 0], active[clear <= 0]
+            a[over], fa[over] = height[clear > 0], clear[clear > 0]
+            b[under], fb[under] = height[clear <= 0], clear[clear <= 0]
+        active = active[~done & np.isfinite(clear)]
+    return out

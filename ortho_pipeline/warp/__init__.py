@@ -1,0 +1,4 @@
+"""Orthoimages: the lattice and its proof, compiled kernels, this engine and GDAL's, mosaics.
+
+Imports `surface`, `exchange`, `imaging` and what is below. A new resampling kernel is a function in `kernels`.
+"""

@@ -1,0 +1,442 @@
+"""Orthorectification: every output pixel through the lattice into the source, by compiled kernels, tile by tile.
+
+A tile reads only its windows of DEM and source, so memory is bounded whatever the size of the image. Tiles are made by
+several threads, each with GDAL handles of its own.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.rpc import RpcExport
+from ortho_pipeline.files.allowance import require_memory, startable_threads
+from ortho_pipeline.geodesy.crs import GroundTransform
+from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.raster.ortho import Profile, RasterWriter, as_written, refuse_empty
+from ortho_pipeline.raster.source import Grid, RasterSource, limit_cache
+from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.warp import kernels
+from ortho_pipeline.warp.gdal_engine import warp_with_gdal
+from ortho_pipeline.warp.lattice import BLOCK, Block, Lattices, Terrain, block_cells
+
+#: Side of a tile, the piece of work of a thread.
+TILE = 4 * BLOCK
+#: Kernels by the name on the command line.
+RESAMPLING = {
+    "nearest": kernels.NEAREST,
+    "bilinear": kernels.BILINEAR,
+    "cubic": kernels.CUBIC,
+    "lanczos": kernels.LANCZOS,
+    "average": kernels.AVERAGE,
+}
+#: Source pixels that a kernel reads around the one that holds the point ('average': plus half of its box).
+_REACH = {"nearest": 0, "bilinear": 1, "cubic": 2, "lanczos": 3, "average": 1}
+#: What GDAL's warper takes for each pixel of an ortho whose image points are geolocation arrays: 1.4 GB for 13.7 Mpx.
+_ARRAYS_BYTES = 100
+
+
+@dataclass(frozen=True)
+class WarpResult:
+    """What `rectify` did.
+
+    `max_error_px` is a bound on the difference (source pixels) between the geometry used and the exact model at every
+    output pixel; `finest_spacing` the smallest lattice spacing that a block needed, 1 where every pixel was projected;
+    `valid_pixels` how many output pixels have a value. `transformer` names the one of GDAL's that stood for the model,
+    where GDAL's warper made the pixels: then the error is what was measured through it.
+    """
+
+    max_error_px: float
+    tolerance_px: float
+    finest_spacing: int
+    refined_blocks: int
+    blocks: int
+    pixels: int
+    valid_pixels: int
+    seconds: float
+    transformer: str | None = None
+
+    def notes(self, memory: int) -> list[str]:
+        """Return a notice if GDAL's geolocation arrays took more memory (bytes) than was allowed, which they may."""
+        took = self.pixels * _ARRAYS_BYTES
+        if self.transformer != "GEOLOC_ARRAY" or took <= memory:
+            return []
+        return [
+            f"GDAL's warper takes about {took / 1e6:.0f} MB for the arrays that stand for this model, beyond --memory "
+            f"{memory / 1e6:.0f}: make a smaller extent, or leave out --engine gdal"
+        ]
+
+
+def rectify(
+    model: SensorModel,
+    source: RasterSource,
+    surface: Surface,
+    grid: Grid,
+    path: str | os.PathLike[str],
+    *,
+    resampling: str = "bilinear",
+    dem_interpolation: str = "bilinear",
+    tolerance: float = 0.01,
+    memory: int = 512_000_000,
+    threads: int | None = None,
+    driver: str = "COG",
+    creation_options: Mapping[str, str] | None = None,
+    profile: Profile | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> WarpResult:
+    """Write the orthoimage of `source` on `grid`.
+
+    Parameters
+    ----------
+    profile : Profile, optional
+        What the ortho looks like; like its source without.
+    tolerance : float
+        Bound on the geometric error of the lattice in source pixels.
+    memory : int
+        Bytes for windows and GDAL's cache together (the interpreter and its libraries come on top).
+    progress : callable, optional
+        Called with the finished share, 0 to 1.
+
+    Raises
+    ------
+    InputError
+        For an unknown kernel, a palette with anything but nearest, or files that cannot be read or written.
+    ModelError
+        If the tolerance cannot be held.
+    """
+    begin = time.monotonic()
+    _check(source, resampling, dem_interpolation, tolerance)
+    threads = limit_cache(memory, _threads(threads, memory), source.block, surface.block)
+    surface = _seamless(surface, grid)
+    profile = profile or Profile.of(source)
+    job = _Job(
+        model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, memory // (4 * threads),
+        profile,
+    )  # fmt: skip
+    with RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads) as writer:
+        tiles = list(_tiles(grid, TILE))
+        for done, tile in enumerate(_in_order(threads, job.make, tiles), start=1):
+            writer.write(*tile)
+            if progress:
+                progress(done / len(tiles))
+        refuse_empty(job.valid_pixels, path)
+    return WarpResult(
+        max_error_px=job.lattices.worst,
+        tolerance_px=tolerance,
+        finest_spacing=job.lattices.finest,
+        refined_blocks=job.lattices.refined,
+        blocks=math.ceil(grid.width / BLOCK) * math.ceil(grid.height / BLOCK),
+        pixels=grid.width * grid.height,
+        valid_pixels=job.valid_pixels,
+        seconds=time.monotonic() - begin,
+    )
+
+
+def rectify_gdal(
+    model: SensorModel,
+    exported: RpcExport | None,
+    source: RasterSource,
+    surface: Surface,
+    grid: Grid,
+    path: str | os.PathLike[str],
+    *,
+    resampling: str = "bilinear",
+    dem_interpolation: str = "bilinear",
+    memory: int = 512_000_000,
+    threads: int | None = None,
+    driver: str = "COG",
+    creation_options: Mapping[str, str] | None = None,
+    profile: Profile | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> WarpResult:
+    """Write the orthoimage by GDAL's own warper with one of its exact transformers: a cross-check of `rectify`.
+
+    Parameters
+    ----------
+    exported : RpcExport or None
+        The RPC that stands for the model (`rpc.export_rpc`), where there is one; GDAL's polynomials, homography and
+        geolocation arrays stand for others (`gdal_engine`).
+
+    Raises
+    ------
+    InputError
+        As `rectify`; for an image in several files; for cubic heights, which GDAL's warper does not take from a DEM as
+        our engine does; if no transformer of GDAL stands for the model within 0.1 px.
+    """
+    begin = time.monotonic()
+    _check(source, resampling, dem_interpolation, 1.0)
+    if dem_interpolation != "bilinear":
+        raise InputError(
+            "with GDAL's warper heights of the DEM are interpolated bilinearly", field="--dem-interpolation",
+            remedy="leave out --dem-interpolation or --engine gdal",
+        )  # fmt: skip
+    # GDAL's warper reads in one of its threads.
+    limit_cache(memory, 1, source.block, surface.block)
+    surface = _seamless(surface, grid)
+    transformer, valid = warp_with_gdal(
+        model, exported, source, surface, grid, path, resampling=resampling, driver=driver,
+        creation_options=creation_options, memory=memory, threads=_threads(threads, memory), profile=profile,
+        progress=progress,
+    )  # fmt: skip
+    return WarpResult(
+        max_error_px=transformer.max_error_px,
+        tolerance_px=transformer.limit,
+        finest_spacing=1,
+        refined_blocks=0,
+        blocks=0,
+        pixels=grid.width * grid.height,
+        valid_pixels=valid,
+        seconds=time.monotonic() - begin,
+        transformer=transformer.method,
+    )
+
+
+def _seamless(surface: Surface, grid: Grid) -> Surface:
+    """Return the surface with the seam of a global DEM away from the grid."""
+    if surface.constant_height is not None:
+        return surface
+    x, y = grid.xy(np.array([grid.width / 2]), np.array([grid.height / 2]))
+    return surface.around(float(GroundTransform(grid.crs, "EPSG:4979")([[x[0], y[0], 0.0]])[0, 0]))
+
+
+def _check(source: RasterSource, resampling: str, dem_interpolation: str, tolerance: float) -> None:
+    if resampling not in RESAMPLING:
+        raise InputError(
+            f"no kernel is called {resampling!r}", field="resampling", remedy=f"one of {', '.join(RESAMPLING)}"
+        )
+    if dem_interpolation not in ("bilinear", "cubic"):
+        raise InputError(
+            f"DEMs are not interpolated by {dem_interpolation!r}", field="dem-interpolation", remedy="bilinear or cubic"
+        )
+    if source.dtype.kind in "iu" and source.dtype.itemsize == 8 and resampling != "nearest":
+        raise InputError(
+            "integers of 64 bits are not interpolated without loss",
+            file=source.path,
+            field="resampling",
+            remedy="use --resampling nearest, or convert the pixels first (gdal_translate -ot Float64)",
+        )
+    if source.palette and resampling != "nearest":
+        raise InputError(
+            "the pixels are indices into a palette, which cannot be averaged",
+            file=source.path,
+            field="resampling",
+            remedy="use --resampling nearest, or expand the palette first (gdal_translate -expand rgb)",
+        )
+    if not 0 < tolerance < math.inf:
+        raise InputError("the tolerance is positive and finite", field="tolerance", remedy="0.01 px is the default")
+
+
+def _threads(wanted: int | None, memory: int) -> int:
+    """Return how many threads there are for tiles, with as many again for GDAL, which waits for missing ones."""
+    wanted = wanted or os.cpu_count() or 1
+    require_memory(memory, 2 * wanted)
+    return max(1, startable_threads(2 * wanted) // 2)
+
+
+def _tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
+    for top in range(0, grid.height, side):
+        for left in range(0, grid.width, side):
+            yield top, left, min(side, grid.height - top), min(side, grid.width - left)
+
+
+def _in_order(threads: int, work: Callable[[Any], Any], items: list[Any]) -> Iterator[Any]:
+    """Yield results of `work` over `items` in their order, so that equal orthos are equal files; few are ahead."""
+    with ThreadPoolExecutor(threads, thread_name_prefix="warp") as pool:
+        pending: deque[Future[Any]] = deque()
+        try:
+            for item in items:
+                pending.append(pool.submit(work, item))
+                if len(pending) > threads + 1:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+class _Job:
+    """The work on one output raster, shared by its threads."""
+
+    def __init__(
+        self,
+        model: SensorModel,
+        source: RasterSource,
+        surface: Surface,
+        grid: Grid,
+        resampling: str,
+        cubic_dem: bool,
+        tolerance: float,
+        window_bytes: int,
+        profile: Profile,
+    ) -> None:
+        self.source, self.surface, self.grid = source, surface, grid
+        self.kernel = RESAMPLING[resampling]
+        self.lattices = Lattices(
+            model, surface, grid, (source.width, source.height), tolerance=tolerance, reach=_REACH[resampling],
+            averages=resampling == "average",
+        )  # fmt: skip
+        self.cubic_dem, self.window_bytes = cubic_dem, window_bytes
+        self.profile = profile
+        self.low, self.high, self.integer, self.fill = _range(source.dtype, profile)
+        self.any_band = profile.validity == "nodata" or profile.dtype.kind == "f"
+        self._lock = threading.Lock()
+        self.valid_pixels = 0
+
+    # -- a tile ------------------------------------------------------------------------------------------------------
+
+    def make(self, tile: tuple[int, int, int, int]) -> tuple[int, int, NDArray[Any], NDArray[np.bool_]]:
+        """Compute one tile (top, left, height, width), as `RasterWriter.write` takes it."""
+        top, left, height, width = tile
+        out = np.full((self.source.count, height, width), self.fill, dtype=self.source.dtype)
+        valid = np.zeros(out.shape, dtype=bool)
+        blocks = [
+            Block(row, column)
+            for row in range(top // BLOCK, -(-(top + height) // BLOCK))
+            for column in range(left // BLOCK, -(-(left + width) // BLOCK))
+        ]
+        terrain = Terrain(self.surface, self.cubic_dem, self.window_bytes)
+        seen = self.lattices.build(blocks, terrain)
+        for group, heights, origin, area in terrain.groups(seen):
+            self._warp(group, heights, origin, area, tile, out, valid)
+        low, _, _, fill = _range(self.profile.dtype, self.profile)
+        out = as_written(out, valid, self.profile.dtype, fill)
+        if self.profile.validity == "nodata":
+            _keep_off_nodata(out, valid, fill, low)
+        # NaN says for itself which band has no value; an integer cannot, so there a pixel needs all of its bands.
+        mask = np.asarray((np.any if self.any_band else np.all)(valid, axis=0))
+        with self._lock:
+            self.valid_pixels += int(np.count_nonzero(mask))
+        return left, top, out, mask
+
+    # -- pixels ------------------------------------------------------------------------------------------------------
+
+    def _warp(
+        self,
+        blocks: list[Block],
+        heights: Array,
+        origin: tuple[int, int],
+        area: tuple[int, int, int, int],
+        tile: tuple[int, int, int, int],
+        out: NDArray[Any],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        windows = np.array([block.window for block in blocks])
+        left, top = windows[:, :2].min(axis=0)
+        right, bottom = windows[:, 2:].max(axis=0)
+        if (right - left) * (bottom - top) * self.source.count * self.source.dtype.itemsize > self.window_bytes:
+            for block in blocks:
+                if len(blocks) > 1:
+                    self._warp([block], heights, origin, area, tile, out, valid)
+                else:
+                    self._warp_cells(block, heights, origin, area, tile, out, valid)
+            return
+        pixels = _Pixels(self.source, int(left), int(top), int(right), int(bottom))
+        for block in blocks:
+            self._warp_block(block, pixels, heights, origin, area, tile, out, valid)
+
+    def _warp_cells(
+        self,
+        block: Block,
+        heights: Array,
+        origin: tuple[int, int],
+        area: tuple[int, int, int, int],
+        tile: tuple[int, int, int, int],
+        out: NDArray[Any],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        """Make a block whose window of the source is too large for the memory, one cell of its lattice at a time."""
+        for cell, nodes in block_cells(block.spacing):
+            window = self.lattices.source_window(block, *nodes)
+            within = all(area[k] <= cell[k] and cell[k + 1] <= area[k + 1] for k in (0, 2))
+            if window is not None and within:
+                self._warp_block(block, _Pixels(self.source, *window), heights, origin, cell, tile, out, valid)
+
+    def _warp_block(
+        self,
+        block: Block,
+        pixels: _Pixels,
+        heights: Array,
+        origin: tuple[int, int],
+        area: tuple[int, int, int, int],
+        tile: tuple[int, int, int, int],
+        out: NDArray[Any],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        top, left = block.row * BLOCK - tile[0], block.column * BLOCK - tile[1]
+        # The last blocks of a grid reach beyond it.
+        area = area[0], min(area[1], tile[2] - top), area[2], min(area[3], tile[3] - left)
+        if area[0] >= area[1] or area[2] >= area[3]:
+            return
+        rows, columns = slice(top + area[0], top + area[1]), slice(left + area[2], left + area[3])
+        while True:
+            short = kernels.warp_block(
+                self.kernel, pixels.values, pixels.valid, pixels.masked, pixels.left, pixels.top,
+                self.source.width, self.source.height, block.spacing, block.nodes, block.dem_nodes, heights,
+                origin[0], origin[1], self.cubic_dem, block.middle, block.half, self.low, self.high, self.integer,
+                self.fill, np.array(area), out[:, rows, columns], valid[:, rows, columns], block.reach,
+                np.array(block.box),
+            )  # fmt: skip
+            if not short:
+                return
+            pixels = pixels.wider(self.source)
+
+
+class _Pixels:
+    """A window of the source."""
+
+    def __init__(self, source: RasterSource, left: int, top: int, right: int, bottom: int) -> None:
+        self.left, self.top, self.right, self.bottom = left, top, right, bottom
+        self.values = source.read(left, top, right - left, bottom - top)
+        valid = source.read_valid(left, top, self.values)
+        self.masked = valid is not None
+        self.valid = valid if valid is not None else np.ones((1, 1, 1), dtype=bool)
+
+    def wider(self, source: RasterSource) -> _Pixels:
+        """Return a window larger by 64 pixels all around (terrain between the nodes reached beyond this one)."""
+        return _Pixels(
+            source,
+            max(0, self.left - 64),
+            max(0, self.top - 64),
+            min(source.width, self.right + 64),
+            min(source.height, self.bottom + 64),
+        )
+
+
+def _range(dtype: np.dtype[Any], profile: Profile) -> tuple[float, float, bool, Any]:
+    """Return lowest and highest value of the output type, whether it is an integer type, and the fill value."""
+    empty = 0 if dtype.kind in "iu" else math.nan
+    fill = dtype.type(empty if profile.nodata is None else profile.nodata)
+    if dtype.kind in "iu":
+        limits = np.iinfo(dtype)
+        return float(limits.min), float(limits.max), True, fill
+    return -math.inf, math.inf, False, fill
+
+
+def _keep_off_nodata(out: NDArray[Any], valid: NDArray[np.bool_], fill: Any, low: float) -> None:
+    """Move valid pixels that happened to get the nodata value to the value beside it, for every kernel.
+
+    To the one that GDAL takes: of integers one less (one more for the least), of floating point the next. GDAL before
+    3.11 does so for integers that it interpolates only.
+    """
+    if np.isnan(fill):
+        return
+    for band, good in zip(out, valid, strict=True):
+        clash = (band == fill) & good
+        if clash.any():
+            if band.dtype.kind in "iu":
+                band[clash] = fill - 1 if fill > low else fill + 1
+            else:
+                greatest = np.finfo(band.dtype).max
+                band[clash] = np.nextafter(fill, greatest if fill < greatest else 0, dtype=band.dtype)

@@ -1,0 +1,369 @@
+"""GDAL's own warper as a second engine: slower, and a cross-check by a program that nobody here wrote.
+
+One of GDAL's transformers stands for the sensor model: the one that expresses it, found by trying. How far it is off
+the exact model on the surface is measured through that transformer, at points of the ortho.
+
+=================  ===================================================================================================
+transformer        stands for
+=================  ===================================================================================================
+RPC                a model that has an RPC (`rpc.export_rpc`), exact or fitted to 0.1 px; heights from the surface
+GCP_POLYNOMIAL     a model of the plane that is a polynomial of order 1 to 3: GDAL's own fit to points of the model
+GCP_HOMOGRAPHY     a model of the plane that is a ratio of the first order, where GDAL computes one (3.6 does not)
+GEOLOC_ARRAY       every other model: the image point of every output pixel, as geolocation arrays of the ortho
+=================  ===================================================================================================
+
+Arrays of the *ortho*, not of the image: GDAL inverts arrays of an image by interpolating in their meshes, which is off
+by tenths of a pixel where terrain bends within a mesh, and has no inverse where a slope is hidden behind another.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from osgeo import gdal, gdal_array
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.rpc import REFUSE_ERROR, RpcExport, rpc_metadata
+from ortho_pipeline.geodesy.crs import GroundTransform, parse_crs
+from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
+from ortho_pipeline.raster.output import close, gdal_errors
+from ortho_pipeline.raster.source import Grid, RasterSource, first_line
+from ortho_pipeline.surface.dem import Surface
+
+#: GDAL's fit to points of a model expresses it if it repeats it this closely (px); another fit only resembles it.
+EXPRESSED = 1e-3
+#: Points per side of the ortho at which a transformer is held against the model.
+_CHECKS = 150
+#: Points per side that GDAL's polynomial or homography is fitted to.
+_GCP_SIDE = 11
+#: Image points farther outside than this (px) are moved there: the arrays keep to the range of the image.
+_FAR = 1000.0
+_NO_PLACE = -1e9
+#: Output pixels whose image points are computed at once.
+_PIECE = 1_000_000
+
+
+@dataclass(frozen=True)
+class Transformer:
+    """One of GDAL's transformers, set up for one model, surface and grid.
+
+    Parameters
+    ----------
+    method : str
+        As in GDAL's documentation: RPC, GCP_POLYNOMIAL, GCP_HOMOGRAPHY, GEOLOC_ARRAY.
+    options : tuple of str
+        Transformer options.
+    rpc, gcps, gcp_crs
+        What the image has to carry: fields of GDAL's RPC domain, or control points with their CRS (WKT).
+    arrays : path, optional
+        Raster with columns and rows of the image for every pixel of the ortho.
+    max_error_px : float
+        Largest difference (px) from the exact model.
+    """
+
+    method: str
+    options: tuple[str, ...]
+    rpc: Mapping[str, str] = field(default_factory=dict)
+    gcps: tuple[gdal.GCP, ...] = ()
+    gcp_crs: str = ""
+    arrays: Path | None = None
+    max_error_px: float = 0.0
+
+    @property
+    def limit(self) -> float:
+        """Largest error (px) with which it may stand for a model."""
+        return EXPRESSED if self.method.startswith("GCP") else REFUSE_ERROR
+
+    def source(self, dataset: gdal.Dataset, bands: tuple[int, ...] = (1,)) -> gdal.Dataset:
+        """Return a view of some bands of an image that has the georeferencing of this transformer and no other."""
+        # A geotransform cannot be taken away again; points keep Translate from copying it.
+        view = gdal.Translate("", dataset, format="VRT", bandList=list(bands), GCPs=[gdal.GCP()])
+        view.SetGCPs(list(self.gcps), self.gcp_crs)
+        view.SetMetadata(dict(self.rpc), "RPC")
+        view.SetMetadata({}, "GEOLOCATION")
+        return view
+
+    def georeference(self, ortho: gdal.Dataset, grid: Grid) -> None:
+        """Give an empty ortho its place: by arrays instead of a geotransform where there are such."""
+        if self.arrays is None:
+            ortho.SetProjection(grid.crs.to_wkt())
+            ortho.SetGeoTransform(grid.geotransform)
+            return
+        name = os.fspath(self.arrays)
+        ortho.SetMetadata(
+            {"X_DATASET": name, "X_BAND": "1", "Y_DATASET": name, "Y_BAND": "2", "PIXEL_OFFSET": "0",
+             "LINE_OFFSET": "0", "PIXEL_STEP": "1", "LINE_STEP": "1", "GEOREFERENCING_CONVENTION": "PIXEL_CENTER"},
+            "GEOLOCATION",
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Exact:
+    """Where pixels of an ortho lie in the image: exact model, surface, grid, columns and rows of the image."""
+
+    model: SensorModel
+    surface: Surface
+    grid: Grid
+    size: tuple[int, int]
+
+    def image(self, columns: Array, rows: Array) -> Array:
+        """Return the image points ``(N, 2)`` of points ``(N,)`` of the ortho; NaN where there is none."""
+        x, y = self.grid.xy(columns, rows)
+        heights = self.surface.heights(np.column_stack([x, y]), self.grid.crs)
+        return self.model.ground_to_image(
+            GroundTransform(self.grid.crs, self.model.crs)(np.column_stack([x, y, heights]))
+        )
+
+    def error(self, transformer: Transformer, image: gdal.Dataset) -> float:
+        """Return how far (px) a transformer is off at points of the ortho; infinite if only one sees a point."""
+        side = [
+            np.unique(np.linspace(0, n - 1, _CHECKS).astype(int)) + 0.5 for n in (self.grid.width, self.grid.height)
+        ]
+        columns, rows = (axis.ravel() for axis in np.meshgrid(*side))
+        ortho = gdal.GetDriverByName("VRT").Create("", self.grid.width, self.grid.height, 1)
+        transformer.georeference(ortho, self.grid)
+        made = gdal.Transformer(transformer.source(image), ortho, list(transformer.options))
+        points, success = made.TransformPoints(1, np.column_stack([columns, rows, 0 * rows]).tolist())
+        found, exact = np.array(points)[:, :2], self.image(columns, rows)
+        found[~(np.array(success, dtype=bool) & np.isfinite(found).all(axis=1))] = np.nan
+        with np.errstate(invalid="ignore"):
+            seen = [((place >= 0) & (place <= self.size)).all(axis=1) for place in (found, exact)]
+        use = seen[0] | seen[1]
+        if transformer.method == "RPC":
+            # GDAL interpolates beside voids and rims of a DEM, where we have no height.
+            use &= np.isfinite(found).all(axis=1) & np.isfinite(exact).all(axis=1)
+        worst = np.abs(found - exact)[use].max(initial=0.0)
+        return float(worst) if np.isfinite(worst) else np.inf
+
+
+def warp_with_gdal(
+    model: SensorModel,
+    exported: RpcExport | None,
+    source: RasterSource,
+    surface: Surface,
+    grid: Grid,
+    path: str | os.PathLike[str],
+    *,
+    resampling: str = "bilinear",
+    driver: str = "COG",
+    creation_options: Mapping[str, str] | None = None,
+    memory: int = 512_000_000,
+    threads: int = 1,
+    profile: Profile | None = None,
+    progress: Any = None,
+) -> tuple[Transformer, int]:
+    """Write the orthoimage of `source` by GDAL's own warper, without approximating its transformer.
+
+    Parameters
+    ----------
+    exported : RpcExport, optional
+        The RPC that stands for the model, where there is one.
+
+    Returns
+    -------
+    Transformer, int
+        What stood for the model, and how many pixels are valid.
+
+    Raises
+    ------
+    InputError
+        If no transformer of GDAL stands for the model within 0.1 px, or the image lies in several files.
+    """
+    if len(source.paths) > 1:
+        raise InputError(
+            "GDAL's warper takes one file", file=source.paths[1], field="engine", remedy="use our own engine"
+        )
+    exact = Exact(model, surface, grid, (source.width, source.height))
+    profile = profile or Profile.of(source)
+    writer = RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads)
+    with writer, gdal_errors(path), contextlib.ExitStack() as scratch:
+        arrays, target = writer.scratch("arrays"), writer.scratch("gdal")
+        for temporary in (arrays, target):
+            scratch.callback(temporary.unlink, missing_ok=True)
+        transformer = _standing(exact, exported, source.dataset, arrays, scratch)
+        view = transformer.source(source.dataset, tuple(source.band_numbers))
+        ortho = _empty(target, profile, grid)
+        transformer.georeference(ortho, grid)
+        _warp_exactly(view, ortho, source, profile, transformer, resampling, memory, threads, progress)
+        close(ortho)
+        valid = writer.copy(target)
+        refuse_empty(valid, path)
+        return transformer, valid
+
+
+# -- what stands for a model -------------------------------------------------------------------------------------------
+
+
+def _standing(
+    exact: Exact, exported: RpcExport | None, image: gdal.Dataset, arrays: Path, scratch: contextlib.ExitStack
+) -> Transformer:
+    """Return the first transformer that stands for the model, with its error."""
+    tried = []
+    for candidate in _candidates(exact, exported, arrays, scratch):
+        try:
+            error = max(exact.error(candidate, image), candidate.max_error_px)
+        except RuntimeError as refusal:  # this GDAL cannot make it
+            tried.append(f"{candidate.method}: {first_line(refusal)}")
+            continue
+        if error <= candidate.limit:
+            return replace(candidate, max_error_px=error)
+        tried.append(f"{candidate.method}: {error:.3g} px off")
+    raise InputError(
+        f"no transformer of GDAL stands for this model ({'; '.join(tried)})", field="--engine",
+        remedy="take our own engine (--engine ortho)",
+    )  # fmt: skip
+
+
+def _candidates(
+    exact: Exact, exported: RpcExport | None, arrays: Path, scratch: contextlib.ExitStack
+) -> Iterator[Transformer]:
+    rpc = None if exported is None else _rpc(exact, exported, scratch)
+    if rpc is not None and rpc.max_error_px == 0.0:
+        yield rpc
+    if not exact.model.uses_height:
+        gcps, crs = _control(exact.model), parse_crs(exact.model.crs).to_wkt()
+        for order in (1, 2, 3):
+            options = ("METHOD=GCP_POLYNOMIAL", f"MAX_GCP_ORDER={order}")
+            yield Transformer("GCP_POLYNOMIAL", options, gcps=gcps, gcp_crs=crs)
+        yield Transformer("GCP_HOMOGRAPHY", ("METHOD=GCP_HOMOGRAPHY",), gcps=gcps, gcp_crs=crs)
+    if rpc is not None and rpc.max_error_px > 0.0:
+        yield rpc
+    _write_arrays(exact, arrays)
+    yield Transformer("GEOLOC_ARRAY", ("SRC_METHOD=NO_GEOTRANSFORM", "DST_METHOD=GEOLOC_ARRAY"), arrays=arrays)
+
+
+def _rpc(exact: Exact, exported: RpcExport, scratch: contextlib.ExitStack) -> Transformer | None:
+    """Return GDAL's RPC transformer with the heights under the grid; None where it would lose some of them."""
+    options = ["METHOD=RPC"]  # GDAL would otherwise prefer GCPs
+    if exact.surface.constant_height is not None:
+        options += [f"RPC_HEIGHT={exact.surface.constant_height!r}"]
+    else:
+        heights = _heights_under(exact.surface, exact.grid)
+        if heights is None:
+            return None
+        dem = f"/vsimem/ortho_dem_{os.getpid()}_{threading.get_ident()}.tif"
+        scratch.callback(gdal.Unlink, dem)
+        _write_dem(dem, *heights, exact.surface)
+        options += [f"RPC_DEM={dem}", "RPC_DEMINTERPOLATION=bilinear", "RPC_DEM_APPLY_VDATUM_SHIFT=NO"]
+    return Transformer("RPC", tuple(options), rpc=rpc_metadata(exported.rpc), max_error_px=exported.max_error_px)
+
+
+def _heights_under(surface: Surface, grid: Grid) -> tuple[Array, tuple[float, ...]] | None:
+    """Return the ellipsoidal heights under a grid and their geotransform; None where GDAL would lose one side.
+
+    That is so at the antimeridian, with a DEM in longitude and latitude.
+    """
+    columns, rows = np.meshgrid(np.linspace(0, grid.width, 65), np.linspace(0, grid.height, 65))
+    x, y = grid.xy(columns.ravel(), rows.ravel())
+    plan = GroundTransform(grid.crs, surface.crs)(np.stack([x, y, np.zeros(x.size)], axis=1))
+    if surface.crs.is_geographic and np.ptp(plan[:, 0]) > 180:
+        return None
+    samples = surface.samples_at(plan[:, :2])
+    low = np.floor(np.nanmin(samples, axis=0)).astype(int) - 3
+    size = np.ceil(np.nanmax(samples, axis=0)).astype(int) + 4 - low
+    u, a, b, v, c, d = surface.pixel_from_crs
+    inverse = np.linalg.inv([[a, b], [c, d]])
+    # GDAL's geotransform starts at the corner of the first sample.
+    corner = inverse @ (low - 0.5 - np.array([u, v]))
+    heights = surface.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]))
+    return heights, (corner[0], inverse[0, 0], inverse[0, 1], corner[1], inverse[1, 0], inverse[1, 1])
+
+
+def _write_dem(path: str, heights: Array, geotransform: tuple[float, ...], surface: Surface) -> None:
+    rows, columns = heights.shape
+    dataset = gdal.GetDriverByName("GTiff").Create(path, columns, rows, 1, gdal.GDT_Float64)
+    dataset.SetProjection(surface.crs.to_wkt())
+    dataset.SetGeoTransform(geotransform)
+    dataset.GetRasterBand(1).SetNoDataValue(-1e6)
+    dataset.GetRasterBand(1).WriteArray(np.where(np.isnan(heights), -1e6, heights))
+    close(dataset)
+
+
+def _control(model: SensorModel) -> tuple[gdal.GCP, ...]:
+    """Return points of a model of the plane, over the box that it is meant for, in its own CRS."""
+    centre, half = model.domain
+    steps = np.linspace(-1.0, 1.0, _GCP_SIDE)
+    x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
+    ground = centre + half * np.column_stack([x, y, 0 * x])
+    rows = np.column_stack([ground, model.ground_to_image(ground)]).tolist()
+    return tuple(gdal.GCP(*row) for row in rows if np.isfinite(row).all())
+
+
+def _write_arrays(exact: Exact, path: Path) -> None:
+    """Write the column and row in the image of the centre of every output pixel."""
+    width, height = exact.grid.width, exact.grid.height
+    options = ["BIGTIFF=IF_SAFER", "INTERLEAVE=BAND"]
+    dataset = gdal.GetDriverByName("GTiff").Create(os.fspath(path), width, height, 2, gdal.GDT_Float64, options)
+    for k in (1, 2):
+        dataset.GetRasterBand(k).SetNoDataValue(_NO_PLACE)
+    step = max(1, _PIECE // width)
+    for top in range(0, height, step):
+        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(top, min(top + step, height)) + 0.5)
+        image = exact.image(columns.ravel(), rows.ravel())
+        image = np.clip(image, -_FAR, np.array(exact.size) + _FAR)  # NaN stays NaN
+        image = np.where(np.isnan(image).any(axis=1, keepdims=True), _NO_PLACE, image).reshape(*columns.shape, 2)
+        for k in (0, 1):
+            dataset.GetRasterBand(k + 1).WriteArray(np.ascontiguousarray(image[:, :, k]), 0, top)
+    close(dataset)
+
+
+# -- the warp ----------------------------------------------------------------------------------------------------------
+
+
+def _empty(path: Path, profile: Profile, grid: Grid) -> gdal.Dataset:
+    """Create the raster that GDAL warps into; its last band is the mask, if the profile has one."""
+    mask = profile.validity == "mask"
+    dataset = gdal.GetDriverByName("GTiff").Create(
+        os.fspath(path), grid.width, grid.height, profile.count + mask, _gdal_type(profile.dtype),
+        ["TILED=YES", "BIGTIFF=IF_SAFER"],
+    )  # fmt: skip
+    if profile.validity in ("mask", "alpha"):
+        dataset.GetRasterBand(dataset.RasterCount).SetColorInterpretation(gdal.GCI_AlphaBand)
+    if profile.nodata is not None:
+        for k in range(profile.count):
+            dataset.GetRasterBand(k + 1).SetNoDataValue(profile.nodata)
+    return dataset
+
+
+def _gdal_type(dtype: np.dtype[Any]) -> int:
+    return int(gdal_array.NumericTypeCodeToGDALTypeCode(dtype.type))
+
+
+def _warp_exactly(
+    view: gdal.Dataset,
+    ortho: gdal.Dataset,
+    source: RasterSource,
+    profile: Profile,
+    transformer: Transformer,
+    resampling: str,
+    memory: int,
+    threads: int,
+    progress: Any,
+) -> None:
+    callback = None if progress is None else (lambda share, *_: progress(share) or 1)
+    # Without the first two the values depend on how the warper cuts the image into chunks; the next two let it find
+    # the window of a chunk in the image from points all over it, because terrain moves them.
+    settings = ["XSCALE=1", "YSCALE=1", "SAMPLE_GRID=YES", "SAMPLE_STEPS=101", "SOURCE_EXTRA=32"]
+    gdal.Warp(
+        ortho,
+        view,
+        transformerOptions=list(transformer.options),
+        errorThreshold=0,
+        resampleAlg=resampling,
+        # By itself the warper clamps the source to the type of the output before it interpolates.
+        workingType=_gdal_type(source.dtype),
+        dstNodata=profile.nodata,
+        multithread=threads > 1,
+        warpMemoryLimit=memory // 2,
+        warpOptions=[*settings, f"NUM_THREADS={threads}", "INIT_DEST=0" if profile.nodata is None else
+                     "INIT_DEST=NO_DATA"],
+        callback=callback,
+    )  # fmt: skip
