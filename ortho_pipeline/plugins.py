@@ -25,16 +25,17 @@ from ortho_pipeline import hookspecs
 from ortho_pipeline.contract import described, scene_faults, sensor_faults
 from ortho_pipeline.errors import InputError, OrthoError, PluginError, Terminated, completed
 from ortho_pipeline.exchange.crop import placed
-from ortho_pipeline.hookspecs import PROJECT_NAME, Scene, Sensor
+from ortho_pipeline.hookspecs import PROJECT_NAME, Scene, Sensor, Study
 from ortho_pipeline.models import KINDS, SensorModel
 from ortho_pipeline.raster.source import open_dataset
 
 BUNDLED = "ortho-pipeline"
-HOOKS = ("ortho_sensors", "ortho_models")
+HOOKS = ("ortho_sensors", "ortho_models", "ortho_studies")
 #: What each hook returns, what it is collected in, and what authors are told who return something else.
 _RETURNS: dict[str, tuple[type, type, str]] = {
     "ortho_sensors": (Iterable, list, "yield the Sensor, or return [Sensor(...)]"),
     "ortho_models": (Mapping, dict, "return {kind: class}"),
+    "ortho_studies": (Iterable, list, "yield the Study, or return [Study(...)]"),
 }
 _COPY_IT = "correct what the file says there, or copy it again from the delivery"
 _COPY_AGAIN = "copy the metadata again from the delivery, or give a sound model (--rpc FILE, --model FILE)"
@@ -344,6 +345,21 @@ class Host:
                     self._claim(plugin, name, "model family")
                     families[name] = family
         return families
+
+    @functools.cached_property
+    def studies(self) -> Mapping[str, Study]:
+        """The simulations and experiments by name; collected when they are first asked for."""
+        studies: dict[str, Study] = {}
+        for plugin, offered in self._returned("ortho_studies"):
+            with self._judged(self._origin[plugin]):
+                for study in offered:
+                    if not isinstance(study, Study):
+                        raise PluginError(f"plugin {plugin}: ortho_studies yields {type(study).__name__}, not Study")
+                    if study.name in studies and self._owner[study.name] == plugin:
+                        raise PluginError(f"plugin {plugin} offers two studies {study.name!r}")
+                    self._claim(plugin, study.name, "study")
+                    studies[study.name] = study
+        return MappingProxyType(dict(sorted(studies.items())))
 
     def _claim(self, plugin: str, name: str, what: str) -> None:
         bundled = {key for key, origin in self._origin.items() if _normalised(origin.distribution) == BUNDLED}

@@ -1,172 +1,99 @@
-"""The command groups ``ortho simulate`` and ``ortho reproduce``."""
+"""The command groups ``ortho simulate`` and ``ortho reproduce``: a command for each study of an installed plugin."""
 
 from __future__ import annotations
 
+import inspect
+from typing import TYPE_CHECKING, Any
+
 import click
 
-from ortho_pipeline.cli.command import Group
+from ortho_pipeline.cli.command import Command, Group
 from ortho_pipeline.cli.options import folder_option, json_option
 from ortho_pipeline.cli.printing import print_result, progress
 
+if TYPE_CHECKING:
+    from ortho_pipeline.hookspecs import Study, StudyOption
 
-@click.group(cls=Group)
+
+class _Studies(Group):
+    """A group whose commands are the studies that have a function of the group's name."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return [name for name, study in _offered().items() if getattr(study, str(self.name))]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        study = _offered().get(cmd_name)
+        if study is None or getattr(study, str(self.name)) is None:
+            return None
+        return _simulation(study) if self.name == "simulate" else _experiment(study)
+
+
+def _offered() -> dict[str, Study]:
+    from ortho_pipeline.commands.studies import studies
+
+    return dict(studies())
+
+
+@click.group(cls=_Studies)
 def simulate() -> None:
     """Make scenes of known truth."""
 
 
-@simulate.command("bilsat")
-@folder_option
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of all noise.")
-@click.option(
-    "--off-nadir", type=click.FloatRange(0, 30), metavar="DEG", help="Tilt  [default: that of 'reproduce bilsat']"
-)
-@click.option("--size", type=int, metavar="PX", help="Columns and rows; fewer are larger  [default: 2048]")
-@click.option("--xs", "all_cameras", is_flag=True, help="An image of each of the four XS cameras, not of the red one.")
-@json_option
-def simulate_bilsat(
-    folder: str, seed: int, off_nadir: float | None, size: int | None, all_cameras: bool, as_json: bool
-) -> None:
-    """Write a BILSAT-1 frame over Ankara: image, imaging survey, DEM, 44 points, truth."""
-    from ortho_pipeline.commands import studies
-
-    result = studies.simulate_bilsat(folder, seed=seed, off_nadir_deg=off_nadir, size=size, all_cameras=all_cameras)
-    print_result(result, as_json)
-
-
-@simulate.command("ikonos")
-@folder_option
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of hills, errors and noise.")
-@click.option(
-    "--off-nadir", type=click.FloatRange(0, 45), metavar="DEG", help="Tilt  [default: that of 'reproduce ikonos']"
-)
-@click.option("--size", type=int, default=1000, show_default=True, metavar="PX", help="Columns and rows.")
-@click.option("--pixel", type=float, metavar="M", help="Size of a pixel  [default: so that the image covers 11 km]")
-@click.option("--rpc/--no-rpc", default=True, help="Deliver _rpc.txt or not.")
-@click.option("--ms", "multispectral", is_flag=True, help="Four bands in files of their own beside pan.")
-@click.option("--components", type=int, default=1, show_default=True, help="Files that each image is cut into.")
-@json_option
-def simulate_ikonos(
-    folder: str,
-    seed: int,
-    off_nadir: float | None,
-    size: int,
-    pixel: float | None,
-    rpc: bool,
-    multispectral: bool,
-    components: int,
-    as_json: bool,
-) -> None:
-    """Write an IKONOS Geo delivery over Tehran: images, metadata, RPC, DEM, 20 control and 20 check points, truth."""
-    from ortho_pipeline.commands import studies
-
-    result = studies.simulate_ikonos(
-        folder, seed=seed, off_nadir_deg=off_nadir, size=size, pixel=pixel, rpc=rpc, multispectral=multispectral,
-        components=components,
-    )  # fmt: skip
-    print_result(result, as_json)
-
-
-@simulate.command("cartosat")
-@folder_option
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of points and all noise.")
-@click.option(
-    "--size",
-    type=int,
-    default=1200,
-    show_default=True,
-    metavar="PX",
-    help="Columns and rows; 12000 are the real ones (25 min), fewer are larger.",
-)
-@click.option(
-    "--jitter",
-    type=click.FloatRange(0, 10),
-    default=0.0,
-    show_default=True,
-    metavar="PX",
-    help="Swinging of the pitch.",
-)
-@json_option
-def simulate_cartosat(folder: str, seed: int, size: int, jitter: float, as_json: bool) -> None:
-    """Write a CARTOSAT-1 stereo pair over Hobart: BANDF and BANDA with _MET.TXT and _RPC.TXT, DEM, 69 points, truth."""
-    from ortho_pipeline.commands import studies
-
-    print_result(studies.simulate_cartosat(folder, seed=seed, size=size, jitter=jitter), as_json)
-
-
-@simulate.command("orbview3")
-@folder_option
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of points and all noise.")
-@click.option(
-    "--pixel", type=int, default=8, show_default=True, metavar="M", help="Metres; 1 is the real one, larger are fewer."
-)
-@json_option
-def simulate_orbview3(folder: str, seed: int, pixel: int, as_json: bool) -> None:
-    """Write two OrbView-3 scenes over Zonguldak: images with .pvl and _rpc.txt, DEM, 34 points, truth."""
-    from ortho_pipeline.commands import studies
-
-    print_result(studies.simulate_orbview3(folder, seed=seed, pixel=pixel), as_json)
-
-
-@click.group(cls=Group)
+@click.group(cls=_Studies)
 def reproduce() -> None:
     """Compute the tables of the papers that this package implements, beside the papers' numbers."""
 
 
-@reproduce.command("bilsat")
-@click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the page.")
-@click.option(
-    "--realisations", type=click.IntRange(min=1), default=100, show_default=True, help="How often noise is drawn."
-)
-@json_option
-def reproduce_bilsat(folder: str | None, realisations: int, as_json: bool) -> None:
-    """Tables 3, 4 and 5 and figure 2 of Ok and Turker, on simulated BILSAT-1 scenes."""
-    from ortho_pipeline.commands import studies
+def _simulation(study: Study) -> click.Command:
+    def run(folder: str, seed: int, as_json: bool, **options: Any) -> None:
+        from ortho_pipeline.commands import studies
 
-    with progress("Reproducing") as advance:
-        result = studies.reproduce_bilsat(folder, realisations=realisations, progress=advance)
-    print_result(result, as_json)
+        print_result(studies.simulate(study.name, folder, seed=seed, **options), as_json)
 
-
-@reproduce.command("ikonos")
-@click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the page.")
-@click.option(
-    "--realisations", type=click.IntRange(min=1), default=100, show_default=True, help="How often a scene is drawn."
-)
-@json_option
-def reproduce_ikonos(folder: str | None, realisations: int, as_json: bool) -> None:
-    """Table 2 and figure 4 of Amini and Hashemi, on simulated IKONOS scenes; and what the paper did not have."""
-    from ortho_pipeline.commands import studies
-
-    with progress("Reproducing") as advance:
-        result = studies.reproduce_ikonos(folder, realisations=realisations, progress=advance)
-    print_result(result, as_json)
+    callback = json_option(run)
+    for option in reversed(study.options):
+        callback = _option(option)(callback)
+    seed_option = click.option(
+        "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of everything that is drawn."
+    )
+    return click.command(study.name, cls=Command, help=_help(study.simulate), short_help=study.title)(
+        folder_option(seed_option(callback))
+    )
 
 
-@reproduce.command("cartosat")
-@click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the page.")
-@click.option(
-    "--realisations", type=click.IntRange(min=1), default=50, show_default=True, help="How often a pair is drawn."
-)
-@json_option
-def reproduce_cartosat(folder: str | None, realisations: int, as_json: bool) -> None:
-    """Tables 2 to 6 of Willneff et al., on simulated CARTOSAT-1 stereo pairs; and curves over the control points."""
-    from ortho_pipeline.commands import studies
+def _experiment(study: Study) -> click.Command:
+    @click.option(
+        "--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the page."
+    )
+    @click.option(
+        "--realisations", type=click.IntRange(min=1), default=study.realisations, show_default=True,
+        help="How often noise is drawn.",
+    )  # fmt: skip
+    @json_option
+    def run(folder: str | None, realisations: int, as_json: bool) -> None:
+        from ortho_pipeline.commands import studies
 
-    with progress("Reproducing") as advance:
-        result = studies.reproduce_cartosat(folder, realisations=realisations, progress=advance)
-    print_result(result, as_json)
+        with progress("Reproducing") as advance:
+            result = studies.reproduce(study.name, folder, realisations=realisations, progress=advance)
+        print_result(result, as_json)
+
+    return click.command(study.name, cls=Command, help=_help(study.reproduce), short_help=study.title)(run)
 
 
-@reproduce.command("orbview3")
-@click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the page.")
-@click.option(
-    "--realisations", type=click.IntRange(min=1), default=100, show_default=True, help="How often a scene is drawn."
-)
-@json_option
-def reproduce_orbview3(folder: str | None, realisations: int, as_json: bool) -> None:
-    """Table 1 and figures 4 to 7 of Bueyueksalih et al., on simulated OrbView-3 scenes; and QuickBird beside them."""
-    from ortho_pipeline.commands import studies
+def _option(option: StudyOption) -> Any:
+    """Return the decorator of click that a declared option stands for."""
+    flag = option.flag or f"--{option.name.replace('_', '-')}"
+    shown = option.default is not None
+    if option.kind is bool:
+        return click.option(flag, option.name, is_flag=True, default=bool(option.default), help=option.help)
+    kind: Any = option.kind
+    if (option.low, option.high) != (None, None):
+        kind = (click.IntRange if kind is int else click.FloatRange)(option.low, option.high)
+    return click.option(
+        flag, option.name, type=kind, default=option.default, show_default=shown, metavar=option.unit or None,
+        help=option.help,
+    )  # fmt: skip
 
-    with progress("Reproducing") as advance:
-        result = studies.reproduce_orbview3(folder, realisations=realisations, progress=advance)
-    print_result(result, as_json)
+
+def _help(function: Any) -> str:
+    return (inspect.getdoc(function) or "").partition("\n\n")[0]
