@@ -88,7 +88,8 @@ def _option(option: StudyOption) -> Any:
         return click.option(flag, option.name, is_flag=True, default=bool(option.default), help=option.help)
     kind: Any = option.kind
     if (option.low, option.high) != (None, None):
-        kind = (click.IntRange if kind is int else click.FloatRange)(option.low, option.high)
+        of_range: Any = click.IntRange if kind is int else click.FloatRange
+        kind = of_range(option.low, option.high)
     return click.option(
         flag, option.name, type=kind, default=option.default, show_default=shown, metavar=option.unit or None,
         help=option.help,

@@ -27,7 +27,7 @@ from ortho_pipeline.raster.source import open_dataset
 from ortho_pipeline.simulation.scanner import EARTH_A, LineScanner
 from ortho_pipeline.testing import check_sensor
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parent.parent.parent
 SENSOR = next(iter(ortho_cartosat.ortho_sensors()))
 
 

@@ -30,7 +30,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parent.parent.parent
 FILE = """
 defaults:
   surface: {dem: dem.tif, vertical: ellipsoid}

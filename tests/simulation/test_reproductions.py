@@ -28,7 +28,7 @@ from ortho_pipeline.simulation.tables import (
     make_document,
 )
 
-PAGES = Path(__file__).resolve().parent.parent / "docs/reproductions"
+PAGES = Path(__file__).resolve().parent.parent.parent / "docs/reproductions"
 EXPERIMENTS = {"bilsat": bilsat, "ikonos": ikonos, "cartosat": cartosat, "orbview3": orbview3}
 NUMBERS = (
     Number(1, "affine", "X", "m", 2.0, 2.2),

@@ -28,7 +28,7 @@ from ortho_pipeline.report.stac import acquisition_time
 
 TIME = "2005-08-03T08:12:31.25Z"
 BASE = "https://stac-extensions.github.io"
-SCHEMAS = Path(__file__).resolve().parent / "data" / "stac"
+SCHEMAS = Path(__file__).resolve().parent.parent / "data" / "stac"
 #: The extensions as they are published, by their URIs (tests/data/stac/README.md).
 EXTENSIONS = {
     f"{BASE}/{path.relative_to(SCHEMAS).as_posix()}": json.loads(path.read_text())
@@ -58,7 +58,7 @@ def validate(path: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """Rectify the sample scene with a STAC item."""
-    sample = Path(__file__).resolve().parent.parent / "sample_data"
+    sample = Path(__file__).resolve().parent.parent.parent / "sample_data"
     folder = tmp_path_factory.mktemp("stac")
     result = commands.rectify(
         sample / "scene.tif", folder, points=PointOptions(gcps=sample / "gcps.geojson"),
@@ -118,7 +118,7 @@ def test_outline_holds_the_valid_pixels(made):
 def test_view_is_that_of_the_camera(made):
     folder, _ = made
     properties = json.loads((folder / "scene_stac.json").read_text())["properties"]
-    truth = json.loads((Path(__file__).resolve().parent.parent / "sample_data" / "truth.json").read_text())
+    truth = json.loads((Path(__file__).resolve().parent.parent.parent / "sample_data" / "truth.json").read_text())
     camera = truth["camera"]
     position = np.array(camera["radial"]) * camera["radius"]
     west, south, east, north = json.loads((folder / "scene_stac.json").read_text())["bbox"]

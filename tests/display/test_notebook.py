@@ -12,7 +12,7 @@ import pytest
 
 import ortho_pipeline as op
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parent.parent.parent
 SAMPLE = ROOT / "sample_data"
 
 

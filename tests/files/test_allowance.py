@@ -14,7 +14,7 @@ import pytest
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.files.allowance import require_memory, startable_threads
 
-SAMPLE = Path(__file__).resolve().parents[1] / "sample_data"
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 EXTENT = ("530600", "4122000", "530800", "4122200")
 
 
@@ -70,7 +70,7 @@ def test_a_run_with_little_memory_ends_within_seconds(tmp_path, megabytes):
         "ended = faults.run(sys.argv[4:], Path(sys.argv[2]), faults.limit_memory(int(sys.argv[3]) << 20)); "
         "print(ended.code, ended.hung, ended.said)"
     )
-    tools = str(Path(__file__).parent / "attack")
+    tools = str(Path(__file__).parents[1] / "attack")
     words = [sys.executable, "-c", line, tools, str(tmp_path), str(megabytes), *rectify()]
     ended = subprocess.run(words, check=False, capture_output=True, text=True, timeout=60)
     assert ended.stdout.startswith("1 False"), ended.stdout + ended.stderr

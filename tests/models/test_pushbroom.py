@@ -417,7 +417,7 @@ def test_tables_hold_the_coefficients_that_they_observe() -> None:
 def test_all_scenes_converge_from_metadata_alone() -> None:
     """Nine points of 0.5 px; forward, backward and nadir views by turns.
 
-    25 scenes, and as many as ORTHO_SCENES says: `ORTHO_SCENES=100 pytest tests/test_pushbroom.py -k all_scenes`.
+    25 scenes, and as many as ORTHO_SCENES says: `ORTHO_SCENES=100 pytest tests/models/test_pushbroom.py -k all_scenes`.
     """
     starts, errors = [], []
     for seed in range(int(os.environ.get("ORTHO_SCENES", "25"))):

@@ -283,7 +283,7 @@ def test_report_holds_the_analysis_and_draws_it(tmp_path):
     scene = Scene("simulated", "scene.tif", 1000, 1000, {"camera": result.model}, "from a seed")
     provenance = {"command": None, "inputs": [], "software": {}}
     made = report.build_report(scene=scene, fit=result, provenance=provenance)
-    schema = json.loads((Path(__file__).parent.parent / "docs" / "report.schema.json").read_text())
+    schema = json.loads((Path(__file__).parent.parent.parent / "docs" / "report.schema.json").read_text())
     jsonschema.validate(made, schema, cls=jsonschema.Draft202012Validator)
     # The check points were tested: their analysis is drawn, and the words are on page and terminal.
     assert {"neighbours", "relative"} <= set(report.plots(made))

@@ -166,7 +166,7 @@ def test_frame_tables_in_an_archive(tmp_path):
 
 def test_a_sensor_of_somebody_else_in_an_archive(tmp_path):
     """The example of docs/plugins.md does nothing for archives but to begin at `place`."""
-    root, folder = Path(__file__).parent.parent, tmp_path / "delivery"
+    root, folder = Path(__file__).parent.parent.parent, tmp_path / "delivery"
     folder.mkdir()
     gdal.GetDriverByName("GTiff").Create(str(folder / "scene.tif"), 120, 90)
     flight = (root / "docs" / "plugins.md").read_text().partition("```json\n")[2].partition("```")[0]

@@ -19,7 +19,7 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import results
 from ortho_pipeline.options import PointOptions, SurfaceOptions
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parent.parent.parent
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 #: Where the browser itself calls, whatever page it shows (and does not get through to, in these tests).

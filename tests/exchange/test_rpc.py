@@ -31,7 +31,7 @@ from ortho_pipeline.models.base import SensorModel, as_ground
 
 gdal.UseExceptions()
 
-REAL = Path(__file__).resolve().parents[1].parent / "shared" / "data"
+REAL = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 QUICKBIRD = "orthority/rpc/qb2_basic1b.tif"
 CORRECTIONS = {
     "shift": (3.0, 0.0, 0.0, -2.1, 0.0, 0.0),

@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-SCENE = Path(__file__).parents[1] / "sample_data/ikonos/po_39001_pan_0000000.tif"
+SCENE = Path(__file__).parents[2] / "sample_data/ikonos/po_39001_pan_0000000.tif"
 #: What numba does where neither the package's folder nor the home can be written: it finds no place for a cache.
 READ_ONLY = "import sys; from numba.core import caching; caching.CacheImpl._locator_classes = []\n"
 
