@@ -3,12 +3,12 @@
 python benchmarks/recommend.py --seeds 100 108     calibration; about 15 minutes on one core
 python benchmarks/recommend.py --seeds 200 208     scenes that nothing was chosen by
 
-The four scenes of tests/estimation/test_compare.py, 16 to 60 control points that are even, in three
-clusters, along a strip, without a corner or about at one height, all left out in turn. A line for each choice: the error of the recommended
-model over the whole scene as a multiple of that of the best one (noise of measuring included), the same for a rule that
-adds to the squared errors what the covariance of the parameters adds over the scene (mean variance there less that at
-the control), the share of the image that control covers, and the chance p (one-sided, paired) by which the points
-themselves could tell the truly best model from the recommended one.
+The four scenes of tests/estimation/test_compare.py, 16 to 60 control points that are even, in three clusters, along a
+strip, without a corner or about at one height, all left out in turn. A line for each choice: the error of the
+recommended model over the whole scene as a multiple of that of the best one (noise of measuring included), the same
+for a rule that adds to the squared errors what the covariance of the parameters adds over the scene (mean variance
+there less that at the control), the share of the image that control covers, and the chance p (one-sided, paired) by
+which the points themselves could tell the truly best model from the recommended one.
 """
 
 from __future__ import annotations
