@@ -6,6 +6,7 @@ import doctest
 import os
 import re
 import shlex
+import sys
 from pathlib import Path
 
 import click
@@ -13,6 +14,7 @@ import pytest
 
 import ortho_pipeline
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.plugins import Host
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("sample_data/**/*.md")])
@@ -43,6 +45,21 @@ def commands(page: Path) -> list[str]:
 COMMANDS = [pytest.param(line, id=f"{page.name}: {line[:60]}") for page in PAGES for line in commands(page)]
 
 
+@pytest.fixture
+def with_tinysat(monkeypatch):
+    """Have the plugin that docs/plugins.md builds."""
+    from ortho_pipeline.commands import studies
+
+    monkeypatch.syspath_prepend(str(ROOT / "examples" / "ortho_tinysat"))
+    import ortho_tinysat_study
+
+    monkeypatch.setattr(studies, "studies", lambda: {"tinysat": ortho_tinysat_study.STUDY, **Host.discover().studies})
+    yield
+    for name in ("ortho_tinysat_study", "ortho_tinysat"):
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.usefixtures("with_tinysat")
 @pytest.mark.parametrize("line", COMMANDS)
 def test_commands_are_understood(line):
     words = shlex.split(line.split(" | ")[0], comments=True)[1:]
