@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
 from osgeo import gdal, osr
@@ -16,6 +17,20 @@ from ortho_pipeline.models import RPC
 ROOT = Path(__file__).resolve().parent.parent
 REAL = ROOT.parent / "shared" / "data"
 SAMPLE = ROOT / "sample_data"
+
+# The same few examples in every run. To search for more: `pytest --hypothesis-profile=search -k round_trip`.
+_QUIET = {
+    "deadline": None,
+    "database": None,
+    "suppress_health_check": [
+        # The files of one example are written over by the next.
+        hypothesis.HealthCheck.function_scoped_fixture,
+        hypothesis.HealthCheck.too_slow,
+    ],
+}
+hypothesis.settings.register_profile("tests", derandomize=True, max_examples=25, **_QUIET)
+hypothesis.settings.register_profile("search", max_examples=2000, **_QUIET)
+hypothesis.settings.load_profile("tests")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -95,7 +95,7 @@ def _reader(path: str | os.PathLike[str], text: str) -> Callable[[str | os.PathL
     first = lines[0].strip() if lines else ""
     for reader, known in (
         (read_geojson, start.startswith(("{", "[")) or suffix in (".geojson", ".json")),
-        (read_qgis, suffix == ".points" or re.search(r"(?mi)^mapX\s*,", start)),
+        (read_qgis, suffix == ".points" or re.match(r"(?i)mapX\s*,", first)),
         (read_envi, suffix == ".pts" or start.startswith(";")),
         (read_asp, suffix == ".gcp" or re.match(r"#\s*WKT\s*:", start)),
         (read_csv, suffix in (".csv", ".tsv") or is_header(first)),

@@ -75,7 +75,7 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, layout: Lay
     role = properties.get("role") or layout.role
     row = Row(
         where=where,
-        id=" ".join(str(name).split()) or None if name is not None else None,
+        id=str(name) if name is not None else None,
         image=(math.nan, math.nan),
         ground=ground,
         role=role_of(role, path, f"{where}.properties.role") if role else "",

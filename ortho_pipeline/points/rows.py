@@ -64,6 +64,12 @@ class Row:
     image_name: str | None = None
     piece: Piece = OWN_IMAGE
 
+    def __post_init__(self) -> None:
+        if self.id is not None:
+            self.id = plain_id(self.id) or None
+            if not is_writable(self.id or ""):
+                raise InputError(f"{short(self.id)} is not an id", field=self.where, remedy="use letters and digits")
+
 
 @dataclass
 class Table:
@@ -81,6 +87,16 @@ class Table:
     assumed_vertical: str | None = None
     of_ground: str | None = None
     origin_allowed: bool = False
+
+
+def plain_id(text: str) -> str:
+    """Return an id as it is known by: no blanks around it, single ones within, and so nothing that ends a line."""
+    return " ".join(text.split())
+
+
+def is_writable(text: str) -> bool:
+    """Tell whether text can stand in a UTF-8 file: no NUL and no half of a surrogate pair, which JSON can hold."""
+    return "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 def origin_shift(path: str | os.PathLike[str], table: Table, origin: str) -> float:

@@ -30,7 +30,7 @@ from ortho_pipeline.geodesy.crs import (
 )
 from ortho_pipeline.points.formats import read_table
 from ortho_pipeline.points.ground import ground_of
-from ortho_pipeline.points.rows import CSV_COLUMNS, ROLES, Piece, Row, Table, origin_shift
+from ortho_pipeline.points.rows import CSV_COLUMNS, ROLES, Piece, Row, Table, is_writable, origin_shift, plain_id, short
 
 Array = NDArray[np.float64]
 
@@ -244,7 +244,8 @@ def gcps_of_dataset(
     gcps = dataset.GetGCPs()
     if not gcps:
         raise InputError("this raster carries no ground control points", file=path, remedy="give a point file")
-    named = all(gcp.Id for gcp in gcps) and len({gcp.Id for gcp in gcps}) == len(gcps)
+    names = [plain_id(gcp.Id) for gcp in gcps]
+    named = all(names) and len(set(names)) == len(gcps)
     flat = all(gcp.GCPZ == 0 for gcp in gcps)
     rows = [
         Row(
@@ -424,7 +425,8 @@ def write_points(
 ) -> None:  # fmt: skip
     """Write points as ``.csv``/``.tsv``, ``.geojson`` (lon, lat, EPSG:4979) or QGIS ``.points``; whole or not at all.
 
-    CSV and GeoJSON read back as they were; a QGIS file has no ids, heights, roles or sigmas.
+    CSV and GeoJSON read back as they were; a QGIS file has no ids, heights, roles or sigmas. An id is text without
+    blanks around it, or several in a row.
 
     Parameters
     ----------
@@ -434,7 +436,7 @@ def write_points(
     Raises
     ------
     InputError
-        For another suffix, or a folder that cannot be written.
+        For another suffix, an id that would be read as another one, or a folder that cannot be written.
     """
     writers = {".csv": _csv_text, ".tsv": _csv_text, ".geojson": _geojson_text, ".points": _qgis_text}
     suffix = Path(path).suffix.lower()
@@ -442,6 +444,12 @@ def write_points(
         raise InputError("points are not written in this format", file=path, remedy=f"one of {', '.join(writers)}")
     if images is not None and writers[suffix] is not _csv_text:
         raise InputError(f"{suffix} does not say in which file a point was measured", file=path, remedy="write .csv")
+    odd = next((name for name in points.ids if not name or name != plain_id(name) or not is_writable(name)), None)
+    if odd is not None and writers[suffix] is not _qgis_text:
+        raise InputError(
+            f"the id {short(odd)} would be read as another one", file=path, field="id",
+            remedy="give each point a name without line breaks, and no blanks around it or in a row",
+        )  # fmt: skip
     write_text(path, _csv_text(points, suffix, images) if images is not None else writers[suffix](points, suffix))
 
 
