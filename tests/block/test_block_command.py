@@ -162,7 +162,7 @@ def test_an_adjustment_starts_from_saved_models(stereo: Stereo, tmp_path: Path) 
     assert any(path.endswith("one/aft_BAND_model.json") for path in inputs)
     # Other corrections go on top, and one model for two images is refused.
     run("adjust", *stereo.images, "--points", points, *saved, "--correction", "affine", "-o", tmp_path / "three")
-    assert "1 models for 2 images" in run(
+    assert "1 model for 2 images" in run(
         "adjust", *stereo.images, "--points", points, *saved[:2], "-o", tmp_path, code=2
     )
 
