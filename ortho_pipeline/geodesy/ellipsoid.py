@@ -126,6 +126,10 @@ def meet_height(origin: Array, direction: Array, height: Array) -> Array:
 
 
 # -- rotations -------------------------------------------------------------------------------------------------------
+#
+# An adjustment turns angles into matrices in every step, and a resection vectors onto others for every triple of
+# points: scipy's Rotation, whose signs and sequences these have (tests/geodesy/test_rotations.py), takes 5 to 20 times
+# as long.
 
 
 def rotation_of_angles(omega: float, phi: float, kappa: float) -> Array:

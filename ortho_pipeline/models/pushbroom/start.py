@@ -150,16 +150,12 @@ def rotations_of_quaternions(quaternions: ArrayLike, *, scalar: str = "first") -
     q = np.asarray(quaternions, dtype=np.float64)
     if q.ndim != 2 or q.shape[1] != 4 or scalar not in ("first", "last"):
         raise InputError("quaternions are N x 4 numbers, their scalar first or last", field="quaternions")
-    length = np.linalg.norm(q, axis=1)
-    if not (length > 0).all():
+    if not (np.linalg.norm(q, axis=1) > 0).all():
         raise InputError("a quaternion is zero or not finite", field="quaternions")
-    w, x, y, z = (np.roll(q, 1, axis=1) if scalar == "last" else q).T / length
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
+    from scipy.spatial.transform import Rotation
+
+    last = np.roll(q, -1, axis=1) if scalar == "first" else q
+    return np.asarray(Rotation.from_quat(last).as_matrix(), dtype=np.float64)
 
 
 def rotations_of_angles(angles: ArrayLike, positions: ArrayLike, velocities: ArrayLike) -> Array:
