@@ -10,14 +10,18 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import whole_or_nothing
+from ortho_pipeline.files.locations import VsiPath
 from ortho_pipeline.raster.source import first_line
 
 #: Blocks of a file that are read again before it gets its name.
@@ -92,6 +96,20 @@ def _destroy(dataset: gdal.Dataset) -> None:
         dataset.Close()
     else:
         gdal.Dataset.__swig_destroy__(dataset)
+
+
+def png_bytes(pixels: NDArray[np.uint8]) -> bytes:
+    """Encode pixels ``(bands, rows, columns)`` as PNG: two bands are grey and alpha, four are RGBA."""
+    count, rows, columns = pixels.shape
+    memory = gdal.GetDriverByName("MEM").Create("", columns, rows, count, gdal.GDT_Byte)
+    memory.WriteArray(pixels)
+    path = f"/vsimem/ortho_png_{secrets.token_hex(8)}.png"
+    try:
+        # More effort makes such a picture hardly smaller, and takes four times as long.
+        close(gdal.GetDriverByName("PNG").CreateCopy(path, memory, options=["ZLEVEL=4"]))
+        return VsiPath(path).read_bytes()
+    finally:
+        gdal.Unlink(path)
 
 
 def check_written(

@@ -1,15 +1,14 @@
-"""The preview of the orthoimage as PNG, without an imaging library."""
+"""The preview of the orthoimage as PNG."""
 
 from __future__ import annotations
 
-import struct
-import zlib
 from os import PathLike
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ortho_pipeline.raster.output import png_bytes
 from ortho_pipeline.raster.source import open_pixels
 
 #: GDAL's number for averaging in a raster read.
@@ -30,7 +29,7 @@ def preview_png(path: str | PathLike[str], *, side: int = 800) -> bytes:
     # Without overviews an average has to look at every pixel, which takes as long as making them did.
     way = {"resample_alg": _AVERAGE} if bands[0].GetOverviewCount() else {}
     planes = [_stretched(np.abs(band.ReadAsArray(**way, **reading)), mask) for band in bands]
-    return _png(np.stack([*planes, np.where(mask, 255, 0).astype(np.uint8)], axis=2))
+    return png_bytes(np.stack([*planes, np.where(mask, 255, 0).astype(np.uint8)]))
 
 
 def _stretched(values: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -41,17 +40,3 @@ def _stretched(values: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[np.uint
     low, high = np.percentile(seen, [1.0, 99.0])
     scaled = np.clip((values - low) / max(high - low, 1e-12), 0.0, 1.0)
     return np.nan_to_num(scaled * 255.0).astype(np.uint8)
-
-
-def _png(pixels: NDArray[np.uint8]) -> bytes:
-    """Encode ``(rows, columns, 2 or 4)`` grey-alpha or RGBA bytes (PNG specification, filter "up")."""
-    rows, columns, channels = pixels.shape
-    before = np.concatenate([np.zeros_like(pixels[:1]), pixels[:-1]])
-    lines = np.full((rows, 1 + columns * channels), 2, dtype=np.uint8)
-    lines[:, 1:] = (pixels - before).reshape(rows, -1)
-    header = struct.pack(">IIBBBBB", columns, rows, 8, 4 if channels == 2 else 6, 0, 0, 0)
-    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 4)), (b"IEND", b"")]
-    body = b"".join(
-        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
-    )
-    return b"\x89PNG\r\n\x1a\n" + body

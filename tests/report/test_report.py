@@ -8,7 +8,6 @@ import re
 import struct
 import subprocess
 import sys
-import zlib
 from html.parser import HTMLParser
 from typing import Any
 
@@ -469,6 +468,7 @@ def test_preview_is_a_png_with_transparent_nodata(tmp_path, bands, colour_type):
     assert decoded[0, -1, -1] == 255
     assert decoded[-1, 10, 10] == 255
     gdal.Unlink("/vsimem/preview.png")
+    assert not [name for name in gdal.ReadDir("/vsimem/") or () if name.startswith("ortho_png")]
 
 
 def test_preview_of_an_empty_ortho(tmp_path):
@@ -478,9 +478,9 @@ def test_preview_of_an_empty_ortho(tmp_path):
     dataset.GetRasterBand(1).SetNoDataValue(float("nan"))
     del dataset
     png = report.preview_png(path)
-    start = png.index(b"IDAT") + 4
-    pixels = zlib.decompress(png[start : start + struct.unpack(">I", png[start - 8 : start - 4])[0]])
-    assert set(pixels) <= {0, 2}
+    gdal.FileFromMemBuffer("/vsimem/preview.png", png)
+    assert not gdal.Open("/vsimem/preview.png").ReadAsArray().any()
+    gdal.Unlink("/vsimem/preview.png")
 
 
 def test_import_is_light():
