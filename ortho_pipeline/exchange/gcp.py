@@ -30,7 +30,7 @@ from ortho_pipeline.exchange.rpc import (
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points
-from ortho_pipeline.raster.output import close, raster_output
+from ortho_pipeline.raster.output import close, raster_output, written
 from ortho_pipeline.surface.dem import Surface
 from ortho_pipeline.surface.footprint import image_grid
 from ortho_pipeline.surface.rays import intersect
@@ -224,10 +224,10 @@ def write_gcps(dataset: gdal.Dataset, gcps: Gcps, path: str | PathLike[str]) -> 
         else:
             options = ["COMPRESS=DEFLATE", "TILED=YES", "BIGTIFF=IF_SAFER"]
             close(gdal.GetDriverByName("GTiff").CreateCopy(os.fspath(temporary), view, options=options))
-        written = gdal.OpenEx(os.fspath(temporary), gdal.OF_RASTER, allowed_drivers=["VRT", "GTiff"])
-        again = np.array([[p.GCPPixel, p.GCPLine, p.GCPX, p.GCPY, p.GCPZ] for p in written.GetGCPs()])
+        copy = gdal.OpenEx(os.fspath(temporary), gdal.OF_RASTER, allowed_drivers=["VRT", "GTiff"])
+        again = np.array([[p.GCPPixel, p.GCPLine, p.GCPX, p.GCPY, p.GCPZ] for p in copy.GetGCPs()])
         # A VRT keeps four decimals of pixels and twelve of degrees.
-        other = written.GetMetadata("RPC") or written.GetGeoTransform(can_return_null=True)
+        other = copy.GetMetadata("RPC") or copy.GetGeoTransform(can_return_null=True)
         if again.shape != gcps.shape or np.abs(again - gcps).max() > 1e-4 or other:
             raise ModelError("the control points that were written are others when they are read again", file=path)
 
@@ -285,12 +285,12 @@ def write_geolocation(
         )  # fmt: skip
     arrays = path.resolve().with_suffix(".tif")
     with raster_output(arrays) as temporary:
-        raster = gdal.GetDriverByName("GTiff").Create(
+        made = gdal.GetDriverByName("GTiff").Create(
             os.fspath(temporary), len(across), len(down), 2, gdal.GDT_Float64, options=["COMPRESS=DEFLATE"]
         )
-        for k in (0, 1):
-            raster.GetRasterBand(k + 1).WriteArray(np.ascontiguousarray(lonlat[:, :, k]))
-        close(raster)
+        with written(made) as raster:
+            for k in (0, 1):
+                raster.GetRasterBand(k + 1).WriteArray(np.ascontiguousarray(lonlat[:, :, k]))
     view = _without_georeferencing(dataset)
     view.SetMetadata(
         {"X_DATASET": str(arrays), "X_BAND": "1", "Y_DATASET": str(arrays), "Y_BAND": "2", "PIXEL_OFFSET": "0",

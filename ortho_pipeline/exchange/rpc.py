@@ -35,7 +35,7 @@ from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.rational import RPC, rpc_terms
 from ortho_pipeline.models.rpc_box import has_pole
-from ortho_pipeline.raster.output import close, raster_output
+from ortho_pipeline.raster.output import close, raster_output, written
 from ortho_pipeline.raster.source import open_dataset
 
 __all__ = [
@@ -223,10 +223,9 @@ def write_vrt(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> Non
         If the file does not give the same RPC again.
     """
     with raster_output(path) as temporary:
-        copy = gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), dataset)
-        copy.SetGCPs([], "")
-        copy.SetMetadata(rpc_metadata(rpc), "RPC")
-        close(copy)
+        with written(gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), dataset)) as copy:
+            copy.SetGCPs([], "")
+            copy.SetMetadata(rpc_metadata(rpc), "RPC")
         name_sources_relatively(temporary, Path(path))
         _check_written(gdal.OpenEx(os.fspath(temporary), gdal.OF_RASTER, allowed_drivers=["VRT"]), rpc, path)
 

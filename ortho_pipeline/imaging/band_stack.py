@@ -11,7 +11,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.imaging.registration import Registration, register
-from ortho_pipeline.raster.output import close, raster_output
+from ortho_pipeline.raster.output import raster_output, written
 from ortho_pipeline.raster.source import open_pixels
 
 
@@ -67,12 +67,12 @@ def write_bands(
     kind = gdal.GDT_Byte if stack.dtype == np.uint8 else gdal.GDT_UInt16
     with raster_output(output) as temporary:
         options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "TILED=YES", "BIGTIFF=IF_SAFER"]
-        dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, count, kind, options)
-        for index, name in enumerate(names, start=1):
-            band = dataset.GetRasterBand(index)
-            band.SetDescription(name)
-            if nodata is not None:
-                band.SetNoDataValue(nodata)
-            band.WriteArray(stack[index - 1])
-        del band
-        close(dataset)
+        made = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, count, kind, options)
+        with written(made) as dataset:
+            for index, name in enumerate(names, start=1):
+                band = dataset.GetRasterBand(index)
+                band.SetDescription(name)
+                if nodata is not None:
+                    band.SetNoDataValue(nodata)
+                band.WriteArray(stack[index - 1])
+            del band

@@ -190,23 +190,21 @@ class RasterWriter:
 
         profile, grid = self.profile, self.grid
         code = gdal_array.NumericTypeCodeToGDALTypeCode(profile.dtype.type)
-        with gdal_errors(self.path):
+        with gdal_errors(self.path), contextlib.ExitStack() as failed:
             dataset = gdal.GetDriverByName("GTiff").Create(
                 str(path), grid.width, grid.height, profile.count, code, [f"{k}={v}" for k, v in options.items()]
             )
-        dataset.SetProjection(grid.crs.to_wkt())
-        dataset.SetGeoTransform(grid.geotransform)
-        dataset.SetMetadataItem("AREA_OR_POINT", "Area")
-        for key, value in profile.metadata.items():
-            dataset.SetMetadataItem(key, value)
-        for i in range(profile.count):
-            _describe(dataset.GetRasterBand(i + 1), profile, i)
-        if profile.validity == "mask":
-            gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", "YES")
-            try:
+            failed.callback(abandon, dataset)
+            dataset.SetProjection(grid.crs.to_wkt())
+            dataset.SetGeoTransform(grid.geotransform)
+            dataset.SetMetadataItem("AREA_OR_POINT", "Area")
+            for key, value in profile.metadata.items():
+                dataset.SetMetadataItem(key, value)
+            for i in range(profile.count):
+                _describe(dataset.GetRasterBand(i + 1), profile, i)
+            if profile.validity == "mask":
                 dataset.CreateMaskBand(gdal.GMF_PER_DATASET)
-            finally:
-                gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", None)
+            failed.pop_all()
         return dataset
 
     def _finish(self) -> None:

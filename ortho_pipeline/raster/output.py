@@ -35,7 +35,7 @@ _SAMPLES = 12
 def raster_output(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path for a raster that is written by GDAL and appears at `path` when it is whole.
 
-    What is written has to be closed by `close` within the block. Masks go into the file itself.
+    What is written has to be closed by `close` or `written` within the block. Masks go into the file itself.
 
     Raises
     ------
@@ -82,6 +82,27 @@ def close(dataset: gdal.Dataset | None) -> None:
         abandon(dataset)
         raise
     _destroy(dataset)
+
+
+@contextlib.contextmanager
+def written(dataset: gdal.Dataset | None) -> Iterator[gdal.Dataset]:
+    """Yield a new dataset to be filled; close it when the block ends well, and throw it away when it does not.
+
+    A dataset that an exception leaves behind would be closed by Python, which prints what GDAL cannot write then.
+
+    Raises
+    ------
+    RuntimeError
+        As `close`.
+    """
+    if dataset is None:
+        close(None)
+    try:
+        yield dataset
+    except BaseException:
+        abandon(dataset)
+        raise
+    close(dataset)
 
 
 def abandon(dataset: gdal.Dataset | None) -> None:

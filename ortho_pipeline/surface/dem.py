@@ -23,7 +23,7 @@ from pyproj.exceptions import CRSError
 from ortho_pipeline.errors import CoverageError, CrsError, DatumError, InputError
 from ortho_pipeline.geodesy.crs import Vertical, declared_vertical, ground_transform, horizontal, parse_crs
 from ortho_pipeline.geodesy.datum import dem_unit, dem_vertical, dem_vertical_remedy
-from ortho_pipeline.raster.output import close, raster_output
+from ortho_pipeline.raster.output import raster_output, written
 from ortho_pipeline.raster.source import first_line, open_pixels
 from ortho_pipeline.surface.voids import nearest_heights
 
@@ -537,14 +537,12 @@ def write_dem(path: str | os.PathLike[str], heights: Array, corner: tuple[float,
     rows, columns = heights.shape
     options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9", "TILED=YES"]
     with raster_output(path) as temporary:
-        dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, 1, gdal.GDT_Float32, options)
-        dataset.SetGeoTransform((corner[0], step, 0.0, corner[1], 0.0, -step))
-        dataset.SetProjection(system.ExportToWkt())
-        band = dataset.GetRasterBand(1)
-        band.SetNoDataValue(-32768.0)
-        band.WriteArray(heights.astype(np.float32))
-        del band
-        close(dataset)
+        made = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, 1, gdal.GDT_Float32, options)
+        with written(made) as dataset:
+            dataset.SetGeoTransform((corner[0], step, 0.0, corner[1], 0.0, -step))
+            dataset.SetProjection(system.ExportToWkt())
+            dataset.GetRasterBand(1).SetNoDataValue(-32768.0)
+            dataset.GetRasterBand(1).WriteArray(heights.astype(np.float32))
 
 
 def write_terrain(

@@ -34,7 +34,7 @@ from ortho_pipeline.exchange.rpc import REFUSE_ERROR, RpcExport, rpc_metadata
 from ortho_pipeline.geodesy.crs import GroundTransform, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
-from ortho_pipeline.raster.output import close, gdal_errors
+from ortho_pipeline.raster.output import gdal_errors, written
 from ortho_pipeline.raster.source import Grid, RasterSource, first_line
 from ortho_pipeline.surface.dem import Surface
 
@@ -190,10 +190,10 @@ def warp_with_gdal(
             scratch.callback(temporary.unlink, missing_ok=True)
         transformer = _standing(exact, exported, source.dataset, arrays, scratch)
         view = transformer.source(source.dataset, tuple(source.band_numbers))
-        ortho = _empty(target, profile, grid)
-        transformer.georeference(ortho, grid)
-        _warp_exactly(view, ortho, source, profile, transformer, resampling, memory, threads, progress)
-        close(ortho)
+        with written(_create(target, profile, grid)) as ortho:
+            _describe(ortho, profile)
+            transformer.georeference(ortho, grid)
+            _warp_exactly(view, ortho, source, profile, transformer, resampling, memory, threads, progress)
         valid = writer.copy(target)
         refuse_empty(valid, path)
         return transformer, valid
@@ -279,12 +279,11 @@ def _heights_under(surface: Surface, grid: Grid) -> tuple[Array, tuple[float, ..
 
 def _write_dem(path: str, heights: Array, geotransform: tuple[float, ...], surface: Surface) -> None:
     rows, columns = heights.shape
-    dataset = gdal.GetDriverByName("GTiff").Create(path, columns, rows, 1, gdal.GDT_Float64)
-    dataset.SetProjection(surface.crs.to_wkt())
-    dataset.SetGeoTransform(geotransform)
-    dataset.GetRasterBand(1).SetNoDataValue(-1e6)
-    dataset.GetRasterBand(1).WriteArray(np.where(np.isnan(heights), -1e6, heights))
-    close(dataset)
+    with written(gdal.GetDriverByName("GTiff").Create(path, columns, rows, 1, gdal.GDT_Float64)) as dataset:
+        dataset.SetProjection(surface.crs.to_wkt())
+        dataset.SetGeoTransform(geotransform)
+        dataset.GetRasterBand(1).SetNoDataValue(-1e6)
+        dataset.GetRasterBand(1).WriteArray(np.where(np.isnan(heights), -1e6, heights))
 
 
 def _control(model: SensorModel) -> tuple[gdal.GCP, ...]:
@@ -301,36 +300,39 @@ def _write_arrays(exact: Exact, path: Path) -> None:
     """Write the column and row in the image of the centre of every output pixel."""
     width, height = exact.grid.width, exact.grid.height
     options = ["BIGTIFF=IF_SAFER", "INTERLEAVE=BAND"]
-    dataset = gdal.GetDriverByName("GTiff").Create(os.fspath(path), width, height, 2, gdal.GDT_Float64, options)
-    for k in (1, 2):
-        dataset.GetRasterBand(k).SetNoDataValue(_NO_PLACE)
+    made = gdal.GetDriverByName("GTiff").Create(os.fspath(path), width, height, 2, gdal.GDT_Float64, options)
     step = max(1, _PIECE // width)
-    for top in range(0, height, step):
-        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(top, min(top + step, height)) + 0.5)
-        image = exact.image(columns.ravel(), rows.ravel())
-        image = np.clip(image, -_FAR, np.array(exact.size) + _FAR)  # NaN stays NaN
-        image = np.where(np.isnan(image).any(axis=1, keepdims=True), _NO_PLACE, image).reshape(*columns.shape, 2)
-        for k in (0, 1):
-            dataset.GetRasterBand(k + 1).WriteArray(np.ascontiguousarray(image[:, :, k]), 0, top)
-    close(dataset)
+    with written(made) as dataset:
+        for k in (1, 2):
+            dataset.GetRasterBand(k).SetNoDataValue(_NO_PLACE)
+        for top in range(0, height, step):
+            columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(top, min(top + step, height)) + 0.5)
+            image = exact.image(columns.ravel(), rows.ravel())
+            image = np.clip(image, -_FAR, np.array(exact.size) + _FAR)  # NaN stays NaN
+            image = np.where(np.isnan(image).any(axis=1, keepdims=True), _NO_PLACE, image).reshape(*columns.shape, 2)
+            for k in (0, 1):
+                dataset.GetRasterBand(k + 1).WriteArray(np.ascontiguousarray(image[:, :, k]), 0, top)
 
 
 # -- the warp ----------------------------------------------------------------------------------------------------------
 
 
-def _empty(path: Path, profile: Profile, grid: Grid) -> gdal.Dataset:
+def _create(path: Path, profile: Profile, grid: Grid) -> gdal.Dataset:
     """Create the raster that GDAL warps into; its last band is the mask, if the profile has one."""
     mask = profile.validity == "mask"
-    dataset = gdal.GetDriverByName("GTiff").Create(
+    return gdal.GetDriverByName("GTiff").Create(
         os.fspath(path), grid.width, grid.height, profile.count + mask, _gdal_type(profile.dtype),
         ["TILED=YES", "BIGTIFF=IF_SAFER"],
     )  # fmt: skip
+
+
+def _describe(dataset: gdal.Dataset, profile: Profile) -> None:
+    """Say which pixels of the raster that GDAL warps into have no value."""
     if profile.validity in ("mask", "alpha"):
         dataset.GetRasterBand(dataset.RasterCount).SetColorInterpretation(gdal.GCI_AlphaBand)
     if profile.nodata is not None:
         for k in range(profile.count):
             dataset.GetRasterBand(k + 1).SetNoDataValue(profile.nodata)
-    return dataset
 
 
 def _gdal_type(dtype: np.dtype[Any]) -> int:

@@ -21,7 +21,7 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.imaging.registration import details, measure
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
-from ortho_pipeline.raster.output import close, raster_output
+from ortho_pipeline.raster.output import raster_output, written
 from ortho_pipeline.raster.source import Grid, RasterSource, limit_cache
 from ortho_pipeline.raster.valid_area import grid_of, valid_outline
 
@@ -138,13 +138,13 @@ def write_vrt(layout: Layout, path: Path) -> None:
     """
     names = [str(layer.ortho.path) for layer in reversed(layout.layers)]
     with raster_output(path) as temporary:
-        dataset = gdal.BuildVRT(
+        made = gdal.BuildVRT(
             str(temporary), names, outputBounds=layout.grid.extent, xRes=layout.grid.dx, yRes=layout.grid.dy,
             resolution="user",
         )  # fmt: skip
-        size = dataset.RasterXSize, dataset.RasterYSize
-        listed = {Path(name).resolve() for name in dataset.GetFileList()}
-        close(dataset)
+        with written(made) as dataset:
+            size = dataset.RasterXSize, dataset.RasterYSize
+            listed = {Path(name).resolve() for name in dataset.GetFileList()}
         missing = [layer.ortho.name for layer in layout.layers if layer.ortho.path.resolve() not in listed]
         if missing or size != (layout.grid.width, layout.grid.height):
             raise InputError(f"GDAL leaves out {', '.join(missing) or 'pixels'}", file=path, remedy="make a COG of it")

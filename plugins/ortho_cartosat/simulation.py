@@ -20,7 +20,7 @@ from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.selection import select_control
-from ortho_pipeline.raster.output import close, raster_output
+from ortho_pipeline.raster.output import raster_output, written
 from ortho_pipeline.surface.dem import write_terrain
 
 MAP, GEOID = simulated.MAP_CRS, "EPSG:5773"
@@ -115,9 +115,9 @@ def _write_image(pixels: np.ndarray[Any, Any], path: Path) -> None:
     rows, columns = pixels.shape
     options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9", "TILED=YES"]
     with raster_output(path) as temporary:
-        dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, 1, gdal.GDT_UInt16, options)
-        dataset.GetRasterBand(1).WriteArray(pixels)
-        close(dataset)
+        made = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, 1, gdal.GDT_UInt16, options)
+        with written(made) as dataset:
+            dataset.GetRasterBand(1).WriteArray(pixels)
 
 
 def _write_points(tables: Mapping[str, Points], path: Path) -> None:

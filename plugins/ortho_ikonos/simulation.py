@@ -19,7 +19,7 @@ from ortho_pipeline.exchange.rpc import fit_rpc, write_rpc_txt
 from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points, write_points
-from ortho_pipeline.raster.output import close, raster_output
+from ortho_pipeline.raster.output import raster_output, written
 from ortho_pipeline.surface.dem import write_terrain
 
 ORDER = "39001"
@@ -171,13 +171,13 @@ def _write_tiff(path: Path, pixels: Array, grid: GeoScene) -> None:
     system.SetFromUserInput(simulated.MAP_CRS)
     options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9"]
     with raster_output(path) as temporary:
-        dataset = gdal.GetDriverByName("GTiff").Create(
+        made = gdal.GetDriverByName("GTiff").Create(
             str(temporary), grid.columns, grid.rows, 1, gdal.GDT_UInt16, options
         )
-        dataset.SetGeoTransform((grid.west, grid.pixel, 0.0, grid.north, 0.0, -grid.pixel))
-        dataset.SetProjection(system.ExportToWkt())
-        dataset.GetRasterBand(1).WriteArray(pixels)
-        close(dataset)
+        with written(made) as dataset:
+            dataset.SetGeoTransform((grid.west, grid.pixel, 0.0, grid.north, 0.0, -grid.pixel))
+            dataset.SetProjection(system.ExportToWkt())
+            dataset.GetRasterBand(1).WriteArray(pixels)
 
 
 def _write_heights(scene: GeoScene, step: float, path: Path) -> None:

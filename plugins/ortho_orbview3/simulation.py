@@ -20,7 +20,7 @@ from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.points import write_points
-from ortho_pipeline.raster.output import close, raster_output
+from ortho_pipeline.raster.output import raster_output, written
 from ortho_pipeline.surface.dem import write_terrain
 
 GEOID = "EPSG:5773"
@@ -159,9 +159,9 @@ def _write_image(pixels: NDArray[np.uint16], path: Path) -> None:
     rows, columns = pixels.shape
     options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9", "TILED=YES", "BIGTIFF=IF_SAFER"]
     with raster_output(path) as temporary:
-        dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, 1, gdal.GDT_UInt16, options)
-        dataset.GetRasterBand(1).WriteArray(pixels)
-        close(dataset)
+        made = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, 1, gdal.GDT_UInt16, options)
+        with written(made) as dataset:
+            dataset.GetRasterBand(1).WriteArray(pixels)
 
 
 def _write_heights(cameras: dict[str, simulated.Scanner], coast: simulated.Coast, step: float, path: Path) -> None:
