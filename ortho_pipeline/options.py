@@ -1,11 +1,17 @@
-"""What a user can ask for, grouped as the pipeline takes it; every field has the default of the command line."""
+"""What a user can ask for, grouped as the pipeline takes it.
 
-from __future__ import annotations
+Each option is stated here, once: its field and default, and in an `Option` what the command line and the pipeline file
+make their own options from. Messages name an option as ``group.field`` between backticks, with a value after an equals
+sign where one is meant (``surface.height=500``): so it is called in Python and in the pipeline file, and the command
+line shows its flag.
+"""
 
+# Annotations are read from the classes: as values, not as text.
+import inspect
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any, Literal, Protocol, TypeVar, get_args
 
 #: What a file of points calls the first pixel -> what is added to reach (0, 0) at its outer corner.
 PIXEL_ORIGINS = {
@@ -16,37 +22,110 @@ PIXEL_ORIGINS = {
 }
 #: Types of pixels that an ortho may have, by GDAL's names.
 PIXEL_TYPES = ("Byte", "UInt16", "Int16", "UInt32", "Int32", "Float32", "Float64")
+#: What is adjusted: nothing, the image points, or the parameters of the model itself.
+CORRECTIONS = ("none", "shift", "shift-drift", "affine", "model")
+
+#: How the value of an option is written, where choices or a field that is true or false do not say it.
+Kind = Literal[
+    "text", "file", "number", "integer", "pair", "box", "one or two", "number or word", "number or nan", "bytes",
+    "integers", "folders", "keys",
+]  # fmt: skip
+PathLike = str | os.PathLike[str]
 
 
 @dataclass(frozen=True)
-class SceneOptions:
-    """How the image is opened.
+class Option:
+    """What users read of a field, and what they may give.
 
     Parameters
     ----------
-    sensor : str, optional
-        Name of the sensor, where several or none recognise the image.
-    rpc : str, optional
-        ``tag``, ``sidecar`` or an RPC file.
-    model : path, optional
-        A model file that takes the place of the image's own model.
-    allow_network : bool
-        Whether URLs and GDAL's network file systems may be opened.
-    roots : sequence of path
-        Folders that an image may refer to, besides its own: sources of a VRT have to lie there.
-    sensor_options : mapping of str to str
-        Options that the sensor declares (`ortho sensors`).
-    crop_offset : (float, float), optional
-        Column and row of the first pixel in the image that the model belongs to, where this one is a crop of it.
+    flags : str
+        On the command line, the one that messages show first.
+    help : str
+        One sentence.
+    metavar : str
+        What stands for the value; its forms, if there are several, with bars between.
+    unset : str
+        What holds where the option is not given and the field has no default that says it.
+    choices : sequence of str
+        The only values.
+    above, below : float, optional
+        Bounds that are no values themselves.
+    in_file : bool
+        Whether the file of `ortho run` has it.
     """
 
-    sensor: str | None = None
-    rpc: str | None = None
-    model: str | os.PathLike[str] | None = None
-    allow_network: bool = False
-    roots: Sequence[str | os.PathLike[str]] = ()
-    sensor_options: Mapping[str, str] = field(default_factory=dict)
-    crop_offset: Sequence[float] | None = None
+    flags: str
+    help: str = ""
+    metavar: str | None = None
+    unset: str = ""
+    kind: Kind = "text"
+    choices: Sequence[str] = ()
+    above: float | None = None
+    below: float | None = None
+    in_file: bool = True
+
+
+_T = TypeVar("_T")
+
+
+def options_of(group: type) -> dict[str, Option]:
+    """Return the option of each field of a group."""
+    return {one.name: get_args(one.type)[1] for one in fields(group)}
+
+
+def _documented(group: type[_T]) -> type[_T]:
+    """Add the parameters to the docstring of a group."""
+    lines = []
+    for one in fields(group):  # type: ignore[arg-type]
+        option: Option = get_args(one.type)[1]
+        said = " ".join(part for part in (option.help, option.unset and f"Default: {option.unset}.") if part)
+        kind = (
+            f"{{{', '.join(map(repr, option.choices))}}}"
+            if option.choices
+            else inspect.formatannotation(get_args(one.type)[0])
+        )
+        lines.append(f"{one.name} : {kind}\n    {said}")
+    group.__doc__ = f"{group.__doc__}\n\nParameters\n----------\n" + "\n".join(lines)
+    return group
+
+
+@_documented
+@dataclass(frozen=True)
+class SceneOptions:
+    """How the image is opened."""
+
+    sensor: Annotated[
+        str | None, Option("--sensor", "Sensor of the image (see 'ortho sensors').", "NAME"),
+    ] = None  # fmt: skip
+    rpc: Annotated[
+        str | None,
+        Option("--rpc", "Which RPC, where there are several, or an RPC file.", "tag|sidecar|FILE"),
+    ] = None
+    model: Annotated[
+        PathLike | None, Option("--model", "A saved *_model.json in place of the image's model.", kind="file")
+    ] = None
+    crop_offset: Annotated[
+        Sequence[float] | None,
+        Option(
+            "--crop-offset", "First pixel of this image in the one that its model belongs to, where it is a crop.",
+            "COL,ROW", kind="pair",
+        ),
+    ] = None  # fmt: skip
+    sensor_options: Annotated[
+        Mapping[str, str],
+        Option("--sensor-option", "Option of the sensor (see 'ortho sensors').", "K=V", kind="keys"),
+    ] = field(default_factory=dict)
+    allow_network: Annotated[
+        bool, Option("--allow-network", "Open URLs (http, https, s3, gs, az) and /vsi paths.", in_file=False)
+    ] = False
+    roots: Annotated[
+        Sequence[PathLike],
+        Option(
+            "--root", "A folder that files may lead to (a VRT), besides their own.", "DIR", kind="folders",
+            in_file=False,
+        ),
+    ] = ()  # fmt: skip
 
     @property
     def access(self) -> dict[str, Any]:
@@ -75,153 +154,259 @@ class PointTable(Protocol):
     def source(self) -> str: ...
 
 
+_VERTICAL_FORMS = "ellipsoid, egm96, egm2008, EPSG:n or a grid file"
+_PIXEL_ORIGIN = Option(
+    "--pixel-origin",
+    "What CSV, ODM and link files call the first pixel: its outer corner or its centre (0, 0), or its corner or its "
+    "centre (1, 1).",
+    choices=tuple(PIXEL_ORIGINS),
+)
+_CHECK = Option("--check", "Points that check and do not control.", "every:N|ids:A,B")
+_MODEL_CRS = "Ground of fitted models: geocentric, geographic, utm or EPSG:n."
+
+
+@_documented
 @dataclass(frozen=True)
 class PointOptions:
     """Which points there are, and what is adjusted to them.
 
-    Parameters
-    ----------
-    gcps : path or Points, optional
-        A file of points, ``own`` for those in the image, or points that are read already, in pixels of this image.
-    crs, vertical : str, optional
-        For files that do not say.
-    pixel_origin : one of `PIXEL_ORIGINS`
-        What files that do not say it (CSV, ODM and link files) call the first pixel.
-    check : str, optional
-        ``every:N`` or ``ids:a,b``: which points only check.
-    select : str, optional
-        ``even:N``, ``cluster:N``, ``ids:a,b`` or ``random:N:seed``: which points control; the others check.
-    correction : {'none', 'shift', 'shift-drift', 'affine', 'model'}, optional
-        A correction in image space, or 'model': the model's own parameters, weighted by what the sensor says of them.
-        Default: shift if there are control points.
-    fit_model : str, optional
-        A model family (`ortho models`) that is fitted to the points alone, in place of the image's own model.
-    model_crs : str, optional
-        Ground CRS of that family: geocentric, geographic, utm or EPSG:n; that of the points by default.
-    prune : bool
-        Remove parameters that the points do not justify.
-    params : str, optional
-        ``a,b,c``: the only parameters that are adjusted.
-    significance : float
-        Chance of calling a parameter justified that is zero.
-    ridge : str
-        Regularisation of a fitted family: ``auto``, ``none``, ``gcv``, ``lcurve`` or its weight.
-    near : float, optional
-        Distance (m) below which points are neighbours in the analysis of the residuals.
+    `gcps` may be points that are read already, in pixels of this image, too.
     """
 
-    gcps: str | os.PathLike[str] | PointTable | None = None
-    crs: str | None = None
-    vertical: str | None = None
-    pixel_origin: str = "corner"
-    check: str | None = None
-    select: str | None = None
-    correction: str | None = None
-    fit_model: str | None = None
-    model_crs: str | None = None
-    prune: bool = False
-    params: str | None = None
-    significance: float = 0.05
-    ridge: str = "auto"
-    near: float | None = None
+    gcps: Annotated[
+        PathLike | PointTable | None,
+        Option(
+            "--gcps",
+            "Points: CSV, GeoJSON, QGIS .points, ODM gcp_list.txt, ENVI .pts, ASP .gcp, ArcGIS link table; or 'own' "
+            "for those in the image.",
+            "FILE|own",
+        ),
+    ] = None
+    crs: Annotated[str | None, Option("--points-crs", "CRS of the points, where their file has none.", "CRS")] = None
+    vertical: Annotated[
+        str | None, Option("--points-vertical", f"Height datum of the points: {_VERTICAL_FORMS}.", "DATUM")
+    ] = None
+    pixel_origin: Annotated[str, _PIXEL_ORIGIN] = "corner"
+    check: Annotated[str | None, _CHECK] = None
+    select: Annotated[
+        str | None,
+        Option(
+            "--select", "Points that control: N well spread, N of one region, these, or N by lot; all others check.",
+            "even:N|cluster:N|ids:A,B|random:N:SEED",
+        ),
+    ] = None  # fmt: skip
+    correction: Annotated[
+        str | None,
+        Option(
+            "--correction",
+            "What is adjusted: the image points, or the parameters of the model itself, such as the exterior "
+            "orientation of a frame.",
+            unset="shift if there are control points",
+            choices=CORRECTIONS,
+        ),
+    ] = None
+    fit_model: Annotated[
+        str | None,
+        Option(
+            "--fit-model",
+            "Fit a model from the points alone (see 'ortho models'), in place of the image's own.",
+            "NAME",
+        ),
+    ] = None
+    model_crs: Annotated[
+        str | None, Option("--model-crs", _MODEL_CRS, "CRS", unset="that of the points")
+    ] = None  # fmt: skip
+    prune: Annotated[bool, Option("--prune", "Remove parameters that the points do not justify.")] = False
+    params: Annotated[str | None, Option("--params", "Adjust these parameters only.", "A,B,C", unset="all")] = None
+    significance: Annotated[
+        float,
+        Option(
+            "--significance", "Above this chance (p) a parameter is not justified.", kind="number", above=0, below=1
+        ),
+    ] = 0.05  # fmt: skip
+    ridge: Annotated[
+        str,
+        Option("--ridge", "Regularisation of fitted models: found, or of this weight.", "auto|none|gcv|lcurve|W"),
+    ] = "auto"
+    near: Annotated[
+        float | None,
+        Option(
+            "--near", "Points closer than this are neighbours in the analysis of residuals.", "M",
+            kind="number", above=0,
+        ),
+    ] = None  # fmt: skip
 
 
+@_documented
 @dataclass(frozen=True)
 class BlockOptions:
     """Which points of a block there are, and what is adjusted to them.
 
-    Parameters
-    ----------
-    points : path
-        Rays: which point was measured where in which image.
-    gcps : path, optional
-        Ground of the points, where that file does not have it.
-    crs, vertical : str, optional
-        For files that do not say.
-    pixel_origin : one of `PIXEL_ORIGINS`
-        What files that do not say it (CSV, ODM and link files) call the first pixel.
-    check : str, optional
-        ``every:N`` or ``ids:a,b``: which control points only check.
-    model : str, optional
-        A name among the models of each scene, or a family (`ortho models`) that is fitted to the control points of
-        each image; the scene's best model by default.
-    model_crs : str, optional
-        Ground CRS of that family: geocentric, geographic, utm or EPSG:n.
-    correction : {'none', 'shift', 'shift-drift', 'affine', 'model'}, optional
-        What is adjusted: a correction in image space, or the model's own parameters. Default: the model's own where it
-        has any, else a shift.
-    hold : float, optional
-        Sigma (px) with which the orientation is held at its start values.
-    ground_sigma : str, optional
-        ``XY`` or ``XY,H``: sigmas (m) in plan and height of ground that states none; estimated by default.
+    `model` is a name among the models of each scene, or a family that is fitted to the control points of each image.
     """
 
-    points: str | os.PathLike[str]
-    gcps: str | os.PathLike[str] | None = None
-    crs: str | None = None
-    vertical: str | None = None
-    pixel_origin: str = "corner"
-    check: str | None = None
-    model: str | None = None
-    model_crs: str | None = None
-    correction: str | None = None
-    hold: float | None = None
-    ground_sigma: str | None = None
+    points: Annotated[
+        PathLike,
+        Option(
+            "--points",
+            "Rays: CSV (id,image,col,row[,x,y,h,role,...]), GeoJSON with 'ji' by image, or ODM gcp_list.txt.",
+            "FILE",
+        ),
+    ]
+    gcps: Annotated[
+        PathLike | None, Option("--gcps", "Ground of the points: CSV (id,x,y,h,...) or GeoJSON.", "FILE")
+    ] = None
+    crs: Annotated[str | None, Option("--points-crs", "CRS of the ground, where its file has none.", "CRS")] = None
+    vertical: Annotated[
+        str | None, Option("--points-vertical", f"Height datum of the ground: {_VERTICAL_FORMS}.", "DATUM")
+    ] = None
+    pixel_origin: Annotated[str, _PIXEL_ORIGIN] = "corner"
+    check: Annotated[str | None, _CHECK] = None
+    model: Annotated[
+        str | None,
+        Option(
+            "--model",
+            "One of the images' models, such as rpc or pushbroom, or a model fitted to points (see 'ortho models').",
+            "NAME",
+            unset="the images' best",
+        ),
+    ] = None
+    correction: Annotated[
+        str | None,
+        Option(
+            "--correction",
+            "What is adjusted: the image points, or the parameters of the model itself.",
+            unset="the model's own if it has any, else a shift",
+            choices=CORRECTIONS,
+        ),
+    ] = None
+    ground_sigma: Annotated[
+        str | None,
+        Option(
+            "--ground-sigma", "Sigmas (m) in plan and height of ground that states none in the points file.", "XY[,H]",
+            unset="estimated",
+        ),
+    ] = None  # fmt: skip
+    model_crs: Annotated[str | None, Option("--model-crs", _MODEL_CRS, "CRS")] = None
+    hold: Annotated[
+        float | None,
+        Option(
+            "--hold", "Hold the orientation at its start values with this sigma.", "PX", kind="number", above=0,
+            unset="10 where nothing else gives a datum",
+        ),
+    ] = None  # fmt: skip
 
 
+@_documented
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """Where heights come from: a DEM, or one ellipsoidal height in metres.
+    """Where heights come from: a DEM, or one ellipsoidal height in metres."""
 
-    Parameters
-    ----------
-    fill : str
-        ``error``, ``mask``, ``nearest`` or a height: what is done where the DEM has no height.
-    override_vertical : bool
-        Believe `vertical` even where the DEM declares another height datum.
-    """
+    dem: Annotated[PathLike | None, Option("--dem", "Digital elevation model.", "FILE")] = None
+    vertical: Annotated[
+        str | None, Option("--dem-vertical", f"Height datum of the DEM: {_VERTICAL_FORMS}.", "DATUM")
+    ] = None
+    override_vertical: Annotated[
+        bool,
+        Option("--override-dem-vertical", "Believe `surface.vertical` even where the DEM declares another datum."),
+    ] = False
+    fill: Annotated[
+        str,
+        Option(
+            "--dem-fill",
+            "Where the DEM has no height: stop, leave pixels out, take the nearest, or an ellipsoidal height.",
+            "error|mask|nearest|M",
+            kind="number or word",
+        ),
+    ] = "error"
+    height: Annotated[
+        float | None, Option("--height", "One ellipsoidal height, no DEM.", "M", kind="number")
+    ] = None  # fmt: skip
 
-    dem: str | os.PathLike[str] | None = None
-    vertical: str | None = None
-    override_vertical: bool = False
-    fill: str = "error"
-    height: float | None = None
 
-
+@_documented
 @dataclass(frozen=True)
 class OutputOptions:
-    """What the ortho looks like and how it is computed; `memory` in bytes, `tolerance` in source pixels.
+    """What the ortho looks like and how it is computed; `memory` in bytes."""
 
-    Parameters
-    ----------
-    resolution : float or (float, float), optional
-        Size of a pixel in x and y, in units of the CRS.
-    align : bool
-        Widen `extent` to whole multiples of the resolution (without an extent that is always so).
-    bands : sequence of int
-        Which bands of the image, from 1, in this order; all without.
-    dtype : str, optional
-        GDAL's name of the type of the pixels (`PIXEL_TYPES`); that of the image without.
-    nodata : float or 'nan', optional
-        Value of pixels without an image; without, that of the image, or a mask.
-    stac : bool
-        Ask for a STAC item; `acquired` is the time of acquisition for it where the metadata have none.
-    """
+    crs: Annotated[str | None, Option("--output-crs -t_srs", metavar="CRS", unset="the UTM zone of the scene")] = None
+    resolution: Annotated[
+        float | Sequence[float] | None,
+        Option(
+            "--resolution -tr", "Pixel size in units of the output CRS.", "X [Y]", unset="the ground sample distance",
+            kind="one or two", above=0,
+        ),
+    ] = None  # fmt: skip
+    extent: Annotated[
+        Sequence[float] | None,
+        Option(
+            "--extent -te", "Taken as it is.", "XMIN YMIN XMAX YMAX", unset="the scene's footprint", kind="box"
+        ),
+    ] = None  # fmt: skip
+    align: Annotated[
+        bool, Option("--align -tap", "Widen `output.extent` to whole multiples of the resolution.")
+    ] = False  # fmt: skip
+    resampling: Annotated[
+        str, Option("--resampling -r", choices=("nearest", "bilinear", "cubic", "lanczos", "average"))
+    ] = "bilinear"
+    bands: Annotated[
+        Sequence[int] | None,
+        Option(
+            "--band -b", "Only these bands of the image, from 1, in this order.", "N", unset="all", kind="integers",
+            above=0,
+        ),
+    ] = None  # fmt: skip
+    dtype: Annotated[
+        str | None,
+        Option(
+            "--output-type -ot", "Type of the pixels; values beyond its range are clamped.", "|".join(PIXEL_TYPES),
+            unset="that of the image", choices=PIXEL_TYPES,
+        ),
+    ] = None  # fmt: skip
+    nodata: Annotated[
+        float | str | None,
+        Option(
+            "--nodata -dstnodata", "Value of pixels without an image.", "VALUE", kind="number or nan",
+            unset="that of the image, or a mask",
+        ),
+    ] = None  # fmt: skip
+    dem_interpolation: Annotated[
+        str, Option("--dem-interpolation", "Between the samples of the DEM.", choices=("bilinear", "cubic"))
+    ] = "bilinear"
+    format: Annotated[str, Option("--format -of", choices=("COG", "GTiff"))] = "COG"
+    creation_options: Annotated[
+        Mapping[str, str], Option("--creation-option -co", "Option of GDAL's driver.", "K=V", kind="keys")
+    ] = field(default_factory=dict)
+    engine: Annotated[
+        str,
+        Option(
+            "--engine", "Our warper, or GDAL's with its own transformers, exactly (slow; for comparison).",
+            choices=("ortho", "gdal"),
+        ),
+    ] = "ortho"  # fmt: skip
+    memory: Annotated[
+        int,
+        Option(
+            "--memory -wm", "Bound on windows and caches; or with a unit, such as 2GB.", "MB", kind="bytes",
+            in_file=False,
+        ),
+    ] = 512_000_000  # fmt: skip
+    threads: Annotated[
+        int | None, Option("--threads", unset="all processors", kind="integer", above=0, in_file=False)
+    ] = None
+    tolerance: Annotated[
+        float,
+        Option(
+            "--tolerance", "Bound on the warper's geometric error, in source pixels.", "PX", kind="number", above=0
+        ),
+    ] = 0.01  # fmt: skip
+    stac: Annotated[bool, Option("--stac", "Write a STAC item of the ortho too.")] = False
+    acquired: Annotated[
+        str | None, Option("--acquired", "Time of acquisition (RFC 3339), where the metadata have none.", "TIME")
+    ] = None
 
-    crs: str | None = None
-    resolution: float | Sequence[float] | None = None
-    extent: Sequence[float] | None = None
-    align: bool = False
-    resampling: str = "bilinear"
-    bands: Sequence[int] | None = None
-    dtype: str | None = None
-    nodata: float | str | None = None
-    dem_interpolation: str = "bilinear"
-    format: str = "COG"
-    creation_options: Mapping[str, str] = field(default_factory=dict)
-    engine: str = "ortho"
-    memory: int = 512_000_000
-    threads: int | None = None
-    tolerance: float = 0.01
-    stac: bool = False
-    acquired: str | None = None
+
+#: The groups, by the name that they have in messages, in the pipeline file and as arguments of the commands.
+GROUPS: Mapping[str, type] = {
+    "scene": SceneOptions, "points": PointOptions, "surface": SurfaceOptions, "output": OutputOptions,
+}  # fmt: skip

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
-
 import click
 
 from ortho_pipeline.cli.command import Command
-from ortho_pipeline.cli.options import block_options, folder_option, json_option, sensor_options
+from ortho_pipeline.cli.options import adjustment_options, block_options, folder_option, json_option, sensor_options
 from ortho_pipeline.cli.printing import print_result, print_warnings
 from ortho_pipeline.options import BlockOptions, SceneOptions
 
@@ -23,24 +20,7 @@ _models = click.option(
 @folder_option
 @block_options
 @_models
-@click.option(
-    "--correction",
-    type=click.Choice(["none", "shift", "shift-drift", "affine", "model"]),
-    help="What is adjusted: the image points, or the parameters of the model itself  [default: the model's own if it "
-    "has any, else a shift]",
-)
-@click.option(
-    "--ground-sigma",
-    metavar="XY[,H]",
-    help="Sigmas (m) in plan and height of ground that states none in the points file  [default: estimated]",
-)
-@click.option("--model-crs", metavar="CRS", help="Ground of fitted models: geocentric, geographic, utm or EPSG:n.")
-@click.option(
-    "--hold",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="PX",
-    help="Hold the orientation at its start values with this sigma  [default: 10 where nothing else gives a datum]",
-)
+@adjustment_options
 @sensor_options
 @json_option
 def adjust(
@@ -50,7 +30,6 @@ def adjust(
     models: tuple[str, ...],
     scene: SceneOptions,
     as_json: bool,
-    **adjusted: Any,
 ) -> None:
     """Adjust several IMAGEs and the points that they share (bundle adjustment of a stereo pair or a block).
 
@@ -61,9 +40,7 @@ def adjust(
     from ortho_pipeline.commands import block as blocks
 
     command = click.get_current_context().meta["command"]
-    print_result(
-        blocks.adjust(images, folder, replace(points, **adjusted), scene, models=models, command=command), as_json
-    )
+    print_result(blocks.adjust(images, folder, points, scene, models=models, command=command), as_json)
 
 
 @click.command(cls=Command)

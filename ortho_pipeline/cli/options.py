@@ -1,24 +1,28 @@
-"""The options that several commands share, as decorators; each group arrives as one object of `options`."""
+"""The options that several commands share, made from `options`; each group arrives as one object of that module."""
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, fields
 from typing import Any
 
 import click
 
 from ortho_pipeline.cli.command import Megabytes, OneOrTwo
 from ortho_pipeline.options import (
-    PIXEL_ORIGINS,
-    PIXEL_TYPES,
     BlockOptions,
+    Option,
     OutputOptions,
     PointOptions,
     SceneOptions,
     SurfaceOptions,
+    options_of,
 )
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 def json_option(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -31,25 +35,6 @@ def json_option(command: Callable[..., Any]) -> Callable[..., Any]:
     return click.option(
         "--json", "as_json", is_flag=True, callback=remember, is_eager=True, help="Print one JSON document on stdout."
     )(command)
-
-
-def _grouped(
-    name: str, make: Callable[..., Any], *options: Callable[[Callable[..., Any]], Callable[..., Any]]
-) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add click options to a command and hand them to it as one object, the keyword argument `name`."""
-
-    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(command)
-        def wrapper(**given: Any) -> Any:
-            fields = {key.removeprefix(prefix): given.pop(key) for key in list(given) if key.startswith(prefix)}
-            return command(**given, **{name: make(**fields)})
-
-        for option in reversed(options):
-            wrapper = option(wrapper)
-        return wrapper
-
-    prefix = f"{name}_"
-    return decorate
 
 
 class _Nodata(click.ParamType):
@@ -66,316 +51,85 @@ class _Nodata(click.ParamType):
         return "nan" if math.isnan(number) else number
 
 
-_FILE = click.Path(dir_okay=False)
-
-_SENSOR_OPTIONS = (
-    click.option("--sensor", "scene_sensor", metavar="NAME", help="Sensor of the image (see 'ortho sensors')."),
-    click.option(
-        "--rpc", "scene_rpc", metavar="tag|sidecar|FILE", help="Which RPC, where there are several, or an RPC file."
-    ),
-    click.option(
-        "--sensor-option",
-        "scene_sensor_options",
-        multiple=True,
-        metavar="K=V",
-        callback=lambda ctx, parameter, values: _key_values(values),
-        help="Option of the sensor (see 'ortho sensors'); may be repeated.",
-    ),
-    click.option(
-        "--allow-network",
-        "scene_allow_network",
-        is_flag=True,
-        help="Open URLs (http, https, s3, gs, az) and /vsi paths.",
-    ),
-    click.option(
-        "--root",
-        "scene_roots",
-        multiple=True,
-        type=click.Path(exists=True, file_okay=False),
-        metavar="DIR",
-        help="A folder that files may lead to (a VRT), besides their own; may be repeated.",
-    ),
-)
-scene_options = _grouped(
-    "scene",
-    SceneOptions,
-    *_SENSOR_OPTIONS[:2],
-    click.option("--model", "scene_model", type=_FILE, help="A saved *_model.json in place of the image's model."),
-    click.option(
-        "--crop-offset",
-        "scene_crop_offset",
-        metavar="COL,ROW",
-        callback=lambda ctx, parameter, value: None if value is None else _pair(value),
-        help="First pixel of this image in the one that its model belongs to, where it is a crop.",
-    ),
-    *_SENSOR_OPTIONS[2:],
-)
-#: The same for the images of a block, where a saved model cannot take the place of all.
-sensor_options = _grouped("scene", SceneOptions, *_SENSOR_OPTIONS)
-
-point_options = _grouped(
-    "points",
-    PointOptions,
-    click.option(
-        "--gcps",
-        "points_gcps",
-        metavar="FILE|own",
-        help="Points: CSV, GeoJSON, QGIS .points, ODM gcp_list.txt, ENVI .pts, ASP .gcp, ArcGIS link table; or 'own' "
-        "for those in the image.",
-    ),
-    click.option("--points-crs", "points_crs", metavar="CRS", help="CRS of the points, where their file has none."),
-    click.option(
-        "--points-vertical",
-        "points_vertical",
-        metavar="DATUM",
-        help="Height datum of the points: ellipsoid, egm96, egm2008, EPSG:n or a grid file.",
-    ),
-    click.option(
-        "--pixel-origin",
-        "points_pixel_origin",
-        type=click.Choice(list(PIXEL_ORIGINS)),
-        default="corner",
-        show_default=True,
-        help="What CSV, ODM and link files call the first pixel: its outer corner or its centre (0, 0), or its corner "
-        "or its centre (1, 1).",
-    ),
-    click.option("--check", "points_check", metavar="every:N|ids:A,B", help="Points that check and do not control."),
-    click.option(
-        "--select",
-        "points_select",
-        metavar="even:N|cluster:N|ids:A,B|random:N:SEED",
-        help="Points that control: N well spread, N of one region, these, or N by lot; all others check.",
-    ),
-    click.option(
-        "--correction",
-        "points_correction",
-        type=click.Choice(["none", "shift", "shift-drift", "affine", "model"]),
-        help="What is adjusted: the image points, or the parameters of the model itself, such as the exterior "
-        "orientation of a frame  [default: shift if there are control points]",
-    ),
-    click.option(
-        "--fit-model",
-        "points_fit_model",
-        metavar="NAME",
-        help="Fit a model from the points alone (see 'ortho models'), in place of the image's own.",
-    ),
-    click.option(
-        "--model-crs",
-        "points_model_crs",
-        metavar="CRS",
-        help="Ground of fitted models: geocentric, geographic, utm or EPSG:n  [default: that of the points]",
-    ),
-    click.option("--prune", "points_prune", is_flag=True, help="Remove parameters that the points do not justify."),
-    click.option("--params", "points_params", metavar="A,B,C", help="Adjust these parameters only  [default: all]"),
-    click.option(
-        "--significance",
-        "points_significance",
-        type=click.FloatRange(0, 1, min_open=True, max_open=True),
-        default=0.05,
-        show_default=True,
-        help="Above this chance (p) a parameter is not justified.",
-    ),
-    click.option(
-        "--ridge",
-        "points_ridge",
-        metavar="auto|none|gcv|lcurve|W",
-        default="auto",
-        show_default=True,
-        help="Regularisation of fitted models: found, or of this weight.",
-    ),
-    click.option(
-        "--near",
-        "points_near",
-        type=click.FloatRange(min=0, min_open=True),
-        metavar="M",
-        help="Points closer than this are neighbours in the analysis of residuals.",
-    ),
-)
-
-block_options = _grouped(
-    "points",
-    BlockOptions,
-    click.option(
-        "--points",
-        "points_points",
-        metavar="FILE",
-        required=True,
-        help="Rays: CSV (id,image,col,row[,x,y,h,role,...]), GeoJSON with 'ji' by image, or ODM gcp_list.txt.",
-    ),
-    click.option("--gcps", "points_gcps", metavar="FILE", help="Ground of the points: CSV (id,x,y,h,...) or GeoJSON."),
-    click.option("--points-crs", "points_crs", metavar="CRS", help="CRS of the ground, where its file has none."),
-    click.option(
-        "--points-vertical",
-        "points_vertical",
-        metavar="DATUM",
-        help="Height datum of the ground: ellipsoid, egm96, egm2008, EPSG:n or a grid file.",
-    ),
-    click.option(
-        "--pixel-origin",
-        "points_pixel_origin",
-        type=click.Choice(list(PIXEL_ORIGINS)),
-        default="corner",
-        show_default=True,
-        help="What CSV, ODM and link files call the first pixel: its outer corner or its centre (0, 0), or its corner "
-        "or its centre (1, 1).",
-    ),
-    click.option("--check", "points_check", metavar="every:N|ids:A,B", help="Points that check and do not control."),
-    click.option(
-        "--model",
-        "points_model",
-        metavar="NAME",
-        help="One of the images' models, such as rpc or pushbroom, or a model fitted to points (see 'ortho models')  "
-        "[default: the images' best]",
-    ),
-)
-
-surface_options = _grouped(
-    "surface",
-    SurfaceOptions,
-    click.option("--dem", "surface_dem", metavar="FILE", help="Digital elevation model."),
-    click.option(
-        "--dem-vertical",
-        "surface_vertical",
-        metavar="DATUM",
-        help="Height datum of the DEM: ellipsoid, egm96, egm2008, EPSG:n or a grid file.",
-    ),
-    click.option(
-        "--override-dem-vertical",
-        "surface_override_vertical",
-        is_flag=True,
-        help="Believe --dem-vertical even where the DEM declares another datum.",
-    ),
-    click.option(
-        "--dem-fill",
-        "surface_fill",
-        metavar="error|mask|nearest|M",
-        default="error",
-        show_default=True,
-        help="Where the DEM has no height: stop, leave pixels out, take the nearest, or an ellipsoidal height.",
-    ),
-    click.option("--height", "surface_height", type=float, metavar="M", help="One ellipsoidal height, no DEM."),
-)
-
-output_options = _grouped(
-    "output",
-    lambda creation_options, bands, **fields: OutputOptions(
-        creation_options=dict(creation_options), bands=bands or None, **fields
-    ),
-    click.option("--output-crs", "-t_srs", "output_crs", metavar="CRS", help="[default: the UTM zone of the scene]"),
-    click.option(
-        "--resolution",
-        "-tr",
-        "output_resolution",
-        type=OneOrTwo(),
-        metavar="X [Y]",
-        help="Pixel size in units of the output CRS  [default: the ground sample distance]",
-    ),
-    click.option(
-        "--extent",
-        "-te",
-        "output_extent",
-        type=float,
-        nargs=4,
-        metavar="XMIN YMIN XMAX YMAX",
-        help="Taken as it is  [default: the scene's footprint]",
-    ),
-    click.option(
-        "--align", "-tap", "output_align", is_flag=True, help="Widen --extent to whole multiples of the resolution."
-    ),
-    click.option(
-        "--resampling",
-        "-r",
-        "output_resampling",
-        type=click.Choice(["nearest", "bilinear", "cubic", "lanczos", "average"]),
-        default="bilinear",
-        show_default=True,
-    ),
-    click.option(
-        "--band",
-        "-b",
-        "output_bands",
-        type=click.IntRange(min=1),
-        multiple=True,
-        metavar="N",
-        help="Only this band; may be repeated, in the order of the ortho  [default: all]",
-    ),
-    click.option(
-        "--output-type",
-        "-ot",
-        "output_dtype",
-        type=click.Choice(PIXEL_TYPES, case_sensitive=False),
-        metavar="|".join(PIXEL_TYPES),
-        help="Type of the pixels; values beyond its range are clamped  [default: that of the image]",
-    ),
-    click.option(
-        "--nodata",
-        "-dstnodata",
-        "output_nodata",
-        type=_Nodata(),
-        metavar="VALUE",
-        help="Of pixels without an image  [default: that of the image, or a mask]",
-    ),
-    click.option(
-        "--dem-interpolation",
-        "output_dem_interpolation",
-        type=click.Choice(["bilinear", "cubic"]),
-        default="bilinear",
-        show_default=True,
-        help="Between the samples of the DEM.",
-    ),
-    click.option(
-        "--format", "-of", "output_format", type=click.Choice(["COG", "GTiff"]), default="COG", show_default=True
-    ),
-    click.option(
-        "--creation-option",
-        "-co",
-        "output_creation_options",
-        multiple=True,
-        metavar="K=V",
-        callback=lambda ctx, parameter, values: [_key_value(value) for value in values],
-        help="Option of GDAL's driver; may be repeated.",
-    ),
-    click.option(
-        "--engine",
-        "output_engine",
-        type=click.Choice(["ortho", "gdal"]),
-        default="ortho",
-        show_default=True,
-        help="Our warper, or GDAL's with its own transformers, exactly (slow; for comparison).",
-    ),
-    click.option(
-        "--memory",
-        "-wm",
-        "output_memory",
-        type=Megabytes(),
-        default="512",
-        show_default=True,
-        metavar="MB",
-        help="Bound on windows and caches; or with a unit, such as 2GB.",
-    ),
-    click.option("--threads", "output_threads", type=click.IntRange(min=1), help="[default: all processors]"),
-    click.option(
-        "--tolerance",
-        "output_tolerance",
-        type=click.FloatRange(min=0, min_open=True),
-        default=0.01,
-        show_default=True,
-        metavar="PX",
-        help="Bound on the warper's geometric error, in source pixels.",
-    ),
-    click.option("--stac", "output_stac", is_flag=True, help="Write a STAC item of the ortho too."),
-    click.option(
-        "--acquired", "output_acquired", metavar="TIME", help="Of acquisition (RFC 3339), where the metadata have none."
-    ),
-)
-
-image_argument = click.argument("image", type=click.Path())
-folder_option = click.option(
-    "--output", "-o", "folder", type=click.Path(file_okay=False), required=True, metavar="DIR", help="Output folder."
-)
+# -- options of click ------------------------------------------------------------------------------------------------
 
 
-def _pair(text: str) -> tuple[float, float]:
+def click_options(group: str, options: type, *names: str, **changes: Any) -> Decorator:
+    """Return the decorator that adds click options for fields of a group.
+
+    Parameters
+    ----------
+    group : str
+        Name of the group; the values arrive as ``{group}_{field}``.
+    options : type
+        Its class, one of `ortho_pipeline.options`.
+    names : str
+        The fields, in the order of ``--help``; all without.
+    changes : optional
+        Of what click is told.
+    """
+    defaults = {one.name: one.default for one in fields(options)}
+    known = options_of(options)
+    flags = {f"{group}.{name}": option.flags.split()[0] for name, option in known.items()}
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        for name in reversed(names or tuple(known)):
+            option = known[name]
+            said = {**_said(option, defaults[name]), "help": _help(option, flags), **changes}
+            command = click.option(*option.flags.split(), f"{group}_{name}", **said)(command)
+        return command
+
+    return decorate
+
+
+def _help(option: Option, flags: Mapping[str, str]) -> str | None:
+    text = option.help
+    if option.kind in ("integers", "folders", "keys"):
+        text = f"{text.removesuffix('.')}; may be repeated."
+    if option.unset:
+        text = f"{text.removesuffix('.')}  [default: {option.unset}]".strip()
+    return with_flags(text, flags) or None
+
+
+def _said(option: Option, default: Any) -> dict[str, Any]:
+    """Return what click is told of an option, besides names and help."""
+    if default is False:
+        return {"is_flag": True}
+    told: dict[str, Any] = {"metavar": option.metavar, **_typed(option)}
+    if default is MISSING and not told.get("multiple"):
+        told["required"] = True
+    elif isinstance(default, int | float | str):
+        shown = int(default) // 1_000_000 if option.kind == "bytes" else default
+        told |= {"default": shown, "show_default": True}
+    return told
+
+
+def _typed(option: Option) -> dict[str, Any]:
+    """Return what reads the value of an option."""
+    if option.choices:
+        return {"type": click.Choice(option.choices, case_sensitive=option.metavar is None)}
+    number: Any = float
+    if option.above is not None:
+        number = click.FloatRange(option.above, option.below, min_open=True, max_open=option.below is not None)
+    whole = click.IntRange(min=None if option.above is None else int(option.above) + 1)
+    return {
+        "file": {"type": click.Path(dir_okay=False)},
+        "number": {"type": number},
+        "integer": {"type": whole},
+        "integers": {"type": whole, "multiple": True},
+        "pair": {"callback": _pair},
+        "box": {"type": float, "nargs": 4},
+        "one or two": {"type": OneOrTwo()},
+        "number or nan": {"type": _Nodata()},
+        "bytes": {"type": Megabytes()},
+        "folders": {"type": click.Path(exists=True, file_okay=False), "multiple": True},
+        "keys": {"callback": _keys, "multiple": True},
+    }.get(option.kind, {})
+
+
+def _pair(_: click.Context, __: click.Parameter, text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
     try:
         column, row = (float(part) for part in text.split(","))
     except ValueError:
@@ -383,16 +137,65 @@ def _pair(text: str) -> tuple[float, float]:
     return column, row
 
 
-def _key_values(texts: tuple[str, ...]) -> dict[str, str]:
-    pairs = [_key_value(text) for text in texts]
-    found = dict(pairs)
-    if len(found) != len(pairs):
-        raise click.BadParameter("one key is given twice")
+def _keys(_: click.Context, __: click.Parameter, texts: Sequence[str]) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key:
+            raise click.BadParameter(f"{text!r} is not KEY=VALUE")
+        if key in found:
+            raise click.BadParameter("one key is given twice")
+        found[key] = value
     return found
 
 
-def _key_value(text: str) -> tuple[str, str]:
-    key, equals, value = text.partition("=")
-    if not equals or not key:
-        raise click.BadParameter(f"{text!r} is not KEY=VALUE")
-    return key, value
+def _grouped(group: str, options: type, *names: str) -> Decorator:
+    """Add the options of a group to a command and hand them to it as one object, the argument of the group's name."""
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(command)
+        def wrapper(**given: Any) -> Any:
+            values = {key.removeprefix(prefix): given.pop(key) for key in list(given) if key.startswith(prefix)}
+            # Without any, click's empty tuple stands for the default.
+            return command(**given, **{group: options(**{key: value for key, value in values.items() if value != ()})})
+
+        return click_options(group, options, *names)(wrapper)
+
+    prefix = f"{group}_"
+    return decorate
+
+
+_OF_IMAGES = ("sensor", "rpc", "sensor_options", "allow_network", "roots")
+scene_options = _grouped("scene", SceneOptions)
+#: The same for the images of a block, where a saved model cannot take the place of all.
+sensor_options = _grouped("scene", SceneOptions, *_OF_IMAGES)
+point_options = _grouped("points", PointOptions)
+block_options = _grouped("points", BlockOptions, "points", "gcps", "crs", "vertical", "pixel_origin", "check", "model")
+#: The rest of that group, which is taken by its decorator too.
+adjustment_options = click_options("points", BlockOptions, "correction", "ground_sigma", "model_crs", "hold")
+surface_options = _grouped("surface", SurfaceOptions)
+dem_datum_options = _grouped("surface", SurfaceOptions, "vertical", "override_vertical")
+network_option = _grouped("scene", SceneOptions, "allow_network")
+output_options = _grouped("output", OutputOptions)
+
+image_argument = click.argument("image", type=click.Path())
+folder_option = click.option(
+    "--output", "-o", "folder", type=click.Path(file_okay=False), required=True, metavar="DIR", help="Output folder."
+)
+
+# -- names of options in messages ------------------------------------------------------------------------------------
+
+_NAMED = re.compile(r"`([a-z_]+(?:\.[a-z_]+)?)(?:\.(\w+))?(?:=([^`]*))?`")
+
+
+def with_flags(text: str, flags: Mapping[str, str]) -> str:
+    """Return a text with the options that it names as they are typed; names without a flag stay as they are."""
+
+    def typed(match: re.Match[str]) -> str:
+        name, key, value = match.groups()
+        if name not in flags:
+            return match[0]
+        given = "=".join(part for part in (key, value) if part is not None)
+        return f"{flags[name]} {given}".strip()
+
+    return _NAMED.sub(typed, text)

@@ -19,9 +19,12 @@ from ortho_pipeline.cli.batch import run
 from ortho_pipeline.cli.block import adjust, intersect
 from ortho_pipeline.cli.command import Group
 from ortho_pipeline.cli.options import (
+    click_options,
+    dem_datum_options,
     folder_option,
     image_argument,
     json_option,
+    network_option,
     output_options,
     point_options,
     scene_options,
@@ -392,13 +395,13 @@ def report(report_file: str, folder: str, kind: str, as_json: bool) -> None:
 @click.option("--edge", metavar="X1,Y1,X2,Y2", help="Columns and rows of its ends  [default: edges are looked for]")
 @click.option("--band", type=click.IntRange(min=1), default=1, show_default=True)
 @click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="For JSON and a plot.")
-@click.option("--allow-network", is_flag=True, help="Open URLs and /vsi paths.")
+@network_option
 @json_option
-def edge(image: str, edge: str | None, band: int, folder: str | None, allow_network: bool, as_json: bool) -> None:
+def edge(image: str, edge: str | None, band: int, folder: str | None, scene: SceneOptions, as_json: bool) -> None:
     """Measure the effective resolution of IMAGE from straight edges (edge spread, line spread, width in pixels)."""
     from ortho_pipeline import commands
 
-    print_result(commands.edge(image, folder, edge=edge, band=band, allow_network=allow_network), as_json)
+    print_result(commands.edge(image, folder, edge=edge, band=band, allow_network=scene.allow_network), as_json)
 
 
 @cli.command()
@@ -429,28 +432,24 @@ def register(
 @cli.command("dem-check")
 @click.argument("dem", type=click.Path())
 @click.option("--points", required=True, metavar="FILE", help="Check heights: CSV or GeoJSON with x, y, h.")
-@click.option("--points-crs", "crs", metavar="CRS", help="CRS of the points, where their file has none.")
-@click.option("--points-vertical", "vertical", metavar="DATUM", help="Their height datum: ellipsoid, egm96, EPSG:n ...")
-@click.option("--dem-vertical", metavar="DATUM", help="Height datum of the DEM, where it does not say it.")
-@click.option("--override-dem-vertical", is_flag=True, help="Believe --dem-vertical where the DEM says otherwise.")
-@click.option("--allow-network", is_flag=True, help="Open URLs and /vsi paths too.")
+@click_options("points", PointOptions, "crs", "vertical")
+@dem_datum_options
+@network_option
 @json_option
 def dem_check(
     dem: str,
     points: str,
-    crs: str | None,
-    vertical: str | None,
-    dem_vertical: str | None,
-    override_dem_vertical: bool,
-    allow_network: bool,
+    points_crs: str | None,
+    points_vertical: str | None,
+    surface: SurfaceOptions,
+    scene: SceneOptions,
     as_json: bool,
 ) -> None:
     """Compare a DEM with check heights: bias, RMSE, NMAD and LE90, also by the slope of the terrain."""
     from ortho_pipeline import commands
 
-    surface = SurfaceOptions(vertical=dem_vertical, override_vertical=override_dem_vertical)
-    scene = SceneOptions(allow_network=allow_network)
-    print_result(commands.dem_check(dem, points, crs=crs, vertical=vertical, surface=surface, scene=scene), as_json)
+    given = {"crs": points_crs, "vertical": points_vertical}
+    print_result(commands.dem_check(dem, points, **given, surface=surface, scene=scene), as_json)
 
 
 @cli.command()

@@ -1,0 +1,62 @@
+"""An option is stated once, in `options`: the command line, its help and the docstrings come from there."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from ortho_pipeline.cli.options import with_flags
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.options import GROUPS, BlockOptions, options_of
+
+
+def params(command: str) -> dict[str, click.Option]:
+    return {str(one.name): one for one in cli.commands[command].params if isinstance(one, click.Option)}
+
+
+@pytest.mark.parametrize(
+    ("command", "group", "options"),
+    [*(("rectify", *one) for one in GROUPS.items()), ("adjust", "points", BlockOptions)],
+)
+def test_every_field_is_an_option_with_its_flags_and_default(command: str, group: str, options: type) -> None:
+    known = params(command)
+    for one in dataclasses.fields(options):
+        stated = options_of(options)[one.name]
+        param = known[f"{group}_{one.name}"]
+        assert set(param.opts) == set(stated.flags.split())
+        help_text = with_flags(stated.help, {"surface.vertical": "--dem-vertical", "output.extent": "--extent"})
+        assert help_text.removesuffix(".") in (param.help or "")
+        if isinstance(one.default, str | float) and one.default is not False and stated.kind != "bytes":
+            assert param.default == one.default
+        assert f"\n{one.name} : " in (options.__doc__ or "")
+
+
+def test_a_flag_is_of_one_field_and_of_the_same_in_all_groups() -> None:
+    taken: dict[str, str] = {}
+    for group, options in GROUPS.items():
+        for name, option in options_of(options).items():
+            for flag in option.flags.split():
+                assert taken.setdefault(flag, f"{group}.{name}") == f"{group}.{name}"
+    for name, option in options_of(BlockOptions).items():
+        other = options_of(GROUPS["points"]).get(name)
+        assert other is None or other.flags == option.flags
+
+
+def test_a_key_that_is_given_twice_is_refused(tmp_path) -> None:
+    for words in (["-co", "LEVEL=1", "-co", "LEVEL=2"], ["--sensor-option", "a=1", "--sensor-option", "a=2"]):
+        done = CliRunner().invoke(cli, ["rectify", "a.tif", "-o", str(tmp_path), *words])
+        assert done.exit_code == 2
+        assert "one key is given twice" in done.output
+
+
+def test_names_of_options_are_shown_as_flags() -> None:
+    flags = {"surface.height": "--height", "scene.sensor_options": "--sensor-option", "workers": "--workers"}
+    text = (
+        "give `surface.height=500`, `scene.sensor_options.rpc=tag`, `workers=1` or `surface.dem=FILE`; see `ortho fit`"
+    )
+    assert with_flags(text, flags) == (
+        "give --height 500, --sensor-option rpc=tag, --workers 1 or `surface.dem=FILE`; see `ortho fit`"
+    )
