@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import functools
+import hashlib
+import inspect
 import logging
+import sys
 from collections.abc import Callable
 from typing import Any
 
 import numba
+from numba.core.caching import FunctionCache
+from numba.core.dispatcher import Dispatcher
 
 log = logging.getLogger(__name__)
 
@@ -23,13 +28,37 @@ def inlined(function: Callable[..., Any]) -> Any:
 
 
 def _made(function: Callable[..., Any], **options: Any) -> Any:
-    make = functools.partial(numba.njit, nogil=True, error_model="numpy", boundscheck=False, **options)
+    made = numba.njit(nogil=True, error_model="numpy", boundscheck=False, **options)(function)
     try:
-        return make(cache=True)(function)
+        made._cache = _Cache(function)  # as enable_caching() does with numba's own
     except RuntimeError:
         # Neither the package's folder nor the user's cache can be written, as in many containers.
         _say_once()
-        return make()(function)
+    return made
+
+
+class _Cache(FunctionCache):
+    """Machine code that is made again if anything that it was made from has changed.
+
+    numba looks at the module of the function alone, not at those of functions that are compiled into it.
+    """
+
+    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
+        return (*super()._index_key(sig, codegen), _others(self._py_func.__module__))
+
+
+@functools.cache
+def _others(module: str) -> str:
+    """Return a digest of the other modules whose compiled functions and records a module uses."""
+    found, todo = {module}, [module]
+    while todo:
+        for value in vars(sys.modules[todo.pop()]).values():
+            record = isinstance(value, type) and issubclass(value, tuple)
+            if (record or isinstance(value, Dispatcher)) and value.__module__ not in found:
+                found.add(value.__module__)
+                todo.append(value.__module__)
+    sources = (inspect.getsource(sys.modules[name]) for name in sorted(found - {module}) if name != "typing")
+    return hashlib.sha256("".join(sources).encode()).hexdigest()
 
 
 @functools.cache
