@@ -6,10 +6,49 @@ Path and attitude come as pieces of polynomials in time, all six components toge
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ortho_pipeline.files.compiled import compiled, inlined
+
+
+class Trajectory(NamedTuple):
+    """Path and attitude.
+
+    Parameters
+    ----------
+    orbit : (3, 3)
+        Columns: the orbital axes in ECEF, about `centre` ``(3,)``.
+    ends, origins, pieces : (k - 1,), (k,), (k, degree + 1, 6)
+        Polynomials in time after their origins; piece i holds until ``ends[i]``.
+    """
+
+    orbit: Any
+    centre: Any
+    ends: Any
+    origins: Any
+    pieces: Any
+
+
+class Camera(NamedTuple):
+    """The line camera on board.
+
+    Parameters
+    ----------
+    mount, lever : (3, 3), (3,)
+        Its axes and its place in those of the platform.
+    numbers : (8,)
+        x0, y0, F, columns, line period, semi-major axis, squared eccentricity, largest miss (px) when done.
+    dx, dy : (n,), (m,)
+        Polynomials of the distortion.
+    """
+
+    mount: Any
+    lever: Any
+    numbers: Any
+    dx: Any
+    dy: Any
 
 
 @inlined
@@ -73,21 +112,17 @@ def _in_camera(px, py, pz, t, ends, origins, pieces, mount, lever):
 
 
 @compiled
-def project(ground, orbit, centre, ends, origins, pieces, mount, lever, camera, dx, dy, limits, image):
+def project(ground: Any, trajectory: Trajectory, camera: Camera, limits: Any, image: Any) -> None:
     """Fill `image` ``(N, 2)`` with the projections of `ground` ``(N, 3)`` (lon, lat in degrees, ellipsoidal height).
 
     Parameters
     ----------
-    orbit : (3, 3)
-        Columns: the orbital axes in ECEF, about `centre` ``(3,)``.
-    ends, origins, pieces : (k - 1,), (k,), (k, degree + 1, 6)
-        Polynomials in time after their origins; piece i holds until ``ends[i]``.
-    camera : (8,)
-        x0, y0, F, columns, line period, semi-major axis, squared eccentricity, largest miss (px) when done.
     limits : (2, 2)
         Lowest and highest column and time; NaN beyond.
     """
-    x0, y0, focal, columns, period, major, e2, verified = camera
+    orbit, centre, ends, origins, pieces = trajectory
+    mount, lever, numbers, dx, dy = camera
+    x0, y0, focal, columns, period, major, e2, verified = numbers
     half = columns / 2.0
     for k in range(ground.shape[0]):
         image[k, 0], image[k, 1] = np.nan, np.nan

@@ -347,9 +347,12 @@ class Pushbroom(SensorModel):
         )  # fmt: skip
         ends, origins, pieces = self._compiled
         pushbroom_kernel.project(
-            ground, self.orbital, self.origin, ends, origins, pieces, self.mounting, self.lever, numbers, camera.dx,
-            camera.dy, self._limits, image,
-        )  # fmt: skip
+            ground,
+            pushbroom_kernel.Trajectory(self.orbital, self.origin, ends, origins, pieces),
+            pushbroom_kernel.Camera(self.mounting, self.lever, numbers, camera.dx, camera.dy),
+            self._limits,
+            image,
+        )
         return image
 
     def rays(self, image: ArrayLike) -> tuple[Array, Array]:
