@@ -5,6 +5,7 @@
     python benchmarks/warp.py --kernels        by kernel, number of bands and sensor model
     python benchmarks/warp.py --accuracy       every output pixel of a ramp against an independent exact evaluation
     python benchmarks/warp.py --against DIR    the warp alone and the whole job, in pairs with another checkout
+                                               (of any time after it got this option), and the first run, which compiles
 
 Every figure is of a whole process: wall time, CPU time, peak memory. Outputs are uncompressed tiled GeoTIFFs. What
 machines do at one moment differs from the next, so programs take turns and only ratios within a round count.
@@ -13,6 +14,7 @@ machines do at one moment differs from the next, so programs take turns and only
 from __future__ import annotations
 
 import argparse
+import ast
 import json
 import os
 import platform
@@ -315,33 +317,48 @@ print(time.process_time() - begin)
 """
 
 
+def code_of(home: Path) -> str:
+    """Return `WARP_CPU` of a checkout: each knows the names of its own modules."""
+    tree = ast.parse((home / "benchmarks/warp.py").read_text(encoding="utf-8"))
+    (value,) = [
+        node.value for node in tree.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "WARP_CPU"
+    ]
+    return str(ast.literal_eval(value))
+
+
 def against(job: Job, other: Path, pairs: int) -> dict[str, list[tuple[float, float]]]:
-    """Alternate this checkout and another one: CPU seconds (here, there) of the warp alone and of the whole job."""
+    """Alternate this checkout and another one: CPU seconds (here, there) of the warp, the whole job, a first run."""
     homes = (Path(__file__).resolve().parents[1], other.resolve())
     places = [{**os.environ, "PYTHONPATH": os.pathsep.join((str(home), str(home / "plugins")))} for home in homes]
+    codes = [code_of(home) for home in homes]
 
-    def warp(place: dict[str, str]) -> float:
-        command = [sys.executable, "-c", WARP_CPU, *api(job, job.folder / "warp.tif")[3:]]
-        return float(subprocess.run(command, env=place, cwd=job.folder, check=True, capture_output=True).stdout)
+    def warp(which: int) -> float:
+        command = [sys.executable, "-c", codes[which], *api(job, job.folder / "warp.tif")[3:]]
+        return float(subprocess.run(command, env=places[which], cwd=job.folder, check=True, capture_output=True).stdout)
 
-    def whole(place: dict[str, str]) -> float:
-        return measure(ours(job, job.folder / "ours"), place).cpu
+    def whole(which: int) -> float:
+        return measure(ours(job, job.folder / "ours"), places[which]).cpu
+
+    def first(which: int) -> float:
+        with tempfile.TemporaryDirectory() as cache:
+            return measure(ours(job, job.folder / "ours"), {**places[which], "NUMBA_CACHE_DIR": cache}).cpu
 
     found: dict[str, list[tuple[float, float]]] = {}
-    for name, run in (("the warp alone", warp), ("the whole job", whole)):
-        for place in places:
-            run(place)
+    todo = (("the warp alone", warp, pairs), ("the whole job", whole, pairs), ("the first run", first, min(pairs, 5)))
+    for name, run, count in todo:
+        for which in (0, 1) if run is not first else ():
+            run(which)
         found[name] = []
-        for number in range(pairs):
+        for number in range(count):
             order = (0, 1) if number % 2 else (1, 0)
-            seconds = {which: run(places[which]) for which in order}
+            seconds = {which: run(which) for which in order}
             found[name].append((seconds[0], seconds[1]))
         ratios = sorted(here / there for here, there in found[name])
         # Order statistics: this interval holds the median of such ratios in 95 of 100 cases.
-        rank = max(0, int((pairs - 1.96 * pairs**0.5) / 2))
+        rank = max(0, int((count - 1.96 * count**0.5) / 2))
         here, there = (statistics.median(values) for values in zip(*found[name], strict=True))
         print(
-            f"{name:15s} {here:6.2f} s of CPU here, {there:6.2f} s there; {pairs} pairs: "
+            f"{name:15s} {here:6.2f} s of CPU here, {there:6.2f} s there; {count} pairs: "
             f"{statistics.median(ratios):.3f} ({ratios[rank]:.3f}-{ratios[-1 - rank]:.3f})",
             flush=True,
         )

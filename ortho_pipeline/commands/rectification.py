@@ -25,6 +25,7 @@ from ortho_pipeline.exchange import gcp as gcp_export
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import retire, sha256, states
+from ortho_pipeline.files.allowance import Resources
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
@@ -255,12 +256,10 @@ def _warp(
     common: dict[str, Any] = {
         "resampling": output.resampling,
         "dem_interpolation": output.dem_interpolation,
-        "memory": output.memory,
-        "threads": output.threads,
+        "resources": Resources(output.memory, output.threads, progress),
         "driver": output.format,
         "creation_options": dict(output.creation_options),
         "profile": Profile.of(source, output.dtype, output.nodata),
-        "progress": progress,
     }
     if output.engine == "ortho":
         return warp.rectify(model, source, surface, grid, path, tolerance=output.tolerance, **common)

@@ -10,6 +10,8 @@ from __future__ import annotations
 import _thread
 import resource
 import threading
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from ortho_pipeline.errors import OrthoError
@@ -20,6 +22,25 @@ LEAST = 256 << 20
 _PER_THREAD = 72 << 20
 #: Seconds in which a thread has begun, if it ever does.
 _PATIENCE = 10.0
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What a long job may take, and whom it tells how far it is.
+
+    Parameters
+    ----------
+    memory : int
+        Bytes for windows and GDAL's cache together (the interpreter and its libraries come on top).
+    threads : int, optional
+        As many as there are processors without.
+    progress : callable, optional
+        Called with the finished share, 0 to 1.
+    """
+
+    memory: int = 512_000_000
+    threads: int | None = None
+    progress: Callable[[float], None] | None = None
 
 
 def require_memory(size: int = LEAST, threads: int = 0) -> None:

@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import RpcExport
-from ortho_pipeline.files.allowance import require_memory, startable_threads
+from ortho_pipeline.files.allowance import Resources, require_memory, startable_threads
 from ortho_pipeline.geodesy.crs import GroundTransform
-from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, as_written, refuse_empty
 from ortho_pipeline.raster.source import Grid, RasterSource, limit_cache
 from ortho_pipeline.surface.dem import Surface
 from ortho_pipeline.warp import kernels
+from ortho_pipeline.warp.block_kernel import DemWindow, Target, warp_block
 from ortho_pipeline.warp.gdal_engine import warp_with_gdal
 from ortho_pipeline.warp.lattice import BLOCK, Block, Lattices, Terrain, block_cells
 
@@ -88,12 +89,10 @@ def rectify(
     resampling: str = "bilinear",
     dem_interpolation: str = "bilinear",
     tolerance: float = 0.01,
-    memory: int = 512_000_000,
-    threads: int | None = None,
+    resources: Resources | None = None,
     driver: str = "COG",
     creation_options: Mapping[str, str] | None = None,
     profile: Profile | None = None,
-    progress: Callable[[float], None] | None = None,
 ) -> WarpResult:
     """Write the orthoimage of `source` on `grid`.
 
@@ -103,10 +102,6 @@ def rectify(
         What the ortho looks like; like its source without.
     tolerance : float
         Bound on the geometric error of the lattice in source pixels.
-    memory : int
-        Bytes for windows and GDAL's cache together (the interpreter and its libraries come on top).
-    progress : callable, optional
-        Called with the finished share, 0 to 1.
 
     Raises
     ------
@@ -117,7 +112,9 @@ def rectify(
     """
     begin = time.monotonic()
     _check(source, resampling, dem_interpolation, tolerance)
-    threads = limit_cache(memory, _threads(threads, memory), source.block, surface.block)
+    resources = resources or Resources()
+    memory = resources.memory
+    threads = limit_cache(memory, _threads(resources), source.block, surface.block)
     surface = _seamless(surface, grid)
     profile = profile or Profile.of(source)
     job = _Job(
@@ -128,8 +125,8 @@ def rectify(
         tiles = list(_tiles(grid, TILE))
         for done, tile in enumerate(_in_order(threads, job.make, tiles), start=1):
             writer.write(*tile)
-            if progress:
-                progress(done / len(tiles))
+            if resources.progress:
+                resources.progress(done / len(tiles))
         refuse_empty(job.valid_pixels, path)
     return WarpResult(
         max_error_px=job.lattices.worst,
@@ -153,12 +150,10 @@ def rectify_gdal(
     *,
     resampling: str = "bilinear",
     dem_interpolation: str = "bilinear",
-    memory: int = 512_000_000,
-    threads: int | None = None,
+    resources: Resources | None = None,
     driver: str = "COG",
     creation_options: Mapping[str, str] | None = None,
     profile: Profile | None = None,
-    progress: Callable[[float], None] | None = None,
 ) -> WarpResult:
     """Write the orthoimage by GDAL's own warper with one of its exact transformers: a cross-check of `rectify`.
 
@@ -181,13 +176,13 @@ def rectify_gdal(
             "with GDAL's warper heights of the DEM are interpolated bilinearly", field="--dem-interpolation",
             remedy="leave out --dem-interpolation or --engine gdal",
         )  # fmt: skip
+    resources = resources or Resources()
     # GDAL's warper reads in one of its threads.
-    limit_cache(memory, 1, source.block, surface.block)
+    limit_cache(resources.memory, 1, source.block, surface.block)
     surface = _seamless(surface, grid)
     transformer, valid = warp_with_gdal(
         model, exported, source, surface, grid, path, resampling=resampling, driver=driver,
-        creation_options=creation_options, memory=memory, threads=_threads(threads, memory), profile=profile,
-        progress=progress,
+        creation_options=creation_options, profile=profile, resources=replace(resources, threads=_threads(resources)),
     )  # fmt: skip
     return WarpResult(
         max_error_px=transformer.max_error_px,
@@ -237,10 +232,10 @@ def _check(source: RasterSource, resampling: str, dem_interpolation: str, tolera
         raise InputError("the tolerance is positive and finite", field="tolerance", remedy="0.01 px is the default")
 
 
-def _threads(wanted: int | None, memory: int) -> int:
+def _threads(resources: Resources) -> int:
     """Return how many threads there are for tiles, with as many again for GDAL, which waits for missing ones."""
-    wanted = wanted or os.cpu_count() or 1
-    require_memory(memory, 2 * wanted)
+    wanted = resources.threads or os.cpu_count() or 1
+    require_memory(resources.memory, 2 * wanted)
     return max(1, startable_threads(2 * wanted) // 2)
 
 
@@ -282,25 +277,24 @@ class _Job:
         profile: Profile,
     ) -> None:
         self.source, self.surface, self.grid = source, surface, grid
-        self.kernel = RESAMPLING[resampling]
         self.lattices = Lattices(
             model, surface, grid, (source.width, source.height), tolerance=tolerance, reach=_REACH[resampling],
             averages=resampling == "average",
         )  # fmt: skip
         self.cubic_dem, self.window_bytes = cubic_dem, window_bytes
         self.profile = profile
-        self.low, self.high, self.integer, self.fill = _range(source.dtype, profile)
+        self.resampling = kernels.Resampling(RESAMPLING[resampling], 0, (1.0, 1.0), *_range(source.dtype, profile))
         self.any_band = profile.validity == "nodata" or profile.dtype.kind == "f"
         self._lock = threading.Lock()
         self.valid_pixels = 0
 
     # -- a tile ------------------------------------------------------------------------------------------------------
 
-    def make(self, tile: tuple[int, int, int, int]) -> tuple[int, int, NDArray[Any], NDArray[np.bool_]]:
+    def make(self, part: tuple[int, int, int, int]) -> tuple[int, int, NDArray[Any], NDArray[np.bool_]]:
         """Compute one tile (top, left, height, width), as `RasterWriter.write` takes it."""
-        top, left, height, width = tile
-        out = np.full((self.source.count, height, width), self.fill, dtype=self.source.dtype)
-        valid = np.zeros(out.shape, dtype=bool)
+        top, left, height, width = part
+        pixels = np.full((self.source.count, height, width), self.resampling.fill, dtype=self.source.dtype)
+        tile = _Tile(top, left, pixels, np.zeros(pixels.shape, dtype=bool))
         blocks = [
             Block(row, column)
             for row in range(top // BLOCK, -(-(top + height) // BLOCK))
@@ -308,110 +302,86 @@ class _Job:
         ]
         terrain = Terrain(self.surface, self.cubic_dem, self.window_bytes)
         seen = self.lattices.build(blocks, terrain)
-        for group, heights, origin, area in terrain.groups(seen):
-            self._warp(group, heights, origin, area, tile, out, valid)
+        for group, dem, area in terrain.groups(seen):
+            self._warp(group, dem, area, tile)
         low, _, _, fill = _range(self.profile.dtype, self.profile)
-        out = as_written(out, valid, self.profile.dtype, fill)
+        out = as_written(tile.pixels, tile.valid, self.profile.dtype, fill)
         if self.profile.validity == "nodata":
-            _keep_off_nodata(out, valid, fill, low)
+            _keep_off_nodata(out, tile.valid, fill, low)
         # NaN says for itself which band has no value; an integer cannot, so there a pixel needs all of its bands.
-        mask = np.asarray((np.any if self.any_band else np.all)(valid, axis=0))
+        mask = np.asarray((np.any if self.any_band else np.all)(tile.valid, axis=0))
         with self._lock:
             self.valid_pixels += int(np.count_nonzero(mask))
         return left, top, out, mask
 
     # -- pixels ------------------------------------------------------------------------------------------------------
 
-    def _warp(
-        self,
-        blocks: list[Block],
-        heights: Array,
-        origin: tuple[int, int],
-        area: tuple[int, int, int, int],
-        tile: tuple[int, int, int, int],
-        out: NDArray[Any],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def _warp(self, blocks: list[Block], dem: DemWindow, area: tuple[int, int, int, int], tile: _Tile) -> None:
         windows = np.array([block.window for block in blocks])
         left, top = windows[:, :2].min(axis=0)
         right, bottom = windows[:, 2:].max(axis=0)
         if (right - left) * (bottom - top) * self.source.count * self.source.dtype.itemsize > self.window_bytes:
             for block in blocks:
                 if len(blocks) > 1:
-                    self._warp([block], heights, origin, area, tile, out, valid)
+                    self._warp([block], dem, area, tile)
                 else:
-                    self._warp_cells(block, heights, origin, area, tile, out, valid)
+                    self._warp_cells(block, dem, area, tile)
             return
-        pixels = _Pixels(self.source, int(left), int(top), int(right), int(bottom))
+        window = _window(self.source, int(left), int(top), int(right), int(bottom))
         for block in blocks:
-            self._warp_block(block, pixels, heights, origin, area, tile, out, valid)
+            self._warp_block(block, window, dem, tile.target(block, area))
 
-    def _warp_cells(
-        self,
-        block: Block,
-        heights: Array,
-        origin: tuple[int, int],
-        area: tuple[int, int, int, int],
-        tile: tuple[int, int, int, int],
-        out: NDArray[Any],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def _warp_cells(self, block: Block, dem: DemWindow, area: tuple[int, int, int, int], tile: _Tile) -> None:
         """Make a block whose window of the source is too large for the memory, one cell of its lattice at a time."""
         for cell, nodes in block_cells(block.spacing):
             window = self.lattices.source_window(block, *nodes)
             within = all(area[k] <= cell[k] and cell[k + 1] <= area[k + 1] for k in (0, 2))
             if window is not None and within:
-                self._warp_block(block, _Pixels(self.source, *window), heights, origin, cell, tile, out, valid)
+                self._warp_block(block, _window(self.source, *window), dem, tile.target(block, cell))
 
-    def _warp_block(
-        self,
-        block: Block,
-        pixels: _Pixels,
-        heights: Array,
-        origin: tuple[int, int],
-        area: tuple[int, int, int, int],
-        tile: tuple[int, int, int, int],
-        out: NDArray[Any],
-        valid: NDArray[np.bool_],
-    ) -> None:
-        top, left = block.row * BLOCK - tile[0], block.column * BLOCK - tile[1]
-        # The last blocks of a grid reach beyond it.
-        area = area[0], min(area[1], tile[2] - top), area[2], min(area[3], tile[3] - left)
-        if area[0] >= area[1] or area[2] >= area[3]:
-            return
-        rows, columns = slice(top + area[0], top + area[1]), slice(left + area[2], left + area[3])
-        while True:
-            short = kernels.warp_block(
-                self.kernel, pixels.values, pixels.valid, pixels.masked, pixels.left, pixels.top,
-                self.source.width, self.source.height, block.spacing, block.nodes, block.dem_nodes, heights,
-                origin[0], origin[1], self.cubic_dem, block.middle, block.half, self.low, self.high, self.integer,
-                self.fill, np.array(area), out[:, rows, columns], valid[:, rows, columns], block.reach,
-                np.array(block.box),
-            )  # fmt: skip
-            if not short:
-                return
-            pixels = pixels.wider(self.source)
+    def _warp_block(self, block: Block, window: kernels.SourceWindow, dem: DemWindow, target: Target) -> None:
+        resampling = self.resampling._replace(reach=block.reach, box=block.box)
+        while target.pixels.size and warp_block(window, block.lattice, dem, resampling, target):
+            window = _wider(self.source, window)
 
 
-class _Pixels:
-    """A window of the source."""
+@dataclass(frozen=True, eq=False)
+class _Tile:
+    """A tile in the making: its first row and column in the ortho, its pixels ``(bands, h, w)``, which are valid."""
 
-    def __init__(self, source: RasterSource, left: int, top: int, right: int, bottom: int) -> None:
-        self.left, self.top, self.right, self.bottom = left, top, right, bottom
-        self.values = source.read(left, top, right - left, bottom - top)
-        valid = source.read_valid(left, top, self.values)
-        self.masked = valid is not None
-        self.valid = valid if valid is not None else np.ones((1, 1, 1), dtype=bool)
+    top: int
+    left: int
+    pixels: NDArray[Any]
+    valid: NDArray[np.bool_]
 
-    def wider(self, source: RasterSource) -> _Pixels:
-        """Return a window larger by 64 pixels all around (terrain between the nodes reached beyond this one)."""
-        return _Pixels(
-            source,
-            max(0, self.left - 64),
-            max(0, self.top - 64),
-            min(source.width, self.right + 64),
-            min(source.height, self.bottom + 64),
-        )
+    def target(self, block: Block, area: tuple[int, int, int, int]) -> Target:
+        """Return the place of a part of a block (see `Terrain.groups`); the last blocks of a grid reach beyond it."""
+        top, left = block.row * BLOCK - self.top, block.column * BLOCK - self.left
+        _, height, width = self.pixels.shape
+        first_row, last_row, first, last = area[0], min(area[1], height - top), area[2], min(area[3], width - left)
+        part = (..., slice(top + first_row, top + last_row), slice(left + first, left + last))
+        return Target(first_row, last_row, first, last, self.pixels[part], self.valid[part])
+
+
+def _window(source: RasterSource, left: int, top: int, right: int, bottom: int) -> kernels.SourceWindow:
+    pixels = source.read(left, top, right - left, bottom - top)
+    valid = source.read_valid(left, top, pixels)
+    masked = valid is not None
+    return kernels.SourceWindow(
+        pixels, valid if masked else np.ones((1, 1, 1), dtype=bool), masked, left, top, source.width, source.height
+    )
+
+
+def _wider(source: RasterSource, window: kernels.SourceWindow) -> kernels.SourceWindow:
+    """Return a window larger by 64 pixels all around (terrain between the nodes reached beyond this one)."""
+    _, height, width = window.pixels.shape
+    return _window(
+        source,
+        max(0, window.left - 64),
+        max(0, window.top - 64),
+        min(source.width, window.left + width + 64),
+        min(source.height, window.top + height + 64),
+    )
 
 
 def _range(dtype: np.dtype[Any], profile: Profile) -> tuple[float, float, bool, Any]:

@@ -31,6 +31,7 @@ from osgeo import gdal, gdal_array
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import REFUSE_ERROR, RpcExport, rpc_metadata
+from ortho_pipeline.files.allowance import Resources
 from ortho_pipeline.geodesy.crs import GroundTransform, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
@@ -155,10 +156,8 @@ def warp_with_gdal(
     resampling: str = "bilinear",
     driver: str = "COG",
     creation_options: Mapping[str, str] | None = None,
-    memory: int = 512_000_000,
-    threads: int = 1,
     profile: Profile | None = None,
-    progress: Any = None,
+    resources: Resources,
 ) -> tuple[Transformer, int]:
     """Write the orthoimage of `source` by GDAL's own warper, without approximating its transformer.
 
@@ -183,7 +182,9 @@ def warp_with_gdal(
         )
     exact = Exact(model, surface, grid, (source.width, source.height))
     profile = profile or Profile.of(source)
-    writer = RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads)
+    writer = RasterWriter(
+        path, grid, profile, driver=driver, creation_options=creation_options, threads=resources.threads or 1
+    )
     with writer, gdal_errors(path), contextlib.ExitStack() as scratch:
         arrays, target = writer.scratch("arrays"), writer.scratch("gdal")
         for temporary in (arrays, target):
@@ -193,7 +194,7 @@ def warp_with_gdal(
         with written(_create(target, profile, grid)) as ortho:
             _describe(ortho, profile)
             transformer.georeference(ortho, grid)
-            _warp_exactly(view, ortho, source, profile, transformer, resampling, memory, threads, progress)
+            _warp_exactly(view, ortho, source, profile, transformer, resampling, resources)
         valid = writer.copy(target)
         refuse_empty(valid, path)
         return transformer, valid
@@ -346,10 +347,9 @@ def _warp_exactly(
     profile: Profile,
     transformer: Transformer,
     resampling: str,
-    memory: int,
-    threads: int,
-    progress: Any,
+    resources: Resources,
 ) -> None:
+    progress, threads = resources.progress, resources.threads or 1
     callback = None if progress is None else (lambda share, *_: progress(share) or 1)
     # Without the first two the values depend on how the warper cuts the image into chunks; the next two let it find
     # the window of a chunk in the image from points all over it, because terrain moves them.
@@ -364,7 +364,7 @@ def _warp_exactly(
         workingType=_gdal_type(source.dtype),
         dstNodata=profile.nodata,
         multithread=threads > 1,
-        warpMemoryLimit=memory // 2,
+        warpMemoryLimit=resources.memory // 2,
         warpOptions=[*settings, f"NUM_THREADS={threads}", "INIT_DEST=0" if profile.nodata is None else
                      "INIT_DEST=NO_DATA"],
         callback=callback,

@@ -44,7 +44,8 @@ from ortho_pipeline.geodesy.crs import GroundTransform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.dem import Surface
-from ortho_pipeline.warp import kernels, lattice_kernel
+from ortho_pipeline.warp import lattice_kernel
+from ortho_pipeline.warp.block_kernel import DemWindow, Lattice, heights_at
 
 #: Side of a block in output pixels.
 BLOCK = 256
@@ -56,7 +57,7 @@ VERIFIED = 24
 #: Least side (output pixels) of the cells into which a block is cut where memory is short.
 _CELL = 32
 #: What stands for the terrain of a block in which every pixel is projected: its heights are in its nodes already.
-_NO_TERRAIN = np.zeros((2, 2)), (0, 0)
+_NO_TERRAIN = DemWindow(np.zeros((2, 2)), 0, 0, False)
 #: Source pixels beyond the lattice nodes of a window, for what lies higher or lower between the nodes.
 _MARGIN = 4
 
@@ -79,16 +80,11 @@ class Block:
     window: tuple[int, int, int, int] | None = None  # source pixels left, top, right, bottom
 
     @property
-    def lattice(self) -> Array:
-        """Coefficients ``(ny, nx, levels, 2)`` of the image coordinates at the nodes."""
+    def lattice(self) -> Lattice:
+        """Its lattice as compiled code takes it."""
         assert self.nodes is not None
-        return self.nodes
-
-    @property
-    def dem_lattice(self) -> Array:
-        """DEM coordinates ``(ny, nx, 2)`` of the nodes."""
         assert self.dem_nodes is not None
-        return self.dem_nodes
+        return Lattice(self.spacing, self.nodes, self.dem_nodes, self.middle, self.half)
 
 
 class _Exact:
@@ -318,7 +314,7 @@ class Terrain:
 
     def __init__(self, surface: Surface, cubic: bool, window_bytes: int) -> None:
         self._surface, self._cubic, self._window_bytes = surface, cubic, window_bytes
-        self._whole: tuple[Array, tuple[int, int]] | None = None
+        self._whole: DemWindow | None = None
 
     def ranges(self, blocks: list[Block], uv: Array) -> list[int]:
         """Set the height range of each block from its lattice in the DEM; return the indices of those with heights."""
@@ -329,32 +325,30 @@ class Terrain:
         together = np.array([windows[k] for k in present])
         whole = (*together[:, :2].min(axis=0), *together[:, 2:].max(axis=0))
         if self._fits(whole):
-            self._whole = self._read(whole), (int(whole[0]), int(whole[1]))
+            self._whole = self._read(whole)
         return [k for k in present if self._range(blocks[k], windows[k])]
 
-    def groups(
-        self, blocks: list[Block]
-    ) -> Iterator[tuple[list[Block], Array, tuple[int, int], tuple[int, int, int, int]]]:
-        """Yield blocks with the heights that they share, the place of the first sample, and the part of the block.
+    def groups(self, blocks: list[Block]) -> Iterator[tuple[list[Block], DemWindow, tuple[int, int, int, int]]]:
+        """Yield blocks with the heights that they share and the part of the block.
 
         The part (first row, last row + 1, first column, last column + 1) is the whole block, or a cell of its lattice
         where the DEM is so much finer than the output that even a block's heights do not fit into the memory.
         """
         whole = (0, BLOCK, 0, BLOCK)
-        yield from (([block], *_NO_TERRAIN, whole) for block in blocks if block.spacing == 1)
+        yield from (([block], _NO_TERRAIN, whole) for block in blocks if block.spacing == 1)
         blocks = [block for block in blocks if block.spacing > 1]
         if self._whole is not None:
             if blocks:
-                yield blocks, *self._whole, whole
+                yield blocks, self._whole, whole
             return
         for block in blocks:
             if self._fits(block.terrain):
-                yield [block], self._read(block.terrain), block.terrain[:2], whole
+                yield [block], self._read(block.terrain), whole
                 continue
             for cell, nodes in block_cells(block.spacing):
-                window = self._window(block.dem_lattice[nodes])
+                window = self._window(block.lattice.dem[nodes])
                 if window is not None:
-                    yield [block], self._read(window), window[:2], cell
+                    yield [block], self._read(window), cell
 
     def heights(self, block: Block, uv: Array) -> Array:
         """Return the heights ``(BLOCK + 1, BLOCK + 1)`` at DEM points of all pixels of a block; NaN in voids."""
@@ -363,8 +357,7 @@ class Terrain:
         for _, nodes in parts:
             window = self._window(uv[nodes])
             if window is not None:
-                samples, origin = self._whole or (self._read(window), window[:2])
-                kernels.heights_at(uv[nodes], samples, *origin, self._cubic, found[nodes])
+                heights_at(uv[nodes], self._whole or self._read(window), found[nodes])
         return found
 
     def _fits(self, window: Any) -> bool:
@@ -384,11 +377,13 @@ class Terrain:
             low, high = np.maximum(low, -2), np.minimum(high, (columns + 2, rows + 2))
         return None if (high - low < 2).any() else (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
 
-    def _read(self, window: Any) -> Array:
+    def _read(self, window: Any) -> DemWindow:
         left, top, right, bottom = (int(value) for value in window)
         if self._surface.constant_height is not None:
-            return np.full((2, 2), float(self._surface.constant_height))
-        return self._surface.window(left, top, right - left, bottom - top)
+            heights = np.full((2, 2), float(self._surface.constant_height))
+        else:
+            heights = self._surface.window(left, top, right - left, bottom - top)
+        return DemWindow(heights, left, top, self._cubic)
 
     def _range(self, block: Block, window: Any) -> bool:
         left, top, right, bottom = block.terrain = window
@@ -398,7 +393,7 @@ class Terrain:
             except CoverageError:
                 return False
         else:
-            heights, (first, above) = self._whole
+            heights, first, above, _ = self._whole
             under = heights[top - above : bottom - above, left - first : right - first]
             if not np.isfinite(under).any():
                 return False
@@ -421,7 +416,7 @@ def block_cells(spacing: int) -> Iterator[tuple[tuple[int, int, int, int], tuple
 
 def _box(block: Block) -> tuple[float, float]:
     """Return how many columns and rows of the source one output pixel covers in the mean over a block, at least 1."""
-    level = block.lattice[:, :, 0]
+    level = block.lattice.image[:, :, 0]
     across = np.abs(np.diff(level, axis=1)) / block.spacing
     down = np.abs(np.diff(level, axis=0)) / block.spacing
     finite = [part[np.isfinite(part).all(axis=2)] for part in (across, down)]

@@ -18,6 +18,7 @@ from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.exchange.rpc import RpcExport, export_rpc
+from ortho_pipeline.files.allowance import Resources
 from ortho_pipeline.models import FrameCamera, ImageCorrection, SensorModel
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
@@ -180,7 +181,7 @@ def test_voids_of_the_surface_stay_empty_with_arrays(tmp_path):
 
 def test_small_pieces_of_the_ortho_find_their_windows_beside_a_cliff(tmp_path):
     """GDAL cuts the ortho into chunks as small as its memory, and looks where the points of each lie in the image."""
-    _, apart, _ = both(model_of("frame, strong distortion"), terrain(tmp_path), tmp_path, memory=400_000)
+    _, apart, _ = both(model_of("frame, strong distortion"), terrain(tmp_path), tmp_path, resources=Resources(400_000))
     assert apart < 1e-3
 
 

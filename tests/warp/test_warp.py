@@ -20,6 +20,7 @@ from scipy.interpolate import RegularGridInterpolator
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import export_rpc, rpc_metadata
 from ortho_pipeline.files import sha256
+from ortho_pipeline.files.allowance import Resources
 from ortho_pipeline.models import RPC, SensorModel
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import Grid, RasterSource
@@ -354,7 +355,7 @@ def test_a_model_that_no_lattice_follows_is_projected_pixel_by_pixel(scene, tmp_
     heights = surface.heights(np.stack([x, y], axis=1))
     exact = Shaken().ground_to_image(np.stack([x, y, heights], axis=1)).T.reshape(2, grid.height, grid.width)
     source = RasterSource(scene.write(ramps()))
-    result = rectify(Shaken(), source, surface, grid, tmp_path / "o.tif", memory=memory, driver="GTiff")
+    result = rectify(Shaken(), source, surface, grid, tmp_path / "o.tif", resources=Resources(memory), driver="GTiff")
     assert (result.finest_spacing, result.max_error_px) == (1, 0.0)
     # Rounding of heights (1e-13 m) and of the Float32 ramp.
     assert np.abs(read(tmp_path / "o.tif")[0] - exact)[:, inner(exact)].max() < 1e-4
@@ -367,7 +368,14 @@ def test_output_is_the_same_for_any_memory_and_threads(scene, tmp_path, kernel):
     for k, (memory, threads) in enumerate([(512_000_000, 1), (512_000_000, 4), (400_000, 2)]):
         path = tmp_path / f"{k}.tif"
         rectify(
-            scene.model, source, surface, grid, path, resampling=kernel, memory=memory, threads=threads, driver="GTiff"
+            scene.model,
+            source,
+            surface,
+            grid,
+            path,
+            resampling=kernel,
+            resources=Resources(memory, threads),
+            driver="GTiff",
         )
         outputs.append(read(path))
     for pixels, valid in outputs[1:]:
@@ -734,7 +742,7 @@ def test_a_fine_dem_under_a_coarse_output_stays_within_the_memory(scene, tmp_pat
     for memory in (512_000_000, 400_000):
         rectify(
             scene.model, RasterSource(scene.write(texture(np.float32))), surface, grid_of(300.0, 5.0),
-            tmp_path / "o.tif", memory=memory, threads=1, driver="GTiff",
+            tmp_path / "o.tif", resources=Resources(memory, 1), driver="GTiff",
         )  # fmt: skip
         outputs.append(read(tmp_path / "o.tif")[0])
     assert np.isfinite(outputs[0]).mean() > 0.9
@@ -746,7 +754,15 @@ def test_masked_pixels_are_the_same_for_any_memory(scene, tmp_path):
     pixels[:, 100:130, 200:260] = -1.0
     source, outputs = RasterSource(scene.write(pixels, nodata=-1.0)), []
     for memory in (512_000_000, 300_000):
-        rectify(scene.model, source, scene.surface(), grid_of(), tmp_path / "o.tif", memory=memory, driver="GTiff")
+        rectify(
+            scene.model,
+            source,
+            scene.surface(),
+            grid_of(),
+            tmp_path / "o.tif",
+            resources=Resources(memory),
+            driver="GTiff",
+        )
         outputs.append(read(tmp_path / "o.tif")[0])
     np.testing.assert_array_equal(*outputs)
 
@@ -841,7 +857,7 @@ def test_strong_downsampling_stays_within_the_memory(scene, tmp_path):
     for memory in (512_000_000, 200_000):
         rectify(
             scene.model, RasterSource(path), Surface.constant(700.0), grid_of(300.0, step), tmp_path / "o.tif",
-            resampling="average", memory=memory, driver="GTiff",
+            resampling="average", resources=Resources(memory), driver="GTiff",
         )  # fmt: skip
         outputs.append(read(tmp_path / "o.tif"))
     np.testing.assert_array_equal(outputs[0][0], outputs[1][0])
@@ -871,8 +887,8 @@ def test_equal_orthos_are_equal_files_whatever_the_number_of_threads(scene, tmp_
     source, found = RasterSource(scene.write(texture())), set()
     for threads in (1, 4, 4, 7):
         out = tmp_path / "o.tif"
-        rectify(scene.model, source, Surface.constant(700.0), grid_of(step=0.1), out, driver="GTiff", threads=threads,
-                creation_options=options)  # fmt: skip
+        rectify(scene.model, source, Surface.constant(700.0), grid_of(step=0.1), out, driver="GTiff",
+                resources=Resources(threads=threads), creation_options=options)  # fmt: skip
         found.add(sha256(out))
     assert len(found) == 1
 

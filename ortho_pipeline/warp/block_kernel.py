@@ -1,0 +1,260 @@
+"""The compiled loop of the warp over one block of output pixels, in a single pass.
+
+`warp_block` takes image coordinates out of the block's lattice, terrain heights out of the DEM, and pixel values out of
+the source by one of `kernels`. Nothing is stored per pixel but the values.
+
+The lattice gives, at nodes every `spacing` output pixels, DEM coordinates (u, v) and image coordinates as a polynomial
+in the normalised height t = (h - middle) / half. Between nodes everything is bilinear.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ortho_pipeline.files.compiled import compiled, inlined
+from ortho_pipeline.warp.kernels import Resampling, SourceWindow, cubic_weights, row_inside, row_with_edges
+
+#: From this many output pixels per DEM sample on, pixels are taken together that lie between the same samples.
+_RUN = 6.0
+
+
+class Lattice(NamedTuple):
+    """The lattice of a block, for compiled code.
+
+    Parameters
+    ----------
+    spacing : int
+        Output pixels from node to node.
+    image : (ny, nx, levels, 2)
+        Coefficients of the image coordinates in the normalised height.
+    dem : (ny, nx, 2)
+        DEM sample coordinates.
+    middle, half : float
+        Metres: the normalised height is -1 at middle - half, 1 at middle + half.
+    """
+
+    spacing: int
+    image: Any
+    dem: Any
+    middle: float
+    half: float
+
+
+class DemWindow(NamedTuple):
+    """A window of the DEM: heights ``(rows, columns)``, the place of the first, and whether they go through cubics."""
+
+    heights: Any
+    left: int
+    top: int
+    cubic: bool
+
+
+class Target(NamedTuple):
+    """Where pixels go: rows first … last - 1 and columns of a block, and its part of the ortho ``(bands, h, w)``.
+
+    `pixels` and `valid` (whether they have a value) begin with the first row and column.
+    """
+
+    first_row: int
+    last_row: int
+    first_column: int
+    last_column: int
+    pixels: Any
+    valid: Any
+
+
+@inlined
+def _between(first, second, share):
+    # A node without weight may be NaN (outside of the model) and must not count.
+    return first if share == 0.0 else first + (second - first) * share
+
+
+@compiled
+def block_coordinates(
+    row: int, left: int, right: int, lattice: Lattice, dem: DemWindow, ticks: Any, columns: Any, rows: Any
+) -> None:
+    """Fill `columns` and `rows` with the image coordinates of output pixels left…right of one row of a block.
+
+    `row`, `left`, `right` count from the block's first pixel; `ticks` are the places of the block's columns between
+    lattice nodes, 0 to 1. NaN where there is no height or no projection.
+    """
+    spacing, nodes, dem_nodes = lattice.spacing, lattice.image, lattice.dem
+    middle, half = lattice.middle, lattice.half
+    levels = nodes.shape[2]
+    cell_row = row // spacing
+    ty = (row - cell_row * spacing) / spacing
+    start, slope = np.empty(2 * levels), np.empty(2 * levels)
+    for cell in range(left // spacing, (right - 1) // spacing + 1):
+        for k in range(levels):
+            for axis in range(2):
+                begin = _between(nodes[cell_row, cell, k, axis], nodes[cell_row + 1, cell, k, axis], ty)
+                end = _between(nodes[cell_row, cell + 1, k, axis], nodes[cell_row + 1, cell + 1, k, axis], ty)
+                start[2 * k + axis], slope[2 * k + axis] = begin, end - begin if spacing > 1 else 0.0
+        u0 = _between(dem_nodes[cell_row, cell, 0], dem_nodes[cell_row + 1, cell, 0], ty)
+        v0 = _between(dem_nodes[cell_row, cell, 1], dem_nodes[cell_row + 1, cell, 1], ty)
+        du = _between(dem_nodes[cell_row, cell + 1, 0], dem_nodes[cell_row + 1, cell + 1, 0], ty) - u0
+        dv = _between(dem_nodes[cell_row, cell + 1, 1], dem_nodes[cell_row + 1, cell + 1, 1], ty) - v0
+        if spacing == 1:
+            du, dv = 0.0, 0.0  # the only pixel of the cell is its first node
+        first, last = max(left, cell * spacing), min(right, (cell + 1) * spacing)
+        tx, cols, lines = ticks[first:last], columns[first - left : last - left], rows[first - left : last - left]
+        # First the heights, kept in `cols`; then both coordinates: two simple loops are faster than one long one.
+        _row_heights(dem, u0, du, v0, dv, spacing, tx, cols)
+        if levels == 3:
+            _quadratic(start, slope, middle, 1.0 / half, tx, cols, lines)
+            continue
+        for k in range(tx.size):
+            t = (cols[k] - middle) / half
+            col = line = 0.0
+            for power in range(levels - 1, -1, -1):
+                col = col * t + (start[2 * power] + slope[2 * power] * tx[k])
+                line = line * t + (start[2 * power + 1] + slope[2 * power + 1] * tx[k])
+            cols[k], lines[k] = col, line
+
+
+@inlined
+def _quadratic(start, slope, middle, scale, tx, cols, lines):
+    """Turn heights in `cols` into image coordinates by the quadratics of one row of a cell."""
+    c0, c1, c2, r0, r1, r2 = start[0], start[2], start[4], start[1], start[3], start[5]
+    dc0, dc1, dc2, dr0, dr1, dr2 = slope[0], slope[2], slope[4], slope[1], slope[3], slope[5]
+    for k in range(tx.size):
+        t = (cols[k] - middle) * scale
+        cols[k] = ((c2 + dc2 * tx[k]) * t + (c1 + dc1 * tx[k])) * t + (c0 + dc0 * tx[k])
+        lines[k] = ((r2 + dr2 * tx[k]) * t + (r1 + dr1 * tx[k])) * t + (r0 + dr0 * tx[k])
+
+
+@inlined
+def _row_heights(dem, u0, du, v0, dv, spacing, tx, out):
+    """Fill `out` with the heights at (u0 + du tx, v0 + dv tx), DEM coordinates that are linear along a row of a cell.
+
+    Fractions are taken of the coordinates in the whole DEM, not in its window: the last bit must not depend on how
+    large a window the memory allows.
+    """
+    heights, dem_left, dem_top, cubic_dem = dem.heights, dem.left, dem.top, dem.cubic
+    dem_rows, dem_columns = heights.shape
+    count = tx.size
+    if cubic_dem or max(abs(du), abs(dv)) * _RUN > spacing:
+        for k in range(count):
+            out[k] = _dem_height_at(heights, u0 + du * tx[k], v0 + dv * tx[k], dem_left, dem_top, cubic_dem)
+        return
+    # A coarse DEM: many pixels lie between the same four samples, and need only one look at them.
+    k = 0
+    while k < count:
+        west, north = np.floor(u0 + du * tx[k]), np.floor(v0 + dv * tx[k])
+        end = k + 1
+        while end < count and np.floor(u0 + du * tx[end]) == west and np.floor(v0 + dv * tx[end]) == north:
+            end += 1
+        i, j = int(west) - dem_left, int(north) - dem_top
+        smooth = 0 <= i < dem_columns - 1 and 0 <= j < dem_rows - 1
+        if smooth:
+            h00, h10, h01 = heights[j, i], heights[j, i + 1] - heights[j, i], heights[j + 1, i] - heights[j, i]
+            h11 = heights[j + 1, i + 1] - heights[j + 1, i] - h10
+            smooth = h11 + h01 == h11 + h01  # no void among them
+        if smooth:
+            for m in range(k, end):
+                fu, fv = u0 + du * tx[m] - west, v0 + dv * tx[m] - north
+                out[m] = (h00 + h10 * fu) + (h01 + h11 * fu) * fv
+        else:
+            for m in range(k, end):
+                out[m] = _dem_height_at(heights, u0 + du * tx[m], v0 + dv * tx[m], dem_left, dem_top, False)
+        k = end
+
+
+@compiled
+def heights_at(uv: Any, dem: DemWindow, out: Any) -> None:
+    """Fill `out` ``(n, m)`` with the heights at DEM coordinates `uv` ``(n, m, 2)``; NaN outside of the window."""
+    for j in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            out[j, i] = _dem_height_at(dem.heights, uv[j, i, 0], uv[j, i, 1], dem.left, dem.top, dem.cubic)
+
+
+@compiled
+def _dem_height_at(heights, u, v, dem_left, dem_top, cubic_dem):
+    """Interpolate the DEM at sample coordinates (u, v); NaN outside of its window."""
+    rows, columns = heights.shape
+    if not (dem_left <= u <= dem_left + columns - 1 and dem_top <= v <= dem_top + rows - 1):
+        return np.nan
+    # The last sample itself is still covered.
+    i, j = min(int(np.floor(u)), dem_left + columns - 2), min(int(np.floor(v)), dem_top + rows - 2)
+    return _dem_height(heights, i - dem_left, j - dem_top, u - i, v - j, cubic_dem)
+
+
+@inlined
+def _dem_height(heights, i, j, fu, fv, cubic_dem):
+    """Interpolate the DEM at (i + fu, j + fv); NaN where a sample with weight is void."""
+    # A sample of weight zero must not spoil the result: 0 * NaN is NaN.
+    upper = heights[j, i] if fu == 0.0 else heights[j, i] + (heights[j, i + 1] - heights[j, i]) * fu
+    if fv == 0.0:
+        bilinear = upper
+    else:
+        lower = heights[j + 1, i] if fu == 0.0 else heights[j + 1, i] + (heights[j + 1, i + 1] - heights[j + 1, i]) * fu
+        bilinear = upper + (lower - upper) * fv
+    if not cubic_dem:
+        return bilinear
+    if not (i >= 1 and j >= 1 and i + 2 < heights.shape[1] and j + 2 < heights.shape[0]):
+        return bilinear
+    a0, a1, a2, a3 = cubic_weights(fu)
+    b0, b1, b2, b3 = cubic_weights(fv)
+    total = 0.0
+    for k in range(4):
+        b = b0 if k == 0 else b1 if k == 1 else b2 if k == 2 else b3
+        line = j - 1 + k
+        total += b * (
+            a0 * heights[line, i - 1] + a1 * heights[line, i] + a2 * heights[line, i + 1] + a3 * heights[line, i + 2]
+        )
+    return total if total == total else bilinear
+
+
+@compiled
+def warp_block(source: SourceWindow, lattice: Lattice, dem: DemWindow, resampling: Resampling, target: Target) -> int:
+    """Make output pixels of one block.
+
+    Returns
+    -------
+    int
+        Number of pixels whose neighbours lie in the source but not in the window; the caller reads a larger one.
+    """
+    first, last, reach = target.first_column, target.last_column, resampling.reach
+    columns, rows = np.empty(last - first), np.empty(last - first)
+    ticks = np.empty(last)
+    for k in range(first, last):
+        ticks[k] = (k % lattice.spacing) / lattice.spacing
+    pixels, left, top, out, out_valid = source.pixels, source.left, source.top, target.pixels, target.valid
+    bands, window_height, window_width = pixels.shape
+    # Points within these bounds have all neighbours both in the source and in the window.
+    low_col = left + reach if left > 0 else reach
+    low_row = top + reach if top > 0 else reach
+    high_col, high_row = left + window_width - reach - 1, top + window_height - reach - 1
+    short = 0
+    for row in range(target.first_row, target.last_row):
+        block_coordinates(row, first, last, lattice, dem, ticks, columns, rows)
+        line, count = row - target.first_row, last - first
+        begin, end = (0, 0) if source.masked else _span(columns, rows, low_col, high_col, low_row, high_row)
+        for band in range(bands if end > begin else 0):
+            row_inside(
+                resampling, pixels[band], columns[begin:end], rows[begin:end], left, top, out[band, line, begin:end]
+            )
+        out_valid[:, line, begin:end] = True
+        for start, stop in ((0, begin), (end, count)):
+            if stop > start:
+                short += row_with_edges(
+                    resampling, source, columns[start:stop], rows[start:stop], out[:, line, start:stop],
+                    out_valid[:, line, start:stop],
+                )  # fmt: skip
+    return short
+
+
+@compiled
+def _span(columns, rows, low_col, high_col, low_row, high_row):
+    """Return where the part of a row begins and ends in which no neighbour is missing; the rest is done with care."""
+    begin, end = 0, columns.size
+    while begin < end and not (low_col <= columns[begin] < high_col and low_row <= rows[begin] < high_row):
+        begin += 1
+    while end > begin and not (low_col <= columns[end - 1] < high_col and low_row <= rows[end - 1] < high_row):
+        end -= 1
+    inside = True
+    for k in range(begin, end):
+        inside &= (columns[k] >= low_col) & (columns[k] < high_col) & (rows[k] >= low_row) & (rows[k] < high_row)
+    return (begin, end) if inside else (0, 0)
