@@ -73,6 +73,7 @@ bench: setup
 	$(BIN)/python benchmarks/fit.py
 	$(BIN)/python benchmarks/adjust.py
 	$(BIN)/python benchmarks/batch.py
+	$(BIN)/python benchmarks/answers.py
 
 docs: setup
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,6 +53,31 @@ def real() -> Path:
 def sample() -> Path:
     """Folder of the simulated sample scene."""
     return SAMPLE
+
+
+class Calls:
+    """Counts the calls of functions, Python's and C's, within a `with`: work that is the same on every machine.
+
+    What one call does inside of a compiled library is not seen; that is for `benchmarks/`.
+    """
+
+    count = 0
+
+    def __enter__(self) -> Calls:
+        sys.setprofile(self._called)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        sys.setprofile(None)
+
+    def _called(self, frame: object, event: str, argument: object) -> None:
+        self.count += event in ("call", "c_call")
+
+
+@pytest.fixture
+def calls() -> Calls:
+    """Count calls: ``with calls: job()``, then `calls.count`."""
+    return Calls()
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 import types
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -83,15 +82,23 @@ def open_with(image: Path, **fields) -> Scene:
     return host_of(sensor).open_scene(image)
 
 
-def test_what_keeps_the_contract_opens_within_milliseconds(image):
+def test_what_keeps_the_contract_opens_with_a_handful_of_projections(image, monkeypatch):
     scene = open_with(image, priors={"shift": Prior(0.0, 1.0)}, model_source=Path("flight.json"))
     # Reports are JSON.
     assert scene.model_source == "flight.json"
     assert list(model_faults(Plane())) == []
-    start = time.perf_counter()
-    for _ in range(20):
-        list(model_faults(Plane()))
-    assert (time.perf_counter() - start) / 20 < 0.02
+    projected = []
+    project = Plane.ground_to_image
+
+    def counted(self, ground):
+        projected.append(len(ground))
+        return project(self, ground)
+
+    monkeypatch.setattr(Plane, "ground_to_image", counted)
+    assert list(model_faults(Plane())) == []
+    # A plugin's model may take long for a point: three calls, and no more than a few points.
+    assert len(projected) <= 3
+    assert sum(projected) <= 8
 
 
 @pytest.mark.parametrize(

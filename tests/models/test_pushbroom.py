@@ -6,7 +6,7 @@ import json
 import math
 import os
 import pickle
-import time
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -201,16 +201,18 @@ def test_what_is_not_seen_is_nan() -> None:
     assert np.abs(model.ground_to_image(outside) - (-3000.0, 16_000.0)).max() < 1e-6
 
 
-def test_a_million_points_per_second_on_one_core() -> None:
+def test_points_are_projected_by_one_compiled_loop(calls) -> None:
+    """As many calls for 200,000 points as for ten; `benchmarks/adjust.py` holds a million points in a second."""
     model = exact(scanner())
     ground = np.tile(sample(scanner(), 2000)[1], (100, 1))
     model.ground_to_image(ground[:10])
-    taken = []
-    for _ in range(5):
-        begin = time.process_time()
+    with calls:
+        model.ground_to_image(ground[:10])
+    few = calls.count
+    with calls:
         model.ground_to_image(ground)
-        taken.append(time.process_time() - begin)
-    assert len(ground) / min(taken) > 1e6
+    assert calls.count - few == few
+    assert few < 100
 
 
 def test_rounded_rotations_are_made_rotations() -> None:
@@ -231,23 +233,25 @@ def test_copies_in_other_processes_project_alike() -> None:
 
 
 def test_few_parameters_of_many_cost_little() -> None:
-    """Partials by the six free parameters of a table with hundreds, which once cost as much as by all of them."""
+    """Partials by the six free parameters of a table with hundreds, which once cost as much as by all of them.
+
+    Arrays are counted, which take what time there is.
+    """
     model = exact(scanner())
     ground = np.tile(sample(scanner(), 1000)[1], (5, 1))
 
-    def taken(one: Pushbroom) -> float:
-        times = []
-        for _ in range(3):
-            begin = time.process_time()
-            one.param_partials(ground)
-            times.append(time.process_time() - begin)
-        return min(times)
+    def peak(one: Pushbroom) -> int:
+        tracemalloc.start()
+        one.param_partials(ground)
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return most
 
     whole = model.freed(*model.groups)
     few = model.param_partials(ground)
     at = [whole.param_names.index(name) for name in model.param_names]
     assert np.allclose(few, whole.param_partials(ground)[:, :, at], rtol=1e-12, atol=0)
-    assert taken(model) < 0.4 * taken(whole)
+    assert peak(model) < 0.4 * peak(whole)
 
 
 # -- conventions -----------------------------------------------------------------------------------------------------

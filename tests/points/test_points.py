@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyproj
@@ -283,12 +283,12 @@ def test_what_is_no_number_is_named_with_line_and_column(tmp_path: Path, cell: s
     ids=lambda data: f"{data[:24]!r}{len(data)}",
 )
 @pytest.mark.parametrize("suffix", [".csv", ".txt", ".points", ".geojson", ".pts"])
-def test_hostile_files_end_in_a_typed_error_within_a_second(tmp_path: Path, data: bytes, suffix: str) -> None:
+def test_hostile_files_end_in_a_typed_error_soon(tmp_path: Path, data: bytes, suffix: str, calls: Any) -> None:
     path = write(tmp_path / f"p{suffix}", data)
-    begin = time.perf_counter()
-    with pytest.raises(InputError):
+    with pytest.raises(InputError), calls:
         read_points(path, crs="EPSG:4979")
-    assert time.perf_counter() - begin < 1.0
+    # Some are of 33 MB: nothing is done for every line, or every letter, of them.
+    assert calls.count < 5000
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import random
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -317,13 +316,13 @@ def test_mutations_raise_nothing_but_typed_errors(tmp_path):
 
 
 @pytest.mark.parametrize("data", [b"x" * 10_000_000, b"\xff\xfe" + b"a\0" * 100, bytes(1000), b"", b"=" * 5000])
-def test_odd_files_are_refused_within_a_second(tmp_path, data):
+def test_odd_files_are_refused_soon(tmp_path, data, calls):
     path = tmp_path / "po_1_metadata.txt"
     path.write_bytes(data)
-    begin = time.monotonic()
-    with pytest.raises(InputError):
+    with pytest.raises(InputError), calls:
         read_metadata(path)
-    assert time.monotonic() - begin < 1.0
+    # Nothing is done for every line of 10 MB.
+    assert calls.count < 1000
     with pytest.raises(InputError, match="cannot be read"):
         read_metadata(tmp_path / "absent.txt")
 
