@@ -327,7 +327,10 @@ class SurfaceOptions:
 @_documented
 @dataclass(frozen=True)
 class OutputOptions:
-    """What the ortho looks like and how it is computed; `memory` in bytes."""
+    """What the ortho looks like and how it is computed.
+
+    `memory` is in bytes.
+    """
 
     crs: Annotated[str | None, Option("--output-crs -t_srs", metavar="CRS", unset="the UTM zone of the scene")] = None
     resolution: Annotated[
@@ -340,7 +343,8 @@ class OutputOptions:
     extent: Annotated[
         Sequence[float] | None,
         Option(
-            "--extent -te", "Taken as it is.", "XMIN YMIN XMAX YMAX", unset="the scene's footprint", kind="box"
+            "--extent -te", "Bounds of the ortho, taken as they are.", "XMIN YMIN XMAX YMAX", kind="box",
+            unset="the scene's footprint",
         ),
     ] = None  # fmt: skip
     align: Annotated[

@@ -1,11 +1,12 @@
 """The file of `ortho run`: what it may hold, and how it is read.
 
-The groups ``scene``, ``points``, ``surface`` and ``output`` are those of `options`, field by field; the budget of the
+The groups ``scene``, ``points``, ``surface`` and ``output`` are made from `options`, field by field; the budget of the
 machine (memory, threads, workers) is no part of the file, because no result depends on it.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import os
 import re
@@ -18,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import read_bounded
+from ortho_pipeline.options import Option, OutputOptions, PointOptions, SceneOptions, SurfaceOptions, options_of
 
 _MAX_BYTES = 5_000_000
 _MAX_DEPTH, _MAX_EVENTS = 20, 300_000
@@ -26,7 +28,6 @@ _SEE = "see docs/run.md for the form of the file"
 #: A path of YAML keys and indices.
 Place = tuple[Hashable, ...]
 Scalar = str | int | float | bool
-_Positive = Annotated[float, Field(gt=0)]
 
 # -- what the file may hold ------------------------------------------------------------------------------------------
 
@@ -35,100 +36,62 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
-class SceneSettings(_Strict):
-    """How an image is opened."""
-
-    sensor: str | None = Field(
-        default=None, description="Name of the sensor, where several or none recognise the image."
-    )
-    rpc: str | None = Field(default=None, description="'tag', 'sidecar' or an RPC file.")
-    model: str | None = Field(default=None, description="A *_model.json in place of the image's own model.")
-    sensor_options: dict[str, Scalar] = Field(
-        default={}, description="Options that the sensor declares ('ortho sensors')."
-    )
-    crop_offset: Annotated[list[float], Field(min_length=2, max_length=2)] | None = Field(
-        default=None, description="Column and row of the first pixel in the image of the model, for a crop of it."
-    )
-
-
-class PointSettings(_Strict):
-    """Which points there are, and what is adjusted to them."""
-
-    gcps: str | None = Field(default=None, description="A file of points, or 'own' for those in the image.")
-    crs: str | None = Field(default=None, description="CRS of files that do not say.")
-    vertical: str | None = Field(default=None, description="Height datum of files that do not say.")
-    pixel_origin: Literal["corner", "center", "corner-1", "center-1"] = Field(
-        default="corner", description="What CSV files call the first pixel: its corner or centre (0, 0), or (1, 1)."
-    )
-    check: str | None = Field(default=None, description="'every:N' or 'ids:A,B': points that check and do not control.")
-    select: str | None = Field(default=None, description="'even:N', 'cluster:N', 'ids:A,B' or 'random:N:SEED'.")
-    correction: Literal["none", "shift", "shift-drift", "affine", "model"] | None = Field(
-        default=None, description="What is adjusted; shift if there are control points."
-    )
-    fit_model: str | None = Field(default=None, description="A model fitted to the points alone ('ortho models').")
-    model_crs: str | None = Field(
-        default=None, description="Ground of that model: geocentric, geographic, utm or EPSG:n."
-    )
-    prune: bool = Field(default=False, description="Remove parameters that the points do not justify.")
-    params: str | None = Field(default=None, description="'A,B,C': the only parameters that are adjusted.")
-    significance: float = Field(default=0.05, gt=0, lt=1, description="Chance of justifying a parameter that is zero.")
-    ridge: str = Field(default="auto", description="Of a fitted model: auto, none, gcv, lcurve or a weight.")
-    near: _Positive | None = Field(default=None, description="Distance (m) below which points are neighbours.")
+def _type(option: Option) -> Any:
+    """Return the type of an option in the file."""
+    if option.choices:
+        return Literal[tuple(option.choices)]
+    bounds: dict[str, Any] = {"gt": option.above, "lt": option.below}
+    number: Any = float if option.above is option.below is None else Annotated[float, Field(**bounds)]
+    whole: Any = int if option.above is None else Annotated[int, Field(ge=int(option.above) + 1)]
+    return {
+        "text": str,
+        "file": str,
+        "number": number,
+        "integers": Annotated[list[whole], Field(min_length=1)],
+        "pair": Annotated[list[number], Field(min_length=2, max_length=2)],
+        "box": Annotated[list[number], Field(min_length=4, max_length=4)],
+        "one or two": number | Annotated[list[number], Field(min_length=2, max_length=2)],
+        "number or word": str | number,
+        "number or nan": number | Literal["nan"],
+        "keys": dict[str, Scalar],
+    }[option.kind]
 
 
-class SurfaceSettings(_Strict):
-    """Where heights come from."""
+def _settings(name: str, group: type) -> Any:
+    """Return the schema of a group of options; what they mean and may be is stated in `options`."""
+    found: dict[str, Any] = {}
+    known = options_of(group)
+    for one in dataclasses.fields(group):
+        option = known[one.name]
+        if not option.in_file:
+            continue
+        default = {} if option.kind == "keys" else one.default
+        kind: Any = bool if isinstance(default, bool) else _type(option)
+        described = Field(default=default, description=_described(option) or None)
+        found[one.name] = (kind | None if default is None else kind, described)
+    return pydantic.create_model(name, __base__=_Strict, __doc__=str(group.__doc__).partition("\n")[0], **found)
 
-    dem: str | None = Field(default=None, description="Digital elevation model.")
-    vertical: str | None = Field(
-        default=None, description="Height datum of the DEM: ellipsoid, egm96, EPSG:n or a grid file."
-    )
-    override_vertical: bool = Field(
-        default=False, description="Believe 'vertical' even where the DEM declares another datum."
-    )
-    fill: str | float = Field(default="error", description="Without a height: 'error', 'mask', 'nearest' or a height.")
-    height: float | None = Field(default=None, description="One ellipsoidal height (m) in place of a DEM.")
+
+def _described(option: Option) -> str:
+    """Return what the schema says of an option: its help, the forms that its value may have, what holds without it."""
+    forms = option.metavar if option.metavar and not option.choices and re.search(r"[| ]", option.metavar) else None
+    unset = option.unset and f"Default: {option.unset}."
+    return " ".join(part for part in (option.help, forms and f"Form: {forms}.", unset) if part)
 
 
-class OutputSettings(_Strict):
-    """What an ortho looks like."""
-
-    crs: str | None = Field(default=None, description="Default: the UTM zone of the scene.")
-    resolution: _Positive | Annotated[list[_Positive], Field(min_length=2, max_length=2)] | None = Field(
-        default=None, description="One number or [x, y], in units of the CRS; default: that of the scene."
-    )
-    extent: Annotated[list[float], Field(min_length=4, max_length=4)] | None = Field(
-        default=None, description="xmin, ymin, xmax, ymax; default: the footprint on whole multiples of the resolution."
-    )
-    align: bool = Field(default=False, description="Widen 'extent' to whole multiples of the resolution.")
-    resampling: Literal["nearest", "bilinear", "cubic", "lanczos", "average"] = "bilinear"
-    bands: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)] | None = Field(
-        default=None, description="Which bands, from 1; default: all."
-    )
-    dtype: Literal["Byte", "UInt16", "Int16", "UInt32", "Int32", "Float32", "Float64"] | None = Field(
-        default=None, description="Type of the pixels; default: that of the image."
-    )
-    nodata: float | Literal["nan"] | None = Field(
-        default=None, description="Of pixels without an image; default: that of the image, or a mask."
-    )
-    dem_interpolation: Literal["bilinear", "cubic"] = "bilinear"
-    format: Literal["COG", "GTiff"] = "COG"
-    creation_options: dict[str, Scalar] = Field(default={}, description="Options of GDAL's driver.")
-    engine: Literal["ortho", "gdal"] = "ortho"
-    tolerance: _Positive = Field(default=0.01, description="Bound on the geometric error of the warp, source pixels.")
-    stac: bool = Field(default=False, description="Write a STAC item of each ortho.")
-    acquired: str | None = Field(
-        default=None, description="Time of acquisition (RFC 3339) for it, where the metadata have none."
-    )
+SceneSettings = _settings("SceneSettings", SceneOptions)
+PointSettings = _settings("PointSettings", PointOptions)
+SurfaceSettings = _settings("SurfaceSettings", SurfaceOptions)
+OutputSettings = _settings("OutputSettings", OutputOptions)
 
 
 class Settings(_Strict):
     """All that can be said of a scene."""
 
-    scene: SceneSettings = SceneSettings()
-    points: PointSettings = PointSettings()
-    surface: SurfaceSettings = SurfaceSettings()
-    output: OutputSettings = OutputSettings()
+    scene: SceneSettings = SceneSettings()  # type: ignore[valid-type]
+    points: PointSettings = PointSettings()  # type: ignore[valid-type]
+    surface: SurfaceSettings = SurfaceSettings()  # type: ignore[valid-type]
+    output: OutputSettings = OutputSettings()  # type: ignore[valid-type]
 
 
 class Entry(Settings):

@@ -213,7 +213,7 @@ class _Planner:
         )  # fmt: skip
 
     def _scene(self, settings: Settings, image: Path, where: str) -> SceneOptions:
-        given = settings.scene
+        given: Any = settings.scene
         options = {}
         for key, value in given.sensor_options.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
@@ -226,7 +226,7 @@ class _Planner:
         )  # fmt: skip
 
     def _points(self, settings: Settings, image: Path, where: str) -> PointOptions:
-        values = dict(settings.points)
+        values: dict[str, Any] = dict(settings.points)
         if values["gcps"] != OWN_POINTS:
             values["gcps"] = self._file(values["gcps"], image, f"{where}.points.gcps")
         if values["vertical"] is not None:
@@ -234,7 +234,7 @@ class _Planner:
         return PointOptions(**values)
 
     def _surface(self, settings: Settings, image: Path, where: str) -> SurfaceOptions:
-        values = dict(settings.surface)
+        values: dict[str, Any] = dict(settings.surface)
         values["dem"] = self._file(values["dem"], image, f"{where}.surface.dem")
         values["fill"] = str(values["fill"])
         if values["vertical"] is not None:
@@ -242,7 +242,7 @@ class _Planner:
         return SurfaceOptions(**values)
 
     def _ortho(self, settings: Settings) -> OutputOptions:
-        values = dict(settings.output)
+        values: dict[str, Any] = dict(settings.output)
         values["creation_options"] = {key: str(value) for key, value in values["creation_options"].items()}
         return OutputOptions(**values)
 

@@ -28,7 +28,7 @@ from ortho_pipeline.batch.records import Record, locked
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
-from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions, options_of
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 FILE = """
@@ -128,6 +128,10 @@ def test_the_file_has_the_options_of_rectify(settings, options, not_in_the_file)
     assert set(settings.model_fields) == {field.name for field in dataclasses.fields(options)} - not_in_the_file
     values = {name: field.default for name, field in settings.model_fields.items()}
     assert options(**values) == options()
+    # What an editor shows is the help of the command line.
+    described = settings.model_json_schema()["properties"]
+    for name, option in options_of(options).items():
+        assert name in not_in_the_file or option.help in described[name].get("description", "")
 
 
 @pytest.mark.parametrize(
