@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.block.points import BlockPoints as BlockPoints
     from ortho_pipeline.block.points import read_block_points as read_block_points
     from ortho_pipeline.commands import rectify as rectify
+    from ortho_pipeline.display.notices import Notice as Notice
     from ortho_pipeline.errors import OrthoError as OrthoError
     from ortho_pipeline.estimation.comparison import compare as compare
     from ortho_pipeline.estimation.fit import Fit as Fit
@@ -60,6 +61,7 @@ _HOMES = {
     "Fit": "estimation.fit",
     "Grid": "raster.source",
     "ImageCorrection": "models",
+    "Notice": "display.notices",
     "OrthoError": "errors",
     "OutputOptions": "options",
     "PointOptions": "options",

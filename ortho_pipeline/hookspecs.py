@@ -36,6 +36,7 @@ from typing import Any
 
 import pluggy
 
+from ortho_pipeline.display.notices import FROM_SENSOR, Notice, with_code
 from ortho_pipeline.estimation.problem import Prior
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.models.base import SensorModel
@@ -89,7 +90,7 @@ class Scene:
     facts : mapping
         What is worth showing to people (acquisition time, sun elevation, cloud cover ...): JSON values.
     warnings : tuple of str
-        What the user ought to know before trusting the result.
+        What the user ought to know before trusting the result; a `Notice` among them brings a code of its own.
     priors : mapping of str to Prior
         How well the vendor knows parameters of the model that ``--correction model`` adjusts (`adjustable`).
     rasters : tuple of path
@@ -133,6 +134,11 @@ class Scene:
     def model(self) -> SensorModel:
         """The first, best model."""
         return next(iter(self.models.values()))
+
+    @property
+    def notices(self) -> tuple[Notice, ...]:
+        """The warnings, each with a code: one that came as text alone is ``from-sensor``."""
+        return with_code(self.warnings, FROM_SENSOR)
 
     @property
     def adjustable(self) -> str | None:

@@ -236,6 +236,7 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
         "rmse_m": {which: rmse and rmse["total"] for which, rmse in report["rmse_m"].items()},
         "ortho": {name: report["ortho"][name] for name in ("crs", "resolution", "size", "valid_share")},
         "warnings": list(report["warnings"]),
+        "notices": list(report["notices"]),
     }
 
 

@@ -25,6 +25,7 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.solver import BlockProblem, Pseudo, Selection, Solved, State
 from ortho_pipeline.block.variance_components import Posterior, Variances, estimate, posterior, reweighed
 from ortho_pipeline.display.notebook import block_html
+from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints, counted
 from ortho_pipeline.estimation.fit import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING, root_mean_square
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT, Prior
@@ -76,7 +77,7 @@ class BlockFit:
     variances: Variances
     rejected: tuple[Rejected, ...] = ()
     outlying: tuple[Outlying, ...] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     condition: float = 1.0
     iterations: int = 0
 
@@ -184,7 +185,7 @@ class BlockFit:
             "rays": [self._ray(k) for k in range(points.rays)],
             "rejected": [asdict(one) for one in self.rejected],
             "outlying": [asdict(one) for one in self.outlying],
-            "warnings": list(self.warnings),
+            **to_document(self.warnings),
         }
 
     def _point(self, k: int) -> dict[str, Any]:
@@ -259,8 +260,7 @@ def adjust(
         blunders = find_blunders(problem, solved, selection)
         rejected = blunders.rejected
         if blunders.undecided:
-            names = ", ".join(blunders.undecided[:10])
-            notes.append(f"points contradict each other, and without them the block is not determined: {names}")
+            notes.append(_undecided(blunders.undecided))
         if rejected:
             gauge = gauge.replace(_by_control(problem, selection), _by_control(problem, blunders.kept))
             selection = blunders.kept
@@ -272,6 +272,11 @@ def adjust(
     return _result(problem, solved, found, selection, points, chosen, gauge, rejected, notes)
 
 
+def _undecided(points: Sequence[str]) -> Notice:
+    text = f"points contradict each other, and without them the block is not determined: {', '.join(points[:10])}"
+    return Notice("undecided-contradiction", text, points=list(points))
+
+
 # -- before ----------------------------------------------------------------------------------------------------------
 
 
@@ -280,7 +285,7 @@ def _prepared(
     points: BlockPoints,
     priors: Mapping[str, Mapping[str, Prior]],
     exclude: Collection[str],
-) -> tuple[BlockProblem, State, Selection, list[str]]:
+) -> tuple[BlockProblem, State, Selection, list[Notice]]:
     """Return the problem, its start, what takes part, and what people ought to know of that."""
     frame = frame_of(models, points)
     known = np.full((len(points), 3), np.nan)
@@ -302,12 +307,13 @@ def _prepared(
         names = [points.ids[i] for i in np.flatnonzero(lost & (points.roles == role))]
         if names:
             some = ", ".join(names[:10]) + (" ..." if len(names) > 10 else "")
-            notes.append(
+            text = (
                 f"{counted(len(names), f'{role} point takes', f'{role} points take')} no part (fewer rays than "
                 "needed, rays that do not meet or are "
                 f"parallel, or outside of the models): {some}"
                 + ("; whether their known ground is right is not tested" if role == "check" else "")
             )
+            notes.append(Notice("takes-no-part", text, role=role, count=len(names), points=names[:10]))
     return problem, State(models, local), selection, notes
 
 
@@ -483,7 +489,7 @@ def _weakest(problem: BlockProblem, solved: Solved) -> str:
     return f"{shown}; and those of {counted(len(parts) - 4, 'more image')}" if len(parts) > 4 else shown
 
 
-def _uncertain(problem: BlockProblem, solved: Solved, stated: BlockPoints) -> list[str]:
+def _uncertain(problem: BlockProblem, solved: Solved, stated: BlockPoints) -> list[Notice]:
     """Refuse images that are far less certain where their own points are than these, and warn of uncertain corners.
 
     Points count as measured as they were `stated` even where they turned out better: constraints of the models are
@@ -513,7 +519,8 @@ def _uncertain(problem: BlockProblem, solved: Solved, stated: BlockPoints) -> li
         spread = np.sqrt(((at_corners @ cofactors) * at_corners).sum(axis=2))
         factor = float(spread.max(initial=0.0)) / sigma
         if factor > EXTRAPOLATION_WARNING and not held:
-            found.append(f"image {name}: at a corner {factor:.0f} times less certain than a measured point")
+            text = f"at a corner {factor:.0f} times less certain than a measured point"
+            found.append(Notice("uncertain-at-edge", text, factor=factor).in_image(name))
     return found
 
 
@@ -526,7 +533,7 @@ def _result(
     start: tuple[SensorModel, ...],
     gauge: str,
     rejected: tuple[Rejected, ...],
-    notes: list[str],
+    notes: list[Notice],
 ) -> BlockFit:
     state = solved.state
     sigma0, freedom = problem.unit_weight(solved)
@@ -569,7 +576,7 @@ def _result(
         gauge=gauge,
         rejected=rejected,
         outlying=doubts,
-        warnings=(*map(str, doubts), *notes),
+        warnings=(*(one.notice() for one in doubts), *notes),
         condition=solved.condition,
         iterations=solved.iterations,
     )

@@ -15,6 +15,7 @@ import numpy as np
 from ortho_pipeline.block.blunders import tests_of_ground
 from ortho_pipeline.block.solver import BlockProblem, Solved
 from ortho_pipeline.block.variance_components import Variances
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.models.base import Array
 
 #: Chance that of a good block any point is named.
@@ -42,14 +43,15 @@ class Outlying:
     metres: float
     sigmas: float
 
-    def __str__(self) -> str:
+    def notice(self) -> Notice:
         """Say it to people."""
         where = {"plan": "its place in plan is", "height": "its height is", "ground": "its ground is"}[self.what]
         taken = "it counts in the accuracy all the same" if self.role == "check" else "it was used all the same"
-        return (
+        text = (
             f"{self.role} point {self.point}: {where} {self.metres:.2f} m ({self.sigmas:.1f} sigma) from where the "
             f"block puts it; {taken}: check its coordinates and measurements"
         )
+        return Notice("contradicting-point", text, point=self.point, role=self.role)
 
 
 def outlying(

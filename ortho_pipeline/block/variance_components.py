@@ -27,6 +27,7 @@ import numpy as np
 
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.block.solver import PERFECT_GROUND, BlockProblem, Selection, Solved
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import NotConverged, counted
 from ortho_pipeline.models.base import Array
 
@@ -118,7 +119,7 @@ class Variances:
         sigma_image = problem.points.sigma_image * self.image
         return replace(problem, points=replace(problem.points, sigma_image=sigma_image), assumed=assumed)
 
-    def notes(self) -> list[str]:
+    def notes(self) -> list[Notice]:
         """Return what people ought to know of them."""
         number = max(self.unstated)
         if not number:
@@ -126,7 +127,8 @@ class Variances:
         remedy = "state sigmas (sigma_xy, sigma_h, or --ground-sigma XY,H) if they are known"
         who = f"{counted(number, 'control point')} without a stated sigma"
         if not self.separable:
-            return [f"{who}: their errors cannot be told from errors of measurement here, and count as such; {remedy}"]
+            text = f"{who}: their errors cannot be told from errors of measurement here, and count as such; {remedy}"
+            return [Notice("unstated-sigma", text, count=number)]
         found = []
         for what, sigma, spare in zip(
             ("in plan", "in height"), (self.sigma_xy, self.sigma_h), self.redundancy[1:], strict=True
@@ -134,7 +136,8 @@ class Variances:
             if sigma is not None:
                 weak = ", hardly determined" if spare < 2.0 else ""
                 found.append(f"{sigma:.2g} m {what} (redundancy {spare:.1f}{weak})")
-        return [f"{who}: estimated as {' and '.join(found)}; {remedy}"]
+        text = f"{who}: estimated as {' and '.join(found)}; {remedy}"
+        return [Notice("unstated-sigma", text, count=number, sigma_xy=self.sigma_xy, sigma_h=self.sigma_h)]
 
     def to_json(self) -> dict[str, Any]:
         """Return JSON values."""

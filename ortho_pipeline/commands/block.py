@@ -24,6 +24,7 @@ from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, points_of_images, start_of
 from ortho_pipeline.commands.results import Result
+from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
@@ -35,9 +36,7 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import BlockOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import assign_roles
 from ortho_pipeline.report import block as block_report
-
-#: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
-_ENOUGH_CHECKS = 30
+from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
 
 
 def adjust(
@@ -90,9 +89,9 @@ def adjust(
     for label in labels:
         try:
             exported[label] = rpc.export_rpc(_plain(fit.models[label]))
-            notes += [f"image {label}: {text}" for text in exported[label].warnings]
+            notes += [notice.in_image(label) for notice in exported[label].warnings]
         except InputError as error:
-            notes.append(f"image {label}: no RPC is written ({error.message})")
+            notes.append(Notice("no-rpc", f"no RPC is written ({error.message})").in_image(label))
             del files[f"{label} rpc"]
     record = _record(images, points, scenes, starts, command)
     document = block_report.build_document(
@@ -148,7 +147,7 @@ def intersect(
     if writer is not None and output is not None:
         write_text(output, writer(rows))
     document = {
-        "points": rows, "sigma0": found.sigma0, "warnings": [*notes, *_left_open(found)],
+        "points": rows, "sigma0": found.sigma0, **to_document([*notes, *_left_open(found)]),
         "median_residual_px": _median_residual(found),
     }  # fmt: skip
     return Result(files, document, _intersection_text(document))
@@ -159,7 +158,7 @@ def intersect(
 
 def _read(
     images: Sequence[str | os.PathLike[str]], labels: Sequence[str], options: BlockOptions, allow_network: bool
-) -> tuple[BlockPoints, list[str]]:
+) -> tuple[BlockPoints, list[Notice]]:
     """Return the points of these images, and what people ought to know of them."""
     read = read_block_points(
         located(options.points, allow_network=allow_network),
@@ -173,11 +172,15 @@ def _read(
         table = assign_roles(table, options.check)
     if options.ground_sigma is not None:
         table = table.with_ground_sigma(*_sigmas(options.ground_sigma))
-    notes = [f"points of images that are not given play no part: {', '.join(strangers[:10])}"] if strangers else []
+    notes = []
+    if strangers:
+        text = f"points of images that are not given play no part: {', '.join(strangers[:10])}"
+        notes.append(Notice("images-not-given", text, images=strangers[:10]))
     flat = table.control & ~np.isfinite(table.ground[:, 2])
     if flat.any():
-        names = ", ".join(np.array(table.ids)[flat][:10])
-        notes.append(f"control points without a height weigh in in plan only: {names}")
+        names = np.array(table.ids)[flat][:10].tolist()
+        text = f"control points without a height weigh in in plan only: {', '.join(names)}"
+        notes.append(Notice("control-without-height", text, points=names))
     return table, notes
 
 
@@ -275,29 +278,29 @@ def _plain(model: SensorModel) -> SensorModel:
     return model.model if isinstance(model, ImageCorrection) and model.correction == "none" else model
 
 
-def _warnings(fit: BlockFit, starts: Mapping[str, Start]) -> list[str]:
+def _warnings(fit: BlockFit, starts: Mapping[str, Start]) -> list[Notice]:
     points = fit.points
-    found = [f"image {label}: {text}" for label, start in starts.items() for text in start.scene.warnings]
+    found = [notice.in_image(label) for label, start in starts.items() for notice in start.scene.notices]
     found += fit.warnings
     for one in fit.rejected[:50]:
         where = f" in {one.image}" if one.image else (" (its ground)" if one.what == "ground" else "")
-        found.append(f"point {one.point}{where} was left out: {one.reason}")
-    if len(fit.rejected) > 50:
-        found.append(f"and {counted(len(fit.rejected) - 50, 'more gross error')}, all of them in the report")
+        text = f"point {one.point}{where} was left out: {one.reason}"
+        found.append(Notice("left-out", text, point=one.point, reason=one.reason))
+    if (more := len(fit.rejected) - 50) > 0:
+        text = f"and {counted(more, 'more gross error')}, all of them in the report"
+        found.append(Notice("more-left-out", text, count=more))
     sizes = np.array([(start.scene.width, start.scene.height) for start in starts.values()])[points.image]
     outside = ((points.measured < 0) | (points.measured > sizes)).any(axis=1)
     if outside.any():
-        names = ", ".join(dict.fromkeys(points.ids[i] for i in points.point[outside][:10]))
-        found.append(
-            f"{counted(int(outside.sum()), 'measurement')} outside of their images (used all the same): {names}"
-        )
+        names = list(dict.fromkeys(points.ids[i] for i in points.point[outside][:10]))
+        number = int(outside.sum())
+        text = f"{counted(number, 'measurement')} outside of their images (used all the same): {', '.join(names)}"
+        found.append(Notice("outside-of-image", text, count=number, points=names))
     if fit.parameters and fit.redundancy == 0:
-        found.append("no redundancy: residuals are zero by construction and say nothing")
+        found.append(Notice("no-redundancy", "no redundancy: residuals are zero by construction and say nothing"))
     checks = max((int(rms["n"]) for rms in _check_rms(fit) if rms), default=0)
-    if points.control.any() and checks < _ENOUGH_CHECKS:
-        found.append(
-            f"{counted(checks, 'check point')}: fewer than the 30 that ASPRS 2023 asks for before accuracy is claimed"
-        )
+    if points.control.any() and checks < ENOUGH_CHECK_POINTS:
+        found.append(few_check_points(checks))
     return list(dict.fromkeys(found))
 
 
@@ -411,15 +414,16 @@ def _median_residual(found: Intersection) -> float | None:
     return float(np.median(lengths)) if len(lengths) else None
 
 
-def _left_open(found: Intersection) -> list[str]:
+def _left_open(found: Intersection) -> list[Notice]:
     open_ = ~np.isfinite(found.ground).all(axis=1)
     if not open_.any():
         return []
-    names = ", ".join(np.array(found.points.ids)[open_][:10])
-    return [
+    names = np.array(found.points.ids)[open_][:10].tolist()
+    text = (
         f"{counted(int(open_.sum()), 'point has', 'points have')} no intersection (one ray, parallel rays, or "
-        f"outside of the models): {names}"
-    ]
+        f"outside of the models): {', '.join(names)}"
+    )
+    return [Notice("no-intersection", text, count=int(open_.sum()), points=names)]
 
 
 def _intersection_text(document: Mapping[str, Any]) -> str:

@@ -20,6 +20,7 @@ from ortho_pipeline.commands.scene_fit import (
     open_adjustable,
 )
 from ortho_pipeline.commands.scene_layout import lay_out, source_of
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.exchange import gcp as gcp_export
 from ortho_pipeline.exchange import rpc
@@ -107,7 +108,7 @@ def rectify(
     document = report.build_report(
         scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
         warp=warped, near=points.near, provenance=record,
-        warnings=[*adjusted.warnings(heights), *found.notes(heights), *laid.sparse(warped.valid_pixels), *complaints,
+        warnings=[*adjusted.warnings(heights), *laid.notes(), *laid.sparse(warped.valid_pixels), *complaints,
                   *warped.notes(output.memory)],
     )  # fmt: skip
     write_report(document, adjusted.fit, files)
@@ -232,12 +233,12 @@ def _of_earlier_run(folder: Path, stem: str, files: Mapping[str, Path], *, all_o
     return [*(path for path in left if path not in files.values()), *inputs.old_side_cars(files["ortho"])]
 
 
-def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[str]]:
+def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[Notice]]:
     """Return the model as RPC and what there is to say about it; None where no RPC stands for it."""
     try:
         exported = rpc.export_rpc(model)
     except InputError as error:
-        return None, [f"no RPC files were written: {error.message}"]
+        return None, [Notice("no-rpc", f"no RPC files were written: {error.message}")]
     return exported, list(exported.warnings)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from ortho_pipeline.display import notebook
+from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.estimation import comparison as comparing
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import viewing
@@ -33,14 +34,13 @@ class FitResult:
 
     scene: Scene
     fit: Fit
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     removed: tuple[Mapping[str, Any], ...] = ()
     near: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho fit --json`` (docs/formats.md)."""
-        document = self.fit.to_json()
-        document["warnings"] = list(self.warnings)
+        document = self.fit.to_json() | to_document(self.warnings)
         pixels = viewing(self.fit.model, self.scene.width, self.scene.height)["ground_pixel_m"]
         scale = map_scale(self.fit, max(pixels) if pixels else None)
         return {

@@ -19,6 +19,7 @@ from ortho_pipeline.commands.results import (
     Result,
     outputs_together,
 )
+from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError, completed, counted
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files import write_text
@@ -77,7 +78,7 @@ def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) 
         "view": viewing(model, *size)["view"],
         "corners_lon_lat": [[_number(value) for value in row] for row in ground[:, :2]],
         "facts": dict(scene.facts),
-        "warnings": list(scene.warnings),
+        **to_document(scene.notices),
     }
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.commands import inputs
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import CoverageError, InputError, ModelError, counted
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import OWN, Removed, fit_family, fit_own, prune, restricted, ridge_of
@@ -21,6 +22,7 @@ from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
 from ortho_pipeline.options import PointOptions, SceneOptions
 from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.points.control_hull import uncovered
+from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
 from ortho_pipeline.surface.dem import Surface
 from ortho_pipeline.surface.footprint import lay
 
@@ -64,37 +66,51 @@ class Adjusted:
         """Return the removed parameters as JSON values."""
         return [{"name": one.name, "t": one.t, "p": one.p} for one in self.removed]
 
-    def warnings(self, surface: Surface | None) -> tuple[str, ...]:
+    def warnings(self, surface: Surface | None) -> tuple[Notice, ...]:
         """Return what people ought to know before they trust the numbers."""
         scene, adjusted, points = self.scene, self.fit, self.fit.points
-        found = [*scene.warnings, *(scene.unsuited[name] for name in scene.models if name in scene.unsuited)]
+        unsuited = [name for name in scene.models if name in scene.unsuited]
+        found = [*scene.notices, *(Notice("unsuited-model", scene.unsuited[name], model=name) for name in unsuited)]
         found += adjusted.warnings
         if surface is not None:
             found += surface.provenance.get("warnings", [])
-        found += [f"point {name} was left out: {reason}" for name, reason in adjusted.rejected]
-        found += [f"{one.role} point {one.id} contradicts the others: {one.reason}" for one in adjusted.outlying]
+        found += self._doubtful()
         found += marks_warning(points.select(adjusted.used & points.control))
         inside = ((points.image >= 0) & (points.image <= (scene.width, scene.height))).all(axis=1)
         if not inside.all():
-            outside = ", ".join(np.array(points.ids)[~inside])
-            found.append(f"points outside of the image (used all the same): {outside}")
+            outside = np.array(points.ids)[~inside].tolist()
+            text = f"points outside of the image (used all the same): {', '.join(outside)}"
+            found.append(Notice("outside-of-image", text, points=outside))
         found += self._elsewhere()
         if len(adjusted.param_names):
             found += uncovered(points.image[adjusted.used], (self.scene.width, self.scene.height))
         if adjusted.used.any() and len(adjusted.param_names) and adjusted.redundancy == 0:
-            found.append("no redundancy: the RMSE of the control points is zero by construction and says nothing")
+            text = "no redundancy: the RMSE of the control points is zero by construction and says nothing"
+            found.append(Notice("no-redundancy", text))
         checks = int(points.check.sum())
-        if len(points) and checks < 30:
-            found.append(
-                f"{counted(checks, 'check point')}: fewer than the 30 that ASPRS 2023 asks for before accuracy "
-                "is claimed"
-            )
+        if len(points) and checks < ENOUGH_CHECK_POINTS:
+            found.append(few_check_points(checks))
         if self.removed:
             names = ", ".join(f"{one.name} (t {one.t:.1f})" for one in self.removed)
-            found.append(f"parameters that the points do not justify were removed: {names}")
+            text = f"parameters that the points do not justify were removed: {names}"
+            found.append(Notice("parameters-removed", text, parameters=[one.name for one in self.removed]))
         return tuple(dict.fromkeys(found))
 
-    def _elsewhere(self) -> list[str]:
+    def _doubtful(self) -> list[Notice]:
+        """Return a notice for each point that was left out, and for each that contradicts the others and was not."""
+        left = [
+            Notice("left-out", f"point {name} was left out: {reason}", point=name, reason=reason)
+            for name, reason in self.fit.rejected
+        ]
+        return left + [
+            Notice(
+                "contradicting-point", f"{one.role} point {one.id} contradicts the others: {one.reason}",
+                point=one.id, role=one.role,
+            )
+            for one in self.fit.outlying
+        ]  # fmt: skip
+
+    def _elsewhere(self) -> list[Notice]:
         """Return a warning if the points say that the model, as delivered, shows quite another place."""
         bias = self.fit.raw_bias
         if bias is None or self.fit.model_name in {family.name for family in families()}:
@@ -102,10 +118,11 @@ class Adjusted:
         sizes = max(abs(bias["col"]) / self.scene.width, abs(bias["row"]) / self.scene.height)
         if not sizes > _ELSEWHERE:
             return []
-        return [
+        text = (
             f"the model as delivered is {sizes:.3g} image sizes away from the points: points or metadata of another "
             "scene, longitude and latitude exchanged, or an angle of another sign or unit"
-        ]
+        )
+        return [Notice("model-elsewhere", text, image_sizes=sizes)]
 
 
 def open_adjustable(image: Any, scene: SceneOptions, points: PointOptions) -> Scene:

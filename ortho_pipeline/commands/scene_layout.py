@@ -6,6 +6,7 @@ import os
 from typing import Any, NamedTuple
 
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust
+from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import completed, of_option
 from ortho_pipeline.geodesy.crs import map_crs
 from ortho_pipeline.hookspecs import Scene
@@ -33,15 +34,20 @@ class Layout(NamedTuple):
         """The scene with the models that were adjusted."""
         return self.adjusted.scene
 
-    def sparse(self, valid_pixels: int) -> list[str]:
+    def notes(self) -> list[Notice]:
+        """Return what there is to say of how the scene lies on its surface."""
+        return [Notice("dem-covers-part", text, coverage=self.lay.coverage) for text in self.lay.notes(self.surface)]
+
+    def sparse(self, valid_pixels: int) -> list[Notice]:
         """Return a warning if hardly any of the pixels of the ortho that the scene covers has a value."""
         part = valid_pixels / max(footprint.scene_pixels(self.model, self.lay, self.grid), 1.0)
         if part >= _SPARSE:
             return []
-        return [
+        text = (
             f"only {part:.2%} of the pixels that the scene covers have a value: check the heights, and the nodata "
             "value and the mask of the image"
-        ]
+        )
+        return [Notice("sparse-ortho", text, share=part)]
 
     def to_json(self) -> dict[str, Any]:
         """Return what is known before the first pixel as JSON values."""
@@ -57,7 +63,7 @@ class Layout(NamedTuple):
                 "crs": ":".join(authority) if authority else grid.crs.name, "size": [grid.width, grid.height],
                 "resolution": [grid.dx, grid.dy], "extent": list(grid.extent),
             },
-            "warnings": [*self.adjusted.warnings(self.surface), *self.lay.notes(self.surface)],
+            **to_document([*self.adjusted.warnings(self.surface), *self.notes()]),
         }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""How things look, whatever they are: numbers as people read them, SVG drawings, HTML for notebooks.
+"""What people see, whatever it is of: numbers as they read them, notices, SVG drawings, HTML for notebooks.
 
-Knows no result and imports nothing above `errors`.
+Knows no result and imports nothing above `files`.
 """

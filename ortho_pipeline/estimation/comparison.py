@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, OrthoError, counted
 from ortho_pipeline.estimation.family_fit import OWN, fit_family, fit_own
 from ortho_pipeline.estimation.fit import SIGNIFICANCE, Fit, Prior, fit
@@ -70,7 +71,7 @@ class Row:
         if self.fit is None:
             unknown = ("condition", "redundancy", "sigma0", "fitted_as", "ridge", "effective_parameters")
             nothing = dict.fromkeys(which)
-            return {**row, "rmse": nothing, "rmse_m": dict(nothing), **dict.fromkeys(unknown), "warnings": []}
+            return {**row, "rmse": nothing, "rmse_m": dict(nothing), **dict.fromkeys(unknown), **to_document(())}
         return {
             **row,
             "rmse": {name: self.fit.rmse(name) for name in which},
@@ -81,7 +82,7 @@ class Row:
             "fitted_as": self.fit.model_name,
             "ridge": self.fit.ridge,
             "effective_parameters": _finite(self.fit.effective_parameters),
-            "warnings": list(self.fit.warnings),
+            **to_document(self.fit.warnings),
         }
 
 
@@ -97,7 +98,7 @@ class Comparison:
     control: int = 0
     check: int = 0
     model_crs: str | None = None
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[Notice, ...] = field(default=())
 
     @property
     def best(self) -> Row | None:
@@ -112,7 +113,7 @@ class Comparison:
             "rows": [row.to_json() for row in self.rows],
             "left_out": [{"id": name, "reason": reason} for name, reason in self.left_out],
             "recommendation": {"model": self.recommended, "criterion": self.criterion, "reason": self.reason},
-            "warnings": list(self.notes),
+            **to_document(self.notes),
         }
 
 
@@ -212,7 +213,8 @@ def compare(
         if isinstance(found, Fit):
             found = replace(found, significance=significance)
         if isinstance(found, Fit) and unsuited and name in unsuited:
-            found = replace(found, warnings=(*found.warnings, unsuited[name]))
+            warning = Notice("unsuited-model", unsuited[name], model=name)
+            found = replace(found, warnings=(*found.warnings, warning))
         parameters, minimum, dimensions = known[name]
         rows.append(
             Row(name, parameters, minimum, dimensions, fit=found) if isinstance(found, Fit)

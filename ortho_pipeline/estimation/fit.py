@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.display.notebook import fit_html
+from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import DegeneratePoints, InputError, counted
 from ortho_pipeline.estimation.blunders import REJECTED_LIMIT, Outlying, find_blunders, outlying
 from ortho_pipeline.estimation.problem import Prior, Problem, Solution
@@ -63,7 +64,7 @@ class Fit:
     redundancy: int
     sigma0: float | None
     rejected: tuple[tuple[str, str], ...] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     condition: float = field(default=1.0)
     degrees_of_freedom: float = 0.0
     effective_parameters: float = 0.0
@@ -205,7 +206,7 @@ class Fit:
             "rejected": [{"id": name, "reason": reason} for name, reason in self.rejected],
             "outlying": [one.to_json() for one in self.outlying],
             "rmse_of_agreeing_checks": self.rmse("agreeing"),
-            "warnings": list(self.warnings),
+            **to_document(self.warnings),
             "statistics": self.statistics(),
         }
 
@@ -292,7 +293,7 @@ def _posed(
     raw: Array,
     priors: Mapping[str, Prior] | None,
     without: Mapping[int, str],
-) -> tuple[Problem, list[str]]:
+) -> tuple[Problem, list[Notice]]:
     """Return the problem of the usable control points, and warnings about those that are not."""
     projected = np.asarray(np.isfinite(raw).all(axis=1))
     if len(points) and not projected.any():
@@ -345,7 +346,7 @@ def _result(
     used: np.ndarray,
     raw: Array,
     rejected: Mapping[int, str],
-    warnings: list[str],
+    warnings: list[Notice],
     name: str | None,
     strength: float | None,
     priors: Mapping[str, Prior],
@@ -376,12 +377,20 @@ def _result(
     )
 
 
-def _unusable(points: Points, usable: np.ndarray, projected: np.ndarray) -> list[str]:
+def _unusable(points: Points, usable: np.ndarray, projected: np.ndarray) -> list[Notice]:
     found = []
     for role, mask in (("control", points.control & ~usable), ("check", points.check & ~projected)):
         if mask.any():
-            names = ", ".join(points.ids[i] for i in np.flatnonzero(mask))
-            found.append(f"{role} points without a projection (no height, or outside the model's domain): {names}")
+            names = [points.ids[i] for i in np.flatnonzero(mask)]
+            found.append(
+                Notice(
+                    "no-projection",
+                    f"{role} points without a projection (no height, or outside the model's domain): "
+                    f"{', '.join(names)}",
+                    role=role,
+                    points=names,
+                )
+            )
     return found
 
 
@@ -426,32 +435,36 @@ def _corner_ratio(solution: Solution, source: str, strength: float | None) -> fl
     return factor
 
 
-def _uncertain_edge(factor: float) -> list[str]:
+def _uncertain_edge(factor: float) -> list[Notice]:
     if factor <= EXTRAPOLATION_WARNING:
         return []
-    return [f"uncertain at the edge: at a corner of the scene {factor:.0f} times less certain than a measured point"]
+    text = f"uncertain at the edge: at a corner of the scene {factor:.0f} times less certain than a measured point"
+    return [Notice("uncertain-at-edge", text, factor=factor)]
 
 
-def _unstable(solution: Solution, strength: float | None) -> list[str]:
+def _unstable(solution: Solution, strength: float | None) -> list[Notice]:
     names = solution.model.param_names
     if strength is not None:
         if solution.condition <= _UNSTABLE:
             return []
-        return [
+        text = (
             f"unstable: the points determine {solution.effective:.1f} of {counted(len(names), 'parameter')} (condition "
             f"{solution.condition:.0e}); regularisation ({strength:.1e}) decides the others: trust check points only"
-        ]
+        )
+        return [Notice("unstable", text, condition=solution.condition)]
     if solution.condition <= _UNSTABLE or len(names) < 2:
         pairs = np.abs(np.triu(correlation_of(solution.cofactors), 1))
         if not (pairs > _INSEPARABLE).any():
             return []
         first, second = np.unravel_index(int(np.argmax(pairs)), pairs.shape)
-        return [
+        text = (
             f"{counted(int((pairs > _INSEPARABLE).sum()), 'pair of parameters is', 'pairs of parameters are')} "
             f"correlated beyond {_INSEPARABLE} "
             f"({names[first]} and {names[second]} the most): they cannot be told apart"
-        ]
-    return [f"unstable: the condition of the adjustment is {solution.condition:.0e}: a simpler model is safer"]
+        )
+        return [Notice("inseparable-parameters", text, parameters=[names[first], names[second]])]
+    text = f"unstable: the condition of the adjustment is {solution.condition:.0e}: a simpler model is safer"
+    return [Notice("unstable", text, condition=solution.condition)]
 
 
 def _numbers(values: Array) -> list[float | None]:

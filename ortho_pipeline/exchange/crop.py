@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC, ImageCorrection, SensorModel
@@ -77,14 +78,15 @@ def placed(scene: Scene, dataset: Any, offset: Sequence[float] | None = None) ->
     """
     if offset is not None:
         place = checked(offset)
-        return _moved(scene, place, f"the image is taken for a crop whose first pixel is {_text(place)} of the whole")
+        text = f"the image is taken for a crop whose first pixel is {_text(place)} of the whole"
+        return _moved(scene, place, Notice("crop-stated", text, offset=place))
     noted = noted_offset(dataset)
     if noted is not None and _is_of_the_whole(scene, noted):
-        return _moved(
-            scene, noted,
+        text = (
             f"the image notes that it is a crop whose first pixel is {_text(noted)} of the whole, and so the model was "
-            "moved; if it is not, give --crop-offset 0,0",
-        )  # fmt: skip
+            "moved; if it is not, give --crop-offset 0,0"
+        )
+        return _moved(scene, noted, Notice("crop-noted", text, offset=noted))
     remark = _elsewhere(scene) or (None if noted is not None else _small(scene))
     return scene if remark is None else replace(scene, warnings=(*scene.warnings, remark))
 
@@ -99,7 +101,7 @@ def moved(model: SensorModel, offset: tuple[float, float]) -> SensorModel:
     return replace(ImageCorrection.identity(model, "none", (0.0, 0.0)), coefficients=coefficients)
 
 
-def _moved(scene: Scene, offset: tuple[float, float], said: str) -> Scene:
+def _moved(scene: Scene, offset: tuple[float, float], said: Notice) -> Scene:
     column, row = offset
     if offset == (0.0, 0.0):
         return scene
@@ -134,21 +136,22 @@ def _is_of_the_whole(scene: Scene, offset: tuple[float, float]) -> bool:
     return whole <= along
 
 
-def _elsewhere(scene: Scene) -> str | None:
+def _elsewhere(scene: Scene) -> Notice | None:
     """Return a warning where the RPC is meant for pixels none of which are in the image."""
     ranges = _ranges(scene.model)
     size = scene.width, scene.height
     if ranges is None or all(first <= side and last >= 0 for (first, last), side in zip(ranges, size, strict=True)):
         return None
     (left, right), (top, bottom) = ranges
-    return (
+    text = (
         f"the RPC is for columns {left:.0f} to {right:.0f} and rows {top:.0f} to {bottom:.0f}, which does not meet "
         f"this image of {scene.width} x {scene.height} pixels: is it a crop with the RPC of the whole? Say where "
         "it lies with --crop-offset COL,ROW"
     )
+    return Notice("rpc-elsewhere", text, columns=[left, right], rows=[top, bottom])
 
 
-def _small(scene: Scene) -> str | None:
+def _small(scene: Scene) -> Notice | None:
     """Return a notice where the image is much smaller than what its RPC is meant for, and may be a crop of that."""
     ranges = _ranges(scene.model)
     if ranges is None:
@@ -158,11 +161,12 @@ def _small(scene: Scene) -> str | None:
     small = scene.width < _SMALL * sizes[0] or scene.height < _SMALL * sizes[1]
     if not (begins and small):
         return None
-    return (
+    text = (
         f"the image has {scene.width} x {scene.height} pixels, its RPC is for about {sizes[0]:.0f} x {sizes[1]:.0f}: "
         "if it was cut out of that image, the RPC is right for it only if both begin at the same corner; say where it "
         "lies with --crop-offset COL,ROW"
     )
+    return Notice("maybe-a-crop", text, rpc_size=sizes)
 
 
 def _text(offset: tuple[float, float]) -> str:

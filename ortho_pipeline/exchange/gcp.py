@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from osgeo import gdal, osr
 
+from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError, ModelError
 from ortho_pipeline.exchange.rpc import (
     RpcExport,
@@ -105,14 +106,14 @@ class Export:
     ) -> None:
         self.dataset, self.model, self.size = dataset, model, size
         self.surface, self.control, self.left_out, self.force = surface, control, tuple(left_out), force
-        self.document: dict[str, Any] = {"exact": None, "max_error_px": None, "warnings": []}
+        self.document: dict[str, Any] = {"exact": None, "max_error_px": None, **to_document(())}
 
     @functools.cached_property
     def rpc(self) -> RpcExport:
         """The model as RPC."""
         exported = export_rpc(self.model, force=self.force)
         self.document |= {"exact": exported.exact, "max_error_px": exported.max_error_px}
-        self.document["warnings"] += exported.warnings
+        self.document |= to_document(exported.warnings)
         return exported
 
     def write(self, name: str, path: Path) -> None:

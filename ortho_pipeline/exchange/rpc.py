@@ -20,6 +20,7 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_pipeline import files
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, ModelError
 from ortho_pipeline.exchange.rpc_files import (
     TEXT_SUFFIXES,
@@ -294,13 +295,13 @@ class RpcExport:
         Whether it is the same function of the ground, up to rounding.
     max_error_px : float
         Largest difference of the two on an independent grid; 0 where exact.
-    warnings : tuple of str
+    warnings : tuple of Notice
     """
 
     rpc: RPC
     exact: bool
     max_error_px: float
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 def export_rpc(
@@ -409,7 +410,7 @@ def fit_rpc(
             f"an RPC stands for this model only to {worst:.3g} px",
             remedy="fit it over a smaller box or height range, or accept the error (force)",
         )
-    message = f"the RPC stands for the model only to {worst:.3g} px"
+    message = Notice("rpc-approximate", f"the RPC stands for the model only to {worst:.3g} px", max_error_px=worst)
     if worst > WARN_ERROR:
         log.warning("%s", message)
     return RpcExport(rpc, False, worst, (message,) if worst > WARN_ERROR else ())

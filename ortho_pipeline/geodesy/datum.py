@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DatumError
 from ortho_pipeline.geodesy.crs import VERTICAL_FORMS, DeclaredVertical, Vertical
 
@@ -57,11 +58,20 @@ def dem_vertical(
                 field="--dem-vertical",
                 remedy=dem_vertical_remedy(),
             )
-        by_name = f"the height datum {declared.vertical.label} of the DEM is known by its name {declared.name!r} only"
+        by_name = Notice(
+            "dem-datum-by-name",
+            f"the height datum {declared.vertical.label} of the DEM is known by its name {declared.name!r} only",
+            declared=declared.name,
+        )
         return declared.vertical, [] if declared.certain else [by_name]
     if option == declared.vertical:
         return option, []
-    warning = f"the DEM declares its heights as {declared.name!r}; {option.label} was used as --dem-vertical says"
+    warning = Notice(
+        "dem-datum-overridden",
+        f"the DEM declares its heights as {declared.name!r}; {option.label} was used as --dem-vertical says",
+        declared=declared.name,
+        used=option.name,
+    )
     # A grid file is how a user brings the geoid of a declared datum whose own grid is not installed.
     realises = declared.vertical is not None and not declared.vertical.is_ellipsoid and ":" not in option.name[:5]
     realises = realises and not option.is_ellipsoid

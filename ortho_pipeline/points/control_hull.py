@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.points.table import Array
 
 #: Below this share of the image, with the margin, the rest is not covered: of the recommendations on simulated scenes
@@ -56,18 +57,19 @@ def empty_parts(image: Array, size: tuple[int, int]) -> tuple[float, tuple[str, 
     return float(covered.area), tuple(dict.fromkeys(names))
 
 
-def uncovered(image: Array, size: tuple[int, int] | None) -> tuple[str, ...]:
+def uncovered(image: Array, size: tuple[int, int] | None) -> tuple[Notice, ...]:
     """Return a notice, with its remedy, if control points ``(N, 2)`` px leave part of the image empty; none if not."""
     if size is None or not len(image):
         return ()
     share, where = empty_parts(image, size)
     if share >= COVERED:
         return ()
-    return (
+    text = (
         f"control covers {100 * share:.0f} % of the image (its hull and a margin of half the distance between points); "
         f"empty: {' and '.join(where)}. Points say nothing of where there are none, nor which model is right there: "
-        "measure some there, or rely on the result only where control is",
+        "measure some there, or rely on the result only where control is"
     )
+    return (Notice("control-covers-part", text, share=share, empty=list(where)),)
 
 
 def _place(part: Any) -> str:

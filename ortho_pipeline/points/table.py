@@ -20,6 +20,7 @@ import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
 
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, counted, reads
 from ortho_pipeline.files import write_text
 from ortho_pipeline.geodesy.crs import (
@@ -352,16 +353,17 @@ def one_mark(points: HasGround) -> list[tuple[str, str]]:
     return [(points.ids[one], points.ids[two]) for one, two in sorted(pairs)]
 
 
-def marks_warning(control: HasGround) -> list[str]:
+def marks_warning(control: HasGround) -> list[Notice]:
     """Return a warning of control points that are one mark: they add no knowledge of its place."""
     pairs = one_mark(control)
     if not pairs:
         return []
     shown = ", ".join(f"{one} and {two}" for one, two in pairs[:5]) + (" ..." if len(pairs) > 5 else "")
-    return [
+    text = (
         f"control points within a centimetre of each other ({shown}): one mark that was measured twice counts as two, "
         "and redundancy and sigmas are too good by that; keep one of them"
-    ]
+    )
+    return [Notice("one-mark-twice", text, pairs=[list(pair) for pair in pairs])]
 
 
 # -- roles -----------------------------------------------------------------------------------------------------------

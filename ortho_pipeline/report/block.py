@@ -10,6 +10,7 @@ import numpy as np
 
 from ortho_pipeline.block.adjustment import BlockFit
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
+from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import fixed, flat, metres, px
 from ortho_pipeline.errors import counted
 from ortho_pipeline.report.document import page_environment
@@ -32,7 +33,7 @@ def build_document(
     starts: Mapping[str, Start],
     exported: Mapping[str, RpcExport],
     provenance: Mapping[str, Any],
-    warnings: Sequence[str],
+    warnings: Sequence[Notice],
 ) -> dict[str, Any]:
     """Return everything that the report says, as JSON values (docs/formats/block-points.md)."""
     images = {}
@@ -53,7 +54,7 @@ def build_document(
         "images": images,
         "adjustment": fit.to_json(),
         "provenance": dict(provenance),
-        "warnings": list(warnings),
+        **to_document(warnings),
     }
     document["headline"] = headline(document)
     return document

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.display.drawing import round_down, style_sheet
+from ortho_pipeline.display.notices import Notice, texts_but, to_document
 from ortho_pipeline.display.numbers import fixed, flat, metres, plain_size, px, share, short, signed
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.estimation.fit import Fit, root_mean_square
@@ -51,8 +52,6 @@ DOCUMENT = "ortho-pipeline report"
 #: Median of control height minus DEM height from which a difference of datums is suspected, metres.
 _SUSPICIOUS_HEIGHT = 5.0
 _MAX_BYTES = 50_000_000
-#: In the pipeline's warning about check points, which the headline repeats in its own words.
-_FEW = "check points: fewer than"
 
 __all__ = [
     "build_report",
@@ -83,7 +82,7 @@ def build_report(
     comparison: Mapping[str, Any] | None = None,
     near: float | None = None,
     provenance: Mapping[str, Any] | None = None,
-    warnings: Iterable[str] = (),
+    warnings: Iterable[Notice] = (),
 ) -> dict[str, Any]:
     """Collect scene, adjustment, heights, ortho and provenance as plain data that JSON holds (no NaN).
 
@@ -97,13 +96,13 @@ def build_report(
         The document of ``ortho compare``.
     near : float, optional
         Distance (m) below which points are neighbours; as `covariance.analyse` chooses it without one.
-    warnings : iterable of str
+    warnings : iterable of Notice
         What the reader ought to know; a suspicious difference between control and DEM heights is added to them.
     """
     seen = viewing(fit.model, scene.width, scene.height)
     heights = None if surface is None else _heights_of_points(fit, surface, seen)
-    noted = [*warnings, *([heights["warning"]] if heights and heights["warning"] else [])]
-    adjustment = {**fit.to_json(), "warnings": noted}
+    noted = to_document([*warnings, *([heights["warning"]] if heights and heights["warning"] else [])])
+    adjustment = fit.to_json() | noted
     shifts, views = in_metres(fit, fit.residuals), along_view(fit)
     for i, point in enumerate(adjustment["points"]):
         point["raw_residual"] = _numbers(fit.raw_residuals[i])
@@ -134,7 +133,7 @@ def build_report(
         "ortho": None if grid is None else _ortho(grid, warp),
         "warp": None if warp is None else _warped(warp),
         "provenance": _plain(provenance or {}),
-        "warnings": noted,
+        **noted,
     }
     report["headline"] = headline(report, accuracy_before(scene), adjusted=scene.adjusted is not None)
     return report
@@ -172,10 +171,11 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> d
         lean = seen["lean_m_per_m"]
         moved = "" if lean is None else f"; that moves the ortho by {metres(abs(median) * lean)}"
         side = "above" if median > 0 else "below"
-        warning = (
+        text = (
             f"the points lie {metres(abs(median))} {side} the DEM (median; spread {metres(spread)}): their heights "
             f"probably have another datum than the DEM's{_undulation_there(points.ground, points.crs)}{moved}"
         )
+        warning = Notice("heights-disagree", text, median_m=median, spread_m=spread)
     return {"median_m": median, "spread_m": spread, "n": len(difference), "warning": warning}
 
 
@@ -331,7 +331,7 @@ def write_report_html(
             adjustment=report["adjustment"],
             head=report["headline"],
             # The headline's notes have said these already.
-            warnings=[text for text in report["warnings"] if not text.startswith("no redundancy") and _FEW not in text],
+            warnings=texts_but(report, "no-redundancy", "few-check-points"),
             rejected={entry["id"]: entry["reason"] for entry in report["adjustment"]["rejected"]},
             outlying={entry["id"]: entry["reason"] for entry in report["adjustment"]["outlying"]},
             has_loo=any(point["loo_residual"] for point in report["adjustment"]["points"]),

@@ -6,11 +6,23 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ortho_pipeline.display.notices import Notice, texts_but
 from ortho_pipeline.display.numbers import metres, px, share, short, signed, size_text
 from ortho_pipeline.errors import counted
 
 #: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
 ENOUGH_CHECK_POINTS = 30
+
+
+def few_check_points(count: int) -> Notice:
+    """Return the notice that there are too few check points for a claim of accuracy."""
+    return Notice(
+        "few-check-points",
+        f"{counted(count, 'check point')}: fewer than the {ENOUGH_CHECK_POINTS} that ASPRS 2023 asks for before "
+        "accuracy is claimed",
+        count=count,
+        enough=ENOUGH_CHECK_POINTS,
+    )
 
 
 def headline(
@@ -122,13 +134,7 @@ def summary_text(report: Mapping[str, Any]) -> str:
         by = f" (GDAL's {name} transformer)" if (name := warp.get("transformer")) else ""
         rows.append(("warp", f"{px(warp['max_error_px'])} at worst from the exact model{by}"))
     # The headline and the rows above have said these already.
-    said = " ".join(value for _, value in rows).lower()
-    known = ("left out", "no redundancy", "check points: fewer")
-    rows += [
-        ("warning", text)
-        for text in report["warnings"]
-        if text.lower() not in said and not any(word in text for word in known)
-    ]
+    rows += [("warning", text) for text in texts_but(report, "left-out", "no-redundancy", "few-check-points")]
     return "\n".join(f"{key:<10}{value}" for key, value in rows)
 
 

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import RpcExport
 from ortho_pipeline.files.allowance import Resources, require_memory, startable_threads
@@ -68,15 +69,16 @@ class WarpResult:
     seconds: float
     transformer: str | None = None
 
-    def notes(self, memory: int) -> list[str]:
+    def notes(self, memory: int) -> list[Notice]:
         """Return a notice if GDAL's geolocation arrays took more memory (bytes) than was allowed, which they may."""
         took = self.pixels * _ARRAYS_BYTES
         if self.transformer != "GEOLOC_ARRAY" or took <= memory:
             return []
-        return [
+        text = (
             f"GDAL's warper takes about {took / 1e6:.0f} MB for the arrays that stand for this model, beyond --memory "
             f"{memory / 1e6:.0f}: make a smaller extent, or leave out --engine gdal"
-        ]
+        )
+        return [Notice("memory-exceeded", text, bytes=took)]
 
 
 def rectify(

@@ -10,6 +10,7 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_bilsat.survey import MARK, Survey, read_survey
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.problem import priors_at
 from ortho_pipeline.files import read_bounded
@@ -78,7 +79,8 @@ def open_scene(dataset: gdal.Dataset, *, survey: str | None = None, attitude: st
     warnings = []
     known = read.attitude is not None and attitude == "survey"
     if not known:
-        warnings.append("the attitude is not known: the model only starts an adjustment to ground control points")
+        text = "the attitude is not known: the model only starts an adjustment to ground control points"
+        warnings.append(Notice("only-a-start", text))
     elif not model.sees_ground:
         warnings.append(LOOKS_PAST)
     return Scene(

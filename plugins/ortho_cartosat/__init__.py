@@ -11,6 +11,7 @@ from osgeo import gdal
 from ortho_cartosat.layout import metadata_of, partner_of, rpc_of, view_of
 from ortho_cartosat.metadata import Metadata, read_metadata
 from ortho_cartosat.start import DEFAULT, SOFT, pushbroom, soft_facts, soft_sigmas
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.exchange.rpc_files import rpc_of_fields
@@ -111,13 +112,13 @@ def open_scene(
     except InputError as error:
         if not models:
             raise
-        warnings.append(f"there is no pushbroom model: {error.message}")
+        warnings.append(Notice("no-pushbroom", f"there is no pushbroom model: {error.message}"))
     if metadata.size not in (None, size):
-        warnings.append(
-            "the metadata is for {} x {} pixels, this image has {} x {}: is it a crop?".format(*metadata.size, *size)
-        )
+        text = "the metadata is for {} x {} pixels, this image has {} x {}: is it a crop?".format(*metadata.size, *size)
+        warnings.append(Notice("maybe-a-crop", text, metadata_size=metadata.size))
     if found is None:
-        warnings.append("there is no readable RPC: the model only starts an adjustment to at least nine control points")
+        text = "there is no readable RPC: the model only starts an adjustment to at least nine control points"
+        warnings.append(Notice("only-a-start", text))
     facts = _facts(name, metadata, warnings) | ({} if found is None else {"rpc_origin": int(rpc_origin)})
     facts = {"view": view} | facts if view else facts
     if "pushbroom" in models:
@@ -125,7 +126,7 @@ def open_scene(
     return Scene("cartosat", name, *size, models, source or str(path), facts, tuple(warnings), sources=(path,))
 
 
-def _facts(name: str, metadata: Metadata, warnings: list[str]) -> dict[str, object]:
+def _facts(name: str, metadata: Metadata, warnings: list[Notice]) -> dict[str, object]:
     """Return what the metadata tell people; what is damaged there is no reason to refuse the image."""
     partner = partner_of(name, metadata)
     facts: dict[str, object] = {"partner": None if partner is None else str(partner), "acquired": metadata.acquired}
@@ -133,11 +134,12 @@ def _facts(name: str, metadata: Metadata, warnings: list[str]) -> dict[str, obje
         try:
             facts[fact] = metadata.number(key) if fact in NUMBERS else metadata.text(key)
         except InputError as error:
-            warnings.append(f"{metadata.path.name}, {key}: {error.message}")
+            text = f"{metadata.path.name}, {key}: {error.message}"
+            warnings.append(Notice("damaged-metadata", text, file=metadata.path.name, field=key))
     return {fact: value for fact, value in facts.items() if value is not None}
 
 
-def _rpc(dataset: gdal.Dataset, choice: str | None, origin: str) -> tuple[RPC | None, str | None, list[str]]:
+def _rpc(dataset: gdal.Dataset, choice: str | None, origin: str) -> tuple[RPC | None, str | None, list[Notice]]:
     if choice is None:
         found, path, warnings = rpc_of(dataset.GetDescription())
         source = None if path is None else str(path)
@@ -151,7 +153,7 @@ def _rpc(dataset: gdal.Dataset, choice: str | None, origin: str) -> tuple[RPC | 
     return found, source, warnings
 
 
-def _compared_with_gdal(dataset: gdal.Dataset, found: RPC, source: str) -> list[str]:
+def _compared_with_gdal(dataset: gdal.Dataset, found: RPC, source: str) -> list[Notice]:
     """Return a warning where GDAL's own readers took another RPC than this plugin."""
     try:
         other = rpc_of_fields(dataset.GetMetadata("RPC") or {})
@@ -162,4 +164,5 @@ def _compared_with_gdal(dataset: gdal.Dataset, found: RPC, source: str) -> list[
     apart = float(np.abs(other.ground_to_image(centre) - found.ground_to_image(centre)).max())
     if apart <= DISAGREEMENT:
         return []
-    return [f"GDAL reads another RPC for this image than {Path(source).name}; they differ by {apart:.1f} px"]
+    text = f"GDAL reads another RPC for this image than {Path(source).name}; they differ by {apart:.1f} px"
+    return [Notice("rpcs-differ", text, difference_px=apart)]

@@ -19,6 +19,7 @@ from os import PathLike
 from pathlib import Path
 
 from ortho_cartosat.metadata import Metadata, read_metadata
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc_files import read_rpc_text
 from ortho_pipeline.files.locations import place
@@ -51,9 +52,9 @@ def metadata_of(image: str | PathLike[str]) -> Path | None:
     return beside(image, "", "_MET.TXT")
 
 
-def rpc_of(image: str | PathLike[str]) -> tuple[RPC | None, Path | None, list[str]]:
+def rpc_of(image: str | PathLike[str]) -> tuple[RPC | None, Path | None, list[Notice]]:
     """Return the first RPC beside an image that can be read, its file, and what was wrong with those before it."""
-    warnings: list[str] = []
+    warnings: list[Notice] = []
     for before, after in (("", "_RPC_ORG.TXT"), ("DECRYPTED_", "_RPC.TXT"), ("", "_RPC.TXT")):
         path = beside(image, before, after)
         if path is None:
@@ -62,7 +63,8 @@ def rpc_of(image: str | PathLike[str]) -> tuple[RPC | None, Path | None, list[st
             return read_rpc_text(path), path, warnings
         except InputError as error:
             what = error.message if error.field is None else f"{error.field}: {error.message}"
-            warnings.append(f"{path.name} is not used, it may be encrypted or damaged ({what})")
+            text = f"{path.name} is not used, it may be encrypted or damaged ({what})"
+            warnings.append(Notice("rpc-not-used", text, file=path.name))
     return None, None, warnings
 
 

@@ -15,6 +15,7 @@ from osgeo import gdal
 
 from ortho_ikonos.metadata import Component, Delivery, SourceImage, read_metadata
 from ortho_ikonos.order import ImageFile, Position, bands_of, position_of, rpc_file
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.problem import Prior, priors_at
 from ortho_pipeline.exchange.rpc import has_rpc, read_rpc, rpc_of_dataset
@@ -192,10 +193,10 @@ def _priors(models: Mapping[str, SensorModel]) -> dict[str, Prior]:
 
 def _pieces(
     image: ImageFile, delivery: Delivery, component: Component, position: Position, with_models: bool
-) -> tuple[tuple[Piece, ...], list[str]]:
+) -> tuple[tuple[Piece, ...], list[Notice]]:
     """Return the other files of the acquisition, of the same plane and maybe other pixels, and what is wrong."""
     found: list[Piece] = []
-    warnings: list[str] = []
+    warnings: list[Notice] = []
     others = list(image.others())
     # Only images with pixels of this size bring models: a component without one cannot be predicted.
     alike = {other.component for other in others if other.grid == image.grid} | {image.component}
@@ -211,7 +212,8 @@ def _pieces(
             place = position.place_of(position_of(opened, delivery, known[0]))
             vendor = _rpc(opened, None) if with_models and other.grid == image.grid else None
         except InputError as error:
-            warnings.append(f"points in {other.path.name} are not taken over: {error.message}")
+            text = f"points in {other.path.name} are not taken over: {error.message}"
+            warnings.append(Notice("piece-left-out", text, file=other.path.name))
             continue
         if place is not None:
             size = opened.RasterXSize, opened.RasterYSize
@@ -222,19 +224,21 @@ def _pieces(
 # -- what to say -----------------------------------------------------------------------------------------------------
 
 
-def _level_warnings(delivery: Delivery) -> list[str]:
+def _level_warnings(delivery: Delivery) -> list[Notice]:
     line, level = delivery.product_line, delivery.level
     if line is None and level is None:
-        return ["the metadata do not state the processing level: the models are those of a Geo product"]
+        text = "the metadata do not state the processing level: the models are those of a Geo product"
+        return [Notice("processing-level", text)]
     if (line is None or line.lower().startswith(PRODUCT_LINE.lower())) and (level or LEVEL).lower() == LEVEL.lower():
         return []
-    return [
+    text = (
         f"this is a product {line or 'of an unknown line'}, {level or 'level not stated'}, not {PRODUCT_LINE}, {LEVEL}:"
         " where the vendor has already corrected the relief it would be corrected twice"
-    ]
+    )
+    return [Notice("processing-level", text, line=line, level=level)]
 
 
-def _disagreement(models: dict[str, SensorModel]) -> list[str]:
+def _disagreement(models: dict[str, SensorModel]) -> list[Notice]:
     """Hold the RPC against the metadata on the plane, where both state the same."""
     vendor, plane = models.get("rpc"), models.get("geo")
     if vendor is None or not isinstance(plane, MapPlane):
@@ -245,7 +249,8 @@ def _disagreement(models: dict[str, SensorModel]) -> list[str]:
     if off <= DISAGREEMENT:
         return []
     apart = f"{off:.1f} px" if math.isfinite(off) else "the whole scene"
-    return [f"RPC and metadata differ by {apart} at Reference Height: one of them belongs to another image"]
+    text = f"RPC and metadata differ by {apart} at Reference Height: one of them belongs to another image"
+    return [Notice("metadata-contradict", text, difference_px=off)]
 
 
 def _facts(

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
 
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import decoded, read_bounded
 
@@ -174,7 +175,7 @@ class Delivery:
     product: Placement
     sources: tuple[SourceImage, ...]
     components: tuple[Component, ...]
-    notes: tuple[str, ...] = ()
+    notes: tuple[Notice, ...] = ()
 
     def component(self, name: str | None) -> Component:
         """Return the component of this ID; without one the only one that there is.
@@ -240,7 +241,8 @@ def read_metadata(path: str | PathLike[str]) -> Delivery:
             raise InputError(
                 "the file is cut off: its last line does not end", file=path, field=COMPONENTS, remedy="copy it again"
             )
-        notes.append("the metadata file does not end with a line of =: was it cut off?")
+        end = "the metadata file does not end with a line of =: was it cut off?"
+        notes.append(Notice("maybe-cut-off", end, file=str(path)))
     projection, crs = _projection(order)
     return Delivery(
         file=str(path),

@@ -12,6 +12,7 @@ import pyproj
 from osgeo import gdal
 
 from ortho_ikonos.metadata import Component, Delivery, Placement, read_header
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.geodesy.crs import same_crs
@@ -115,7 +116,7 @@ class Position:
     corner: tuple[float, float] | None
     pixel: tuple[float, float] | None
     reference_height: float | None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     sources: tuple[Path, ...] = ()
 
     def place_of(self, other: Position) -> tuple[float, float, float] | None:
@@ -154,14 +155,16 @@ def position_of(dataset: gdal.Dataset, delivery: Delivery, component: Component)
         own_crs, own_corner, own_pixel = own
         crs = crs or own_crs.to_string()
         if not same_crs(pyproj.CRS(crs), own_crs):
-            warnings.append(f"the image says it is in {own_crs.name}, the metadata {delivery.projection}")
+            text = f"the image says it is in {own_crs.name}, the metadata {delivery.projection}"
+            warnings.append(Notice("metadata-contradict", text))
         elif corner is not None and pixel is not None:
             off = _difference(corner, pixel, own_corner, own_pixel, size)
             if off > _SAME:
-                warnings.append(
+                text = (
                     f"the georeferencing of the image is {off:.2f} px off the metadata, which are believed "
                     "(UL Map X and Y are the centre of the first pixel)"
                 )
+                warnings.append(Notice("metadata-contradict", text, difference_px=off))
         corner, pixel = corner or own_corner, pixel or own_pixel
     return Position(crs, corner, pixel, stated.reference_height, tuple(warnings), sources)
 

@@ -11,6 +11,7 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_orbview3.product import Product, choose_rpc, label_of, read_product, rpc_text_of
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import place
@@ -140,8 +141,9 @@ def slow_down(line_spacing: float, kind: str) -> float:
     return GROUND_SPEED / (LINES_PER_SECOND[kind] * line_spacing)
 
 
-def _contradictions(product: Product) -> Iterator[str]:
+def _contradictions(product: Product) -> Iterator[Notice]:
     misses = product.corner_misses
     worst = float(np.abs(misses).max()) if np.isfinite(misses).all() else math.inf
     if not worst <= _CORNER_MISS:
-        yield f"the label contradicts itself: its RPC projects its corners up to {worst:.3g} px beside the image's"
+        text = f"the label contradicts itself: its RPC projects its corners up to {worst:.3g} px beside the image's"
+        yield Notice("metadata-contradict", text, difference_px=worst)

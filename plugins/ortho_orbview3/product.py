@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ortho_orbview3.label import Group, read_label
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.exchange.rpc import read_rpc
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, rpc_of_fields
@@ -134,7 +135,7 @@ def read_product(path: str | PathLike[str]) -> Product:
     )
 
 
-def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple[RPC, str, tuple[str, ...]]:
+def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple[RPC, str, tuple[Notice, ...]]:
     """Return the RPC to use, its file, and what there is to say about it.
 
     Parameters
@@ -154,7 +155,8 @@ def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple
     if text is None:
         if choice is not None:
             raise InputError("there is no RPC text beside the image", field="rpc", remedy="take --rpc label")
-        return product.rpc, product.file, ("there is no RPC text beside the label, whose own RPC is taken",)
+        text_missing = "there is no RPC text beside the label, whose own RPC is taken"
+        return product.rpc, product.file, (Notice("no-rpc-text", text_missing),)
     rpc = read_rpc_text(text)
     difference = _difference(product.rpc, rpc)
     if choice is not None or difference <= DIFFERENT:
@@ -164,7 +166,8 @@ def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple
             f"the RPC in this file and that of {Path(product.file).name} differ by {difference:.3g} px",
             file=text, field="rpc", remedy="choose one: --rpc label, --rpc text, or --rpc FILE",
         )  # fmt: skip
-    return rpc, str(text), (f"the RPCs of label and text differ by {difference:.2g} px; that of the text is taken",)
+    differ = f"the RPCs of label and text differ by {difference:.2g} px; that of the text is taken"
+    return rpc, str(text), (Notice("rpcs-differ", differ, difference_px=difference),)
 
 
 def _difference(first: RPC, second: RPC) -> float:

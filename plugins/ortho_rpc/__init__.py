@@ -11,6 +11,7 @@ from typing import Any
 
 from osgeo import gdal
 
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.exchange.rpc import has_rpc, rpc_of_dataset
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
@@ -75,8 +76,9 @@ def _facts_of(rigorous: Rigorous) -> dict[str, Any]:
     return facts | ({"rigorous_models_not_read": dict(rigorous.left)} if rigorous.left else {})
 
 
-def _warnings(dataset: gdal.Dataset, model: RPC) -> tuple[str, ...]:
+def _warnings(dataset: gdal.Dataset, model: RPC) -> tuple[Notice, ...]:
     warnings = []
     if dataset.GetGCPCount():
-        warnings.append(f"the file also has {dataset.GetGCPCount()} GCPs of its own, which GDAL programs prefer to RPC")
+        text = f"the file also has {dataset.GetGCPCount()} GCPs of its own, which GDAL programs prefer to RPC"
+        warnings.append(Notice("gcps-beside-rpc", text, count=dataset.GetGCPCount()))
     return tuple(warnings)

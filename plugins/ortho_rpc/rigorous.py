@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.pushbroom.scanner import Pushbroom
 from ortho_pipeline.models.rational import RPC
@@ -37,9 +38,12 @@ class Rigorous:
     left: dict[str, str] = field(default_factory=dict)
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[Notice, ...]:
         """A sentence for each model that was not read."""
-        return tuple(f"{name} has a rigorous model that is left out: {reason}" for name, reason in self.left.items())
+        return tuple(
+            Notice("rigorous-left-out", f"{name} has a rigorous model that is left out: {reason}", file=name)
+            for name, reason in self.left.items()
+        )
 
 
 def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:

@@ -16,12 +16,14 @@ import pytest
 from defusedxml import ElementTree
 from osgeo import gdal
 
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.points import Points
 from ortho_pipeline.report import document as report
+from ortho_pipeline.report.wording import few_check_points
 from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
 from ortho_pipeline.simulation.terrain import Terrain
 
@@ -92,13 +94,16 @@ class FakeSurface:
 
 
 def test_report_is_json_without_nan(tmp_path):
-    made = document(adjusted(points()), warnings=["look here"], provenance={"image": {"path": "scene.tif"}})
+    made = document(
+        adjusted(points()), warnings=[Notice("from-sensor", "look here")], provenance={"image": {"path": "scene.tif"}}
+    )
     report.write_report_json(made, tmp_path / "r.json")
     again = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"), parse_constant=pytest.fail)
     assert again == made
     assert again["schema_version"] == 1
     assert again["scene"]["facts"] == {"sun": None}
     assert again["warnings"] == ["look here"]
+    assert again["notices"] == again["adjustment"]["notices"] == [{"code": "from-sensor", "text": "look here"}]
 
 
 def test_raw_bias_is_measured_minus_delivered():
@@ -216,12 +221,32 @@ def test_summary_fits_a_screen():
         adjusted(dataclasses.replace(measured, image=image)),
         surface=FakeSurface(0.0),
         coverage=0.9996,
-        warnings=["Mind it"],
+        warnings=[Notice("from-sensor", "Mind it")],
     )
     text = report.summary_text(made)
     assert len(text.splitlines()) <= 24
     for part in ("scene.tif", "raw bias", "column +6.3", measured.ids[3], "99.9 % of the scene", "Mind it"):
         assert part in text
+
+
+def test_what_is_left_out_is_not_known_by_these_words(tmp_path):
+    """A model that was left out was taken for a point that was, and not said; so was what a plugin says of nodata."""
+    said = "DIM_1.XML has a rigorous model that is left out: it is of 10 x 10 pixels"
+    point = Notice("left-out", "point G3 was left out: gross error")
+    made = document(adjusted(points()), warnings=[Notice("rigorous-left-out", said), point])
+    assert f"warning   {said}" in report.summary_text(made)
+    assert point not in report.summary_text(made)
+
+
+def test_a_single_check_point_is_named_once(tmp_path):
+    """The plural alone was recognised."""
+    few = few_check_points(1)
+    made = document(adjusted(points(check=1)), warnings=[few])
+    text = report.summary_text(made)
+    assert "Fewer than 30 check points" in text
+    assert few not in text
+    report.write_report_html(made, tmp_path / "r.html")
+    assert few not in (tmp_path / "r.html").read_text(encoding="utf-8")
 
 
 # -- page ------------------------------------------------------------------------------------------------------------
@@ -250,7 +275,7 @@ def page(tmp_path) -> str:
         surface=FakeSurface(0.0),
         coverage=1.0,
         provenance={"image": {"path": HOSTILE, "sha256": "ab" * 32}, "empty": None},
-        warnings=[f"{HOSTILE} was left out"],
+        warnings=[Notice("left-out", f"{HOSTILE} was left out")],
     )
     png = report.preview_png(_raster(tmp_path / "ortho.tif"))
     report.write_report_html(made, tmp_path / "r.html", ortho=png)

@@ -34,6 +34,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.geodesy.ellipsoid import (
@@ -60,9 +61,10 @@ REFRACTIVITY, SCALE_HEIGHT = 2.77e-4, 9200.0
 #: Rays flatter than this (cosine of the zenith angle) belong to no useful part of the scene.
 _FLATTEST = 0.17
 #: Warning for a camera whose `FrameCamera.sees_ground` is false.
-LOOKS_PAST = (
+LOOKS_PAST = Notice(
+    "only-a-start",
     "by its exterior orientation the camera looks past the ground: the model only starts an adjustment to ground "
-    "control points"
+    "control points",
 )
 _LIFT_STEPS = 12
 

@@ -1,0 +1,85 @@
+"""Notices: what people ought to know before they trust a result, each with a code that programs compare.
+
+A module that treats some notices in a way of its own compares their codes, never their sentences. docs/notices.md
+lists all codes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+from typing import Any, NoReturn
+
+from ortho_pipeline.files.documents import json_value
+
+_CODE = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
+#: Code of a warning of a sensor that came as text alone.
+FROM_SENSOR = "from-sensor"
+
+
+class Notice(str):
+    """A warning: the text itself, and with it a code and what it is about.
+
+    What only shows warnings treats it as the text that it is; two notices of one text are equal.
+
+    Parameters
+    ----------
+    code : str
+        Which notice it is, in lower case with hyphens. Texts may change between versions, codes do not.
+    text : str
+        The sentence for people.
+    **fields
+        What it is about: numbers, names and lists of them.
+    """
+
+    __slots__ = ("code", "fields")
+
+    code: str
+    fields: Mapping[str, Any]
+
+    def __new__(cls, code: str, text: str, **fields: Any) -> Notice:
+        """Make a notice of a code, a text and fields."""
+        if not _CODE.fullmatch(code):
+            raise ValueError(f"{code!r} is not a code: lower case with hyphens")
+        notice = super().__new__(cls, text)
+        object.__setattr__(notice, "code", code)
+        object.__setattr__(notice, "fields", MappingProxyType(fields))
+        return notice
+
+    def __setattr__(self, name: str, value: object) -> NoReturn:
+        """Refuse: a notice stays as it is."""
+        raise AttributeError(f"a notice cannot be changed: {name}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuilt, (self.code, str(self), dict(self.fields))
+
+    def in_image(self, label: str) -> Notice:
+        """Return the notice as one of an image among several."""
+        return Notice(self.code, f"image {label}: {self}", **{**self.fields, "image": label})
+
+    def to_json(self) -> dict[str, Any]:
+        """Return code, text and fields as JSON values."""
+        return {"code": self.code, "text": str(self), **json_value(self.fields)}
+
+
+def _rebuilt(code: str, text: str, fields: Mapping[str, Any]) -> Notice:
+    return Notice(code, text, **fields)
+
+
+def with_code(texts: Iterable[str], code: str) -> tuple[Notice, ...]:
+    """Return texts as notices: what is none yet gets this code."""
+    return tuple(text if isinstance(text, Notice) else Notice(code, text) for text in texts)
+
+
+def to_document(notices: Iterable[Notice]) -> dict[str, Any]:
+    """Return the members `warnings` (texts) and `notices` (with codes) of a JSON document, in one order."""
+    found = list(notices)
+    return {"warnings": [str(one) for one in found], "notices": [one.to_json() for one in found]}
+
+
+def texts_but(document: Mapping[str, Any], *codes: str) -> list[str]:
+    """Return the warnings of a document, without those of the codes."""
+    if "notices" not in document:
+        return list(document["warnings"])
+    return [one["text"] for one in document["notices"] if one["code"] not in codes]

@@ -1,0 +1,32 @@
+"""JSON documents: what becomes of numbers, arrays, paths and records in them. No number in one is NaN or infinite."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+
+def json_value(value: Any) -> Any:
+    """Return a value as what JSON holds, however nested.
+
+    A number that is not finite is null, by itself or within an array; NumPy's numbers are Python's; arrays, tuples and
+    sets are lists; mappings and dataclasses are objects; paths and whatever else is not known are text.
+    """
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if value is None or isinstance(value, bool | int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): json_value(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [json_value(item) for item in value]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: json_value(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return os.fspath(value) if isinstance(value, os.PathLike) else str(value)
