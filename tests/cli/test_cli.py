@@ -90,8 +90,8 @@ def test_fit_prints_the_documented_json(tiny):
     document = json.loads(done.stdout)
     expected = {
         "schema_version", "sensor", "model", "model_source", "parameters", "points", "rmse", "raw_bias",
-        "redundancy", "sigma0", "rejected", "outlying", "rmse_of_agreeing_checks", "warnings", "statistics", "removed",
-        "covariance", "map_scale",
+        "redundancy", "sigma0", "rejected", "outlying", "rmse_of_agreeing_checks", "warnings", "notices", "statistics",
+        "removed", "covariance", "map_scale",
     }  # fmt: skip
     assert set(document) == expected
     assert document["model"] == "rpc+shift"
