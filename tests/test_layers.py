@@ -46,7 +46,15 @@ cli
 LINE = {name: number for number, line in enumerate(ROOMS.split("\n")) for name in line.split()}
 #: Where GDAL, numba and matplotlib are imported.
 GDAL_MODULES = {"files.locations", "raster.gate", "raster.source", "raster.output", "raster.ortho", "surface.dem"}
-GDAL_MODULES |= {"plugins", "exchange.rpc", "exchange.gcp", "imaging.band_stack", "warp.mosaic", "warp.gdal_engine"}
+GDAL_MODULES |= {
+    "plugins",
+    "exchange.rpc",
+    "exchange.gcp",
+    "exchange.export",
+    "imaging.band_stack",
+    "warp.mosaic",
+    "warp.gdal_engine",
+}
 NUMBA_MODULES = {"files.compiled"}
 MATPLOTLIB_MODULES = {"display.drawing"}
 MAX_ENTRIES, MAX_MODULES, MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_PARAMETERS = 26, 12, 600, 250, 50, 12

@@ -17,7 +17,7 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, TypeVar
 
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.files.allowance import require_memory, startable_threads
+from ortho_pipeline.files.process_limits import require_memory, startable_threads
 
 #: Jobs that are handed over before their turn, so that no worker waits for the next one.
 _AHEAD = 256

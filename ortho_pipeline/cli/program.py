@@ -1,4 +1,4 @@
-"""The command line: each command parses, calls `pipeline`, prints.
+"""The command line: each command parses, calls a function of `commands`, prints.
 
 Heavy imports happen inside the commands, so that ``ortho --help`` answers at once.
 """

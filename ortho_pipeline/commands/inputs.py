@@ -21,8 +21,8 @@ from ortho_pipeline.exchange import crop
 from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.exchange.rpc import files_of
 from ortho_pipeline.files import sha256, states
-from ortho_pipeline.files.allowance import startable_threads
 from ortho_pipeline.files.locations import archive_of, located
+from ortho_pipeline.files.process_limits import startable_threads
 from ortho_pipeline.geodesy.crs import Vertical, parse_crs
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import PointOptions, SceneOptions, SurfaceOptions

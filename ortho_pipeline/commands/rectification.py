@@ -22,11 +22,11 @@ from ortho_pipeline.commands.scene_fit import (
 from ortho_pipeline.commands.scene_layout import lay_out, source_of
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, completed
-from ortho_pipeline.exchange import gcp as gcp_export
+from ortho_pipeline.exchange import export as formats_of_models
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import retire, sha256, states
-from ortho_pipeline.files.allowance import Resources
+from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
@@ -153,7 +153,7 @@ def export(
     image: str | os.PathLike[str],
     folder: str | os.PathLike[str],
     *,
-    formats: Sequence[str] = gcp_export.FORMATS[:4],
+    formats: Sequence[str] = formats_of_models.FORMATS[:4],
     scene: SceneOptions = SceneOptions(),
     points: PointOptions = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
@@ -164,7 +164,7 @@ def export(
     Parameters
     ----------
     formats : sequence of str
-        Some of `gcp_export.FORMATS`: rpc-txt, rpb, vrt, tag, gcp, gcp-tag, geolocation.
+        Some of `exchange.export.FORMATS`: rpc-txt, rpb, vrt, tag, gcp, gcp-tag, geolocation.
     force : bool
         Accept an RPC that stands for the model only to more than 0.1 px.
 
@@ -178,9 +178,9 @@ def export(
     InputError
         For an unknown format, a geolocation without heights, and as `fit`.
     """
-    formats = gcp_export.check_formats(formats)
+    formats = formats_of_models.check_formats(formats)
     stem = Path(image).stem
-    files = {name: Path(folder) / f"{stem}{gcp_export.ENDINGS[name]}" for name in formats}
+    files = {name: Path(folder) / f"{stem}{formats_of_models.ENDINGS[name]}" for name in formats}
     inputs.check_paths(files, image, scene, points, surface)
     opened = open_adjustable(image, scene, points)
     heights = open_surface(surface, scene) if has_surface(surface) else None
@@ -191,7 +191,7 @@ def export(
     with completed(adjusted.scene.model_source, of="model"):
         if heights is not None:
             heights = footprint.facing(adjusted.model, heights, *size)
-        job = gcp_export.Export(
+        job = formats_of_models.Export(
             dataset, adjusted.model, size, heights, adjustment.points.select(adjustment.used), adjustment.rejected,
             force=force,
         )  # fmt: skip

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files.allowance import require_memory
 from ortho_pipeline.files.locations import VsiPath, archive_of, in_local_archive, located, members
+from ortho_pipeline.files.process_limits import require_memory
 from ortho_pipeline.options import PIXEL_TYPES
 from ortho_pipeline.raster.gate import DRIVERS, Block, open_seen
 

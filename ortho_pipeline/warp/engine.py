@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import RpcExport
-from ortho_pipeline.files.allowance import Resources, require_memory, startable_threads
+from ortho_pipeline.files.process_limits import Resources, require_memory, startable_threads
 from ortho_pipeline.geodesy.crs import GroundTransform
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, as_written, refuse_empty

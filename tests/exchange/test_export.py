@@ -16,7 +16,7 @@ from ortho_pipeline import commands
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.inputs import open_surface
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.gcp import FORMATS
+from ortho_pipeline.exchange.export import FORMATS
 from ortho_pipeline.exchange.rpc import export_rpc, read_rpc
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.options import PointOptions, SurfaceOptions

@@ -20,7 +20,7 @@ from scipy.interpolate import RegularGridInterpolator
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import export_rpc, rpc_metadata
 from ortho_pipeline.files import sha256
-from ortho_pipeline.files.allowance import Resources
+from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import RPC, SensorModel
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import Grid, RasterSource

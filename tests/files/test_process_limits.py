@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from ortho_pipeline.errors import OrthoError
-from ortho_pipeline.files.allowance import require_memory, startable_threads
+from ortho_pipeline.files.process_limits import require_memory, startable_threads
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 EXTENT = ("530600", "4122000", "530800", "4122200")
