@@ -8,7 +8,6 @@ from __future__ import annotations
 import importlib
 import logging
 import shlex
-import signal
 import sys
 import traceback
 from typing import Any
@@ -40,6 +39,7 @@ from ortho_pipeline.cli.printing import (
     progress,
     view_text,
 )
+from ortho_pipeline.cli.signals import ended_by_signals
 from ortho_pipeline.cli.studies import reproduce, simulate
 from ortho_pipeline.errors import InputError, OrthoError, Terminated
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
@@ -146,21 +146,13 @@ def main() -> None:
     # Before GDAL is loaded, which reads the environment; worker processes inherit it.
     close_network()
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING, stream=sys.stderr)
-    for ending in (signal.SIGTERM, signal.SIGHUP):
-        # Under nohup a command is to survive the end of its terminal.
-        if signal.getsignal(ending) == signal.SIG_DFL:
-            signal.signal(ending, _end)
-    try:
-        cli(prog_name="ortho")
-    except KeyboardInterrupt:
-        # Before a command has begun; later `_Commands` says so.
-        click.echo("Interrupted.", err=True)
-        raise SystemExit(INTERRUPTED) from None
-
-
-def _end(number: int, _: Any) -> None:
-    """End as after an exception, so that temporary files go and locks are released."""
-    raise Terminated(128 + number)
+    with ended_by_signals():
+        try:
+            cli(prog_name="ortho")
+        except KeyboardInterrupt:
+            # Before a command has begun; later `_Commands` says so.
+            click.echo("Interrupted.", err=True)
+            raise SystemExit(INTERRUPTED) from None
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})

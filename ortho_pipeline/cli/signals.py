@@ -1,0 +1,56 @@
+"""Signals: a command that is asked to end does so as after an exception, whatever it is doing at that moment."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from ortho_pipeline.errors import Terminated
+
+#: Seconds after which an end that was lost is asked for again.
+_AGAIN = 0.01
+
+
+@contextlib.contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the block by `Terminated`, as SIGINT does by `KeyboardInterrupt`.
+
+    Python drops an exception that a signal raises within a destructor, prints it, and goes on; here it comes again.
+    After the block a signal ends the process at once, without a traceback of the interpreter that shuts down: the
+    outputs have their names.
+    """
+    for ending in (signal.SIGTERM, signal.SIGHUP):
+        # Under nohup a command is to survive the end of its terminal.
+        if signal.getsignal(ending) == signal.SIG_DFL:
+            signal.signal(ending, _end)
+    before, sys.unraisablehook = sys.unraisablehook, _ask_again
+    try:
+        yield
+    finally:
+        for ending in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(ending) in (signal.default_int_handler, _end):
+                signal.signal(ending, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        sys.unraisablehook = before
+
+
+def _end(number: int, _: Any) -> None:
+    """End as after an exception, so that temporary files go and locks are released."""
+    raise Terminated(128 + number)
+
+
+def _ask_again(lost: Any) -> None:
+    """Raise the exception of a signal a moment later once more; say what else a destructor cannot raise."""
+    error = lost.exc_value
+    if not isinstance(error, KeyboardInterrupt | Terminated):
+        sys.__unraisablehook__(lost)
+        return
+
+    def end(*_: Any) -> None:
+        raise error.with_traceback(None)
+
+    signal.signal(signal.SIGALRM, end)
+    signal.setitimer(signal.ITIMER_REAL, _AGAIN)
