@@ -56,12 +56,16 @@ class Case:
         The command of the run before, whose outputs are others of the same names.
     names : tuple of (str, str)
         Folder and name of each set of outputs, as `files.together` has them.
+    parts : dict of str to tuple of str
+        For a run: the command that makes one of its scenes only, which is what a run has to leave that fails with the
+        others.
     """
 
     name: str
     words: tuple[str, ...]
     before: tuple[str, ...]
     names: tuple[tuple[str, str], ...]
+    parts: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def cases(inputs: Path) -> list[Case]:
@@ -96,9 +100,26 @@ def cases(inputs: Path) -> list[Case]:
     found.append(Case("register", (*register, "affine"), (*register, "similarity"), (("out", "a_bands"),)))
     folders = (("out/a", "a"), ("out/b", "b"), ("out", "mosaic"), ("out", "catalog"), ("out", "run"))
     for kind in ("VRT", "COG"):
-        words = ("run", "--executor", "sequential", "--root", str(inputs.parent), str(inputs / f"new_{kind}.yaml"))
-        found.append(Case(f"run {kind}", words, (*words[:-1], str(inputs / f"old_{kind}.yaml")), folders))
+        words = ("run", "--executor", "sequential", "--root", str(inputs.parent))
+        new, old, *parts = ((*words, str(inputs / part / f"{age}_{kind}.yaml"))
+                            for part, age in (("", "new"), ("", "old"), ("a", "new"), ("b", "new")))  # fmt: skip
+        found.append(Case(f"run {kind}", new, old, folders, dict(zip("ab", parts, strict=True))))
     return found
+
+
+def _pipeline(kind: str, kernel: str, part: str) -> str:
+    """Return a pipeline file of two scenes that overlap, or in a folder below of one of them."""
+    west, south, east, north = map(int, EXTENT)
+    up = "../" if part else ""
+    boxes = {"a": [west, south, east - 200, north], "b": [west + 300, south, east, north]}
+    scenes = "".join(f"  - image: {up}{name}.tif\n    output: {{extent: {box}}}\n"
+                     for name, box in boxes.items() if part in ("", name))  # fmt: skip
+    return (
+        f"scenes:\n{scenes}output: {up}../work/out\nmosaic: {{format: {kind}}}\n"
+        f"defaults:\n  surface: {{dem: {up}dem.tif}}\n"
+        f"  output: {{crs: 'EPSG:32636', resolution: 2.5, resampling: {kernel}, stac: true, "
+        "acquired: '2005-08-03T08:12:31Z'}\n"
+    )
 
 
 def copy_inputs(folder: Path) -> Path:
@@ -107,17 +128,11 @@ def copy_inputs(folder: Path) -> Path:
     for name in ("a", "b"):
         for ending in (".tif", "_RPC.TXT"):
             shutil.copyfile(SAMPLE / f"scene{ending}", folder / f"{name}{ending}")
-    west, south, east, north = map(int, EXTENT)
-    for kind in ("VRT", "COG"):
-        for age, kernel in (("old", "nearest"), ("new", "bilinear")):
-            (folder / f"{age}_{kind}.yaml").write_text(
-                f"scenes:\n  - image: a.tif\n    output: {{extent: [{west}, {south}, {east - 200}, {north}]}}\n"
-                f"  - image: b.tif\n    output: {{extent: [{west + 300}, {south}, {east}, {north}]}}\n"
-                f"output: ../work/out\nmosaic: {{format: {kind}}}\n"
-                "defaults:\n  surface: {dem: dem.tif}\n"
-                f"  output: {{crs: 'EPSG:32636', resolution: 2.5, resampling: {kernel}, stac: true, "
-                "acquired: '2005-08-03T08:12:31Z'}\n"
-            )
+    for part in ("", "a", "b"):
+        (folder / part).mkdir(exist_ok=True)
+        for kind in ("VRT", "COG"):
+            for age, kernel in (("old", "nearest"), ("new", "bilinear")):
+                (folder / part / f"{age}_{kind}.yaml").write_text(_pipeline(kind, kernel, part))
     return folder
 
 
@@ -334,6 +349,8 @@ class Attack:
 
     def start_from(self, case: Case, old: bool) -> Files:
         """Put the outputs of the run before into place, or nothing; return their checksums."""
+        for words in (case.words, *case.parts.values()):
+            self.whole(words)
         self.clear()
         if not old:
             return {}
@@ -344,6 +361,7 @@ class Attack:
 
     def one_set(self, case: Case, before: Files, new: Files, now: Files) -> bool:
         """Tell whether each set of a case is one of the two whole ones."""
+        partly = self._of_what_was_made(case, before)
         for folder, name in case.names:
             # A run has several sets in its folder, which begin with their names.
             start = "" if len(case.names) == 1 else f"{name}." if folder == "out" else f"{name}/"
@@ -351,9 +369,21 @@ class Attack:
             def part(files: Files, start: str = start) -> Files:
                 return {path: value for path, value in files.items() if path.startswith(start)}
 
-            if part(now) not in (part(before), part(new)):
+            if part(now) not in (part(before), part(new), *([part(partly[name])] if name in partly else [])):
                 return False
         return True
+
+    def _of_what_was_made(self, case: Case, before: Files) -> dict[str, Files]:
+        """Return what the mosaic and the catalog of a run have to hold by what it says that it made of its scenes."""
+        try:
+            told = json.loads((self.out / "run.json").read_text())
+        except (OSError, ValueError):
+            return {}
+        made = [scene["name"] for scene in told["scenes"] if scene["status"] != "failed"]
+        if not case.parts or len(made) != 1:
+            return {}
+        files = self._kept[case.parts[made[0]]][1]
+        return {"catalog": files, "mosaic": before if "error" in told["mosaic"] else files}
 
     def recover(self, case: Case) -> None:
         """Do what the next command does before anything else."""
