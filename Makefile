@@ -54,8 +54,7 @@ test: setup
 test-all: setup
 	@$(BIN)/python -m pytest -q -n $(WORKERS)
 
-N ?= 400
-
+faults: N := $(if $(filter file,$(origin N)),400,$(N))
 faults: setup
 	@$(BIN)/python tests/attack/faults.py --limits $(N) --kills $$(( $(N) * 3 / 4 ))
 

@@ -41,8 +41,9 @@ def run(code, number):
 
 
 @pytest.mark.parametrize(
-    ("number", "end"), [(signal.SIGINT, "KeyboardInterrupt"), (signal.SIGTERM, "Terminated"), (signal.SIGHUP, "Terminated")]
-)  # fmt: skip
+    ("number", "end"),
+    [(signal.SIGINT, "KeyboardInterrupt"), (signal.SIGTERM, "Terminated"), (signal.SIGHUP, "Terminated")],
+)
 def test_a_signal_within_a_destructor_is_not_lost(number, end):
     done = run(LOST, number)
     assert (done.stdout, done.stderr) == (f"{end}\n", "")
