@@ -1,4 +1,4 @@
-"""Signals end a command whatever it is doing: in a destructor, whose exceptions Python drops, and after its last line."""
+"""Signals end a command whatever it is doing: in a destructor, whose exceptions Python drops, and after its end."""
 
 from __future__ import annotations
 
