@@ -29,6 +29,7 @@ from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints, counted
 from ortho_pipeline.estimation.fit import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING, root_mean_square
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT, Prior
+from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import marks_warning
@@ -162,7 +163,7 @@ class BlockFit:
             "sigma0": self.sigma0,
             "redundancy": self.redundancy,
             "degrees_of_freedom": self.degrees_of_freedom,
-            "condition": _number(self.condition),
+            "condition": json_value(self.condition),
             "iterations": self.iterations,
             "variances": self.variances.to_json(),
             "images": {
@@ -194,9 +195,9 @@ class BlockFit:
             "id": points.ids[k],
             "role": str(points.roles[k]),
             "used_ground": bool(self.used_ground[k]),
-            "ground": _numbers(self.ground[k]),
-            "sigma": _numbers(np.sqrt(np.diag(self.ground_covariance[k]))),
-            "residual": _numbers(self.object_residuals[k]),
+            "ground": json_value(self.ground[k]),
+            "sigma": json_value(np.sqrt(np.diag(self.ground_covariance[k]))),
+            "residual": json_value(self.object_residuals[k]),
         }
 
     def _ray(self, k: int) -> dict[str, Any]:
@@ -205,9 +206,9 @@ class BlockFit:
             "id": points.ids[points.point[k]],
             "image": points.images[points.image[k]],
             "used": bool(self.used_rays[k]),
-            "measured": _numbers(points.measured[k]),
-            "residual": _numbers(self.residuals[k]),
-            "back_projected": _numbers(self.back_projected[k]),
+            "measured": json_value(points.measured[k]),
+            "residual": json_value(self.residuals[k]),
+            "back_projected": json_value(self.back_projected[k]),
         }
 
 
@@ -586,11 +587,3 @@ def _at(problem: BlockProblem, models: Sequence[SensorModel], ground: Array) -> 
     """Return measured minus the projection of known ground ``(N, 3)`` lon, lat, h."""
     local = problem.frame.of_geodetic(ground)
     return problem.points.measured - predict(problem.frame, models, problem.points, local)
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def _numbers(values: Array) -> list[float | None]:
-    return [_number(value) for value in values]

@@ -29,6 +29,7 @@ from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
 from ortho_pipeline.files import together, write_text
+from ortho_pipeline.files.documents import json_position, json_value
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import Vertical, parse_crs
 from ortho_pipeline.models import ImageCorrection, SensorModel
@@ -341,17 +342,13 @@ def _ground_rows(
     rows = []
     for k, name in enumerate(points.ids):
         row = {
-            "id": name, "role": str(points.roles[k]), "rays": int(rays[k]), "ground": _numbers(ground[k]),
-            "sigma": _numbers(sigmas[k]), "residual": _numbers(residuals[k]),
+            "id": name, "role": str(points.roles[k]), "rays": int(rays[k]), "ground": json_position(ground[k]),
+            "sigma": json_position(sigmas[k]), "residual": json_position(residuals[k]),
         }  # fmt: skip
         if angles_deg is not None:
-            row["angle_deg"] = float(angles_deg[k]) if np.isfinite(angles_deg[k]) else None
+            row["angle_deg"] = json_value(angles_deg[k])
         rows.append(row)
     return rows
-
-
-def _numbers(values: Array) -> list[float] | None:
-    return [float(value) for value in values] if np.isfinite(values).all() else None
 
 
 def _writer(path: str | os.PathLike[str]) -> Any:

@@ -23,6 +23,7 @@ from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError, completed, counted
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files import write_text
+from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.geodesy import crs as crs_module
 from ortho_pipeline.imaging import resolution
 from ortho_pipeline.models import families
@@ -76,7 +77,7 @@ def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) 
         "utm": crs_text(crs),
         "gsd_m": gsd,
         "view": viewing(model, *size)["view"],
-        "corners_lon_lat": [[_number(value) for value in row] for row in ground[:, :2]],
+        "corners_lon_lat": json_value(ground[:, :2]),
         "facts": dict(scene.facts),
         **to_document(scene.notices),
     }
@@ -216,7 +217,3 @@ def crs_text(crs: pyproj.CRS) -> str:
     """Return ``EPSG:n`` where there is such a code, the name otherwise."""
     authority = crs.to_authority()
     return ":".join(authority) if authority else crs.name
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -32,6 +32,7 @@ from ortho_pipeline.estimation.family_fit import OWN, fit_family, fit_own
 from ortho_pipeline.estimation.fit import SIGNIFICANCE, Fit, Prior, fit
 from ortho_pipeline.estimation.ground_residuals import rmse_metres
 from ortho_pipeline.estimation.statistics import student_of
+from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.models import ImageCorrection, SensorModel, families, family_of
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points
@@ -76,12 +77,12 @@ class Row:
             **row,
             "rmse": {name: self.fit.rmse(name) for name in which},
             "rmse_m": rmse_metres(self.fit),
-            "condition": _finite(self.fit.condition),
+            "condition": json_value(float(self.fit.condition)),
             "redundancy": self.fit.redundancy,
             "sigma0": self.fit.sigma0,
             "fitted_as": self.fit.model_name,
             "ridge": self.fit.ridge,
-            "effective_parameters": _finite(self.fit.effective_parameters),
+            "effective_parameters": json_value(float(self.fit.effective_parameters)),
             **to_document(self.fit.warnings),
         }
 
@@ -406,7 +407,3 @@ def _what(checks: int, control: int) -> str:
     if not checks:
         return left_out
     return counted(checks, "check point") + (f" and {left_out}" if control else "")
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

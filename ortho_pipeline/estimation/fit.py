@@ -20,6 +20,7 @@ from ortho_pipeline.estimation.blunders import REJECTED_LIMIT, Outlying, find_bl
 from ortho_pipeline.estimation.problem import Prior, Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.statistics import correlation_of, student_of, total_correlation_of
+from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points
 
@@ -157,15 +158,15 @@ class Fit:
         t, p = self.student
         named = {"total_correlation": self.total_correlation, "t": t, "p": p}
         return {
-            "correlation": [_numbers(row) for row in self.correlation],
-            **{key: dict(zip(self.param_names, _numbers(values), strict=True)) for key, values in named.items()},
+            "correlation": [json_value(row) for row in self.correlation],
+            **{key: dict(zip(self.param_names, json_value(values), strict=True)) for key, values in named.items()},
             "significance": self.significance,
             "not_justified": list(self.not_justified),
             "degrees_of_freedom": self.degrees_of_freedom,
             "effective_parameters": self.effective_parameters,
             "ridge": self.ridge,
-            "condition": self.condition if math.isfinite(self.condition) else None,
-            "corner_ratio": self.corner_ratio if math.isfinite(self.corner_ratio) else None,
+            "condition": json_value(self.condition),
+            "corner_ratio": json_value(self.corner_ratio),
         }
 
     def __repr__(self) -> str:
@@ -192,10 +193,10 @@ class Fit:
                     "id": points.ids[i],
                     "role": str(points.roles[i]),
                     "used": bool(self.used[i]),
-                    "image": _numbers(points.image[i]),
-                    "predicted": _numbers(self.predicted[i]),
-                    "residual": _numbers(self.residuals[i]),
-                    "loo_residual": _numbers(self.loo_residuals[i]),
+                    "image": json_value(points.image[i]),
+                    "predicted": json_value(self.predicted[i]),
+                    "residual": json_value(self.residuals[i]),
+                    "loo_residual": json_value(self.loo_residuals[i]),
                 }
                 for i in range(len(points))
             ],
@@ -465,7 +466,3 @@ def _unstable(solution: Solution, strength: float | None) -> list[Notice]:
         return [Notice("inseparable-parameters", text, parameters=[names[first], names[second]])]
     text = f"unstable: the condition of the adjustment is {solution.condition:.0e}: a simpler model is safer"
     return [Notice("unstable", text, condition=solution.condition)]
-
-
-def _numbers(values: Array) -> list[float | None]:
-    return [float(value) if math.isfinite(value) else None for value in values]

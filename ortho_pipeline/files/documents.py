@@ -19,14 +19,20 @@ def json_value(value: Any) -> Any:
     """
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
-    if value is None or isinstance(value, bool | int):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
+    if isinstance(value, os.PathLike):
+        value = os.fspath(value)
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {str(key): json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
         return [json_value(item) for item in value]
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: json_value(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return os.fspath(value) if isinstance(value, os.PathLike) else str(value)
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int) else str(value)
+
+
+def json_position(values: Any) -> list[float] | None:
+    """Return a place, or a vector ``(N,)``, as numbers; null as a whole where any of them is not finite."""
+    found: list[float] = np.asarray(values, dtype=np.float64).tolist()
+    return found if all(map(math.isfinite, found)) else None

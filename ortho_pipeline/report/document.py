@@ -28,6 +28,7 @@ from ortho_pipeline.estimation.fit import Fit, root_mean_square
 from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rmse_metres, viewing
 from ortho_pipeline.estimation.spatial_correlation import analyse_fit
 from ortho_pipeline.files import read_json, whole_or_nothing, write_text
+from ortho_pipeline.files.documents import json_position, json_value
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform
 from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
@@ -105,10 +106,10 @@ def build_report(
     adjustment = fit.to_json() | noted
     shifts, views = in_metres(fit, fit.residuals), along_view(fit)
     for i, point in enumerate(adjustment["points"]):
-        point["raw_residual"] = _numbers(fit.raw_residuals[i])
-        point["residual_m"] = _numbers(shifts[i])
-        point["view_residual"] = _numbers(views[i])
-        point["height_m"] = _number(fit.points.ground[i, 2])
+        point["raw_residual"] = json_position(fit.raw_residuals[i])
+        point["residual_m"] = json_position(shifts[i])
+        point["view_residual"] = json_position(views[i])
+        point["height_m"] = json_value(fit.points.ground[i, 2])
     report = {
         "document": DOCUMENT,
         "schema_version": SCHEMA_VERSION,
@@ -117,7 +118,7 @@ def build_report(
             "size": [scene.width, scene.height],
             "sensor": scene.sensor,
             "model_source": scene.model_source,
-            "facts": {str(key): _plain(value) for key, value in scene.facts.items()},
+            "facts": {str(key): json_value(value) for key, value in scene.facts.items()},
             **seen,
         },
         "adjustment": adjustment,
@@ -126,13 +127,13 @@ def build_report(
         "covariance": {role: found and found.to_json() for role, found in analyse_fit(fit, near=near).items()},
         "map_scale": _map_scale(fit, seen),
         "control_hull": control_hull(fit.points.image[fit.used], (scene.width, scene.height)),
-        "comparison": None if comparison is None else _plain(comparison),
+        "comparison": None if comparison is None else json_value(comparison),
         "heights": heights,
-        "surface": None if surface is None else {"coverage": coverage, **_plain(surface.provenance)},
+        "surface": None if surface is None else {"coverage": coverage, **json_value(surface.provenance)},
         "rpc": None if exported is None else {"exact": exported.exact, "max_error_px": exported.max_error_px},
         "ortho": None if grid is None else _ortho(grid, warp),
         "warp": None if warp is None else _warped(warp),
-        "provenance": _plain(provenance or {}),
+        "provenance": json_value(provenance or {}),
         **noted,
     }
     report["headline"] = headline(report, accuracy_before(scene), adjusted=scene.adjusted is not None)
@@ -228,7 +229,7 @@ def residuals_geojson(fit: Fit) -> dict[str, Any]:
             "id": name,
             "role": str(points.roles[i]),
             "used": bool(fit.used[i]),
-            **{key: _number(value) for key, value in numbers.items()},
+            **{key: json_value(value) for key, value in numbers.items()},
             "rejected": reasons.get(name),
             "outlying": doubts.get(name),
         }
@@ -367,27 +368,3 @@ def page_environment() -> Any:
 def _brief(provenance: Mapping[str, Any]) -> dict[str, Any]:
     """Return the provenance without what the page shows in tables of its own."""
     return {key: value for key, value in provenance.items() if key not in ("inputs", "surface", "model_source")}
-
-
-# -- plain data ------------------------------------------------------------------------------------------------------
-
-
-def _numbers(values: Array) -> list[float] | None:
-    return [float(value) for value in values] if np.isfinite(values).all() else None
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def _plain(value: Any) -> Any:
-    """Return nested values as what JSON holds; the rest as text."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | set):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float):
-        return _number(value)
-    return value if value is None or isinstance(value, bool | int | str) else str(value)
