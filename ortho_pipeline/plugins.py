@@ -38,7 +38,7 @@ _RETURNS: dict[str, tuple[type, type, str]] = {
     "ortho_studies": (Iterable, list, "yield the Study, or return [Study(...)]"),
 }
 _COPY_IT = "correct what the file says there, or copy it again from the delivery"
-_COPY_AGAIN = "copy the metadata again from the delivery, or give a sound model (--rpc FILE, --model FILE)"
+_COPY_AGAIN = "copy the metadata again from the delivery, or give a sound model (`scene.rpc=FILE`, `scene.model=FILE`)"
 _TEST_IT = "its author: run ortho_pipeline.testing.check_sensor on this file"
 log = logging.getLogger(__name__)
 
@@ -220,7 +220,7 @@ class Host:
                     f"the sensor {chosen.name!r} has no option {name!r} (its options: {declared})",
                     file=path,
                     field=name,
-                    remedy="see `ortho sensors`, or choose another sensor with --sensor NAME",
+                    remedy="see `ortho sensors`, or choose another sensor with `scene.sensor=NAME`",
                 )
         try:
             with completed(path, remedy=_COPY_IT):
@@ -385,7 +385,7 @@ class Host:
             raise PluginError(
                 f"{self._name(sensor)} failed while looking at the dataset ({described(error, sensor.recognises)})",
                 file=dataset.GetDescription(),
-                remedy="choose the sensor yourself with --sensor NAME, or uninstall that plugin",
+                remedy="choose the sensor yourself with `scene.sensor=NAME`, or uninstall that plugin",
             ) from error
 
     def _name(self, sensor: Sensor) -> str:
@@ -445,19 +445,22 @@ def _normalised(distribution: str) -> str:
 def _unknown_sensor(name: str, sensors: Iterable[str]) -> InputError:
     names = ", ".join(sensors) or "none"
     return InputError(
-        f"there is no sensor {name!r} (installed: {names})", field="--sensor", remedy="see `ortho sensors`"
+        f"there is no sensor {name!r} (installed: {names})", field="scene.sensor", remedy="see `ortho sensors`"
     )
 
 
 def _not_one(found: list[Sensor], sensors: Iterable[Sensor], path: str) -> InputError:
     if found:
         names = ", ".join(item.name for item in found)
-        return InputError(f"several sensors recognise it: {names}", file=path, remedy="choose one with --sensor NAME")
+        return InputError(
+            f"several sensors recognise it: {names}", file=path, remedy="choose one with `scene.sensor=NAME`"
+        )
     names = ", ".join(item.name for item in sensors) or "none"
     general = ", ".join(item.name for item in sensors if item.fallback)
     hint = f" (for images in general: {general})" if general else ""
     return InputError(
         f"no sensor recognises it (installed: {names})",
         file=path,
-        remedy=f"choose one with --sensor NAME, which says what it needs{hint}, or give the RPC file with --rpc FILE",
+        remedy=f"choose one with `scene.sensor=NAME`, which says what it needs{hint}, or give the RPC file with "
+        "`scene.rpc=FILE`",
     )

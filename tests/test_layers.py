@@ -15,6 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from ortho_pipeline.options import GROUPS, BlockOptions, options_of
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "ortho_pipeline"
 
@@ -194,6 +196,39 @@ def test_the_map_of_the_house_is_true() -> None:
     found = MARKS.search(page)
     assert found
     assert found[0] == f"{found[1]}{table()}{found[2]}", "write it again: python tests/test_layers.py"
+
+
+#: Whole command lines, of this program and of others, which are typed as they are.
+COMMAND_LINE = re.compile(r"\b(ortho (adjust|fit|rectify|run)|pyproj sync|projsync) ")
+
+
+def texts(path: Path) -> Iterator[str]:
+    """Yield the strings of a module but docstrings; of a formatted one what is between its values, joined by blanks."""
+    tree = parse(path)
+    skipped: set[ast.AST] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            skipped.add(node.value)
+        if isinstance(node, ast.JoinedStr):
+            skipped |= set(node.values)
+            yield " ".join(str(one.value) for one in node.values if isinstance(one, ast.Constant))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in skipped:
+            yield node.value
+
+
+@pytest.mark.parametrize(
+    "path",
+    [path for path in FILES + PLUGIN_FILES if path.parent.name != "cli" and path.name != "options.py"],
+    ids=lambda path: str(path.relative_to(ROOT)),
+)
+def test_messages_name_options_by_their_fields(path: Path) -> None:
+    for text in texts(path):
+        typed = re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)
+        if path.name != "study.py":  # the switches of a study are its own to name
+            assert not typed or COMMAND_LINE.search(text), f"{typed}: a flag is the command line's (cli/flags.py)"
+        for group, name in re.findall(r"`(scene|points|surface|output)\.([a-z_]+)", text):
+            known = {**options_of(GROUPS[group]), **(options_of(BlockOptions) if group == "points" else {})}
+            assert name in known, f"there is no option {group}.{name}"
 
 
 def test_starting_a_command_loads_nothing_that_few_need() -> None:

@@ -231,9 +231,9 @@ def test_recognises_one_none_or_several(tmp_path):
     alpha, beta = make_sensor("alpha"), make_sensor("beta")
     nobody = make_sensor("nobody", recognises=lambda dataset: False)
     assert Host([make_plugin(alpha, nobody)]).open_scene(image).sensor == "alpha"
-    with pytest.raises(InputError, match=r"alpha, beta(.|\n)*--sensor"):
+    with pytest.raises(InputError, match=r"alpha, beta(.|\n)*scene.sensor"):
         Host([make_plugin(alpha, beta)]).open_scene(image)
-    with pytest.raises(InputError, match=r"no sensor recognises it \(installed: nobody\)(.|\n)*--sensor"):
+    with pytest.raises(InputError, match=r"no sensor recognises it \(installed: nobody\)(.|\n)*scene.sensor"):
         Host([make_plugin(nobody)]).open_scene(image)
     assert Host([make_plugin(alpha, beta)]).open_scene(image, "beta").sensor == "beta"
     with pytest.raises(InputError, match=r"no sensor 'gamma' \(installed: alpha, beta\)"):

@@ -122,7 +122,7 @@ def test_own_points_take_the_options_of_points(tiny, tmp_path: Path) -> None:
     dataset = None
     given = op.PointOptions(gcps="own", crs="EPSG:4326", vertical="ellipsoid")
     assert len(commands.fit(tiny.image, given).fit.points) == 6
-    with pytest.raises(InputError, match="points-crs"):
+    with pytest.raises(InputError, match=r"points\.crs"):
         commands.fit(tiny.image, op.PointOptions(gcps="own"))
 
 

@@ -131,7 +131,7 @@ class Config(_Strict):
     root: str | None = Field(
         default=None,
         description="Folder that every path has to lie in, relative to this file; within the file's own, or that of "
-        "--root. Default: that one.",
+        "the command. Default: that one.",
     )
     defaults: Settings = Field(default=Settings(), description="What holds for all scenes.")
     mosaic: MosaicSettings | None = None

@@ -201,7 +201,7 @@ def _died(future: Future[Outcome]) -> Future[Outcome]:
         return future
     told: Future[Outcome] = Future()
     told.set_exception(
-        WorkerDied("the process that made this scene was killed", remedy="give it more memory, or --workers 1")
+        WorkerDied("the process that made this scene was killed", remedy="give it more memory, or `workers=1`")
     )
     return told
 
@@ -218,13 +218,13 @@ def dask_executor(scheduler: str) -> Any:
         from distributed import Client
     except ImportError as error:
         raise InputError(
-            "dask is not installed", field="--scheduler", remedy="pip install 'ortho-pipeline[dask]'"
+            "dask is not installed", field="scheduler", remedy="pip install 'ortho-pipeline[dask]'"
         ) from error
     try:
         client = Client(scheduler, timeout="5s", set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"no dask scheduler answers at {scheduler!r} ({error or type(error).__name__})", field="--scheduler",
+            f"no dask scheduler answers at {scheduler!r} ({error or type(error).__name__})", field="scheduler",
             remedy="give its address, for example tcp://host:8786",
         ) from error  # fmt: skip
     return client, client.get_executor(pure=False)

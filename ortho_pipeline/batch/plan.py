@@ -101,14 +101,14 @@ class Plan:
         known = {job.name: job for job in self.jobs}
         for name in only:
             if name not in known:
-                raise InputError(f"no scene is called {name!r}", file=self.path, field="--only",
+                raise InputError(f"no scene is called {name!r}", file=self.path, field="only",
                                  remedy="'ortho run FILE --list' lists the names")  # fmt: skip
         jobs = tuple(known[name] for name in dict.fromkeys(only)) if only else self.jobs
         if shard is None:
             return jobs
         part, parts = shard
         if not 1 <= part <= parts:
-            raise InputError(f"there is no part {part} of {parts}", field="--shard", remedy="for example 1/4")
+            raise InputError(f"there is no part {part} of {parts}", field="shard", remedy="for example 1/4")
         return jobs[part - 1 :: parts]
 
 
@@ -148,7 +148,7 @@ class _Planner:
         self.base = Path(os.path.abspath(path)).parent
         self.root = self.base.resolve() if root is None else Path(root).resolve()
         if config.root is not None:
-            self.root = self._inside(config.root, "root")
+            self.root = self._inside(config.root, "root of the file")
         self.output = self._inside(config.output, "output")
 
     def plan(self) -> Plan:
@@ -264,7 +264,7 @@ class _Planner:
         if not resolved.is_relative_to(self.root):
             raise InputError(
                 f"{text} lies outside of the root {self.root}", file=self.path, field=field,
-                remedy=f"move it there, or allow a folder that holds both with --root {self._common(path.resolve())}",
+                remedy=f"move it there, or allow a folder that holds both with `root={self._common(path.resolve())}`",
             )  # fmt: skip
         return path
 

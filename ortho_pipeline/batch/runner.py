@@ -158,7 +158,7 @@ def _check_versions(job: Job) -> None:
         if here[name] != job.versions.get(name)
     ]
     if other:
-        raise InputError(f"this worker has other software than the run: {'; '.join(other)}", field="--scheduler",
+        raise InputError(f"this worker has other software than the run: {'; '.join(other)}", field="scheduler",
                          remedy="install the same versions everywhere")  # fmt: skip
 
 
@@ -495,12 +495,12 @@ def _crew(
 ) -> Iterator[tuple[Executor | Processes, int | None]]:
     """Yield who does the work, and the threads of each scene."""
     if scheduler is not None and executor not in ("dask", None):
-        raise InputError("a scheduler is for dask", field="--scheduler", remedy="leave out --executor, or say dask")
+        raise InputError("a scheduler is for dask", field="scheduler", remedy="leave out `executor`, or say dask")
     if isinstance(executor, Executor):
         yield executor, threads or 1
     elif executor == "dask" or scheduler is not None:  # a scheduler alone means dask
         if scheduler is None:
-            raise InputError("dask needs the address of its scheduler", field="--scheduler",
+            raise InputError("dask needs the address of its scheduler", field="scheduler",
                              remedy="for example tcp://host:8786")  # fmt: skip
         client, pool = dask_executor(scheduler)
         with client:
@@ -513,4 +513,4 @@ def _crew(
         budget = threads or max(1, processors // count)
         yield Processes(count, budget), budget
     else:
-        raise InputError(f"no executor is called {executor!r}", field="--executor", remedy=", ".join(EXECUTORS))
+        raise InputError(f"no executor is called {executor!r}", field="executor", remedy=", ".join(EXECUTORS))

@@ -508,5 +508,5 @@ def _refuse_many(problem: BlockProblem, selection: Selection, rejected: list[int
                 "cannot be decided",
                 file=problem.points.source or None,
                 remedy="measure these points again, remove the wrong ones, or state sigmas as large as their errors "
-                "(sigma_image, sigma_xy, sigma_h; --ground-sigma XY,H for ground that states none)",
+                "(sigma_image, sigma_xy, sigma_h; `points.ground_sigma=XY,H` for ground that states none)",
             )

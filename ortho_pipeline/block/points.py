@@ -193,7 +193,7 @@ class BlockPoints:
         height = plan if height is None else height
         if not (math.isfinite(plan) and plan > 0 and math.isfinite(height) and height > 0):
             raise InputError(
-                "standard deviations of the ground are positive numbers", field="--ground-sigma",
+                "standard deviations of the ground are positive numbers", field="points.ground_sigma",
                 remedy="give metres in plan, or in plan and height, such as 0.5,1",
             )  # fmt: skip
         return replace(self, sigma_ground=np.where(self.sigma_ground > 0, self.sigma_ground, (plan, plan, height)))

@@ -124,7 +124,7 @@ class Variances:
         number = max(self.unstated)
         if not number:
             return []
-        remedy = "state sigmas (sigma_xy, sigma_h, or --ground-sigma XY,H) if they are known"
+        remedy = "state sigmas (sigma_xy, sigma_h, or `points.ground_sigma=XY,H`) if they are known"
         who = f"{counted(number, 'control point')} without a stated sigma"
         if not self.separable:
             text = f"{who}: their errors cannot be told from errors of measurement here, and count as such; {remedy}"

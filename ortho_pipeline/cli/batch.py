@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ortho_pipeline.cli.command import Command, Megabytes
+from ortho_pipeline.cli.flags import as_typed
 from ortho_pipeline.cli.options import json_option
 from ortho_pipeline.cli.printing import print_json, progress
 from ortho_pipeline.errors import counted
@@ -137,7 +138,8 @@ def _checked_text(one: Mapping[str, Any]) -> str:
         f"DEM covers {100 * one['coverage']:.1f} %",
         f"{grid['size'][0]} x {grid['size'][1]} px of {grid['resolution'][0]:g} in {grid['crs']}",
     ]
-    return "\n".join([f"{one['name']}: {'; '.join(parts)}", *(f"  Warning: {text}" for text in one["warnings"])])
+    warnings = (f"  Warning: {as_typed(str(text))}" for text in one["warnings"])
+    return "\n".join([f"{one['name']}: {'; '.join(parts)}", *warnings])
 
 
 def _print_summary(result: BatchResult) -> None:
@@ -195,4 +197,4 @@ def _mosaic_text(mosaic: Mapping[str, Any]) -> str:
 def _error_text(error: Mapping[str, Any]) -> str:
     where = ": ".join(part for part in (error["file"], error["field"]) if part)
     text = f"{where}: {error['message']}" if where else error["message"]
-    return f"{text}\n  Remedy: {error['remedy']}" if error["remedy"] else text
+    return as_typed(f"{text}\n  Remedy: {error['remedy']}" if error["remedy"] else text)

@@ -15,6 +15,9 @@ from typing import Any, NoReturn
 
 import click
 
+from ortho_pipeline.cli.flags import name_as_typed
+from ortho_pipeline.errors import OrthoError
+
 _WORD = re.compile(r"-[A-Za-z_]\S")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
@@ -72,6 +75,14 @@ class Command(click.Command):
             shown = " ".join(ctx.args[:3]) + (" ..." if len(ctx.args) > 3 else "")
             ctx.fail(f"'{ctx.info_name}' does not take {shown!r} too." + (f" {self.one}" if self.one else ""))
         return ctx.args
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; what it refuses names options as they are typed."""
+        try:
+            return super().invoke(ctx)
+        except OrthoError as error:
+            name_as_typed(error, self)
+            raise
 
 
 class Group(click.Group):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import functools
 import math
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import MISSING, fields
 from typing import Any
 
 import click
 
 from ortho_pipeline.cli.command import Megabytes, OneOrTwo
+from ortho_pipeline.cli.flags import FLAGS, with_flags
 from ortho_pipeline.options import (
     BlockOptions,
     Option,
@@ -54,7 +54,7 @@ class _Nodata(click.ParamType):
 # -- options of click ------------------------------------------------------------------------------------------------
 
 
-def click_options(group: str, options: type, *names: str, **changes: Any) -> Decorator:
+def click_options(group: str, options: type, *names: str) -> Decorator:
     """Return the decorator that adds click options for fields of a group.
 
     Parameters
@@ -65,30 +65,27 @@ def click_options(group: str, options: type, *names: str, **changes: Any) -> Dec
         Its class, one of `ortho_pipeline.options`.
     names : str
         The fields, in the order of ``--help``; all without.
-    changes : optional
-        Of what click is told.
     """
     defaults = {one.name: one.default for one in fields(options)}
     known = options_of(options)
-    flags = {f"{group}.{name}": option.flags.split()[0] for name, option in known.items()}
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         for name in reversed(names or tuple(known)):
             option = known[name]
-            said = {**_said(option, defaults[name]), "help": _help(option, flags), **changes}
+            said = {**_said(option, defaults[name]), "help": _help(option)}
             command = click.option(*option.flags.split(), f"{group}_{name}", **said)(command)
         return command
 
     return decorate
 
 
-def _help(option: Option, flags: Mapping[str, str]) -> str | None:
+def _help(option: Option) -> str | None:
     text = option.help
     if option.kind in ("integers", "folders", "keys"):
         text = f"{text.removesuffix('.')}; may be repeated."
     if option.unset:
         text = f"{text.removesuffix('.')}  [default: {option.unset}]".strip()
-    return with_flags(text, flags) or None
+    return with_flags(text, FLAGS) or None
 
 
 def _said(option: Option, default: Any) -> dict[str, Any]:
@@ -182,20 +179,3 @@ image_argument = click.argument("image", type=click.Path())
 folder_option = click.option(
     "--output", "-o", "folder", type=click.Path(file_okay=False), required=True, metavar="DIR", help="Output folder."
 )
-
-# -- names of options in messages ------------------------------------------------------------------------------------
-
-_NAMED = re.compile(r"`([a-z_]+(?:\.[a-z_]+)?)(?:\.(\w+))?(?:=([^`]*))?`")
-
-
-def with_flags(text: str, flags: Mapping[str, str]) -> str:
-    """Return a text with the options that it names as they are typed; names without a flag stay as they are."""
-
-    def typed(match: re.Match[str]) -> str:
-        name, key, value = match.groups()
-        if name not in flags:
-            return match[0]
-        given = "=".join(part for part in (key, value) if part is not None)
-        return f"{flags[name]} {given}".strip()
-
-    return _NAMED.sub(typed, text)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ortho_pipeline.cli.flags import as_typed
 from ortho_pipeline.errors import counted
 
 if TYPE_CHECKING:
@@ -25,14 +26,14 @@ def print_json(document: Any) -> None:
 def print_warnings(warnings: Any) -> None:
     """Print warnings on stderr."""
     for warning in warnings:
-        click.echo(f"Warning: {warning}", err=True)
+        click.echo(f"Warning: {as_typed(str(warning))}", err=True)
 
 
 def print_result(result: Result, as_json: bool) -> None:
     """Print the summary of a result and its files, or its document."""
     if as_json:
         return print_json(result.to_json())
-    click.echo(result.summary)
+    click.echo(as_typed(result.summary))
     for name, path in result.files.items():
         click.echo(f"  {name:<10} {path}")
     return None
@@ -144,7 +145,9 @@ def print_comparison(result: CompareResult, units: str) -> None:
     for row in rows:
         mark = "*" if row["model"] == document["recommendation"]["model"] else " "
         if row["error"]:
-            click.echo(f"{row['model']:<{wide}}{mark} {row['parameters']:>6}    not fitted: {row['error']}")
+            click.echo(
+                f"{row['model']:<{wide}}{mark} {row['parameters']:>6}    not fitted: {as_typed(str(row['error']))}"
+            )
             continue
         rmse = row["rmse" if units == "px" else "rmse_m"]
         loo = _error(rmse["loo"]["total"] if rmse["loo"] else None)
@@ -155,7 +158,7 @@ def print_comparison(result: CompareResult, units: str) -> None:
             notes += [text for text in row["warnings"] if text not in notes]
             line += "  " + ",".join(f"[{notes.index(text) + 1}]" for text in row["warnings"])
         click.echo(line)
-    for number, text in enumerate(notes, 1):
+    for number, text in enumerate(map(as_typed, notes), 1):
         click.echo(f"\n[{number}] {text}" if number == 1 else f"[{number}] {text}")
     for point in document["left_out"]:
         click.echo(f"\nleft out of all models: {point['id']} ({point['reason']})")

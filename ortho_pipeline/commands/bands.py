@@ -61,7 +61,7 @@ def register(
     names = [path.stem for path in paths]
     if chosen not in paths or len(set(names)) != len(names):
         wrong = "the reference is not among the images" if chosen not in paths else "two images have one name"
-        raise InputError(wrong, file=chosen, field="--reference", remedy="name each band once, the reference too")
+        raise InputError(wrong, file=chosen, field="reference", remedy="name each band once, the reference too")
     opened = inputs.open_image(chosen, scene, needs_model=False)
     files = {"image": Path(folder) / f"{chosen.stem}_bands.tif", "table": Path(folder) / f"{chosen.stem}_bands.json"}
     beside = _metadata_beside(opened, files["image"])
@@ -72,7 +72,7 @@ def register(
     for path in files.values():
         if path.resolve() in {one.resolve() for one in (*paths, place(opened.model_source))}:
             raise InputError(
-                "this path would be read and written", file=path, field="-o", remedy="choose another folder"
+                "this path would be read and written", file=path, field="folder", remedy="choose another folder"
             )
     begun = states([*paths, opened.model_source])
     with together(folder, files["image"].stem):

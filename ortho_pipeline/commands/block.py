@@ -193,7 +193,7 @@ def _sigmas(text: str) -> list[float]:
         found = []
     if len(found) not in (1, 2):
         raise InputError(
-            f"{text!r} is not one sigma, or two", field="--ground-sigma",
+            f"{text!r} is not one sigma, or two", field="points.ground_sigma",
             remedy="give metres in plan, or in plan and height, such as 0.5,1",
         )  # fmt: skip
     return found
@@ -207,7 +207,7 @@ def _heights(table: BlockPoints) -> tuple[float, float] | None:
 def _own(scene: Any, name: str | None) -> SensorModel:
     if name is not None and name not in scene.models:
         raise InputError(
-            f"this image has no model {name!r}", file=scene.path, field="--model",
+            f"this image has no model {name!r}", file=scene.path, field="points.model",
             remedy=f"its models are {', '.join(scene.models)}",
         )  # fmt: skip
     model: SensorModel = scene.model if name is None else scene.models[name]
@@ -217,7 +217,7 @@ def _own(scene: Any, name: str | None) -> SensorModel:
 def _check_models(images: Sequence[str | os.PathLike[str]], models: Sequence[str | os.PathLike[str]]) -> None:
     if models and len(models) != len(images):
         raise InputError(
-            f"{counted(len(models), 'model')} for {counted(len(images), 'image')}", field="--models",
+            f"{counted(len(models), 'model')} for {counted(len(images), 'image')}", field="models",
             remedy="give one model file for each image, in their order",
         )  # fmt: skip
 

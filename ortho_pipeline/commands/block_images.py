@@ -126,12 +126,12 @@ def start_of(
         return _family_start(opened, str(name), options, table, heights)
     if options.model_crs is not None:
         raise InputError(
-            "--model-crs is the ground CRS of a fitted model", field="--model-crs",
-            remedy=f"give --model with one of {', '.join(sorted(named))}",
+            "`points.model_crs` is the ground CRS of a fitted model", field="points.model_crs",
+            remedy=f"give `points.model` with one of {', '.join(sorted(named))}",
         )  # fmt: skip
     if name is not None and name not in opened.models:
         raise InputError(
-            f"this image has no model {name!r}", file=image, field="--model",
+            f"this image has no model {name!r}", file=image, field="points.model",
             remedy=f"its models are {', '.join(opened.models)}; models fitted to points are {', '.join(sorted(named))}",
         )  # fmt: skip
     own = name if name is not None else next(iter(opened.models))
@@ -139,7 +139,7 @@ def start_of(
     correction = options.correction or (OWN if model.param_names else "shift")
     if correction == OWN and not model.param_names:
         raise InputError(
-            f"the model {own!r} has no parameters of its own to adjust", file=image, field="--correction",
+            f"the model {own!r} has no parameters of its own to adjust", file=image, field="points.correction",
             remedy="take shift, shift-drift or affine",
         )  # fmt: skip
     first = own == next(iter(opened.models))
@@ -157,7 +157,9 @@ def _family_start(
 ) -> Start:
     if options.correction not in (None, OWN):
         raise InputError(
-            f"the model {name!r} is fitted as a whole", field="--correction", remedy="leave out --correction"
+            f"the model {name!r} is fitted as a whole",
+            field="points.correction",
+            remedy="leave out `points.correction`",
         )
     size = opened.width, opened.height
     if family_of(name).variants:

@@ -50,7 +50,9 @@ def fit(
         If there are no points, or a file is wrong (message names file, field and remedy).
     """
     if points.gcps is None:
-        raise InputError("there are no points to fit to", field="--gcps", remedy="give a file of points with --gcps")
+        raise InputError(
+            "there are no points to fit to", field="points.gcps", remedy="give a file of points with `points.gcps`"
+        )
     opened = open_adjustable(image, scene, points)
     heights = open_surface(surface, scene) if has_surface(surface) else None
     adjusted = adjust(opened, points, scene, heights)
@@ -86,12 +88,16 @@ def compare(
         If there are no points, a model is unknown, or a file is wrong. A model that cannot be fitted is a row.
     """
     if points.gcps is None:
-        raise InputError("there are no points to fit to", field="--gcps", remedy="give a file of points with --gcps")
+        raise InputError(
+            "there are no points to fit to", field="points.gcps", remedy="give a file of points with `points.gcps`"
+        )
     if points.correction is not None or points.fit_model is not None:
-        raise InputError("compare takes its models from --models", field="--models", remedy="for example all")
+        raise InputError("compare takes its models from `models`", field="models", remedy="for example all")
     if points.params is not None or points.prune:
         raise InputError(
-            "compare fits whole models", field="--params" if points.params else "--prune", remedy="take ortho fit"
+            "compare fits whole models",
+            field="points.params" if points.params else "points.prune",
+            remedy="take ortho fit",
         )
     opened = inputs.open_image(image, scene, needs_model=False)
     names = comparing.choose_models(models, opened.model if opened.models else None)

@@ -63,14 +63,16 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
         given: dict[str, Any] = dict(options.sensor_options)
         if options.rpc is not None:
             if "rpc" in given:
-                raise InputError("the RPC is chosen twice", field="--rpc", remedy="leave out --sensor-option rpc=...")
+                raise InputError(
+                    "the RPC is chosen twice", field="scene.rpc", remedy="leave out `scene.sensor_options.rpc=...`"
+                )
             given["rpc"] = options.rpc
         given = {name: _perhaps_elsewhere(value, options.allow_network) for name, value in given.items()}
         return plugins.open_scene(image, options.sensor, given, crop_offset=options.crop_offset, **options.access)
     if options.rpc is not None or options.sensor is not None or options.sensor_options:
         raise InputError(
-            "a model file takes the place of the image's model", field="--model",
-            remedy="leave out --rpc, --sensor and --sensor-option",
+            "a model file takes the place of the image's model", field="scene.model",
+            remedy="leave out `scene.rpc`, `scene.sensor` and `scene.sensor_options`",
         )  # fmt: skip
     dataset = raster.open_dataset(image, **options.access)
     plugins.Host.discover()  # model families of plugins, which the file may name
@@ -85,7 +87,7 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
             f"{size[0]} x {size[1]}",
             file=options.model,
             field="size",
-            remedy="give the model file of this image, or --crop-offset COL,ROW if it is a crop of that one",
+            remedy="give the model file of this image, or `scene.crop_offset=COL,ROW` if it is a crop of that one",
         )
     scene = Scene(
         sensor=saved.sensor or "model file", path=image, width=size[0], height=size[1],
@@ -132,12 +134,16 @@ def open_surface(options: SurfaceOptions, scene: SceneOptions = SceneOptions()) 
         If both or neither are given, or a rule is unknown.
     """
     if options.dem is not None and options.height is not None:
-        raise InputError("--dem and --height exclude each other", field="--height", remedy="give one of them")
+        raise InputError(
+            "`surface.dem` and `surface.height` exclude each other", field="surface.height", remedy="give one of them"
+        )
     if options.height is not None:
         return dem.Surface.constant(options.height)
     if options.dem is None:
-        raise InputError("there are no heights", field="--dem", remedy="give --dem FILE or --height METRES")
-    with of_option("--dem-vertical"):
+        raise InputError(
+            "there are no heights", field="surface.dem", remedy="give `surface.dem=FILE` or `surface.height=METRES`"
+        )
+    with of_option("surface.vertical"):
         vertical = None if options.vertical is None else Vertical.parse(options.vertical)
     return dem.Surface.open(
         options.dem, vertical, override=options.override_vertical, fill=options.fill,
@@ -149,8 +155,8 @@ def require_heights(options: SurfaceOptions) -> None:
     """Raise an `InputError` if there are no heights."""
     if not has_surface(options):
         raise InputError(
-            "an orthoimage needs heights", field="--dem",
-            remedy="give --dem FILE, or --height METRES above the ellipsoid for flat ground",
+            "an orthoimage needs heights", field="surface.dem",
+            remedy="give `surface.dem=FILE`, or `surface.height=METRES` above the ellipsoid for flat ground",
         )  # fmt: skip
 
 
@@ -180,14 +186,16 @@ def read_control(scene: Scene, options: PointOptions, opened: SceneOptions = Sce
         if options.correction not in (None, "none"):
             raise InputError(
                 f"the correction {options.correction!r} needs control points",
-                field="--gcps",
+                field="points.gcps",
                 remedy="give a file of points",
             )
         return no_points()
     points = _given_points(scene, options, opened)
     if options.select is not None and options.check is not None:
         raise InputError(
-            "--select and --check both say which points check", field="--select", remedy="give one of them"
+            "`points.select` and `points.check` both say which points check",
+            field="points.select",
+            remedy="give one of them",
         )
     if options.select is not None:
         return select_control(points, options.select)
@@ -195,17 +203,18 @@ def read_control(scene: Scene, options: PointOptions, opened: SceneOptions = Sce
 
 
 def _given_points(scene: Scene, options: PointOptions, opened: SceneOptions) -> Points:
-    with of_option("--points-crs"):
+    with of_option("points.crs"):
         crs = None if options.crs is None else parse_crs(options.crs)
-    with of_option("--points-vertical"):
+    with of_option("points.vertical"):
         vertical = None if options.vertical is None else Vertical.parse(options.vertical)
     path = point_file(options)
     origin = options.pixel_origin
     if path is None or os.fspath(path) == OWN_POINTS:
         if origin != "corner" or (path is None and not (crs is vertical is None)):
             raise InputError(
-                "these points say themselves what their coordinates are", field="--pixel-origin",
-                remedy="leave --pixel-origin out, and of points that are read already --points-crs, --points-vertical",
+                "these points say themselves what their coordinates are", field="points.pixel_origin",
+                remedy="leave `points.pixel_origin` out, and of points that are read already `points.crs` and "
+                "`points.vertical`",
             )  # fmt: skip
         if isinstance(options.gcps, Points):
             return options.gcps
@@ -244,7 +253,7 @@ def with_heights(points: Points, surface: dem.Surface | None) -> Points:
         raise InputError(
             f"{int(missing.sum())} of {counted(len(points), 'point')} without a height "
             f"({names})", file=points.source, field="h",
-            remedy="give heights in the file, or a DEM with --dem to take them from",
+            remedy="give heights in the file, or a DEM with `surface.dem` to take them from",
         )  # fmt: skip
     ground = points.ground.copy()
     ground[missing, 2] = surface.heights(ground[missing, :2], points.crs)
@@ -279,14 +288,14 @@ def check_paths(
     for path in (*files.values(), *removed):
         if path.resolve() in inputs:
             raise InputError(
-                "this path would be read and written", file=path, field="-o", remedy="choose another output folder"
+                "this path would be read and written", file=path, field="folder", remedy="choose another output folder"
             )
     folder = next(iter(files.values())).parent
     attaching = any(str(path).endswith(SIDE_CARS) for path in files.values())
     if attaching and folder.resolve() == Path(image).resolve().parent:
         raise InputError(
             "the RPC files written here would attach to the source image and change its model", file=folder,
-            field="-o", remedy="choose an output folder of its own",
+            field="folder", remedy="choose an output folder of its own",
         )  # fmt: skip
     if "ortho" in files and not overwrite:
         # Statistics, overviews and masks go with an ortho that is replaced; a model is nothing that an ortho has.
@@ -294,7 +303,7 @@ def check_paths(
             if stale.name.endswith(SIDE_CARS) or not files["ortho"].exists():
                 raise InputError(
                     "an old side-car lies here that GDAL would attach to the ortho", file=stale,
-                    remedy="remove it (--overwrite does), or choose another output folder",
+                    remedy="remove it (`overwrite` does), or choose another output folder",
                 )  # fmt: skip
 
 

@@ -265,7 +265,7 @@ def _warp(
     if output.engine == "ortho":
         return warp.rectify(model, source, surface, grid, path, tolerance=output.tolerance, **common)
     if output.engine != "gdal":
-        raise InputError(f"no engine is called {output.engine!r}", field="--engine", remedy="ortho or gdal")
+        raise InputError(f"no engine is called {output.engine!r}", field="output.engine", remedy="ortho or gdal")
     return warp.rectify_gdal(model, exported, source, surface, grid, path, **common)
 
 

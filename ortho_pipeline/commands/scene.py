@@ -179,7 +179,7 @@ def dem_check(
     found = dem_accuracy.check_dem(heights, ground, plane, ids)
     if not found.overall.count:
         raise InputError(
-            f"none of the {counted(len(ids), 'check point')} has a height in this DEM", file=dem_file, field="--points",
+            f"none of the {counted(len(ids), 'check point')} has a height in this DEM", file=dem_file, field="points",
             remedy="check the CRS of the points, and whether they lie on the DEM",
         )  # fmt: skip
     document = {

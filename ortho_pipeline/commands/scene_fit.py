@@ -136,22 +136,29 @@ def open_adjustable(image: Any, scene: SceneOptions, points: PointOptions) -> Sc
     if points.fit_model is None:
         if points.model_crs is not None:
             raise InputError(
-                "--model-crs is the ground CRS of a fitted model", field="--model-crs", remedy="give --fit-model"
+                "`points.model_crs` is the ground CRS of a fitted model",
+                field="points.model_crs",
+                remedy="give `points.fit_model`",
             )
         if points.ridge != "auto":
-            raise InputError("--ridge regularises a fitted model", field="--ridge", remedy="give --fit-model")
+            raise InputError(
+                "`points.ridge` regularises a fitted model", field="points.ridge", remedy="give `points.fit_model`"
+            )
         return inputs.open_scene(image, scene)
     if scene.model is not None or points.correction is not None:
-        other = "--model" if scene.model is not None else "--correction"
+        other = "scene.model" if scene.model is not None else "points.correction"
         raise InputError(
-            f"--fit-model takes the place of the image's own model, {other} starts from it", field="--fit-model",
-            remedy=f"leave out one of --fit-model and {other}",
+            f"`points.fit_model` takes the place of the image's own model, `{other}` starts from it",
+            field="points.fit_model",
+            remedy=f"leave out one of `points.fit_model` and `{other}`",
         )  # fmt: skip
     if points.gcps is None:
-        raise InputError("a model is fitted to points", field="--gcps", remedy="give a file of points with --gcps")
+        raise InputError(
+            "a model is fitted to points", field="points.gcps", remedy="give a file of points with `points.gcps`"
+        )
     if points.fit_model not in {family.name for family in families()}:
         raise InputError(
-            f"no model is called {points.fit_model!r}", field="--fit-model",
+            f"no model is called {points.fit_model!r}", field="points.fit_model",
             remedy=f"one of {', '.join(family.name for family in families())} (see `ortho models`)",
         )  # fmt: skip
     return inputs.open_image(image, scene, needs_model=False)
@@ -216,8 +223,8 @@ def _corrected(
     elif correction != "none" and opened.model is not None:
         raise InputError(
             "a model file is an adjusted model: adjusting it again would count points twice",
-            field="--correction",
-            remedy="adjust the scene's own model with all points (leave out --model)",
+            field="points.correction",
+            remedy="adjust the scene's own model with all points (leave out `scene.model`)",
         )
     if correction == OWN:
         scene = _by_own_parameters(scene)

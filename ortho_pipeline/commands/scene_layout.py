@@ -84,7 +84,7 @@ def lay_out(
         lay = footprint.lay(model, surface, *size)
         lay.require_coverage(surface)
         model = lay.fitted(model)
-        with of_option("--output-crs"):
+        with of_option("output.crs"):
             crs = map_crs(output.crs) if output.crs else None
         grid = footprint.choose_grid(
             model, lay, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align

@@ -157,8 +157,8 @@ class Drawing:
             from matplotlib.figure import Figure
         except ImportError as error:
             raise InputError(
-                "PNG needs matplotlib, which is not installed", field="--kind",
-                remedy="pip install 'ortho-pipeline[plots]', or take --kind svg",
+                "PNG needs matplotlib, which is not installed", field="kind",
+                remedy="pip install 'ortho-pipeline[plots]', or take `kind=svg`",
             ) from error  # fmt: skip
         figure = Figure(figsize=(self.width / 100, self.height / 100), dpi=100 * scale, facecolor=_COLOURS["paper"])
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))

@@ -159,7 +159,7 @@ def choose_models(text: str, own: SensorModel | None = None) -> tuple[str, ...]:
     if unknown or not names:
         raise InputError(
             f"no model is called {', '.join(unknown)}" if unknown else "no model is named",
-            field="--models",
+            field="models",
             remedy=f"all, or some of {', '.join(known)}",
         )
     return names

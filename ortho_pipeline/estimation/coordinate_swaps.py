@@ -100,7 +100,7 @@ def refuse_swapped(model: SensorModel, points: Points, rows: int) -> None:
             "most points lie outside of the model's domain",
             file=points.source,
             field="CRS",
-            remedy="check the coordinate system of the points (--points-crs) and that they belong to this scene",
+            remedy="check the coordinate system of the points (`points.crs`) and that they belong to this scene",
         )
 
 

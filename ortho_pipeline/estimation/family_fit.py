@@ -40,7 +40,7 @@ def fit_own(
     """
     if not model.param_names:
         raise InputError(
-            f"a model {model.kind!r} has no parameters of its own to adjust", field="--correction",
+            f"a model {model.kind!r} has no parameters of its own to adjust", field="points.correction",
             remedy="take shift, shift-drift or affine",
         )  # fmt: skip
     return fit(model, points, priors=priors, robust=robust, name=f"{model.kind}+{OWN}")
@@ -124,7 +124,8 @@ def restricted(model: SensorModelT, params: Sequence[str] | None) -> SensorModel
     unknown = [name for name in params if name not in model.param_names]
     if unknown or not params:
         raise InputError(
-            f"no parameter is called {', '.join(unknown)}" if unknown else "no parameter is named", field="--params",
+            f"no parameter is called {', '.join(unknown)}" if unknown else "no parameter is named",
+            field="points.params",
             remedy=f"some of {', '.join(model.param_names) or 'none: this model has no parameters'}",
         )  # fmt: skip
     rest = [name for name in model.param_names if name not in params]
@@ -149,7 +150,7 @@ def ridge_of(text: str) -> float | str | None:
         weight = math.nan
     if not (math.isfinite(weight) and weight > 0):
         raise InputError(
-            f"{text!r} is no regularisation", field="--ridge",
+            f"{text!r} is no regularisation", field="points.ridge",
             remedy=f"auto, none, {', '.join(METHODS)}, or a positive weight such as 1e-5",
         )  # fmt: skip
     return weight
@@ -228,7 +229,7 @@ def prune(found: Fit, *, significance: float | None = None) -> Pruned:
         raise InputError("a significance lies between 0 and 1", field="significance")
     if found.sigma0 is None:
         raise InputError(
-            "without redundancy no parameter can be tested", field="--prune", remedy="give more control points"
+            "without redundancy no parameter can be tested", field="points.prune", remedy="give more control points"
         )
     removed: list[Removed] = []
     while True:

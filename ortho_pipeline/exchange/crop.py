@@ -34,7 +34,7 @@ def checked(offset: Sequence[float]) -> tuple[float, float]:
     """
     if len(offset) != 2 or not all(math.isfinite(value) for value in offset):
         raise InputError(
-            f"{', '.join(f'{value:g}' for value in offset)} is not the place of a crop", field="--crop-offset",
+            f"{', '.join(f'{value:g}' for value in offset)} is not the place of a crop", field="scene.crop_offset",
             remedy="give the column and row of its first pixel in the whole image: COL,ROW",
         )  # fmt: skip
     return float(offset[0]), float(offset[1])
@@ -84,7 +84,7 @@ def placed(scene: Scene, dataset: Any, offset: Sequence[float] | None = None) ->
     if noted is not None and _is_of_the_whole(scene, noted):
         text = (
             f"the image notes that it is a crop whose first pixel is {_text(noted)} of the whole, and so the model was "
-            "moved; if it is not, give --crop-offset 0,0"
+            "moved; if it is not, give `scene.crop_offset=0,0`"
         )
         return _moved(scene, noted, Notice("crop-noted", text, offset=noted))
     remark = _elsewhere(scene) or (None if noted is not None else _small(scene))
@@ -146,7 +146,7 @@ def _elsewhere(scene: Scene) -> Notice | None:
     text = (
         f"the RPC is for columns {left:.0f} to {right:.0f} and rows {top:.0f} to {bottom:.0f}, which does not meet "
         f"this image of {scene.width} x {scene.height} pixels: is it a crop with the RPC of the whole? Say where "
-        "it lies with --crop-offset COL,ROW"
+        "it lies with `scene.crop_offset=COL,ROW`"
     )
     return Notice("rpc-elsewhere", text, columns=[left, right], rows=[top, bottom])
 
@@ -164,7 +164,7 @@ def _small(scene: Scene) -> Notice | None:
     text = (
         f"the image has {scene.width} x {scene.height} pixels, its RPC is for about {sizes[0]:.0f} x {sizes[1]:.0f}: "
         "if it was cut out of that image, the RPC is right for it only if both begin at the same corner; say where it "
-        "lies with --crop-offset COL,ROW"
+        "lies with `scene.crop_offset=COL,ROW`"
     )
     return Notice("maybe-a-crop", text, rpc_size=sizes)
 

@@ -56,7 +56,7 @@ def gcps_of_model(
     if len(gcps) < 4:
         raise InputError(
             "the rays of the image do not meet the ground: there is no grid of control points", field="model",
-            remedy="give the metadata of this very image, and a DEM or --height that lies under it",
+            remedy="give the metadata of this very image, and a DEM or `surface.height` that lies under it",
         )  # fmt: skip
     return gcps
 
@@ -148,8 +148,8 @@ def write_geolocation(
     if not np.isfinite(lonlat).all():
         raise InputError(
             "some rays of the image do not meet the ground: geolocation arrays would have holes",
-            field="model" if surface is None else "--dem",
-            remedy="give the metadata of this very image, and a DEM that covers the whole scene, or --height",
+            field="model" if surface is None else "surface.dem",
+            remedy="give the metadata of this very image, and a DEM that covers the whole scene, or `surface.height`",
         )  # fmt: skip
     arrays = path.resolve().with_suffix(".tif")
     with raster_output(arrays) as temporary:

@@ -102,7 +102,7 @@ def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
         raise InputError(
             "this is no model file of ortho-pipeline",
             file=path,
-            remedy="give a <stem>_model.json; RPC files go to --rpc",
+            remedy="give a <stem>_model.json; RPC files go to `scene.rpc`",
         )
     if version != SCHEMA_VERSION:
         raise InputError(

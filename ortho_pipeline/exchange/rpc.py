@@ -125,7 +125,7 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
     damaged = ", ".join(_unreadable_beside(place(name))) if choice != "tag" else ""
     raise InputError(
         f"there is no {what}" + (f" that can be read: {damaged} is damaged or encrypted" if damaged else ""),
-        file=name, field="--rpc", remedy="give the RPC file with --rpc FILE",
+        file=name, field="scene.rpc", remedy="give the RPC file with `scene.rpc=FILE`",
     )  # fmt: skip
 
 
@@ -203,8 +203,8 @@ def _check_agreement(sidecar: RPC, tag: RPC, sidecar_name: str, name: str) -> No
         raise InputError(
             f"the RPC of the file and that of {sidecar_name} differ {apart} at the centre of the scene",
             file=name,
-            field="--rpc",
-            remedy="choose one: --rpc tag, --rpc sidecar, or --rpc FILE",
+            field="scene.rpc",
+            remedy="choose one: `scene.rpc=tag`, `scene.rpc=sidecar`, or `scene.rpc=FILE`",
         )
 
 

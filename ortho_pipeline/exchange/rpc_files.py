@@ -72,7 +72,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
 # Bounded, so that no hostile file makes it slow.
 _RPB_ITEM = re.compile(r"(\w{1,40})[ \t]*=[ \t]*(?:\(([^()]{0,8000})\)|\"([^\"\n]{0,200})\"|([^;\n(\"]{0,200}))\s*;")
 _CENTRE = 0.5
-_REMEDY = "give the RPC file as the vendor delivers it, or another one (--rpc FILE)"
+_REMEDY = "give the RPC file as the vendor delivers it, or another one (`scene.rpc=FILE`)"
 
 
 # -- reading ---------------------------------------------------------------------------------------------------------

@@ -267,7 +267,7 @@ def located(path: AnyPath, *, allow_network: bool = False) -> AnyPath:
         raise InputError(
             "files of the network are not opened unasked",
             file=os.fspath(path),
-            remedy="allow them with --allow-network",
+            remedy="allow them with `scene.allow_network`",
         )
     if allow_network and not in_local_archive(name):
         _open_network()

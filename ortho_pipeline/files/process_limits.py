@@ -68,7 +68,7 @@ def require_memory(size: int = LEAST, threads: int = 0) -> None:
             f"there is not enough memory: a limit on this process leaves {max(0, limit - used) >> 20} MB of address "
             f"space, and the work takes {needed >> 20} MB",
             field="ulimit -v",
-            remedy="raise the limit, or give less work at once (--memory MB, --threads 1)",
+            remedy="raise the limit, or give less work at once (`output.memory=MB`, `output.threads=1`)",
         )
 
 

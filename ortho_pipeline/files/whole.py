@@ -101,7 +101,7 @@ class Outputs:
             except BlockingIOError as error:
                 os.close(descriptor)
                 raise InputError(
-                    f"another command is writing {self.name!r} in this folder", file=self.folder, field="-o",
+                    f"another command is writing {self.name!r} in this folder", file=self.folder, field="folder",
                     remedy="wait for its end, or choose another output folder",
                 ) from error  # fmt: skip
             except OSError:

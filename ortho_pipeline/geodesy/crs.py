@@ -121,10 +121,10 @@ def map_crs(text: str | pyproj.CRS) -> pyproj.CRS:
     try:
         plain = horizontal(crs)
     except CrsError as error:
-        raise CrsError(error.message, field="--output-crs", remedy=remedy) from error
+        raise CrsError(error.message, field="output.crs", remedy=remedy) from error
     operation = plain.coordinate_operation
     if "Derived" in plain.type_name or (operation is not None and operation.method_name.startswith("PROJ ")):
-        raise CrsError(f"a GeoTIFF cannot hold {plain.to_string()!r}", field="--output-crs", remedy=remedy)
+        raise CrsError(f"a GeoTIFF cannot hold {plain.to_string()!r}", field="output.crs", remedy=remedy)
     return crs
 
 

@@ -18,7 +18,7 @@ UNITS = (
 
 def dem_vertical_remedy(first: str = "") -> str:
     """Return the advice to state the height datum by option, after another advice if there is one."""
-    option = f"say what the heights are measured above with --dem-vertical ({VERTICAL_FORMS})"
+    option = f"say what the heights are measured above with `surface.vertical` ({VERTICAL_FORMS})"
     return f"{first}; or {option}" if first else option
 
 
@@ -46,7 +46,7 @@ def dem_vertical(
             raise DatumError(
                 "this DEM does not say what its heights are measured above",
                 file=path,
-                field="--dem-vertical",
+                field="surface.vertical",
                 remedy=dem_vertical_remedy(),
             )
         return option, []
@@ -55,7 +55,7 @@ def dem_vertical(
             raise DatumError(
                 f"the heights of this DEM are in {declared.name!r}, which is not a datum that is known here",
                 file=path,
-                field="--dem-vertical",
+                field="surface.vertical",
                 remedy=dem_vertical_remedy(),
             )
         by_name = Notice(
@@ -68,7 +68,7 @@ def dem_vertical(
         return option, []
     warning = Notice(
         "dem-datum-overridden",
-        f"the DEM declares its heights as {declared.name!r}; {option.label} was used as --dem-vertical says",
+        f"the DEM declares its heights as {declared.name!r}; {option.label} was used as `surface.vertical` says",
         declared=declared.name,
         used=option.name,
     )
@@ -77,10 +77,10 @@ def dem_vertical(
     realises = realises and not option.is_ellipsoid
     if declared.certain and not override and not realises:
         raise DatumError(
-            f"the DEM declares its heights as {declared.name!r}, --dem-vertical says {option.label}",
+            f"the DEM declares its heights as {declared.name!r}, `surface.vertical` says {option.label}",
             file=path,
-            field="--dem-vertical",
-            remedy="leave the option out, or override what the file declares with --override-dem-vertical",
+            field="surface.vertical",
+            remedy="leave the option out, or override what the file declares with `surface.override_vertical`",
         )
     return option, [warning]
 

@@ -34,7 +34,7 @@ BIN = 0.25
 APERTURE = math.sqrt(1 / 12)
 #: Least step of an edge, in standard deviations of the pixels beside it.
 _CONTRAST = 5.0
-_NO_EDGE_REMEDY = "give an edge between two even areas with --edge x1,y1,x2,y2"
+_NO_EDGE_REMEDY = "give an edge between two even areas with `edge=x1,y1,x2,y2`"
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,12 +107,12 @@ def analyse_edge(pixels: Array, segment: Segment, *, half_width: float = HALF_WI
     """
     (x1, y1), (x2, y2) = segment
     if not all(map(math.isfinite, (x1, y1, x2, y2))):
-        raise InputError("an edge has four finite numbers", field="--edge", remedy=_NO_EDGE_REMEDY)
+        raise InputError("an edge has four finite numbers", field="edge", remedy=_NO_EDGE_REMEDY)
     height, width = pixels.shape
     if min(x1, x2) < 0 or min(y1, y2) < 0 or max(x1, x2) > width or max(y1, y2) > height:
         raise InputError(
             f"the edge {said(segment)} leaves the image of {width} x {height} pixels",
-            field="--edge",
+            field="edge",
             remedy="give columns and rows within the image",
         )
     steep = abs(y2 - y1) >= abs(x2 - x1)
@@ -166,7 +166,7 @@ class _Area:
         if len(rows) < SHORTEST:
             raise InputError(
                 f"the edge crosses {counted(len(rows), 'line')} of pixels; it takes {SHORTEST}",
-                field="--edge",
+                field="edge",
                 remedy="give a longer edge",
             )
         middle = x1 + (x2 - x1) * (rows + 0.5 - y1) / (y2 - y1)
@@ -177,7 +177,7 @@ class _Area:
         if np.isfinite(values).mean() < 0.5:
             raise InputError(
                 "most pixels beside the edge have no value (nodata, or beyond the border)",
-                field="--edge",
+                field="edge",
                 remedy="give an edge with pixels to both sides",
             )
         return cls(np.asarray(rows + 0.5), np.asarray(columns + 0.5), values.astype(np.float64), np.asarray(middle))
@@ -192,7 +192,7 @@ class _Area:
         total = weight.sum(axis=1)
         known = total > 0
         if known.sum() < 3:
-            raise InputError("there is no step of brightness", field="--edge", remedy=_NO_EDGE_REMEDY)
+            raise InputError("there is no step of brightness", field="edge", remedy=_NO_EDGE_REMEDY)
         # The square favours the steepest place over the noise beside it.
         at = (x * weight**2).sum(axis=1)[known] / (weight**2).sum(axis=1)[known]
         rows = self.rows[known]
@@ -203,7 +203,7 @@ class _Area:
             off = np.abs(at - a - b * rows)
             keep = off <= max(3 * 1.4826 * float(np.median(off)), 0.1)
         if abs(b) > 1.5 or np.abs(a + b * self.rows - self.middle).max() > HALF_WIDTH:
-            raise InputError("there is no straight step of brightness", field="--edge", remedy=_NO_EDGE_REMEDY)
+            raise InputError("there is no straight step of brightness", field="edge", remedy=_NO_EDGE_REMEDY)
         return float(a), float(b)
 
 
@@ -234,7 +234,7 @@ class _Fitted:
         place = line[0] + line[1] * centre
         side = x - place - line[1] * (y - centre)
         if min((side < -3).sum(), (side > 3).sum()) < SHORTEST:
-            raise InputError("there are too few pixels to one side", field="--edge", remedy=_NO_EDGE_REMEDY)
+            raise InputError("there are too few pixels to one side", field="edge", remedy=_NO_EDGE_REMEDY)
         levels = float(np.median(values[side < -2])), float(np.median(values[side > 2]))
         scale = max(abs(levels[1] - levels[0]), 1e-9 * (1.0 + abs(levels[0])))
 
@@ -312,7 +312,7 @@ def _require_step(fitted: _Fitted) -> None:
     if fitted.sigma > HALF_WIDTH / 2.5 or fitted.sigma_error > 0.25 * math.hypot(fitted.sigma, APERTURE):
         raise InputError(
             f"the width of the edge cannot be told: {fitted.sigma:.2g} ± {fitted.sigma_error:.2g} px",
-            field="--edge",
+            field="edge",
             remedy="give a longer or a sharper edge, between even areas",
         )
 
@@ -320,7 +320,7 @@ def _require_step(fitted: _Fitted) -> None:
 def _faint(step: float, noise: float) -> InputError:
     return InputError(
         f"no edge of enough contrast: the step is {step:.3g}, the pixels beside it scatter by {noise:.3g}",
-        field="--edge",
+        field="edge",
         remedy=_NO_EDGE_REMEDY,
     )
 
@@ -346,7 +346,7 @@ def _binned(fitted: _Fitted) -> tuple[Array, Array, Array]:
         angle = abs(math.degrees(math.atan(fitted.b)))
         raise InputError(
             f"the edge lies at {angle:.1f} degrees to the pixel axis: the pixels sample it at a few distances only",
-            field="--edge",
+            field="edge",
             remedy="give an edge that is turned against the pixel axes by some 3 to 40 degrees, or a longer one",
         )
     # What the model leaves, so that it does not matter where in a bin its pixels lie.

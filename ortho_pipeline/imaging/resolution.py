@@ -126,7 +126,7 @@ def parse_edge(given: str) -> Segment:
         x1 = y1 = x2 = y2 = math.nan
     if not all(map(math.isfinite, (x1, y1, x2, y2))):
         raise InputError(
-            f"{given!r} is no edge", field="--edge", remedy="give columns and rows of both ends, as 120.5,30,140,95"
+            f"{given!r} is no edge", field="edge", remedy="give columns and rows of both ends, as 120.5,30,140,95"
         )
     return (x1, y1), (x2, y2)
 
@@ -146,7 +146,7 @@ def measure(
         raise InputError(
             f"the image has {counted(source.count, 'band')}, not {band}",
             file=source.path,
-            field="--band",
+            field="band",
             remedy=f"1 to {source.count}",
         )
     if edge is not None:
@@ -159,7 +159,7 @@ def measure(
         raise InputError(
             "no straight edge between even areas, turned against the pixel axes, was found",
             file=source.path,
-            remedy="give one with --edge x1,y1,x2,y2",
+            remedy="give one with `edge=x1,y1,x2,y2`",
         )
     return _distinct(found, _MOST)
 
@@ -173,12 +173,12 @@ def _given(source: RasterSource, edge: Segment, band: int) -> Edge:
         raise InputError(
             f"the edge {said(edge)} leaves the image of {source.width} x {source.height} pixels",
             file=source.path,
-            field="--edge",
+            field="edge",
             remedy="give columns and rows within the image",
         )
     if math.hypot(x2 - x1, y2 - y1) > _LONGEST:
         raise InputError(
-            f"an edge of more than {_LONGEST} pixels is not measured", file=source.path, field="--edge",
+            f"an edge of more than {_LONGEST} pixels is not measured", file=source.path, field="edge",
             remedy="give a part of it",
         )  # fmt: skip
     left, top = max(0, math.floor(min(x1, x2) - reach)), max(0, math.floor(min(y1, y2) - reach))

@@ -208,7 +208,7 @@ def family_of(name: str) -> Family:
     if name not in _BY_NAME:
         raise InputError(
             f"no model family is called {name!r}",
-            field="--model",
+            field="points.model",
             remedy=f"one of {', '.join(family.name for family in _FAMILIES)}",
         )
     return _BY_NAME[name]

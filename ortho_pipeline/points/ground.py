@@ -65,15 +65,15 @@ def _crs_of(path: str | os.PathLike[str], table: Table, option: str | pyproj.CRS
     given = None if option is None else parse_crs(option)
     if stated is None and given is None:
         raise CrsError(
-            "the CRS of these points is not known", file=path, field="--points-crs", remedy="give --points-crs EPSG:n"
+            "the CRS of these points is not known", file=path, field="points.crs", remedy="give `points.crs=EPSG:n`"
         )
     if stated is None or given is None:
         return given if stated is None else stated  # type: ignore[return-value]
     if not same_crs(_plan(stated), _plan(given)):
         raise CrsError(
-            f"the file says {stated.name!r}, --points-crs says {given.name!r}",
+            f"the file says {stated.name!r}, `points.crs` says {given.name!r}",
             file=path,
-            field="--points-crs",
+            field="points.crs",
             remedy="leave the option out",
         )
     # The one that also says what heights are in tells more.
@@ -94,7 +94,7 @@ def _from_geocentric(
         if not said.is_ellipsoid:
             raise DatumError(
                 f"{crs.name!r} has X, Y, Z from the centre of the Earth and no heights above {said.label}",
-                file=path, field="--points-vertical", remedy="leave the height datum out",
+                file=path, field="points.vertical", remedy="leave the height datum out",
             )  # fmt: skip
     placed = ground_transform(crs, "EPSG:4979")(ground)
     # No deeper than the sea, no higher than an aircraft: kilometres for metres and other systems come out elsewhere.
@@ -104,7 +104,7 @@ def _from_geocentric(
         x, y, z = ground[first]
         raise InputError(
             f"X {x:.12g}, Y {y:.12g}, Z {z:.12g} is not on Earth", file=path, field=wheres[first],
-            remedy="geocentric points need x, y and h (Z) in metres; other coordinates another --points-crs",
+            remedy="geocentric points need x, y and h (Z) in metres; other coordinates another `points.crs`",
         )  # fmt: skip
     return placed, pyproj.CRS.from_epsg(4326)
 
@@ -129,9 +129,9 @@ def _vertical_of(
     certain = stated or said
     if given is not None and certain is not None and given != certain:
         raise DatumError(
-            f"the heights of these points are in {certain.label}, --points-vertical says {given.label}",
+            f"the heights of these points are in {certain.label}, `points.vertical` says {given.label}",
             file=path,
-            field="--points-vertical",
+            field="points.vertical",
             remedy="leave the option out",
         )
     found = given or stated or (declared.vertical if declared else None)
@@ -143,8 +143,8 @@ def _vertical_of(
         raise DatumError(
             "it is not known what the heights of these points are measured above",
             file=path,
-            field="--points-vertical",
-            remedy=f"say it with --points-vertical ({VERTICAL_FORMS})",
+            field="points.vertical",
+            remedy=f"say it with `points.vertical` ({VERTICAL_FORMS})",
         )
     return found, unit
 
@@ -164,14 +164,14 @@ def _ellipsoidal(
     try:
         undulation = vertical.undulation(lonlat[:, 0], lonlat[:, 1])
     except DatumError as error:
-        raise DatumError(error.message, file=path, field="--points-vertical", remedy=error.remedy) from error
+        raise DatumError(error.message, file=path, field="points.vertical", remedy=error.remedy) from error
     outside = given & ~np.isfinite(undulation)
     if outside.any():
         raise DatumError(
             f"the geoid of {vertical.label} does not reach this point",
             file=path,
             field=wheres[int(np.flatnonzero(outside)[0])],
-            remedy="check its coordinates and --points-crs",
+            remedy="check its coordinates and `points.crs`",
         )
     out = ground.copy()
     out[given, 2] += undulation[given]
@@ -185,7 +185,7 @@ def _check_kind(path: str | os.PathLike[str], table: Table, crs: pyproj.CRS) -> 
         return
     named = "longitude" if table.of_ground == "geographic" else "easting"
     raise CrsError(
-        f"the columns are called {named} and so on, but {crs.name!r} is {kind}", file=path, field="--points-crs",
+        f"the columns are called {named} and so on, but {crs.name!r} is {kind}", file=path, field="points.crs",
         remedy="give the CRS that these columns are in, or rename them x and y",
     )  # fmt: skip
 
@@ -199,5 +199,5 @@ def _check_places(path: str | os.PathLike[str], crs: pyproj.CRS, wheres: Sequenc
                     f"longitude {x}, latitude {y} is not on Earth",
                     file=path,
                     field=where,
-                    remedy="x is longitude and y latitude; projected coordinates need another --points-crs",
+                    remedy="x is longitude and y latitude; projected coordinates need another `points.crs`",
                 )

@@ -109,12 +109,14 @@ def origin_shift(path: str | os.PathLike[str], table: Table, origin: str) -> flo
     """
     if origin not in PIXEL_ORIGINS:
         raise InputError(
-            f"{origin!r} is not a pixel origin", field="--pixel-origin", remedy=f"one of {', '.join(PIXEL_ORIGINS)}"
+            f"{origin!r} is not a pixel origin",
+            field="points.pixel_origin",
+            remedy=f"one of {', '.join(PIXEL_ORIGINS)}",
         )
     if origin != "corner" and not table.origin_allowed:
         raise InputError(
-            f"the format {table.format} says itself what its first pixel is called", file=path, field="--pixel-origin",
-            remedy="leave the option out",
+            f"the format {table.format} says itself what its first pixel is called", file=path,
+            field="points.pixel_origin", remedy="leave the option out",
         )  # fmt: skip
     return PIXEL_ORIGINS[origin]
 

@@ -38,7 +38,7 @@ def select_control(points: Points, spec: str) -> Points:
             raise TooFewPoints(
                 f"{spec!r} asks for {count} of {counted(len(rows), 'control point')}",
                 file=points.source or None,
-                field="--select",
+                field="points.select",
             )
         places = points.image[rows]
         if kind == "even":
@@ -58,7 +58,7 @@ def select_control(points: Points, spec: str) -> Points:
 
 
 def _unknown(spec: str) -> InputError:
-    return InputError(f"{spec!r} does not select points", field="--select", remedy=f"give {_FORMS}")
+    return InputError(f"{spec!r} does not select points", field="points.select", remedy=f"give {_FORMS}")
 
 
 def _numbers(text: str, spec: str) -> tuple[int, int | None]:
@@ -78,12 +78,12 @@ def _named(points: Points, text: str) -> list[int]:
         raise InputError(
             f"there is no point {', '.join(unknown)}" if unknown else "no point is named",
             file=points.source or None,
-            field="--select",
+            field="points.select",
             remedy=f"the ids are {', '.join(points.ids[:12])}{' ...' if len(points) > 12 else ''}",
         )
     wrong = [name for name in names if points.roles[points.ids.index(name)] != "control"]
     if wrong:
-        raise InputError(f"{', '.join(wrong)}: no control point", file=points.source or None, field="--select")
+        raise InputError(f"{', '.join(wrong)}: no control point", file=points.source or None, field="points.select")
     return [points.ids.index(name) for name in names]
 
 

@@ -411,12 +411,12 @@ def assign_roles(points: AnyPoints, spec: str) -> AnyPoints:
             raise InputError(
                 f"there is no point {', '.join(unknown)}",
                 file=points.source or None,
-                field="--check",
+                field="points.check",
                 remedy=f"the ids are {', '.join(points.ids[:12])}{' ...' if len(points.ids) > 12 else ''}",
             )
         roles[np.isin(np.array(points.ids), names)] = "check"
         return points.with_roles(roles)
-    raise InputError(f"{spec!r} does not choose check points", field="--check", remedy="give every:N or ids:a,b,c")
+    raise InputError(f"{spec!r} does not choose check points", field="points.check", remedy="give every:N or ids:a,b,c")
 
 
 # -- writing ---------------------------------------------------------------------------------------------------------

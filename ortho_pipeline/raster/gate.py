@@ -47,7 +47,7 @@ _MAX_HEADER = 5_000_000
 _MANY = 10_000
 _OVERVIEWS = "OVERVIEWS"
 _OUTSIDE = (
-    "name a folder that holds both with --root {root}, put the files into one folder, or make one file of them "
+    "name a folder that holds both with `scene.roots={root}`, put the files into one folder, or make one file of them "
     "(gdal_translate in out.tif)"
 )
 

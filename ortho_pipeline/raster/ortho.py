@@ -82,13 +82,13 @@ class Profile:
 def _given_nodata(value: float, dtype: np.dtype[Any], source: RasterSource) -> float:
     if source.validity == "alpha":
         raise InputError(
-            "the image says by its alpha band which pixels are valid", file=source.path, field="--nodata",
-            remedy="leave out --nodata, or choose the other bands (-b 1 -b 2 -b 3)",
+            "the image says by its alpha band which pixels are valid", file=source.path, field="output.nodata",
+            remedy="leave out `output.nodata`, or choose the other bands with `output.bands`",
         )  # fmt: skip
     if not holds(dtype, value):
         raise InputError(
-            f"pixels of the type {dtype} cannot have the value {value:g}", field="--nodata",
-            remedy="give another value, or another type with --output-type",
+            f"pixels of the type {dtype} cannot have the value {value:g}", field="output.nodata",
+            remedy="give another value, or another type with `output.dtype`",
         )  # fmt: skip
     return value
 
@@ -96,8 +96,8 @@ def _given_nodata(value: float, dtype: np.dtype[Any], source: RasterSource) -> f
 def _kept_nodata(value: float | None, dtype: np.dtype[Any], source: RasterSource) -> float | None:
     if value is not None and not holds(dtype, value):
         raise InputError(
-            f"the image's nodata value {value:g} does not fit into {dtype}", file=source.path, field="--output-type",
-            remedy="say with --nodata what pixels without an image shall be",
+            f"the image's nodata value {value:g} does not fit into {dtype}", file=source.path, field="output.dtype",
+            remedy="say with `output.nodata` what pixels without an image shall be",
         )  # fmt: skip
     return value
 
@@ -126,8 +126,8 @@ def refuse_empty(valid_pixels: int, path: str | os.PathLike[str]) -> None:
     if not valid_pixels:
         raise InputError(
             "no pixel of this ortho has a value", file=path,
-            remedy="check the extent, the heights (--height, or the DEM's place, datum and unit), and the nodata value "
-            "and mask of the image",
+            remedy="check the extent, the heights (`surface.height`, or the DEM's place, datum and unit), and the "
+            "nodata value and mask of the image",
         )  # fmt: skip
 
 

@@ -99,7 +99,8 @@ def open_pixels(
             f"one block of this raster is {block.size / 1e6:,.0f} MB when it is unpacked, which is beyond the "
             f"{memory / 1e6:,.0f} MB of memory allowed",
             file=block.path, field="block size",
-            remedy="tile it (gdal_translate -co TILED=YES in.tif out.tif), or for an image give a larger --memory MB",
+            remedy="tile it (gdal_translate -co TILED=YES in.tif out.tif), or for an image give a larger "
+            "`output.memory=MB`",
         )  # fmt: skip
     keep_blocks(block.size)
     return dataset, block.size
@@ -406,7 +407,7 @@ class RasterSource:
         for band in bands:
             if not 1 <= band <= len(places):
                 raise InputError(
-                    f"there is no band {band}: the image has {len(places)}", file=self.path, field="--band",
+                    f"there is no band {band}: the image has {len(places)}", file=self.path, field="output.bands",
                     remedy=f"give one from 1 to {len(places)}",
                 )  # fmt: skip
             path, number = places[band - 1]
@@ -488,7 +489,7 @@ def pixel_type(name: str) -> np.dtype[Any]:
     """Return the type of pixels that GDAL calls `name`."""
     code = gdal.GetDataTypeByName(name)
     if name.lower() not in {one.lower() for one in PIXEL_TYPES}:
-        raise InputError(f"no pixels are of the type {name!r}", field="--output-type", remedy=", ".join(PIXEL_TYPES))
+        raise InputError(f"no pixels are of the type {name!r}", field="output.dtype", remedy=", ".join(PIXEL_TYPES))
     return _numpy_type(code)
 
 

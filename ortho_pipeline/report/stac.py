@@ -66,8 +66,9 @@ def acquisition_time(facts: Mapping[str, Any], given: str | None = None) -> date
     text = given if given is not None else facts.get("acquired")
     if not text:
         raise InputError(
-            "a STAC item needs the time of acquisition, and the metadata of this scene have none", field="--acquired",
-            remedy="give it, for example --acquired 2005-08-03T08:12:31Z (in a pipeline file output: acquired:)",
+            "a STAC item needs the time of acquisition, and the metadata of this scene have none",
+            field="output.acquired",
+            remedy="give it, for example `output.acquired=2005-08-03T08:12:31Z`",
         )  # fmt: skip
     try:
         time = datetime.fromisoformat(str(text).strip())
@@ -76,7 +77,7 @@ def acquisition_time(facts: Mapping[str, Any], given: str | None = None) -> date
         # Overflow: the last hours of the last year, in a zone in which they are the next year in UTC.
         raise InputError(
             f"{str(text)[:40]!r} is no time of acquisition",
-            field="--acquired",
+            field="output.acquired",
             remedy="for example 2005-08-03T08:12:31Z",
         ) from error
 

@@ -251,13 +251,13 @@ class Surface:
             undulation = self.vertical.undulation(*self._lonlat(u, v))
         except DatumError as error:
             raise DatumError(
-                error.message, file=self._path, field="--dem-vertical", remedy=dem_vertical_remedy(error.remedy or "")
+                error.message, file=self._path, field="surface.vertical", remedy=dem_vertical_remedy(error.remedy or "")
             ) from error
         if not np.isfinite(undulation).any():
             raise DatumError(
                 f"the geoid grid of {self.vertical.label} does not reach this DEM",
                 file=self._path,
-                field="--dem-vertical",
+                field="surface.vertical",
                 remedy=dem_vertical_remedy(),
             )
 
@@ -511,7 +511,7 @@ def _parse_fill(fill: str | float) -> str | float:
     if not math.isfinite(height):
         raise InputError(
             f"{fill!r} does not say how to fill voids",
-            field="--dem-fill",
+            field="surface.fill",
             remedy="give error, mask, nearest or an ellipsoidal height in metres",
         )
     return height

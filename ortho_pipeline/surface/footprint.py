@@ -32,8 +32,8 @@ _BLOCK = 1024
 #: A model is meant for the heights under its scene and this part of their range beyond, or so many metres.
 _MARGIN, _LEAST_MARGIN = 0.1, 10.0
 _SOUND = (
-    "give the metadata of this very image (--rpc FILE, --model FILE), and points that were measured in it; if they "
-    "are, its plugin reads them wrongly (docs/plugins.md)"
+    "give the metadata of this very image (`scene.rpc=FILE`, `scene.model=FILE`), and points that were measured in it; "
+    "if they are, its plugin reads them wrongly (docs/plugins.md)"
 )
 
 
@@ -113,11 +113,14 @@ class Footprint:
         CoverageError
             If a ray found no height and the surface has no fill rule.
         """
-        file, wanted = surface.provenance.get("path"), "say what the rest shall be: --dem-fill mask (no pixels there)"
+        file, wanted = (
+            surface.provenance.get("path"),
+            "say what the rest shall be: `surface.fill=mask` (no pixels there)",
+        )
         if self.beyond and ((surface.fill == "error" and not self.complete) or not self.coverage):
             raise CoverageError(
-                self.beyond, file=file, field="--dem",
-                remedy=f"check datum and unit of the DEM (--dem-vertical) and the place of the scene, or {wanted}",
+                self.beyond, file=file, field="surface.dem",
+                remedy=f"check datum and unit of the DEM (`surface.vertical`) and the place of the scene, or {wanted}",
             )  # fmt: skip
         if not self.complete and surface.fill == "error":
             raise CoverageError(
@@ -126,14 +129,14 @@ class Footprint:
             )  # fmt: skip
         if self.coverage == 0.0 and surface.fill == "mask":
             raise CoverageError(
-                "the DEM covers nothing of the scene: the ortho would have no pixels", file=file, field="--dem",
+                "the DEM covers nothing of the scene: the ortho would have no pixels", file=file, field="surface.dem",
                 remedy="give the DEM of this place",
             )  # fmt: skip
         if self.unmet and surface.fill == "nearest":
             raise CoverageError(
                 f"parts of the scene are more than {surface.nearest_reach * surface.sample_size / 1000:.3g} km from "
                 "the next height of the DEM",
-                file=file, field="--dem-fill", remedy=f"give a DEM that reaches farther, or {wanted}",
+                file=file, field="surface.fill", remedy=f"give a DEM that reaches farther, or {wanted}",
             )  # fmt: skip
 
     def notes(self, surface: Surface) -> list[str]:
@@ -198,7 +201,7 @@ def _nowhere(model: SensorModel, surface: Surface) -> InputError:
             "no border pixel meets the ground: the model does not belong to this image", field="model", remedy=_SOUND
         )
     return InputError(
-        f"the scene does not meet the ground at a height of {surface.constant_height:g} m", field="--height",
+        f"the scene does not meet the ground at a height of {surface.constant_height:g} m", field="surface.height",
         remedy=f"give an ellipsoidal height of the terrain; the model is meant for {low:.0f} to {high:.0f} m",
     )  # fmt: skip
 
@@ -357,7 +360,7 @@ def choose_grid(
     ground = _continuous(GroundTransform(model.crs, crs)(found.reach), crs)
     if not np.isfinite(ground).any():
         raise InputError(
-            f"the scene does not lie in the domain of {crs.name!r}", field="--output-crs", remedy="choose another CRS"
+            f"the scene does not lie in the domain of {crs.name!r}", field="output.crs", remedy="choose another CRS"
         )
     low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
     return Grid.of_extent(crs, (low[0], low[1], high[0], high[1]), step, align=True)
@@ -382,8 +385,8 @@ def scene_pixels(model: SensorModel, found: Footprint, grid: Grid) -> float:
     if not len(ground) or not hull.intersects(shapely.box(xmin, ymin, xmax, ymax)):
         place = " ".join(f"{value:.10g}" for value in hull.bounds) if len(ground) else "outside of this CRS"
         raise InputError(
-            f"the extent lies beside the scene, which reaches over {place}", field="--extent",
-            remedy="give xmin ymin xmax ymax in units of the output CRS, or leave --extent out",
+            f"the extent lies beside the scene, which reaches over {place}", field="output.extent",
+            remedy="give xmin ymin xmax ymax in units of the output CRS, or leave `output.extent` out",
         )  # fmt: skip
     return float(hull.intersection(shapely.box(xmin, ymin, xmax, ymax)).area) / (grid.dx * grid.dy)
 

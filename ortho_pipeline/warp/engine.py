@@ -75,8 +75,8 @@ class WarpResult:
         if self.transformer != "GEOLOC_ARRAY" or took <= memory:
             return []
         text = (
-            f"GDAL's warper takes about {took / 1e6:.0f} MB for the arrays that stand for this model, beyond --memory "
-            f"{memory / 1e6:.0f}: make a smaller extent, or leave out --engine gdal"
+            f"GDAL's warper takes about {took / 1e6:.0f} MB for the arrays that stand for this model, beyond "
+            f"`output.memory` {memory / 1e6:.0f}: make a smaller extent, or leave out `output.engine=gdal`"
         )
         return [Notice("memory-exceeded", text, bytes=took)]
 
@@ -175,8 +175,8 @@ def rectify_gdal(
     _check(source, resampling, dem_interpolation, 1.0)
     if dem_interpolation != "bilinear":
         raise InputError(
-            "with GDAL's warper heights of the DEM are interpolated bilinearly", field="--dem-interpolation",
-            remedy="leave out --dem-interpolation or --engine gdal",
+            "with GDAL's warper heights of the DEM are interpolated bilinearly", field="output.dem_interpolation",
+            remedy="leave out `output.dem_interpolation` or `output.engine=gdal`",
         )  # fmt: skip
     resources = resources or Resources()
     # GDAL's warper reads in one of its threads.
@@ -221,14 +221,14 @@ def _check(source: RasterSource, resampling: str, dem_interpolation: str, tolera
             "integers of 64 bits are not interpolated without loss",
             file=source.path,
             field="resampling",
-            remedy="use --resampling nearest, or convert the pixels first (gdal_translate -ot Float64)",
+            remedy="use `output.resampling=nearest`, or convert the pixels first (gdal_translate -ot Float64)",
         )
     if source.palette and resampling != "nearest":
         raise InputError(
             "the pixels are indices into a palette, which cannot be averaged",
             file=source.path,
             field="resampling",
-            remedy="use --resampling nearest, or expand the palette first (gdal_translate -expand rgb)",
+            remedy="use `output.resampling=nearest`, or expand the palette first (gdal_translate -expand rgb)",
         )
     if not 0 < tolerance < math.inf:
         raise InputError("the tolerance is positive and finite", field="tolerance", remedy="0.01 px is the default")

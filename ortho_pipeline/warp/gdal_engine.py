@@ -218,8 +218,8 @@ def _standing(
             return replace(candidate, max_error_px=error)
         tried.append(f"{candidate.method}: {error:.3g} px off")
     raise InputError(
-        f"no transformer of GDAL stands for this model ({'; '.join(tried)})", field="--engine",
-        remedy="take our own engine (--engine ortho)",
+        f"no transformer of GDAL stands for this model ({'; '.join(tried)})", field="output.engine",
+        remedy="take our own engine (`output.engine=ortho`)",
     )  # fmt: skip
 
 

@@ -59,7 +59,7 @@ def write_product(
     """
     if not SMALLEST <= size <= LARGEST or seed < 0:
         raise InputError(
-            f"size {size} and seed {seed} are not possible", field="--size, --seed",
+            f"size {size} and seed {seed} are not possible", field="size, seed",
             remedy=f"a size from {SMALLEST} to {LARGEST} and a seed from 0",
         )  # fmt: skip
     out = Path(folder)

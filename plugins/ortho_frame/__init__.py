@@ -28,7 +28,7 @@ OPTIONS = {
     "vertical": "what the camera heights are above: ellipsoid, egm96, egm2008, EPSG:n or a grid file",
     "frame": "work in a topocentric frame (default) or directly in the map projection: topocentric, map",
     "heights": "lowest and highest ground in ellipsoidal metres: low,high",
-    "sigmas": "standard deviations of position and angles for --correction model: metres,degrees",
+    "sigmas": "standard deviations of position and angles for the correction 'model': metres,degrees",
     "refraction": "bend rays by the standard atmosphere: yes or no (default)",
 }
 
@@ -67,7 +67,7 @@ def open_scene(
         missing = [key for key, value in given.items() if not value]
         raise InputError(
             f"a frame image needs {', '.join(missing)}", file=name, field=missing[0],
-            remedy="; ".join(f"--sensor-option {key}=... ({OPTIONS[key]})" for key in missing),
+            remedy="; ".join(f"`scene.sensor_options.{key}=...` ({OPTIONS[key]})" for key in missing),
         )  # fmt: skip
     if refraction not in ("yes", "no"):
         raise InputError(f"{refraction!r} is neither yes nor no", field="refraction")

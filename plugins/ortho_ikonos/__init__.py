@@ -105,8 +105,8 @@ def open_scene(
     if contradiction and vendor is not None and rpc is None and geometry is None:
         raise InputError(
             contradiction[0], file=vendor[1], field="rpc",
-            remedy="choose one: the RPC with --rpc tag, --rpc sidecar or --rpc FILE, or the metadata with "
-            "--sensor-option geometry=geo",
+            remedy="choose one: the RPC with `scene.rpc=tag`, `scene.rpc=sidecar` or `scene.rpc=FILE`, or the metadata "
+            "with `scene.sensor_options.geometry=geo`",
         )  # fmt: skip
     return Scene(
         sensor="ikonos",
@@ -177,12 +177,12 @@ def _first(
         raise InputError(f"{geometry!r} is no geometry", field="geometry", remedy="rpc or geo")
     first = geometry or next(iter(models), "geo")
     if first == "rpc" and "rpc" not in models:
-        raise InputError("there is no RPC", file=file, field="geometry", remedy="give it with --rpc, or take geo")
+        raise InputError("there is no RPC", file=file, field="geometry", remedy="give it with `scene.rpc`, or take geo")
     if first not in models:
         raise InputError(
             f"there is no plane of Reference Height without {'; '.join(lacking)}", file=file,
             field=f"component {component.component}: {lacking[0]}",
-            remedy="give the whole metadata file, an RPC (--rpc), or fit a model to points (--fit-model)",
+            remedy="give the whole metadata file, an RPC (`scene.rpc`), or fit a model to points (`points.fit_model`)",
         )  # fmt: skip
     return first
 

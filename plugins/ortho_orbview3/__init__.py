@@ -87,7 +87,7 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None, label: str | No
             f"the label is for {product.columns} x {product.rows} pixels, the image has {size[0]} x {size[1]}",
             file=path,
             field="productInfo.pixelsPerScanLine, productInfo.numScanLines",
-            remedy="give the whole scene and its own label, or an image with an RPC of its own (--sensor rpc)",
+            remedy="give the whole scene and its own label, or an image with an RPC of its own (`scene.sensor=rpc`)",
         )
     model, source, warnings = choose_rpc(product, rpc_text_of(name), rpc)
     return Scene(

@@ -58,7 +58,7 @@ def write_product(
     """
     if not SMALLEST <= pixel <= LARGEST or seed < 0:
         raise InputError(
-            f"pixels of {pixel} m and seed {seed} are not possible", field="--pixel, --seed",
+            f"pixels of {pixel} m and seed {seed} are not possible", field="pixel, seed",
             remedy=f"whole metres from {SMALLEST} to {LARGEST} and a seed from 0",
         )  # fmt: skip
     out, coast = Path(folder), simulated.Coast()

@@ -304,7 +304,7 @@ def test_roots_open_what_they_hold(tmp_path):
     secret = hostile.raster(tmp_path / "secret.tif", 9)
     (tmp_path / "a" / "b").mkdir(parents=True)
     path = hostile.vrt(tmp_path / "a" / "b" / "a.vrt", hostile.source(f"../../{secret.name}", relative=1))
-    with pytest.raises(InputError, match=f"--root {tmp_path}"):
+    with pytest.raises(InputError, match=f"`scene.roots={tmp_path}"):
         open_dataset(path)
     only(path, 9, roots=[tmp_path])
 

@@ -281,7 +281,7 @@ def test_the_user_widens_the_root_and_the_file_only_narrows_it(block):
         block.write(root + widened)
         with pytest.raises(InputError, match="outside of the root") as caught:
             batch_plan.plan(block.file)
-        assert "--root" in (caught.value.remedy or "")
+        assert "`root=" in (caught.value.remedy or "")
     block.write("root: /\n" + widened)
     with pytest.raises(InputError, match="outside of the root"):
         batch_plan.plan(block.file, block.folder.parent)

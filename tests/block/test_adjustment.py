@@ -534,7 +534,7 @@ def test_sigmas_of_the_survey_are_found_and_said(rpcs: dict[str, RPC]) -> None:
     assert found.variances.sigma_xy == pytest.approx(0.5, rel=0.25)
     assert found.variances.sigma_h == pytest.approx(1.5, rel=0.35)
     assert found.sigma0 == pytest.approx(0.2, rel=0.2)
-    assert any("without a stated sigma" in text and "--ground-sigma" in text for text in found.warnings)
+    assert any("without a stated sigma" in text and "`points.ground_sigma=XY,H`" in text for text in found.warnings)
     document = found.to_json()["variances"]
     assert document["unstated_ground"]["h"]["sigma"] == found.variances.sigma_h
     assert document["unstated_ground"]["xy"]["points"] == 40

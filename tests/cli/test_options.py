@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import click
 import pytest
 from click.testing import CliRunner
 
-from ortho_pipeline.cli.options import with_flags
+from ortho_pipeline import commands
+from ortho_pipeline.cli.flags import FLAGS, flags_of, with_flags
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.options import GROUPS, BlockOptions, options_of
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import GROUPS, BlockOptions, SurfaceOptions, options_of
 
 
 def params(command: str) -> dict[str, click.Option]:
@@ -27,7 +30,7 @@ def test_every_field_is_an_option_with_its_flags_and_default(command: str, group
         stated = options_of(options)[one.name]
         param = known[f"{group}_{one.name}"]
         assert set(param.opts) == set(stated.flags.split())
-        help_text = with_flags(stated.help, {"surface.vertical": "--dem-vertical", "output.extent": "--extent"})
+        help_text = with_flags(stated.help, FLAGS)
         assert help_text.removesuffix(".") in (param.help or "")
         if isinstance(one.default, str | float) and one.default is not False and stated.kind != "bytes":
             assert param.default == one.default
@@ -60,3 +63,38 @@ def test_names_of_options_are_shown_as_flags() -> None:
     assert with_flags(text, flags) == (
         "give --height 500, --sensor-option rpc=tag, --workers 1 or `surface.dem=FILE`; see `ortho fit`"
     )
+
+
+def test_an_error_names_options_as_the_caller_knows_them(tiny, tmp_path) -> None:
+    with pytest.raises(InputError) as caught:
+        commands.rectify(tiny.image, tmp_path / "out", surface=SurfaceOptions(dem=tiny.dem, height=3))
+    assert caught.value.field == "surface.height"
+    assert caught.value.message == "`surface.dem` and `surface.height` exclude each other"
+    words = ["rectify", str(tiny.image), "-o", str(tmp_path / "out"), "--dem", str(tiny.dem), "--height", "3", "--json"]
+    done = CliRunner().invoke(cli, words)
+    error = json.loads(done.stdout)["error"]
+    assert (error["field"], error["message"]) == ("--height", "--dem and --height exclude each other")
+    assert "--height: --dem and --height exclude" in done.stderr
+    # The pipeline file has keys, the command that reads it some options of its own.
+    (tmp_path / "block").mkdir()
+    (tmp_path / "block" / "p.yaml").write_text(
+        f"scenes: [{{image: '{tiny.image}', surface: {{dem: '{tiny.dem}', height: 3}}}}]\noutput: out\n"
+    )
+    words = ["run", str(tmp_path / "block" / "p.yaml"), "--executor", "sequential"]
+    refused = CliRunner().invoke(cli, words)
+    assert "--root" in refused.stderr
+    assert "`root" not in refused.stderr
+    done = CliRunner().invoke(cli, [*words, "--root", "/"])
+    assert "`surface.dem` and `surface.height` exclude each other" in done.output
+
+
+def test_every_flag_of_a_command_has_a_name() -> None:
+    for command in cli.commands.values():
+        names = flags_of(command)
+        typed = {one.opts[0] for one in command.params if isinstance(one, click.Option)}
+        assert typed == set(names.values())
+    assert flags_of(cli.commands["edge"])["output.bands"] == "--band"
+    assert flags_of(cli.commands["run"])["output.memory"] == "--memory"
+    assert "surface.dem" not in flags_of(cli.commands["run"])
+    assert flags_of(cli.commands["adjust"])["points.model"] == "--model"
+    assert "scene.model" not in flags_of(cli.commands["adjust"])

@@ -197,8 +197,8 @@ def test_a_dem_of_unknown_datum_is_refused(tiny, tmp_path):
 def test_heights_have_no_default(tiny, tmp_path):
     with pytest.raises(InputError) as caught:
         rectify(tiny, tmp_path / "out", surface=SurfaceOptions())
-    assert caught.value.field == "--dem"
-    assert "--height" in str(caught.value.remedy)
+    assert caught.value.field == "surface.dem"
+    assert "`surface.height=METRES`" in str(caught.value.remedy)
     assert not (tmp_path / "out").exists()
 
 
@@ -372,7 +372,7 @@ def test_quickbird_without_the_geoid_is_refused(real, tmp_path):
     text = str(caught.value)
     assert "EGM2008" in text
     assert "us_nga_egm08_25.tif" in text
-    assert "--dem-vertical" in text
+    assert "surface.vertical" in text
 
 
 @pytest.mark.realdata

@@ -39,7 +39,7 @@ def refused(tiny, folder, match, kind=InputError, **options):
 def test_an_extent_beside_the_scene_is_refused(tiny, tmp_path):
     output = OutputOptions(extent=(0.0, 0.0, 1000.0, 1000.0), resolution=10.0)
     error = refused(tiny, tmp_path / "out", "lies beside the scene", output=output)
-    assert error.field == "--extent"
+    assert error.field == "output.extent"
 
 
 def test_an_extent_at_the_other_turn_of_longitude_is_the_same_extent(tiny, tmp_path):
@@ -56,13 +56,13 @@ def test_an_extent_at_the_other_turn_of_longitude_is_the_same_extent(tiny, tmp_p
 )  # fmt: skip
 def test_a_crs_that_no_map_can_have_is_refused(tiny, tmp_path, crs):
     error = refused(tiny, tmp_path / "out", "GeoTIFF|horizontal", CrsError, output=OutputOptions(crs=crs))
-    assert error.field == "--output-crs"
+    assert error.field == "output.crs"
 
 
 @pytest.mark.parametrize("height", [9000.0, -20000.0, -430.0])
 def test_a_height_that_the_model_is_not_good_for_is_refused(tiny, tmp_path, height):
     error = refused(tiny, tmp_path / "out", f"height of {height:g} m", surface=SurfaceOptions(height=height))
-    assert error.field == "--height"
+    assert error.field == "surface.height"
     assert "0 to 1000 m" in error.remedy
 
 

@@ -173,7 +173,7 @@ def test_compare_writes_the_report_of_the_recommended_model(tiny, tmp_path):
 def test_selected_points_control_and_the_others_check(tiny, spec):
     document = commands.compare(tiny.image, points_of(tiny, select=spec), models="rpc+shift").to_json()
     assert document["points"] == {"control": 6, "check": 6}
-    with pytest.raises(InputError, match="--select"):
+    with pytest.raises(InputError, match=r"points\.select"):
         commands.fit(tiny.image, points_of(tiny, select=spec, check="every:3"))
 
 
@@ -188,9 +188,9 @@ def test_prune_takes_out_what_the_points_do_not_justify(tiny):
 @pytest.mark.parametrize(
     ("options", "field"),
     [
-        ({"fit_model": "affine99"}, "--fit-model"),
-        ({"fit_model": "dlt", "correction": "shift"}, "--fit-model"),
-        ({"model_crs": "utm"}, "--model-crs"),
+        ({"fit_model": "affine99"}, "points.fit_model"),
+        ({"fit_model": "dlt", "correction": "shift"}, "points.fit_model"),
+        ({"model_crs": "utm"}, "points.model_crs"),
     ],
 )
 def test_contradicting_options_are_refused(tiny, options, field):

@@ -76,11 +76,11 @@ def test_parameters_are_chosen_by_name(tiny):
 @pytest.mark.parametrize(
     ("options", "field"),
     [
-        ({"correction": "affine", "params": "col_shift,nonsense"}, "--params"),
-        ({"correction": "affine", "params": " , "}, "--params"),
-        ({"correction": "shift", "ridge": "1e-5"}, "--ridge"),
-        ({"fit_model": "rfm1", "ridge": "strong"}, "--ridge"),
-        ({"fit_model": "rfm1", "ridge": "-1"}, "--ridge"),
+        ({"correction": "affine", "params": "col_shift,nonsense"}, "points.params"),
+        ({"correction": "affine", "params": " , "}, "points.params"),
+        ({"correction": "shift", "ridge": "1e-5"}, "points.ridge"),
+        ({"fit_model": "rfm1", "ridge": "strong"}, "points.ridge"),
+        ({"fit_model": "rfm1", "ridge": "-1"}, "points.ridge"),
     ],
 )
 def test_what_makes_no_sense_is_refused(tiny, options, field):

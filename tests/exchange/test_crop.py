@@ -94,7 +94,7 @@ def test_an_image_much_smaller_than_its_rpc_is_remarkable(tiny, whole, tmp_path)
     gdal.GetDriverByName("GTiff").Create(str(small), 90, 60, 1)
     (said,) = open_scene(small, SceneOptions(rpc=whole)).warnings
     assert "90 x 60" in said
-    assert "--crop-offset" in said
+    assert "scene.crop_offset" in said
     # Crops by GDAL are small too, but their RPC says where they lie; the whole image is not.
     part = tmp_path / "part.tif"
     gdal.Translate(str(part), str(tiny.image), srcWin=[300, 200, 60, 60])
@@ -172,7 +172,7 @@ def test_any_model_can_be_moved(tiny):
 def test_places_that_are_none(tiny, offset):
     with pytest.raises(InputError, match="not the place of a crop") as error:
         open_scene(tiny.image, SceneOptions(crop_offset=offset))
-    assert error.value.field == "--crop-offset"
+    assert error.value.field == "scene.crop_offset"
 
 
 @pytest.mark.realdata

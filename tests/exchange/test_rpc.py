@@ -262,7 +262,9 @@ def test_stale_side_car_is_an_error_with_a_choice(tmp_path):
     image = make_image(tmp_path / "a.tif", rpc)
     write_rpb(rpc.shifted(3.0, 0.0), tmp_path / "a.RPB")
     dataset = gdal.Open(str(image))
-    with pytest.raises(InputError, match=r"a\.RPB differ by 3\.0 px(.|\n)*--rpc tag, --rpc sidecar, or --rpc FILE"):
+    with pytest.raises(
+        InputError, match=r"a\.RPB differ by 3\.0 px(.|\n)*`scene.rpc=tag`, `scene.rpc=sidecar`, or `scene.rpc=FILE`"
+    ):
         rpc_of_dataset(dataset)
     assert rpc_of_dataset(dataset, "tag")[0].col_off == pytest.approx(rpc.col_off, abs=1e-9)
     assert rpc_of_dataset(dataset, "tag")[1] == f"{image} (TIFF tag)"

@@ -91,7 +91,7 @@ def test_urls_are_names_of_gdal(url, name):
     assert isinstance(place, VsiPath)
     assert str(place) == name
     assert (place.stem, place.suffix) == ("a", ".tif")
-    with pytest.raises(InputError, match="--allow-network"):
+    with pytest.raises(InputError, match=r"scene\.allow_network"):
         located(url)
 
 
@@ -117,7 +117,7 @@ def test_other_urls_are_refused_and_files_stay_files():
 def test_archives_on_disk_are_not_the_network(name, local):
     assert in_local_archive(name) == local
     if not local:
-        with pytest.raises(InputError, match="--allow-network"):
+        with pytest.raises(InputError, match=r"scene\.allow_network"):
             open_dataset(name)
 
 

@@ -53,7 +53,7 @@ def test_less_memory_than_the_budget_is_said_before_the_work():
             require_memory(512_000_000, threads=2)
     finally:
         resource.setrlimit(resource.RLIMIT_AS, before)
-    assert "--memory" in str(raised.value.remedy)
+    assert "`output.memory=MB`" in str(raised.value.remedy)
 
 
 def test_threads_that_are_tried_are_gone_afterwards():

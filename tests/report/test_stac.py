@@ -160,7 +160,7 @@ def test_time_of_acquisition(tiny, tmp_path):
         with pytest.raises(InputError) as caught:
             acquisition_time(facts, given)
         assert caught.value.remedy
-        assert caught.value.field == "--acquired"
+        assert caught.value.field == "output.acquired"
     arguments = [
         "rectify",
         tiny.image,

@@ -111,11 +111,11 @@ def test_info_says_what_is_missing(tmp_path):
     path = image(tmp_path)
     with pytest.raises(InputError) as error:
         commands.info(path)
-    assert "--sensor NAME, which says what it needs (for images in general: frame" in str(error.value)
+    assert "`scene.sensor=NAME`, which says what it needs (for images in general: frame" in str(error.value)
     with pytest.raises(InputError) as error:
         commands.info(path, SceneOptions(sensor="frame"))
     for option in ("camera", "exterior", "vertical"):
-        assert f"--sensor-option {option}=" in str(error.value.remedy)
+        assert f"`scene.sensor_options.{option}=" in str(error.value.remedy)
     with pytest.raises(InputError) as error:
         commands.info(path, SceneOptions(sensor_options={"exterior": "reconstruction.json"}))
     assert error.value.field == "vertical"

@@ -230,7 +230,7 @@ def test_label_and_text_are_compared(copied, moved, outcome):
     if outcome is InputError:
         with pytest.raises(InputError, match="differ by 3 px") as caught:
             open_scene(copied)
-        assert "--rpc label" in caught.value.remedy
+        assert "`scene.rpc=label`" in caught.value.remedy
         by_label, by_text, by_file = (
             open_scene(copied, options={"rpc": choice}).model.col_off for choice in ("label", "text", str(text))
         )

@@ -108,7 +108,7 @@ def test_a_declared_datum_whose_grid_is_missing(tmp_path: Path) -> None:
     path = write_dem(tmp_path / "d.tif", hills(), "EPSG:32735+3855")
     with pytest.raises(DatumError, match=r"us_nga_egm08_25\.tif") as caught:
         Surface.open(path)
-    assert "--dem-vertical" in str(caught.value)
+    assert "surface.vertical" in str(caught.value)
     assert "EGM2008" in str(caught.value)
     with pytest.raises(DatumError, match="override"):
         Surface.open(path, "egm96")
@@ -143,7 +143,7 @@ def test_feet_of_the_crs_and_units_that_contradict(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("fill", ["bad", "nan", float("inf")])
 def test_fill_rules_are_checked(tmp_path: Path, fill: str | float) -> None:
-    with pytest.raises(InputError, match="--dem-fill"):
+    with pytest.raises(InputError, match=r"surface\.fill"):
         Surface.open(write_dem(tmp_path / "d.tif", hills()), "ellipsoid", fill=fill)
 
 

@@ -217,13 +217,13 @@ def test_where_nothing_stands_for_the_model_the_remedy_is_our_engine(tmp_path, m
     monkeypatch.setattr(Transformer, "limit", -1.0)
     with pytest.raises(InputError, match=r"RPC: .* px off; GEOLOC_ARRAY: ") as caught:
         both(frame(k1=-0.05), Surface.constant(80.0), tmp_path)
-    assert "--engine ortho" in str(caught.value.remedy)
+    assert "`output.engine=ortho`" in str(caught.value.remedy)
     assert [path.name for path in tmp_path.iterdir() if "gdal" in path.name] == []
 
 
 def test_what_gdals_warper_cannot_do_as_asked_is_refused_or_said(tiny, tmp_path):
     cubic = OutputOptions(engine="gdal", dem_interpolation="cubic")
-    with pytest.raises(InputError, match="--dem-interpolation"):
+    with pytest.raises(InputError, match=r"output\.dem_interpolation"):
         commands.rectify(tiny.image, tmp_path / "cubic", surface=SurfaceOptions(height=500.0), output=cubic)
     assert not list((tmp_path / "cubic").glob("*.tif"))
     arrays = WarpResult(0.0, 0.1, 1, 0, 0, 10_000_000, 1, 1.0, "GEOLOC_ARRAY")
