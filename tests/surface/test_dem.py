@@ -70,7 +70,7 @@ def test_a_dem_without_height_datum_is_refused(tmp_path: Path) -> None:
         Surface.open(path)
     text = str(caught.value)
     assert str(path) in text
-    for word in ("--dem-vertical", "ellipsoid", "egm96", "egm2008", "EPSG:n", "grid file"):
+    for word in ("`surface.vertical`", "ellipsoid", "egm96", "egm2008", "EPSG:n", "grid file"):
         assert word in text
 
 
