@@ -470,7 +470,7 @@ def test_the_real_dem_refuses_without_option_and_takes_egm96(real: Path) -> None
         with pytest.raises(DatumError) as caught:
             Surface.open(path)
         text = str(caught.value)
-        for word in ("EGM2008", "us_nga_egm08_25.tif", "--dem-vertical"):
+        for word in ("EGM2008", "us_nga_egm08_25.tif", "`surface.vertical`"):
             assert word in text
     surface = Surface.open(path, "egm96")
     assert any("EGM2008" in warning for warning in surface.provenance["warnings"])
