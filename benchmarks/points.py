@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from warp import Job
 
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import intersect
 
 POINTS = 2_000_000

@@ -35,7 +35,7 @@ from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.models import RPC, SensorModel
 from ortho_pipeline.models.rpc_box import RPC_TERMS
 from ortho_pipeline.raster.source import Grid, RasterSource
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp.engine import rectify
 
 gdal.UseExceptions()
@@ -167,7 +167,7 @@ def ours(job: Job, out: Path, kernel: str = "bilinear", *extra: str) -> list[str
 
 API = """
 import sys, pyproj
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.warp.engine import rectify
@@ -302,7 +302,7 @@ def alone(job: Job, model: SensorModel | None = None, kernel: str = "bilinear") 
 WARP_CPU = """
 import sys, time, pyproj
 from pathlib import Path
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.warp.engine import rectify

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.points import write_points as write_points
     from ortho_pipeline.raster.source import Grid as Grid
     from ortho_pipeline.raster.source import RasterSource as RasterSource
-    from ortho_pipeline.surface.dem import Surface as Surface
+    from ortho_pipeline.surface.base import Surface as Surface
 
 __version__: str
 
@@ -73,7 +73,7 @@ _HOMES = {
     "SceneOptions": "options",
     "Sensor": "hookspecs",
     "SensorModel": "models",
-    "Surface": "surface.dem",
+    "Surface": "surface.base",
     "SurfaceOptions": "options",
     "Vertical": "geodesy.crs",
     "adjust": "block.adjustment",

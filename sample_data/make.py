@@ -30,7 +30,7 @@ from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.points import Points, write_points
 from ortho_pipeline.simulation.scanner import LineScanner, SimulatedPoints, render, simulate_points
 from ortho_pipeline.simulation.terrain import Landscape, Terrain
-from ortho_pipeline.surface.dem import write_dem as write_dem_file
+from ortho_pipeline.surface.writing import write_dem as write_dem_file
 
 gdal.UseExceptions()
 

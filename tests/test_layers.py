@@ -47,8 +47,9 @@ cli
 """
 LINE = {name: number for number, line in enumerate(ROOMS.split("\n")) for name in line.split()}
 #: Where GDAL, numba and matplotlib are imported.
-GDAL_MODULES = {"files.locations", "raster.gate", "raster.source", "raster.output", "raster.ortho", "surface.dem"}
+GDAL_MODULES = {"files.locations", "raster.gate", "raster.source", "raster.output", "raster.ortho", "surface.dem_file"}
 GDAL_MODULES |= {
+    "surface.writing",
     "plugins",
     "exchange.rpc",
     "exchange.gcp",

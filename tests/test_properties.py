@@ -40,7 +40,7 @@ from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.start import pushbroom_of_metadata
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid, RasterSource
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp import engine as warp
 
 SEEDS = st.integers(0, 10_000)

@@ -25,11 +25,12 @@ from ortho_pipeline.files.locations import archive_of, located
 from ortho_pipeline.files.process_limits import startable_threads
 from ortho_pipeline.geodesy.crs import Vertical, parse_crs
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.options import PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, read_points
 from ortho_pipeline.points.selection import select_control
 from ortho_pipeline.raster import source as raster
-from ortho_pipeline.surface import dem
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import DemSurface
 
 #: Side-cars that GDAL would attach to an image of this stem, whatever the image itself says.
 SIDE_CARS = ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", "_metadata.txt", ".IMD")
@@ -125,8 +126,15 @@ def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_mo
     return open_scene(image, options)
 
 
-def open_surface(options: SurfaceOptions, scene: SceneOptions = SceneOptions()) -> dem.Surface:
-    """Open the DEM, or make a surface of one height.
+def open_surface(
+    options: SurfaceOptions, scene: SceneOptions = SceneOptions(), memory: int = OutputOptions.memory
+) -> Surface:
+    """Open the DEM, or take the ground to be flat.
+
+    Parameters
+    ----------
+    memory : int
+        Bytes of the whole job.
 
     Raises
     ------
@@ -138,17 +146,23 @@ def open_surface(options: SurfaceOptions, scene: SceneOptions = SceneOptions()) 
             "`surface.dem` and `surface.height` exclude each other", field="surface.height", remedy="give one of them"
         )
     if options.height is not None:
-        return dem.Surface.constant(options.height)
+        return Surface.constant(options.height)
     if options.dem is None:
         raise InputError(
             "there are no heights", field="surface.dem", remedy="give `surface.dem=FILE` or `surface.height=METRES`"
         )
+    return open_dem(options.dem, options, scene, memory)
+
+
+def open_dem(
+    path: str | os.PathLike[str], options: SurfaceOptions, scene: SceneOptions, memory: int = OutputOptions.memory
+) -> DemSurface:
+    """Open a DEM; of the options it is those that say how its heights are to be understood."""
     with of_option("surface.vertical"):
         vertical = None if options.vertical is None else Vertical.parse(options.vertical)
-    return dem.Surface.open(
-        options.dem, vertical, override=options.override_vertical, fill=options.fill,
-        **scene.access,
-    )  # fmt: skip
+    return Surface.open(
+        path, vertical, override=options.override_vertical, fill=options.fill, memory=memory, **scene.access
+    )
 
 
 def require_heights(options: SurfaceOptions) -> None:
@@ -243,7 +257,7 @@ def no_points() -> Points:
     )  # fmt: skip
 
 
-def with_heights(points: Points, surface: dem.Surface | None) -> Points:
+def with_heights(points: Points, surface: Surface | None) -> Points:
     """Fill heights that a file does not give from the surface."""
     missing = ~np.isfinite(points.ground[:, 2])
     if not missing.any():
@@ -426,7 +440,7 @@ def _files_of(path: str | os.PathLike[str], scene: SceneOptions) -> list[str]:
 def provenance(
     scene: Scene,
     points: PointOptions,
-    surface: dem.Surface | None,
+    surface: Surface | None,
     inputs: list[dict[str, Any]],
     command: str | None,
     asked: Mapping[str, Any],

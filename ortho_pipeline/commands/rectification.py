@@ -35,7 +35,8 @@ from ortho_pipeline.raster import source as raster
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report import stac as stac_items
-from ortho_pipeline.surface import dem, footprint
+from ortho_pipeline.surface import footprint
+from ortho_pipeline.surface.base import Surface
 
 if TYPE_CHECKING:
     from ortho_pipeline.warp import engine as warp
@@ -90,7 +91,7 @@ def rectify(
     # Before the DEM is read: left alone, GDAL keeps blocks in a share of the machine's memory.
     raster.limit_cache(output.memory, 1)
     opened = open_adjustable(image, scene, points)
-    heights = open_surface(surface, scene)
+    heights = open_surface(surface, scene, output.memory)
     acquired = stac_items.acquisition_time(opened.facts, output.acquired) if output.stac else None
     read = inputs.files_read(image, scene, points, surface, opened)
     begun = states(read) | begun
@@ -143,7 +144,7 @@ def check(
     opened = open_adjustable(image, scene, points)
     if output.stac:
         stac_items.acquisition_time(opened.facts, output.acquired)
-    laid = lay_out(opened, points, scene, open_surface(surface, scene), output)
+    laid = lay_out(opened, points, scene, open_surface(surface, scene, output.memory), output)
     Profile.of(source_of(laid.scene, image, scene, output), output.dtype, output.nodata)
     return laid.to_json()
 
@@ -246,7 +247,7 @@ def _warp(
     model: SensorModel,
     exported: rpc.RpcExport | None,
     source: raster.RasterSource,
-    surface: dem.Surface,
+    surface: Surface,
     grid: raster.Grid,
     path: Path,
     output: OutputOptions,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +12,7 @@ import numpy as np
 import pyproj
 
 from ortho_pipeline import plugins
-from ortho_pipeline.commands.inputs import open_scene, open_surface
+from ortho_pipeline.commands.inputs import open_dem, open_scene
 from ortho_pipeline.commands.results import (
     SCHEMA_VERSION,
     Result,
@@ -174,7 +173,7 @@ def dem_check(
     InputError
         If a file cannot be used, or no check point lies on the DEM.
     """
-    heights = open_surface(replace(surface, dem=dem_file), scene)
+    heights = open_dem(dem_file, surface, scene)
     ground, plane, ids = dem_accuracy.read_check_heights(points, crs, vertical)
     found = dem_accuracy.check_dem(heights, ground, plane, ids)
     if not found.overall.count:

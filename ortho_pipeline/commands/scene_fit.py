@@ -16,14 +16,13 @@ from ortho_pipeline.errors import CoverageError, InputError, ModelError, counted
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import OWN, Removed, fit_family, fit_own, prune, restricted, ridge_of
 from ortho_pipeline.estimation.fit import Fit, fit
-from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
 from ortho_pipeline.options import PointOptions, SceneOptions
 from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.points.control_hull import uncovered
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.footprint import lay
 
 #: A delivered model that is so many image sizes off belongs to another place, or reads its metadata wrongly.
@@ -282,16 +281,8 @@ def heights_around(points: Points, surface: Surface | None) -> tuple[float, floa
     """Return the lowest and highest terrain about the points (m), None where no surface says."""
     if surface is None or not len(points):
         return None
-    if surface.constant_height is not None:
-        return surface.constant_height, surface.constant_height
     plan = np.column_stack([points.ground[:, :2], np.zeros(len(points))])
-    samples = surface.samples_at(ground_transform(points.crs, surface.crs)(plan)[:, :2])
-    low, high = np.nanmin(samples, axis=0), np.nanmax(samples, axis=0)
-    reach = _MARGIN * (high - low) + 1
-    rows, columns = surface.shape
-    u0, v0 = (int(value) for value in np.clip(np.floor(low - reach), 0, (columns, rows)))
-    u1, v1 = (int(value) for value in np.clip(np.ceil(high + reach) + 1, 0, (columns, rows)))
     try:
-        return surface.range_within(u0, v0, u1 - u0, v1 - v0)
+        return surface.range_under(plan, points.crs, _MARGIN)
     except CoverageError:
         return None

@@ -14,7 +14,7 @@ from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface import footprint
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 
 #: An ortho with a smaller part of what its scene covers is worth a warning.
 _SPARSE = 0.05
@@ -36,7 +36,7 @@ class Layout(NamedTuple):
 
     def notes(self) -> list[Notice]:
         """Return what there is to say of how the scene lies on its surface."""
-        return [Notice("dem-covers-part", text, coverage=self.lay.coverage) for text in self.lay.notes(self.surface)]
+        return [Notice("dem-covers-part", text, coverage=self.lay.coverage) for text in self.lay.notes()]
 
     def sparse(self, valid_pixels: int) -> list[Notice]:
         """Return a warning if hardly any of the pixels of the ortho that the scene covers has a value."""
@@ -80,9 +80,8 @@ def lay_out(
     adjusted = adjust(opened, points, scene, surface)
     model, size = adjusted.model, (opened.width, opened.height)
     with completed(adjusted.scene.model_source, of="model"):
-        surface = footprint.facing(model, surface, *size)
         lay = footprint.lay(model, surface, *size)
-        lay.require_coverage(surface)
+        lay.require_coverage()
         model = lay.fitted(model)
         with of_option("output.crs"):
             crs = map_crs(output.crs) if output.crs else None
@@ -90,7 +89,7 @@ def lay_out(
             model, lay, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
         )
         footprint.scene_pixels(model, lay, grid)
-    return Layout(adjusted, model, surface, lay, grid)
+    return Layout(adjusted, model, lay.surface, lay, grid)
 
 
 def source_of(

@@ -22,7 +22,7 @@ from ortho_pipeline.exchange.rpc import (
 )
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.points import Points
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 
 #: What ``ortho export --format`` takes, and what the file's name ends with.
 ENDINGS = {
@@ -125,10 +125,8 @@ class Export:
         self.document["geolocation"] = {"max_error_px": worst, "heights": f"the model{self._where()}"}
 
     def _where(self) -> str:
-        if self.surface is not None and self.surface.constant_height is None:
-            return " on the DEM"
-        height = self.model.reference_height if self.surface is None else self.surface.constant_height
-        return f" at {height:.0f} m above the ellipsoid"
+        surface = self.surface or Surface.constant(self.model.reference_height)
+        return f" {surface.describe()}"
 
     def summary(self, model: str, source: str) -> str:
         """Say in a line each what was written and how well it stands for the model."""

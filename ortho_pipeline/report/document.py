@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.exchange.rpc import RpcExport
     from ortho_pipeline.hookspecs import Scene
     from ortho_pipeline.raster.source import Grid
-    from ortho_pipeline.surface.dem import Surface
+    from ortho_pipeline.surface.base import Surface
     from ortho_pipeline.warp.engine import WarpResult
 
 Array = NDArray[np.float64]
@@ -159,9 +159,7 @@ def _view_rmse(fit: Fit, views: Array) -> dict[str, Any]:
 def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> dict[str, Any] | None:
     """Compare the heights of the points with the DEM's: a difference of datums shows here and nowhere else."""
     points = fit.points
-    if surface.constant_height is not None or not len(points):
-        return None
-    difference = points.ground[:, 2] - surface.heights(points.ground[:, :2], points.crs)
+    difference = surface.above(points.ground, points.crs)
     difference = difference[np.isfinite(difference)]
     if not len(difference):
         return None

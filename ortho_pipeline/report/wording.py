@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.display.notices import Notice, texts_but
-from ortho_pipeline.display.numbers import metres, px, share, short, signed, size_text
+from ortho_pipeline.display.numbers import metres, px, short, signed, size_text
 from ortho_pipeline.errors import counted
+from ortho_pipeline.surface.base import provenance_text
 
 #: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
 ENOUGH_CHECK_POINTS = 30
@@ -126,7 +126,7 @@ def summary_text(report: Mapping[str, Any]) -> str:
             rows.append(("pattern", f"{role} points: {found['statement']}"))
     rows += [("left out", f"{entry['id']}: {entry['reason']}") for entry in adjustment["rejected"]]
     if surface := report["surface"]:
-        rows.append(("heights", _surface_text(surface)))
+        rows.append(("heights", provenance_text(surface)))
     if ortho := report["ortho"]:
         steps = " x ".join(short(step) for step in ortho["resolution"])
         rows.append(("ortho", f"{size_text(ortho['size'])} px of {steps} {ortho['unit']}, {ortho['crs']}"))
@@ -136,13 +136,6 @@ def summary_text(report: Mapping[str, Any]) -> str:
     # The headline and the rows above have said these already.
     rows += [("warning", text) for text in texts_but(report, "left-out", "no-redundancy", "few-check-points")]
     return "\n".join(f"{key:<10}{value}" for key, value in rows)
-
-
-def _surface_text(surface: Mapping[str, Any]) -> str:
-    if surface.get("constant_height") is not None:
-        return f"flat ground at {metres(surface['constant_height'])} above the ellipsoid"
-    covered = "" if surface["coverage"] is None else f", covers {share(surface['coverage'])} of the scene"
-    return f"{Path(str(surface.get('path', ''))).name}, heights above {surface.get('vertical_label')}{covered}"
 
 
 def _bias(raw: Mapping[str, Any]) -> str:

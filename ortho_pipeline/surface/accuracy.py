@@ -24,7 +24,7 @@ from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.points.formats import read_block_table
 from ortho_pipeline.points.ground import ground_of
 from ortho_pipeline.points.rows import OF_HEIGHTS
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.dem import DemSurface
 
 Array = NDArray[np.float64]
 
@@ -127,7 +127,7 @@ def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def check_dem(surface: Surface, ground: Array, crs: str | pyproj.CRS, ids: Sequence[str]) -> DemAccuracy:
+def check_dem(surface: DemSurface, ground: Array, crs: str | pyproj.CRS, ids: Sequence[str]) -> DemAccuracy:
     """Compare a DEM with check heights.
 
     Parameters
@@ -142,11 +142,11 @@ def check_dem(surface: Surface, ground: Array, crs: str | pyproj.CRS, ids: Seque
     """
     lonlat = ground_transform(parse_crs(crs), "EPSG:4979")(ground)
     surface = surface.with_fill("mask").around(float(np.nanmedian(lonlat[:, 0])))
-    heights = surface.heights(lonlat[:, :2], "EPSG:4979")
-    return DemAccuracy(tuple(ids), heights - ground[:, 2], slopes_at(surface, lonlat[:, :2]))
+    differences = -surface.above(np.column_stack([lonlat[:, :2], ground[:, 2]]), "EPSG:4979")
+    return DemAccuracy(tuple(ids), differences, slopes_at(surface, lonlat[:, :2]))
 
 
-def slopes_at(surface: Surface, lonlat: Array) -> Array:
+def slopes_at(surface: DemSurface, lonlat: Array) -> Array:
     """Return the slope (degrees) ``(N,)`` of a DEM at longitudes and latitudes ``(N, 2)``, over two of its samples."""
     step, geod, count = surface.sample_size, pyproj.Geod(ellps="WGS84"), len(lonlat)
 

@@ -21,7 +21,9 @@ from ortho_pipeline.errors import CoverageError, InputError, counted
 from ortho_pipeline.geodesy.crs import GroundTransform, ground_transform, utm_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.source import Grid
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import DemSurface
+from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.surface.rays import intersect
 
 #: Points per side of the image at which the DEM is asked for.
@@ -61,7 +63,7 @@ def border(width: int, height: int, side: int = _BORDER_SIDE) -> Array:
 
 def facing(model: SensorModel, surface: Surface, width: int, height: int) -> Surface:
     """Return the surface with the seam of a global DEM opposite to the scene; any other surface unchanged."""
-    if surface.constant_height is not None:
+    if isinstance(surface, FlatSurface):
         return surface
     centre = ground_transform(model.crs, "EPSG:4979")(_centre(model, width, height))
     return surface.around(float(centre[0, 0]))
@@ -73,6 +75,8 @@ class Footprint:
 
     Parameters
     ----------
+    surface : Surface
+        What it lies on, with the seam of a global DEM opposite to the scene.
     ring : (N, 3)
         The border of the image on the ground, in the model's CRS: on the surface, and where a ray leaves the DEM, at
         the height `middle`. Rays that do not meet the ground are left out.
@@ -95,6 +99,7 @@ class Footprint:
         Heights of the surface at which the model does not project, as a sentence; empty if there are none.
     """
 
+    surface: Surface
     ring: Array
     reach: Array
     heights: tuple[float, float]
@@ -105,7 +110,7 @@ class Footprint:
     unmet: bool = False
     beyond: str = ""
 
-    def require_coverage(self, surface: Surface) -> None:
+    def require_coverage(self) -> None:
         """Raise a `CoverageError` if the surface does not cover the scene and nothing was said about the rest.
 
         Raises
@@ -113,6 +118,9 @@ class Footprint:
         CoverageError
             If a ray found no height and the surface has no fill rule.
         """
+        surface = self.surface
+        if not isinstance(surface, DemSurface):
+            return  # flat ground is everywhere
         file, wanted = (
             surface.provenance.get("path"),
             "say what the rest shall be: `surface.fill=mask` (no pixels there)",
@@ -139,12 +147,12 @@ class Footprint:
                 file=file, field="surface.fill", remedy=f"give a DEM that reaches farther, or {wanted}",
             )  # fmt: skip
 
-    def notes(self, surface: Surface) -> list[str]:
+    def notes(self) -> list[str]:
         """Return what is to be said of a scene that the DEM does not cover as a whole."""
         said = [f"{self.beyond}: such places have no pixels"] if self.beyond else []
         if self.coverage >= 1.0:
             return said
-        what = "have no pixels in the ortho" if surface.fill in ("error", "mask") else "were filled"
+        what = "have no pixels in the ortho" if self.surface.fill in ("error", "mask") else "were filled"
         inside = f" ({counted(self.voids, 'sample')} without a height within it)" if self.voids else ""
         return [*said, f"the DEM covers {share(self.coverage)} of the scene{inside}: the other places {what}"]
 
@@ -177,11 +185,11 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
     closed = ground[outer]
     ends = [model.image_to_ground(image[lost], level) for level in heights] if len(lost) else []
     reach = np.concatenate([closed, *ends])
-    found = Footprint(_finite(closed), _finite(reach), heights, middle)
+    found = Footprint(surface, _finite(closed), _finite(reach), heights, middle)
     if not len(found.reach):
         raise _nowhere(model, surface)
     found = replace(found, beyond=_beyond(model, surface, found))
-    if surface.constant_height is not None:
+    if not isinstance(surface, DemSurface):
         return found
     projects = met[inner] | np.isfinite(model.image_to_ground(image[inner], middle)).all(axis=1)
     own = surface.coverage(ground[inner][met[inner], :2], model.crs) * met[inner].sum() / max(projects.sum(), 1)
@@ -196,12 +204,12 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
 def _nowhere(model: SensorModel, surface: Surface) -> InputError:
     """Return the error of a scene none of whose pixels meets the ground."""
     low, high = model.height_range
-    if surface.constant_height is None or low <= surface.constant_height <= high:
+    if not isinstance(surface, FlatSurface) or low <= surface.height <= high:
         return InputError(
             "no border pixel meets the ground: the model does not belong to this image", field="model", remedy=_SOUND
         )
     return InputError(
-        f"the scene does not meet the ground at a height of {surface.constant_height:g} m", field="surface.height",
+        f"the scene does not meet the ground at a height of {surface.height:g} m", field="surface.height",
         remedy=f"give an ellipsoidal height of the terrain; the model is meant for {low:.0f} to {high:.0f} m",
     )  # fmt: skip
 
@@ -212,13 +220,8 @@ def _beyond(model: SensorModel, surface: Surface, found: Footprint) -> str:
     if not (math.isfinite(low) or math.isfinite(high)):
         return ""
     lowest, highest = found.heights
-    if surface.constant_height is None:
-        samples = surface.samples_at(ground_transform(model.crs, surface.crs)(found.reach)[:, :2])
-        size = surface.shape[::-1]
-        first = np.clip(np.floor(np.nanmin(samples, axis=0)), 0, size).astype(int)
-        last = np.clip(np.ceil(np.nanmax(samples, axis=0)) + 1, 0, size).astype(int)
-        with contextlib.suppress(CoverageError):
-            lowest, highest = surface.range_within(*first.tolist(), *(last - first).tolist())
+    with contextlib.suppress(CoverageError):
+        lowest, highest = surface.range_under(found.reach, model.crs)
     if low <= lowest and highest <= high:
         return ""
     return (
@@ -235,23 +238,21 @@ def _heights_under(
     model: SensorModel, surface: Surface, ground: Array, met: NDArray[np.bool_]
 ) -> tuple[tuple[float, float], float]:
     """Return the range of heights under a scene, and the height at which the middle of the image is seen."""
-    if surface.constant_height is not None:
-        return (surface.constant_height, surface.constant_height), surface.constant_height
+    if isinstance(surface, FlatSurface):
+        return surface.height_range, surface.height
     if not met.any():
         return model.height_range, model.reference_height
     seen = ground[met]
     low, high = float(seen[:, 2].min()), float(seen[:, 2].max())
     # Peaks and hollows between the rays count too.
-    samples = surface.samples_at(ground_transform(model.crs, surface.crs)(seen)[:, :2])
-    first, last = np.floor(samples.min(axis=0)).astype(int), np.ceil(samples.max(axis=0)).astype(int) + 1
     with contextlib.suppress(CoverageError):  # all of it filled
-        lowest, highest = surface.range_within(*first.tolist(), *(last - first).tolist())
+        lowest, highest = surface.range_under(seen, model.crs)
         low, high = min(low, lowest), max(high, highest)
     centre = _COVERAGE_SIDE**2 // 2
     return (low, high), float(ground[centre, 2] if met[centre] else np.median(seen[:, 2]))
 
 
-def _voids(model: SensorModel, surface: Surface, ring: Array, *, whole: bool) -> tuple[int, float, float]:
+def _voids(model: SensorModel, surface: DemSurface, ring: Array, *, whole: bool) -> tuple[int, float, float]:
     """Count the samples of the DEM within a footprint that have no height of their own, whatever the fill rule.
 
     Returns
@@ -263,7 +264,7 @@ def _voids(model: SensorModel, surface: Surface, ring: Array, *, whole: bool) ->
 
     surface = surface.with_fill("mask")
     rows, columns = surface.shape
-    samples = surface.samples_at(ground_transform(model.crs, surface.crs)(ring)[:, :2])
+    samples = surface.sampler(model.crs)(ring)
     outline = shapely.Polygon(samples)
     if not whole or not outline.is_valid:
         outline = shapely.MultiPoint(samples).convex_hull

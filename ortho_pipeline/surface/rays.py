@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from ortho_pipeline.errors import CoverageError
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models.base import SensorModel
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import DemSurface
 
 Array = NDArray[np.float64]
 
@@ -46,8 +47,8 @@ def intersect(model: SensorModel, image: ArrayLike, surface: Surface, *, toleran
         Ground in the model's CRS; NaN where the ray meets no terrain of the surface, or a void first.
     """
     image = np.asarray(image, dtype=float)
-    if surface.constant_height is not None:
-        return model.image_to_ground(image, surface.constant_height)
+    if not isinstance(surface, DemSurface):
+        return model.image_to_ground(image, surface.height_range[0])
     ray = _Ray(model, image, surface)
     reach = ray.reach()
     if reach is None:
@@ -70,7 +71,7 @@ def intersect(model: SensorModel, image: ArrayLike, surface: Surface, *, toleran
 class _Ray:
     """Image points as functions of height."""
 
-    def __init__(self, model: SensorModel, image: Array, surface: Surface) -> None:
+    def __init__(self, model: SensorModel, image: Array, surface: DemSurface) -> None:
         self.model, self.image, self.surface = model, image, surface
         self._transform = ground_transform(parse_crs(model.crs), surface.crs)
         # The box of the finite points; per column, which is much faster than along the first axis.

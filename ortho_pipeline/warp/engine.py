@@ -23,11 +23,10 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import RpcExport
 from ortho_pipeline.files.process_limits import Resources, require_memory, startable_threads
-from ortho_pipeline.geodesy.crs import GroundTransform
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, as_written, refuse_empty
 from ortho_pipeline.raster.source import Grid, RasterSource, limit_cache
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp import kernels
 from ortho_pipeline.warp.block_kernel import DemWindow, Target, warp_block
 from ortho_pipeline.warp.gdal_engine import warp_with_gdal
@@ -100,6 +99,8 @@ def rectify(
 
     Parameters
     ----------
+    surface : Surface
+        The seam of a global DEM beside the grid (`Surface.around`).
     profile : Profile, optional
         What the ortho looks like; like its source without.
     tolerance : float
@@ -117,7 +118,6 @@ def rectify(
     resources = resources or Resources()
     memory = resources.memory
     threads = limit_cache(memory, _threads(resources), source.block, surface.block)
-    surface = _seamless(surface, grid)
     profile = profile or Profile.of(source)
     job = _Job(
         model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, memory // (4 * threads),
@@ -181,7 +181,6 @@ def rectify_gdal(
     resources = resources or Resources()
     # GDAL's warper reads in one of its threads.
     limit_cache(resources.memory, 1, source.block, surface.block)
-    surface = _seamless(surface, grid)
     transformer, valid = warp_with_gdal(
         model, exported, source, surface, grid, path, resampling=resampling, driver=driver,
         creation_options=creation_options, profile=profile, resources=replace(resources, threads=_threads(resources)),
@@ -197,14 +196,6 @@ def rectify_gdal(
         seconds=time.monotonic() - begin,
         transformer=transformer.method,
     )
-
-
-def _seamless(surface: Surface, grid: Grid) -> Surface:
-    """Return the surface with the seam of a global DEM away from the grid."""
-    if surface.constant_height is not None:
-        return surface
-    x, y = grid.xy(np.array([grid.width / 2]), np.array([grid.height / 2]))
-    return surface.around(float(GroundTransform(grid.crs, "EPSG:4979")([[x[0], y[0], 0.0]])[0, 0]))
 
 
 def _check(source: RasterSource, resampling: str, dem_interpolation: str, tolerance: float) -> None:

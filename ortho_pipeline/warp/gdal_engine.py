@@ -37,7 +37,7 @@ from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
 from ortho_pipeline.raster.output import gdal_errors, written
 from ortho_pipeline.raster.source import Grid, RasterSource, first_line
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Excerpt, Surface
 
 #: GDAL's fit to points of a model expresses it if it repeats it this closely (px); another fit only resembles it.
 EXPRESSED = 1e-3
@@ -244,47 +244,33 @@ def _candidates(
 def _rpc(exact: Exact, exported: RpcExport, scratch: contextlib.ExitStack) -> Transformer | None:
     """Return GDAL's RPC transformer with the heights under the grid; None where it would lose some of them."""
     options = ["METHOD=RPC"]  # GDAL would otherwise prefer GCPs
-    if exact.surface.constant_height is not None:
-        options += [f"RPC_HEIGHT={exact.surface.constant_height!r}"]
+    ground = _heights_under(exact.surface, exact.grid)
+    if ground is None:
+        return None
+    if ground.heights.size == 1:
+        options += [f"RPC_HEIGHT={float(ground.heights[0, 0])!r}"]
     else:
-        heights = _heights_under(exact.surface, exact.grid)
-        if heights is None:
-            return None
         dem = f"/vsimem/ortho_dem_{os.getpid()}_{threading.get_ident()}.tif"
         scratch.callback(gdal.Unlink, dem)
-        _write_dem(dem, *heights, exact.surface)
+        _write_dem(dem, ground)
         options += [f"RPC_DEM={dem}", "RPC_DEMINTERPOLATION=bilinear", "RPC_DEM_APPLY_VDATUM_SHIFT=NO"]
     return Transformer("RPC", tuple(options), rpc=rpc_metadata(exported.rpc), max_error_px=exported.max_error_px)
 
 
-def _heights_under(surface: Surface, grid: Grid) -> tuple[Array, tuple[float, ...]] | None:
-    """Return the ellipsoidal heights under a grid and their geotransform; None where GDAL would lose one side.
-
-    That is so at the antimeridian, with a DEM in longitude and latitude.
-    """
+def _heights_under(surface: Surface, grid: Grid) -> Excerpt | None:
+    """Return the ellipsoidal heights under a grid; None where GDAL would lose one side, at the antimeridian."""
     columns, rows = np.meshgrid(np.linspace(0, grid.width, 65), np.linspace(0, grid.height, 65))
     x, y = grid.xy(columns.ravel(), rows.ravel())
-    plan = GroundTransform(grid.crs, surface.crs)(np.stack([x, y, np.zeros(x.size)], axis=1))
-    if surface.crs.is_geographic and np.ptp(plan[:, 0]) > 180:
-        return None
-    samples = surface.samples_at(plan[:, :2])
-    low = np.floor(np.nanmin(samples, axis=0)).astype(int) - 3
-    size = np.ceil(np.nanmax(samples, axis=0)).astype(int) + 4 - low
-    u, a, b, v, c, d = surface.pixel_from_crs
-    inverse = np.linalg.inv([[a, b], [c, d]])
-    # GDAL's geotransform starts at the corner of the first sample.
-    corner = inverse @ (low - 0.5 - np.array([u, v]))
-    heights = surface.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]))
-    return heights, (corner[0], inverse[0, 0], inverse[0, 1], corner[1], inverse[1, 0], inverse[1, 1])
+    return surface.excerpt(np.stack([x, y, np.zeros(x.size)], axis=1), grid.crs)
 
 
-def _write_dem(path: str, heights: Array, geotransform: tuple[float, ...], surface: Surface) -> None:
-    rows, columns = heights.shape
+def _write_dem(path: str, ground: Excerpt) -> None:
+    rows, columns = ground.heights.shape
     with written(gdal.GetDriverByName("GTiff").Create(path, columns, rows, 1, gdal.GDT_Float64)) as dataset:
-        dataset.SetProjection(surface.crs.to_wkt())
-        dataset.SetGeoTransform(geotransform)
+        dataset.SetProjection(ground.crs.to_wkt())
+        dataset.SetGeoTransform(ground.geotransform)
         dataset.GetRasterBand(1).SetNoDataValue(-1e6)
-        dataset.GetRasterBand(1).WriteArray(np.where(np.isnan(heights), -1e6, heights))
+        dataset.GetRasterBand(1).WriteArray(np.where(np.isnan(ground.heights), -1e6, ground.heights))
 
 
 def _control(model: SensorModel) -> tuple[gdal.GCP, ...]:

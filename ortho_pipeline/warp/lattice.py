@@ -43,7 +43,7 @@ from ortho_pipeline.errors import CoverageError
 from ortho_pipeline.geodesy.crs import GroundTransform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.source import Grid
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface, Window
 from ortho_pipeline.warp import lattice_kernel
 from ortho_pipeline.warp.block_kernel import DemWindow, Lattice, heights_at
 
@@ -91,9 +91,9 @@ class _Exact:
     """The exact geometry of an output grid: pixels and heights to source image and DEM coordinates."""
 
     def __init__(self, model: SensorModel, surface: Surface, grid: Grid) -> None:
-        self._model, self._surface, self._grid = model, surface, grid
+        self._model, self._grid = model, grid
         self._to_model = GroundTransform(grid.crs, model.crs)
-        self._to_dem = None if surface.constant_height is not None else GroundTransform(grid.crs, surface.crs)
+        self._samples = surface.sampler(grid.crs)
         self._flat = self._ignores_height()
 
     def _ignores_height(self) -> bool:
@@ -132,11 +132,9 @@ class _Exact:
 
     def dem(self, columns: Array, rows: Array) -> Array:
         """DEM sample coordinates ``(..., 2)`` of output pixel positions ``(...)``."""
-        if self._to_dem is None:
-            return np.full((*np.shape(columns), 2), 0.5)
         x, y = self._grid.xy(columns, rows)
-        plan = self._to_dem(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
-        return self._surface.samples_at(plan[:, :2]).reshape(*np.shape(columns), 2)
+        samples = self._samples(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
+        return samples.reshape(*np.shape(columns), 2)
 
 
 def _positions(spacing: int) -> tuple[Array, Array]:
@@ -363,26 +361,13 @@ class Terrain:
     def _fits(self, window: Any) -> bool:
         return (window[2] - window[0]) * (window[3] - window[1]) * 8 <= self._window_bytes
 
-    def _window(self, nodes: Array) -> tuple[int, int, int, int] | None:
+    def _window(self, nodes: Array) -> Window | None:
         """Return the samples (left, top, right, bottom) under lattice nodes, with those that interpolation needs."""
-        if self._surface.constant_height is not None:
-            return 0, 0, 2, 2
-        points = nodes.reshape(-1, 2)
-        points = points[np.isfinite(points).all(axis=1)]
-        rows, columns = self._surface.shape
-        if not len(points):
-            return None
-        low, high = np.floor(points.min(axis=0)).astype(int) - 2, np.floor(points.max(axis=0)).astype(int) + 5
-        if self._surface.fill in ("error", "mask"):  # with any other rule there are heights beyond the DEM
-            low, high = np.maximum(low, -2), np.minimum(high, (columns + 2, rows + 2))
-        return None if (high - low < 2).any() else (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        return self._surface.window_under(nodes.reshape(-1, 2))
 
     def _read(self, window: Any) -> DemWindow:
         left, top, right, bottom = (int(value) for value in window)
-        if self._surface.constant_height is not None:
-            heights = np.full((2, 2), float(self._surface.constant_height))
-        else:
-            heights = self._surface.window(left, top, right - left, bottom - top)
+        heights = self._surface.window(left, top, right - left, bottom - top)
         return DemWindow(heights, left, top, self._cubic)
 
     def _range(self, block: Block, window: Any) -> bool:

@@ -21,7 +21,7 @@ from ortho_pipeline.imaging.band_stack import write_bands
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.points import write_points
-from ortho_pipeline.surface.dem import write_terrain
+from ortho_pipeline.surface.writing import write_terrain
 
 #: Standard deviation (rad) of the attitude that a survey gives, per axis: a star camera of a small satellite.
 ATTITUDE_SIGMA = math.radians(0.02)

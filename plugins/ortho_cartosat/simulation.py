@@ -21,7 +21,7 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.selection import select_control
 from ortho_pipeline.raster.output import raster_output, written
-from ortho_pipeline.surface.dem import write_terrain
+from ortho_pipeline.surface.writing import write_terrain
 
 MAP, GEOID = simulated.MAP_CRS, "EPSG:5773"
 SMALLEST, LARGEST = 64, simulated.SIZE

@@ -20,7 +20,7 @@ from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points, write_points
 from ortho_pipeline.raster.output import raster_output, written
-from ortho_pipeline.surface.dem import write_terrain
+from ortho_pipeline.surface.writing import write_terrain
 
 ORDER = "39001"
 GEOID = "EPSG:5773"

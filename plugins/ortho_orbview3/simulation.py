@@ -21,7 +21,7 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.points import write_points
 from ortho_pipeline.raster.output import raster_output, written
-from ortho_pipeline.surface.dem import write_terrain
+from ortho_pipeline.surface.writing import write_terrain
 
 GEOID = "EPSG:5773"
 #: Metres of a pixel that can be asked for; the real ones are 1 m.

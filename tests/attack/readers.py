@@ -35,7 +35,7 @@ from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import RasterSource, open_dataset
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.stac import acquisition_time
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.source import RasterSource, open_dataset
 from ortho_pipeline.raster.valid_area import valid_outline
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp.mosaic import Ortho, lay_out
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -9,7 +9,9 @@ from osgeo import gdal
 from ortho_pipeline import commands
 from ortho_pipeline.errors import CoverageError, CrsError, InputError
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
-from ortho_pipeline.surface.dem import NEAREST_METRES, Surface
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import NEAREST_METRES
+from ortho_pipeline.surface.dem_file import DemFile
 
 
 def dem_of(tiny, **options):
@@ -148,7 +150,7 @@ def test_a_fill_rule_does_not_read_the_whole_dem(tiny, tmp_path, monkeypatch, fi
     large.SetProjection(source.GetProjection())
     large.WriteArray(source.ReadAsArray())
     large = None
-    read, inside = [], Surface._read_metres
-    monkeypatch.setattr(Surface, "_read_metres", lambda self, *window: read.append(window) or inside(self, *window))
+    read, inside = [], DemFile.read
+    monkeypatch.setattr(DemFile, "read", lambda self, *window: read.append(window) or inside(self, *window))
     commands.check(tiny.image, surface=dem_of(tiny, dem=dem, fill=fill))
-    assert max(left + width for left, _, width, _ in read) < 3000
+    assert max(left + width for left, _, width, *_ in read) < 3000

@@ -62,7 +62,7 @@ RECTIFY = """
 import resource, signal, sys
 from ortho_pipeline.warp import engine as warp
 from ortho_pipeline.raster import source as raster
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 image, out, driver, limit = sys.argv[1], sys.argv[2], sys.argv[3], int(sys.argv[4])

@@ -18,7 +18,7 @@ from ortho_pipeline.geodesy.ellipsoid import angles_of_rotation
 from ortho_pipeline.models.frame.camera import MAP, TOPOCENTRIC, FrameCamera
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import intersect
 from ortho_pipeline.warp.engine import rectify
 

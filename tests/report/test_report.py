@@ -80,14 +80,13 @@ def renamed(measured: Points, index: int, name: str) -> Points:
 class FakeSurface:
     """The terrain, lower or higher by a constant."""
 
-    constant_height = None
     provenance: dict[str, Any] = {"path": "dem.tif", "crs": "WGS 84", "vertical_label": "EGM96", "fill": "error"}  # noqa: RUF012
 
     def __init__(self, offset: float) -> None:
         self.offset = offset
 
-    def heights(self, xy: np.ndarray, crs: Any) -> np.ndarray:
-        return TERRAIN(xy[:, 0], xy[:, 1]) + self.offset
+    def above(self, ground: np.ndarray, crs: Any) -> np.ndarray:
+        return ground[:, 2] - TERRAIN(ground[:, 0], ground[:, 1]) - self.offset
 
 
 # -- numbers ---------------------------------------------------------------------------------------------------------

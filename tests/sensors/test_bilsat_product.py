@@ -33,7 +33,7 @@ from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.simulation.page import text
 from ortho_pipeline.simulation.tables import is_missed
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp.engine import rectify
 
 

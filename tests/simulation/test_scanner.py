@@ -238,7 +238,7 @@ def test_sample_is_what_its_truth_says(sample):
 
 
 def test_sample_dem_is_the_terrain(sample):
-    from ortho_pipeline.surface.dem import Surface
+    from ortho_pipeline.surface.base import Surface
 
     truth = json.loads((sample / "truth.json").read_text(encoding="utf-8"))
     terrain = Terrain(**truth["terrain"])

@@ -13,7 +13,7 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.surface.accuracy import check_dem, read_check_heights, slopes_at
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 
 UTM = "EPSG:32634"
 WEST, NORTH, STEP, SIDE = 500_000.0, 4_000_000.0, 10.0, 300

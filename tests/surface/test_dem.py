@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import multiprocessing
+import pickle
 import threading
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -16,8 +21,10 @@ from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.geodesy.crs import GroundTransform, Vertical
 from ortho_pipeline.geodesy.datum import dem_unit
 from ortho_pipeline.models.base import SensorModel
-from ortho_pipeline.surface.dem import Surface
-from ortho_pipeline.surface.footprint import lay
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import TILE, Tiles
+from ortho_pipeline.surface.dem_file import DemFile
+from ortho_pipeline.surface.footprint import image_grid, lay
 from ortho_pipeline.surface.rays import intersect
 
 gdal.UseExceptions()
@@ -312,6 +319,83 @@ def test_a_look_with_another_rule_leaves_a_surface_as_it_was(tmp_path: Path, fil
         surface.fill = "mask"  # type: ignore[misc]
 
 
+def copies(surface: Surface) -> dict[str, Surface]:
+    return {
+        "copy": copy.copy(surface), "deep copy": copy.deepcopy(surface), "pickle": pickle.loads(pickle.dumps(surface)),
+        "other fill": surface.with_fill("mask"), "other seam": surface.around(179.0),
+    }  # fmt: skip
+
+
+def global_dem(folder: Path, **options: str) -> Surface:
+    heights = np.arange(20.0 * 36).reshape(20, 36)
+    heights[5, 17:19] = -9999.0
+    path = write_dem(folder / "world.tif", heights, "EPSG:4326", (-180, 10, 0, 90, 0, -9), nodata=-9999.0)
+    return Surface.open(path, "ellipsoid", **options)
+
+
+def test_no_two_surfaces_share_what_they_keep(tmp_path: Path) -> None:
+    surface = global_dem(tmp_path, fill="nearest")
+    where = np.array([[-0.5, 42.0], [33.0, 10.0], [-91.0, -33.3]])  # the first beside a void
+    expected, lowest = surface.heights(where), surface.height_range
+    assert np.isfinite(expected).all()
+    for name, other in copies(surface).items():
+        assert "height_range" not in vars(other), name
+        found = other.heights(where)
+        assert np.isnan(found[0]) == (name == "other fill"), name
+        np.testing.assert_allclose(found[1:], expected[1:], rtol=1e-14)
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            other.fill = 5.0
+    np.testing.assert_array_equal(surface.heights(where), expected)
+    assert surface.height_range == lowest
+
+
+def test_a_worker_process_gets_a_surface(tmp_path: Path) -> None:
+    surface = global_dem(tmp_path, fill="nearest").around(179.0)
+    where = np.array([[-0.5, 42.0], [179.9, 10.0], [-179.9, 10.0]])
+    flat = Surface.constant(7.5)
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        np.testing.assert_array_equal(pool.submit(surface.heights, where).result(), surface.heights(where))
+        np.testing.assert_array_equal(pool.submit(flat.heights, where).result(), [7.5, 7.5, 7.5])
+    assert pickle.loads(pickle.dumps(surface)).provenance == surface.provenance
+
+
+def test_rays_that_stand_far_apart_read_every_tile_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On every step over a thousand rays each need another tile, which the next step needs again."""
+    side, transform = 2600, (UTM_BOX[0], 2.0, 0.0, UTM_BOX[1], 0.0, -2.0)
+    heights = hills(side, side).astype(np.float32)
+    heights[700:760, 900:980] = -9999.0
+    path = write_dem(tmp_path / "d.tif", heights, transform=transform, nodata=-9999.0, kind=gdal.GDT_Float32)
+    surface = Surface.open(path, "ellipsoid", fill="nearest")
+    model = Oblique(lean=0.02)
+    reads: list[int] = []
+    inside = DemFile.read
+
+    def read(self: DemFile, left: int, top: int, width: int, height: int, unit: float) -> np.ndarray:
+        reads.append(width * height)
+        return inside(self, left, top, width, height, unit)
+
+    monkeypatch.setattr(DemFile, "read", read)
+    ground = intersect(model, image_grid(5000, 5000, 33) + 50.0, surface)
+    assert np.isfinite(ground).all()
+    # The whole DEM for the range of heights, the tiles, and the wide surroundings of a few that lie on the void.
+    assert sum(reads) < 3 * side**2 + 30 * (2 * surface.nearest_reach + TILE) ** 2
+
+
+def test_heights_that_are_kept_take_no_more_memory_than_they_may(tmp_path: Path) -> None:
+    kept, made = Tiles(3 * 80), []
+
+    def make(key: int) -> np.ndarray:
+        return kept.get(key, lambda: made.append(key) or np.full(10, float(key)))
+
+    for key in (1, 2, 3, 1, 4, 1, 2):  # 4 drives out 2, which was used longest ago
+        assert (make(key) == key).all()
+    assert made == [1, 2, 3, 4, 2]
+    large = Tiles(8)
+    assert large.get("a", lambda: np.zeros(10)) is large.get("a", lambda: np.ones(10)), "the last one stays"
+    path = write_dem(tmp_path / "d.tif", hills())
+    assert Surface.open(path, "ellipsoid", memory=80_000_000).cache_bytes == 10_000_000
+
+
 def test_windows_do_not_depend_on_how_they_are_cut(tmp_path: Path) -> None:
     heights = hills(300, 320)
     rng = np.random.default_rng(3)
@@ -378,7 +462,7 @@ def test_nothing_but_voids(tmp_path: Path) -> None:
 
 def test_a_plane() -> None:
     surface = Surface.constant(85.5)
-    assert surface.constant_height == 85.5
+    assert surface.height == 85.5
     assert surface.heights([[24.0, -33.0], [np.nan, 0]], "EPSG:4326") == pytest.approx([85.5, np.nan], nan_ok=True)
     assert surface.height_range == (85.5, 85.5)
     assert surface.coverage([[0, 0]]) == 1.0

@@ -13,8 +13,9 @@ from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.models import FrameCamera, ImageCorrection
 from ortho_pipeline.models.frame.camera import MAP
 from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.surface.dem import Surface, write_dem
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.footprint import Footprint, choose_grid, lay
+from ortho_pipeline.surface.writing import write_dem
 
 CRS, X, Y = "EPSG:32651", 300_000.0, 2_700_000.0
 #: A drone 200 m above the ellipsoid and 120 m above the ground: pixels of 0.12 m, 120 x 80 m in all.
@@ -59,11 +60,11 @@ def test_the_part_beyond_the_dem_is_laid_at_the_heights_there(tmp_path, west, sh
     found = laid(model, on)
     assert found.coverage == pytest.approx(share, abs=1e-3)
     with pytest.raises(CoverageError, match=rf"covers {int(found.coverage * 1000) / 10:.1f} % of the scene"):
-        found.require_coverage(on)
+        found.require_coverage()
     whole = choose_grid(model, laid(model, surface(tmp_path)), (WIDTH, HEIGHT))
     assert choose_grid(model, found, (WIDTH, HEIGHT)).extent == pytest.approx(whole.extent, abs=0.13)
     masked = surface(tmp_path, west=west, fill="mask")
-    (note,) = laid(model, masked).notes(masked)
+    (note,) = laid(model, masked).notes()
     assert f"covers {int(found.coverage * 1000) / 10:.1f} % of the scene" in note
 
 

@@ -11,7 +11,7 @@ from osgeo import gdal
 
 from ortho_pipeline.models import RPC
 from ortho_pipeline.surface import rays
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import MANY, intersect
 
 

@@ -27,7 +27,7 @@ from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.simulation.scanner import LineScanner
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp.engine import WarpResult, rectify, rectify_gdal
 from ortho_pipeline.warp.gdal_engine import EXPRESSED, Exact, Transformer
 

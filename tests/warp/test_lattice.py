@@ -22,7 +22,7 @@ from ortho_pipeline.models.pushbroom.line_camera import LineCamera
 from ortho_pipeline.models.pushbroom.start import pushbroom_of_tables
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.simulation.scanner import LineScanner
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp.engine import WarpResult, rectify
 
 UTM = pyproj.CRS.from_epsg(32651)

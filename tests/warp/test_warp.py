@@ -24,7 +24,7 @@ from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import RPC, SensorModel
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import Grid, RasterSource
-from ortho_pipeline.surface.dem import Surface
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp import engine as warp
 from ortho_pipeline.warp.engine import rectify, rectify_gdal
 

@@ -1,0 +1,249 @@
+"""What everyone asks of the ground, be it a DEM or flat: heights, and the windows of samples that a warp reads."""
+
+from __future__ import annotations
+
+import abc
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import pyproj
+from numpy.typing import ArrayLike, NDArray
+
+from ortho_pipeline.display.numbers import metres, share
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import Vertical
+
+if TYPE_CHECKING:
+    from ortho_pipeline.surface.dem import DemSurface
+    from ortho_pipeline.surface.flat import FlatSurface
+
+Array = NDArray[np.float64]
+#: Samples left, top, right, bottom; the last two are the first beyond.
+Window = tuple[int, int, int, int]
+
+
+class Excerpt(NamedTuple):
+    """A piece of a surface as a raster: heights ``(rows, columns)``, geotransform as GDAL's, horizontal CRS.
+
+    Flat ground is a single sample.
+    """
+
+    heights: Array
+    geotransform: tuple[float, ...]
+    crs: pyproj.CRS
+
+
+class Surface(abc.ABC):
+    """The ground as ellipsoidal heights: `open` a DEM, or take it to be `constant`.
+
+    A surface never changes: `with_fill` and `around` return another one. Safe to use from several threads; copies and
+    pickles know what the surface is and nothing of what was read.
+
+    To a warp every surface is a raster of samples, which it reads by windows; flat ground is one whose samples are
+    all alike.
+
+    Attributes
+    ----------
+    fill : 'error', 'mask', 'nearest' or float
+        What stands for a void: NaN for the first two; a height with the others.
+    """
+
+    fill: str | float
+
+    @staticmethod
+    def constant(height: float) -> FlatSurface:
+        """Return flat ground at an ellipsoidal height (m)."""
+        from ortho_pipeline.surface.flat import FlatSurface
+
+        return FlatSurface(height)
+
+    @staticmethod
+    def open(
+        path: str | os.PathLike[str],
+        vertical: Vertical | str | None = None,
+        override: bool = False,
+        fill: str | float = "error",
+        allow_network: bool = False,
+        roots: Sequence[str | os.PathLike[str]] = (),
+        memory: int = 512_000_000,
+    ) -> DemSurface:
+        """Open a DEM.
+
+        Parameters
+        ----------
+        vertical : Vertical or str, optional
+            What the heights are measured above; needed where the DEM does not say it.
+        override : bool
+            Let `vertical` stand against a datum that the DEM declares by an authority code.
+        fill : 'error', 'mask', 'nearest' or float
+            See the class; a number is an ellipsoidal height in metres.
+        memory : int
+            Bytes of a whole job; an eighth of them may hold heights that were read.
+
+        Raises
+        ------
+        DatumError
+            If the height datum is unknown, contradicted, or its geoid grid is not installed or does not reach here.
+        CrsError
+            If the DEM has no usable georeference.
+        InputError
+            If it cannot be opened.
+        """
+        from ortho_pipeline.surface.dem import open_dem
+
+        access = {"allow_network": allow_network, "roots": tuple(roots)}
+        return open_dem(os.fspath(path), vertical, override, parse_fill(fill), access, memory)
+
+    # -- what it is --------------------------------------------------------------------------------------------------
+
+    @property
+    @abc.abstractmethod
+    def block(self) -> int:
+        """Bytes that GDAL decodes at once to read a sample; 0 where nothing is read."""
+
+    @property
+    @abc.abstractmethod
+    def provenance(self) -> dict[str, Any]:
+        """Path, declared and used height datum, fill rule, warnings, or the one height; JSON values."""
+
+    @abc.abstractmethod
+    def describe(self) -> str:
+        """Say where a point on the surface lies: on the DEM, at so many metres."""
+
+    @abc.abstractmethod
+    def with_fill(self, fill: str | float) -> Surface:
+        """Return this surface with another rule for voids.
+
+        Raises
+        ------
+        InputError
+            If there is no such rule.
+        """
+
+    @abc.abstractmethod
+    def around(self, lon: float) -> Surface:
+        """Return this surface with the seam of a global DEM opposite to `lon` (degrees); any other one unchanged.
+
+        Sample coordinates are then continuous about `lon`, also over the antimeridian.
+        """
+
+    # -- heights -----------------------------------------------------------------------------------------------------
+
+    @abc.abstractmethod
+    def heights(self, xy: ArrayLike, crs: str | pyproj.CRS | None = None) -> Array:
+        """Return heights ``(N,)`` at positions ``(N, 2)`` (x, y) of `crs` (that of the surface by default).
+
+        Bilinear between sample centres; NaN outside and beside a void, unless `fill` gives them a height.
+        """
+
+    @abc.abstractmethod
+    def coverage(self, xy: ArrayLike, crs: str | pyproj.CRS | None = None) -> float:
+        """Return the share (0 to 1) of positions ``(N, 2)`` that have a height of their own, not a filled one."""
+
+    @abc.abstractmethod
+    def above(self, ground: Array, crs: str | pyproj.CRS) -> Array:
+        """Return how far (m) points ``(N, 3)`` lie above heights that were measured; NaN where none were."""
+
+    @abc.abstractmethod
+    def range_under(self, ground: Array, crs: str | pyproj.CRS, margin: float = 0.0) -> tuple[float, float]:
+        """Return the lowest and the highest height (m) in the box of samples under points ``(N, 3)``.
+
+        Parameters
+        ----------
+        margin : float
+            Part of the box's sides by which it is widened on each side, and one sample more.
+
+        Raises
+        ------
+        CoverageError
+            If there is no valid height in it.
+        """
+
+    @property
+    @abc.abstractmethod
+    def height_range(self) -> tuple[float, float]:
+        """Lowest and highest height (m) of the whole surface, with a fill height; every sample is read, once."""
+
+    # -- samples -----------------------------------------------------------------------------------------------------
+
+    @abc.abstractmethod
+    def sampler(self, crs: str | pyproj.CRS) -> Callable[[Array], Array]:
+        """Return the function from ground ``(N, 3)`` in `crs` to sample coordinates (u, v) ``(N, 2)``."""
+
+    @abc.abstractmethod
+    def window_under(self, samples: Array) -> Window | None:
+        """Return the samples that cubic interpolation at sample coordinates ``(N, 2)`` needs; None without heights."""
+
+    @abc.abstractmethod
+    def window(self, u0: int, v0: int, nu: int, nv: int) -> Array:
+        """Return the heights ``(nv, nu)`` of samples, from column `u0` and row `v0`; it may reach outside.
+
+        NaN for a void and outside of the DEM, unless `fill` gives them a height. Does not depend on how a
+        larger window is cut into smaller ones.
+        """
+
+    @abc.abstractmethod
+    def range_within(self, u0: int, v0: int, nu: int, nv: int) -> tuple[float, float]:
+        """Return the lowest and the highest height (m) of a window of samples, with a fill height.
+
+        Raises
+        ------
+        CoverageError
+            If there is no valid height in it.
+        """
+
+    @abc.abstractmethod
+    def excerpt(self, ground: Array, crs: str | pyproj.CRS) -> Excerpt | None:
+        """Return the surface under points ``(N, 3)`` as a raster; None where that has no continuous coordinates.
+
+        That is so at the antimeridian, with a DEM in longitude and latitude.
+        """
+
+
+def parse_fill(fill: str | float) -> str | float:
+    """Return the rule for voids that a user gives: a known name, or a height as number.
+
+    Raises
+    ------
+    InputError
+        If there is no such rule.
+    """
+    if isinstance(fill, str) and fill in ("error", "mask", "nearest"):
+        return fill
+    try:
+        height = float(fill)
+    except ValueError:
+        height = math.nan
+    if not math.isfinite(height):
+        raise InputError(
+            f"{fill!r} does not say how to fill voids",
+            field="surface.fill",
+            remedy="give error, mask, nearest or an ellipsoidal height in metres",
+        )
+    return height
+
+
+def positions(xy: ArrayLike) -> Array:
+    """Return positions ``(N, 2)`` as an array, of what may have more columns.
+
+    Raises
+    ------
+    InputError
+        If they have another shape.
+    """
+    found = np.asarray(xy, dtype=float)
+    if found.ndim != 2 or found.shape[1] < 2:
+        raise InputError(f"positions have the shape (N, 2), not {found.shape}")
+    return found[:, :2]
+
+
+def provenance_text(provenance: Mapping[str, Any]) -> str:
+    """Say what a surface was, from its provenance and its ``coverage`` of a scene as a report holds them."""
+    if provenance.get("constant_height") is not None:
+        return f"flat ground at {metres(provenance['constant_height'])} above the ellipsoid"
+    covered = "" if provenance["coverage"] is None else f", covers {share(provenance['coverage'])} of the scene"
+    return f"{Path(str(provenance.get('path', ''))).name}, heights above {provenance.get('vertical_label')}{covered}"

@@ -1,0 +1,222 @@
+"""The file of a DEM: where its samples lie, and what they say in metres."""
+
+from __future__ import annotations
+
+import functools
+import math
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pyproj
+from numpy.typing import ArrayLike
+from osgeo import gdal
+from pyproj.exceptions import CRSError
+
+from ortho_pipeline.errors import CrsError, InputError
+from ortho_pipeline.geodesy.crs import ground_transform, horizontal
+from ortho_pipeline.raster.source import first_line, open_pixels
+from ortho_pipeline.surface.base import Array
+
+#: Heights (m) outside of this are voids, declared or not.
+SANE_HEIGHTS = (-500.0, 9000.0)
+#: No DEM has samples that are nearer to each other (m); work along a ray is counted in samples.
+_FINEST = 1e-3
+
+Affine = tuple[float, float, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class SampleGrid:
+    """Where the samples of a DEM lie.
+
+    Parameters
+    ----------
+    crs : pyproj.CRS
+        Their horizontal system, x first.
+    shape : tuple
+        (rows, columns).
+    crs_from_pixel : tuple of 6 floats
+        ``x = a + b u + c v``, ``y = d + e u + f v``; (0, 0) is the centre of the first sample.
+    first_column : int
+        Column of the file that is the first of the grid, in one that goes round the world.
+    """
+
+    crs: pyproj.CRS
+    shape: tuple[int, int]
+    crs_from_pixel: Affine
+    first_column: int = 0
+
+    @functools.cached_property
+    def pixel_from_crs(self) -> Affine:
+        """``u = a + b x + c y``, ``v = d + e x + f y``."""
+        x, a, b, y, c, d = self.crs_from_pixel
+        inverse = np.linalg.inv([[a, b], [c, d]])
+        shift = -inverse @ [x, y]
+        return (
+            float(shift[0]), float(inverse[0, 0]), float(inverse[0, 1]),
+            float(shift[1]), float(inverse[1, 0]), float(inverse[1, 1]),
+        )  # fmt: skip
+
+    @property
+    def sample_size(self) -> float:
+        """Larger side of a sample, in metres (on the equator where the DEM is in degrees)."""
+        _, a, b, _, c, d = self.crs_from_pixel
+        unit = 111320.0 if self.crs.is_geographic else self.crs.axis_info[0].unit_conversion_factor
+        return unit * max(math.hypot(a, c), math.hypot(b, d))
+
+    def around(self, lon: float) -> SampleGrid:
+        """Return the grid with the seam opposite to `lon` (degrees) if it goes round the world, else as it is."""
+        x, a, b, y, c, d = self.crs_from_pixel
+        columns = self.shape[1]
+        if not self.crs.is_geographic or b or c or abs(abs(a) * columns - 360) > 1e-6 * abs(a):
+            return self
+        shift = round((lon - (x + a * (columns - 1) / 2)) / a)
+        if not shift:
+            return self
+        first = (self.first_column + shift) % columns
+        return replace(self, first_column=first, crs_from_pixel=(x + shift * a, a, b, y, c, d))
+
+    def samples_at(self, xy: ArrayLike) -> Array:
+        """Return sample coordinates (u, v) ``(N, 2)`` of positions (x, y) ``(N, 2)`` in `crs`.
+
+        Longitudes are taken modulo 360 into the range of the DEM, so that it may run from -180 or from 0 degrees.
+        """
+        xy = np.asarray(xy, dtype=float)
+        x, y = xy[:, 0], xy[:, 1]
+        if self.crs.is_geographic:
+            rows, columns = self.shape
+            x0, a, b, *_ = self.crs_from_pixel
+            middle = x0 + a * (columns - 1) / 2 + b * (rows - 1) / 2
+            far = np.abs(x - middle) > 180
+            if far.any():
+                x = np.where(far, middle + np.remainder(x - middle + 180, 360) - 180, x)
+        p = self.pixel_from_crs
+        return np.stack([p[0] + p[1] * x + p[2] * y, p[3] + p[4] * x + p[5] * y], axis=1)
+
+    def lonlat(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """Return longitudes and latitudes (degrees) ``(N,)`` of sample coordinates."""
+        p = self.crs_from_pixel
+        ground = np.stack([p[0] + p[1] * u + p[2] * v, p[3] + p[4] * u + p[5] * v, np.zeros(len(u))], axis=1)
+        lonlat = ground_transform(self.crs, "EPSG:4979")(ground)
+        return lonlat[:, 0], lonlat[:, 1]
+
+
+@dataclass(frozen=True, eq=False)
+class DemFile:
+    """The samples as they stand in a file; every thread has a GDAL handle of its own.
+
+    Parameters
+    ----------
+    path : str
+    access : mapping
+        What `raster.open_pixels` may do for it.
+    """
+
+    path: str
+    access: Mapping[str, Any]
+    _local: threading.local = field(default_factory=threading.local, init=False, repr=False)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return DemFile, (self.path, self.access)
+
+    @property
+    def dataset(self) -> gdal.Dataset:
+        """The handle of this thread."""
+        if not hasattr(self._local, "dataset"):
+            self._local.dataset, self._local.block = open_pixels(self.path, **self.access)
+        return self._local.dataset
+
+    @property
+    def block(self) -> int:
+        """Bytes that GDAL decodes at once to read a sample."""
+        return self._local.block if self.dataset else 0
+
+    @property
+    def unit(self) -> str:
+        """The unit of the heights, as the file calls it."""
+        return self.dataset.GetRasterBand(1).GetUnitType()
+
+    def place(self) -> tuple[pyproj.CRS, SampleGrid]:
+        """Return the full CRS of the file and the grid of its samples.
+
+        Raises
+        ------
+        CrsError
+            If there is no usable georeference.
+        InputError
+            If the samples are no heights.
+        """
+        dataset = self.dataset
+        reference, transform = dataset.GetSpatialRef(), dataset.GetGeoTransform(can_return_null=True)
+        if reference is None or transform is None:
+            missing = "CRS" if reference is None else "geotransform"
+            raise CrsError(
+                f"this DEM has no {missing}",
+                file=self.path,
+                field=missing,
+                remedy="set it with gdal_edit.py -a_srs / -a_ullr",
+            )
+        crs, plane = self._crs(reference.ExportToWkt(["FORMAT=WKT2_2018"]))
+        x, a, b, y, c, d = transform
+        if not np.isfinite(transform).all() or abs(a * d - b * c) <= 1e-14 * (abs(a) + abs(b)) * (abs(c) + abs(d)):
+            raise CrsError(
+                f"the geotransform {transform} of this DEM is degenerate", file=self.path, field="geotransform",
+                remedy="set it with gdal_edit.py -a_ullr",
+            )  # fmt: skip
+        if gdal.DataTypeIsComplex(dataset.GetRasterBand(1).DataType):
+            raise InputError("complex numbers are not heights", file=self.path, field="band 1",
+                             remedy="choose one part of them with gdal_calc.py")  # fmt: skip
+        # GDAL counts from the corner of the first pixel; heights belong to the centres.
+        centre = (x + 0.5 * (a + b), a, b, y + 0.5 * (c + d), c, d)
+        grid = SampleGrid(plane, (dataset.RasterYSize, dataset.RasterXSize), centre)
+        if grid.sample_size < _FINEST:
+            raise CrsError(
+                f"the samples of this DEM would be {grid.sample_size:.1g} m apart", file=self.path,
+                field="geotransform", remedy="set the true one with gdal_edit.py -a_ullr",
+            )  # fmt: skip
+        return crs, grid
+
+    def _crs(self, wkt: str) -> tuple[pyproj.CRS, pyproj.CRS]:
+        """Return the CRS and its horizontal part."""
+        try:
+            crs = pyproj.CRS.from_wkt(wkt)
+            plane = horizontal(crs)
+            ground_transform(plane, "EPSG:4979")
+        except (CrsError, CRSError) as error:
+            raise CrsError(
+                f"the CRS of this DEM cannot be used ({getattr(error, 'message', error)})",
+                file=self.path,
+                field="CRS",
+                remedy="set a CRS of known datum with gdal_edit.py -a_srs",
+            ) from error
+        return crs, plane
+
+    def read(self, left: int, top: int, width: int, height: int, metres_per_unit: float) -> Array:
+        """Return the heights ``(height, width)`` of a window inside the file in metres; NaN for voids."""
+        band = self.dataset.GetRasterBand(1)
+        try:
+            raw = band.ReadAsArray(left, top, width, height)
+            mask = None
+            if band.GetMaskFlags() & gdal.GMF_PER_DATASET:
+                mask = band.GetMaskBand().ReadAsArray(left, top, width, height)
+        except RuntimeError as error:
+            raise InputError(
+                f"the heights cannot be read ({first_line(error)})",
+                file=self.path,
+                remedy="copy the DEM again: it is damaged",
+            ) from error
+        scale, offset = (1.0 if band.GetScale() is None else band.GetScale()), band.GetOffset() or 0.0
+        heights = raw.astype(float) * (scale * metres_per_unit) + offset * metres_per_unit
+        with np.errstate(invalid="ignore"):
+            void = ~((heights >= SANE_HEIGHTS[0]) & (heights <= SANE_HEIGHTS[1]))
+        nodata = band.GetNoDataValue()
+        if nodata is not None and math.isfinite(nodata):
+            with np.errstate(over="ignore"):
+                void |= raw == (raw.dtype.type(nodata) if raw.dtype.kind == "f" else nodata)
+        if mask is not None:
+            void |= mask == 0
+        heights[void] = np.nan
+        return heights
