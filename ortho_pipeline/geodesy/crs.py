@@ -27,7 +27,7 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import AreaOfInterest, Transformer, TransformerGroup
 
 from ortho_pipeline.errors import CrsError, DatumError, OrthoError
-from ortho_pipeline.geodesy.geoid_grid import header_fault
+from ortho_pipeline.geodesy.geoid_grid import header_fault, refuse_absurd
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -211,7 +211,7 @@ class Vertical:
         Raises
         ------
         DatumError
-            If the grid is not installed; the message names it and says how to get it.
+            If the grid is not installed (the message names it and says how to get it), or gives absurd heights.
         """
         lon, lat = np.broadcast_arrays(np.asarray(lon, dtype=float), np.asarray(lat, dtype=float))
         if self.is_ellipsoid:
@@ -222,6 +222,7 @@ class Vertical:
         except ProjError as error:
             raise _grid_error(self, str(error)) from error
         shift[~np.isfinite(shift)] = np.nan
+        refuse_absurd(shift, self.name)
         asked = np.isfinite(lon) & np.isfinite(lat)
         if asked.any() and not np.isfinite(shift).any() and self.name.startswith("EPSG:"):
             # PROJ picks among several operations per point, and answers inf, not an error, where none has its grid.

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
+from osgeo import gdal
 from pyproj.database import query_crs_info
 
 from ortho_pipeline.errors import CrsError, DatumError
@@ -113,6 +114,23 @@ def test_a_geoid_whose_header_lies(tmp_path: Path, change: tuple[bytes, tuple]) 
         Vertical.parse(str(path))
     path.write_bytes(struct.pack(">ddddii", 30.0, 33.0, 1.0, 1.0, 8, 8) + bytes(256))
     assert Vertical.parse(str(path)).undulation([34.0], [33.0]) == 0
+
+
+@pytest.mark.parametrize(("ending", "value"), [(".gtx", 250.0), (".tif", 250.0), (".tif", 1e30), (".tif", -28_000.0)])
+def test_a_geoid_of_absurd_heights(tmp_path: Path, ending: str, value: float) -> None:
+    path = tmp_path / f"geoid{ending}"
+    if ending == ".gtx":  # of which PROJ takes what is beyond 1000 m for places without a value
+        path.write_bytes(struct.pack(">ddddii", 30.0, 33.0, 1.0, 1.0, 8, 8) + struct.pack(">f", value) * 64)
+    else:
+        grid = gdal.GetDriverByName("GTiff").Create(str(path), 8, 8, 1, gdal.GDT_Float32)
+        grid.SetProjection(pyproj.CRS.from_epsg(4326).to_wkt())
+        grid.SetGeoTransform((32.5, 1.0, 0.0, 37.5, 0.0, -1.0))
+        grid.WriteArray(np.full((8, 8), value))
+        grid = None
+    with pytest.raises(DatumError, match="above the ellipsoid") as refused:
+        Vertical.parse(str(path)).undulation([34.5, 200.0], [33.5, 0.0])
+    assert refused.value.file == str(path)
+    assert refused.value.remedy
 
 
 @pytest.mark.parametrize("name", ["pipe.gtx", "pipe.tif"])
