@@ -92,7 +92,10 @@ def compare(
             "there are no points to fit to", field="points.gcps", remedy="give a file of points with `points.gcps`"
         )
     if points.correction is not None or points.fit_model is not None:
-        raise InputError("compare takes its models from `models`", field="models", remedy="for example all")
+        raise InputError(
+            "compare takes its models from `models`", remedy="for example `models=all`",
+            field="points.fit_model" if points.correction is None else "points.correction",
+        )  # fmt: skip
     if points.params is not None or points.prune:
         raise InputError(
             "compare fits whole models",

@@ -181,7 +181,21 @@ def _perhaps_elsewhere(value: Any, allow_network: bool) -> Any:
 
 
 def has_surface(options: SurfaceOptions) -> bool:
-    """Tell whether heights are given."""
+    """Tell whether heights are given.
+
+    Raises
+    ------
+    InputError
+        If something is said of a DEM that is not given.
+    """
+    idle = {
+        "surface.vertical": options.vertical is not None,
+        "surface.override_vertical": options.override_vertical,
+        "surface.fill": options.fill != SurfaceOptions.fill,
+    }
+    for field in (field for field, given in idle.items() if given and options.dem is None):
+        raise InputError("this is said of a DEM, and there is none", field=field,
+                         remedy="leave it out, or give `surface.dem`")  # fmt: skip
     return options.dem is not None or options.height is not None
 
 

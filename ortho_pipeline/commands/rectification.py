@@ -92,7 +92,7 @@ def rectify(
     raster.limit_cache(output.memory, 1)
     opened = open_adjustable(image, scene, points)
     heights = open_surface(surface, scene, output.memory)
-    acquired = stac_items.acquisition_time(opened.facts, output.acquired) if output.stac else None
+    acquired = _acquired(opened.facts, output)
     read = inputs.files_read(image, scene, points, surface, opened)
     begun = states(read) | begun
     with inputs.hashed_beside(read, digest) as hashing:
@@ -142,8 +142,7 @@ def check(
     """
     inputs.require_heights(surface)
     opened = open_adjustable(image, scene, points)
-    if output.stac:
-        stac_items.acquisition_time(opened.facts, output.acquired)
+    _acquired(opened.facts, output)
     laid = lay_out(opened, points, scene, open_surface(surface, scene, output.memory), output)
     Profile.of(source_of(laid.scene, image, scene, output), output.dtype, output.nodata)
     return laid.to_json()
@@ -232,6 +231,16 @@ def _of_earlier_run(folder: Path, stem: str, files: Mapping[str, Path], *, all_o
             ours = bool(report.read_report_json(folder / f"{stem}{_ENDINGS['report']}"))
     left = [folder / f"{stem}{ending}" for ending in _ENDINGS.values()] if ours else []
     return [*(path for path in left if path not in files.values()), *inputs.old_side_cars(files["ortho"])]
+
+
+def _acquired(facts: Mapping[str, Any], output: OutputOptions) -> Any:
+    """Return the time of acquisition for the STAC item, None where none is asked for."""
+    if output.stac:
+        return stac_items.acquisition_time(facts, output.acquired)
+    if output.acquired is not None:
+        raise InputError("only a STAC item says when", field="output.acquired",
+                         remedy="give `output.stac` too, or leave it out")  # fmt: skip
+    return None
 
 
 def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[Notice]]:

@@ -60,8 +60,8 @@ def test_texts_and_files_that_are_none(tiny, tmp_path, command):
     tried = 0
     for one in params:
         plain = isinstance(one.type, click.types.StringParamType | click.Path) and not one.is_flag
-        # Of these nothing is wrong: a folder's name, and what is only looked at with --stac or points alone.
-        if not plain or set(one.opts) & {"--output", "--acquired", "--model-crs"}:
+        # Of these nothing is wrong: a folder's name, and what is only looked at with points alone.
+        if not plain or set(one.opts) & {"--output", "--model-crs"}:
             continue
         more = [word for name, value in given.items() if name in known and name not in one.opts
                 for word in (name, value)]  # fmt: skip
@@ -71,3 +71,25 @@ def test_texts_and_files_that_are_none(tiny, tmp_path, command):
         tried += 1
     assert tried >= 8
     assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "flag"),
+    [
+        ("rectify", ("--height", "0", "--dem-vertical", "ellipsoid"), "--dem-vertical"),
+        ("rectify", ("--height", "0", "--dem-fill", "nearest"), "--dem-fill"),
+        ("fit", ("--dem-vertical", "ellipsoid"), "--dem-vertical"),
+        ("compare", ("--override-dem-vertical",), "--override-dem-vertical"),
+        ("export", ("--dem-fill", "100"), "--dem-fill"),
+        ("rectify", ("--height", "0", "--acquired", "2005-08-03T08:12:31Z"), "--acquired"),
+        ("compare", ("--fit-model", "dlt"), "--fit-model"),
+        ("compare", ("--correction", "shift"), "--correction"),
+    ],
+)
+def test_what_would_have_no_effect_is_refused(tiny, tmp_path, command, words, flag):
+    given = ["--gcps", str(tiny.gcps), "--points-crs", "EPSG:4979", "--points-vertical", "ellipsoid"]
+    out = ["-o", str(tmp_path / "out")] if command in ("rectify", "export") else []
+    error = document([command, str(tiny.image), *given, *out, *words])
+    assert error["field"] == flag
+    assert error["remedy"]
+    assert not (tmp_path / "out").exists()
