@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from ortho_pipeline import commands
 from ortho_pipeline.batch import plan as batch_plan
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange.rpc import fit_rpc
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
@@ -139,3 +141,25 @@ def test_an_rpc_at_an_edge_is_the_model_or_says_that_it_is_none(tmp_path, place)
         return
     # What it says of itself is what is measured at points of its own; 0.05 px is beside what any control resolves.
     assert np.abs(found.rpc.ground_to_image(ground) - image).max() <= max(0.05, 1.5 * found.max_error_px)
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="a file whose every read fails (EIO) is Linux's")
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("info", "BAD"),
+        ("info", "IMAGE", "--rpc", "BAD"),
+        ("info", "IMAGE", "--model", "BAD"),
+        ("fit", "IMAGE", "--gcps", "BAD"),
+        ("rectify", "IMAGE", "--dem", "BAD", "-o", "OUT"),
+        ("run", "BAD"),
+        ("report", "BAD", "--plots", "OUT"),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_named(tmp_path, words):
+    places = {"BAD": "/proc/self/mem", "IMAGE": str(SAMPLE / "scene.tif"), "OUT": str(tmp_path / "out")}
+    ended = CliRunner().invoke(cli, [places.get(word, word) for word in words])
+    assert ended.exit_code == 2, ended.output
+    assert "/proc/self/mem" in ended.output
+    assert "Remedy" in ended.output
+    assert not (tmp_path / "out").exists()
