@@ -229,7 +229,7 @@ def _tiff(data: bytes, draw: random.Random) -> bytes:
     elif action == 1:
         struct.pack_into("<H", found, at + 2, draw.choice((0, 1, 2, 3, 4, 5, 7, 12, 13, 255, 65535)))
     elif action == 2:
-        struct.pack_into("<I", found, at + 4, draw.choice((0, 1, length + 1, 2**31 - 1, 2**32 - 1)))
+        struct.pack_into("<I", found, at + 4, draw.choice((0, 1, min(length + 1, 2**32 - 1), 2**31 - 1, 2**32 - 1)))
     else:
         struct.pack_into("<I", found, at + 8, draw.choice((0, 1, 7, 65535, 2**31 - 1, 2**32 - 1, len(data) - 1)))
     return bytes(found)
