@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
-from html import escape
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import counted
 
 #: In a notebook, pages of reports are this high (CSS pixels).
@@ -15,19 +15,8 @@ _PAGE_HEIGHT = 640
 _LISTED = 20
 
 
-def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table with a title; the first column is text, the others are numbers."""
-
-    def line(kind: str, texts: Sequence[str]) -> str:
-        sides = ["left"] + ["right;font-variant-numeric:tabular-nums"] * (len(texts) - 1)
-        cells = (
-            f'<{kind} style="text-align:{side}">{escape(text)}</{kind}>'
-            for side, text in zip(sides, texts, strict=True)
-        )
-        return f"<tr>{''.join(cells)}</tr>"
-
-    body = "".join(line("td", row) for row in rows)
-    return f"<p><b>{escape(title)}</b></p><table><thead>{line('th', head)}</thead><tbody>{body}</tbody></table>"
+def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> dict[str, Any]:
+    return {"title": title, "head": head, "rows": rows}
 
 
 def fit_html(document: Mapping[str, Any]) -> str:
@@ -38,14 +27,12 @@ def fit_html(document: Mapping[str, Any]) -> str:
         for role, found in document["rmse"].items()
         if role in names and found
     ]
-    parts = [table(f"{document['model']}: RMSE, pixels", ("", "points", "column", "row", "both"), rmse)]
+    tables = [_table(f"{document['model']}: RMSE, pixels", ("", "points", "column", "row", "both"), rmse)]
     values = [(name, f"{one['value']:.6g}", f"{one['sigma']:.2g}") for name, one in document["parameters"].items()]
     if values:
-        parts.append(table("Parameters", ("", "value", "sigma"), values))
+        tables.append(_table("Parameters", ("", "value", "sigma"), values))
     said = [f"left out: point {one['id']} ({one['reason']})" for one in document["rejected"]] + document["warnings"]
-    if said:
-        parts.append("<ul>" + "".join(f"<li>{escape(text)}</li>" for text in said) + "</ul>")
-    return "".join(parts)
+    return render("display/notebook.html.j2", tables=tables, notes=said)
 
 
 def block_html(document: Mapping[str, Any]) -> str:
@@ -55,7 +42,7 @@ def block_html(document: Mapping[str, Any]) -> str:
         for role, found in document["object_rms"].items()
         if found
     ]
-    parts = [table("Known minus adjusted ground: RMSE, metres", ("", "points", "east", "north", "height"), ground)]
+    tables = [_table("Known minus adjusted ground: RMSE, metres", ("", "points", "east", "north", "height"), ground)]
     images = [
         (f"{name}, {role} points", str(found["n"]), *(f"{found[axis]:.3f}" for axis in ("col", "row", "total")))
         for name, image in list(document["images"].items())[:_LISTED]
@@ -63,14 +50,13 @@ def block_html(document: Mapping[str, Any]) -> str:
         if found
     ]
     what = "Known ground in the images" if ground else "Rays at the adjusted ground"
-    parts.append(table(f"{what}: RMSE, pixels", ("", "points", "column", "row", "both"), images))
+    tables.append(_table(f"{what}: RMSE, pixels", ("", "points", "column", "row", "both"), images))
     rejected = document["rejected"]
     said = [document["gauge"], *document["warnings"]]
     said += [f"left out: point {one['point']} ({one['reason']})" for one in rejected[:_LISTED]]
     if len(rejected) > _LISTED:
         said.append(f"and {counted(len(rejected) - _LISTED, 'more gross error')}")
-    parts.append("<ul>" + "".join(f"<li>{escape(text)}</li>" for text in said) + "</ul>")
-    return "".join(parts)
+    return render("display/notebook.html.j2", tables=tables, notes=said)
 
 
 def page_html(page: str) -> str:
@@ -84,4 +70,6 @@ def page_html(page: str) -> str:
 
 def text_html(text: str) -> str:
     """Return plain text as HTML that keeps its lines."""
-    return f"<pre>{escape(text)}</pre>"
+    from markupsafe import Markup
+
+    return str(Markup("<pre>{}</pre>").format(text))

@@ -12,8 +12,8 @@ from ortho_pipeline.block.adjustment import BlockFit
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import fixed, flat, metres, px
+from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import counted
-from ortho_pipeline.report.document import page_environment
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS
 
 if TYPE_CHECKING:
@@ -170,27 +170,23 @@ def page(document: Mapping[str, Any]) -> str:
         label: merged([found["rms"]["residuals"][role] for role in ("control", "check", "tie")])
         for label, found in adjustment["images"].items()
     }
-    html: str = (
-        page_environment()
-        .get_template("block.html.j2")
-        .render(
-            document=document,
-            adjustment=adjustment,
-            head=document["headline"],
-            ground_sigmas=variance_lines(adjustment["variances"]),
-            warnings=document["warnings"],
-            residuals=residuals,
-            roles={role: sum(p["role"] == role for p in adjustment["points"]) for role in ("control", "check", "tie")},
-            points=sorted(adjustment["points"], key=lambda p: ("control", "check", "tie").index(p["role"]))[:_LISTED],
-            figures=figures,
-            plan=None if plan is None else plan.svg(),
-            plot_style=style_sheet(),
-            provenance=list(flat({k: v for k, v in document["provenance"].items() if k != "inputs"})),
-            inputs=document["provenance"].get("inputs") or [],
-            fixed=fixed,
-        )
+    return render(
+        "report/block.html.j2",
+        document=document,
+        adjustment=adjustment,
+        head=document["headline"],
+        ground_sigmas=variance_lines(adjustment["variances"]),
+        warnings=document["warnings"],
+        residuals=residuals,
+        roles={role: sum(p["role"] == role for p in adjustment["points"]) for role in ("control", "check", "tie")},
+        points=sorted(adjustment["points"], key=lambda p: ("control", "check", "tie").index(p["role"]))[:_LISTED],
+        figures=figures,
+        plan=None if plan is None else plan.svg(),
+        plot_style=style_sheet(),
+        provenance=list(flat({k: v for k, v in document["provenance"].items() if k != "inputs"})),
+        inputs=document["provenance"].get("inputs") or [],
+        fixed=fixed,
     )
-    return html
 
 
 def plot_rays(document: Mapping[str, Any], label: str) -> Drawing | None:

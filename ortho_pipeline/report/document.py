@@ -8,7 +8,6 @@ the assumption that the DEM is right there.
 from __future__ import annotations
 
 import base64
-import functools
 import json
 import math
 from collections.abc import Iterable, Mapping
@@ -22,7 +21,8 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.display.drawing import round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, texts_but, to_document
-from ortho_pipeline.display.numbers import fixed, flat, metres, plain_size, px, share, short, signed
+from ortho_pipeline.display.numbers import flat, metres
+from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.estimation.fit import Fit, root_mean_square
 from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rmse_metres, viewing
@@ -243,7 +243,6 @@ def residuals_style(report: Mapping[str, Any]) -> str:
 
     QGIS takes it by itself, as it has the name of the GeoJSON file with the ending ``.qml``.
     """
-    template = page_environment().get_template("residuals.qml.j2")
     # Points that were left out have no arrow: a gross error would shrink those of all others to dots.
     lengths = [
         math.hypot(*point["residual_m"])
@@ -254,7 +253,8 @@ def residuals_style(report: Mapping[str, Any]) -> str:
     extent = max(report["scene"]["size"]) * (max(ground) if ground else 1.0)
     longest = max(lengths, default=0.0)
     # The longest arrow spans about a twelfth of the scene.
-    return str(template.render(exaggeration=round_down(extent / 12 / longest) if longest > 0 else 1.0))
+    exaggeration = round_down(extent / 12 / longest) if longest > 0 else 1.0
+    return render("report/residuals.qml.j2", exaggeration=exaggeration)
 
 
 # -- showing ---------------------------------------------------------------------------------------------------------
@@ -322,45 +322,24 @@ def write_report_html(
         The orthoimage, of which a preview is made, or the PNG of a preview.
     """
     png = ortho if isinstance(ortho, bytes) or ortho is None else preview_png(ortho)
-    page = (
-        page_environment()
-        .get_template("report.html.j2")
-        .render(
-            report=report,
-            adjustment=report["adjustment"],
-            head=report["headline"],
-            # The headline's notes have said these already.
-            warnings=texts_but(report, "no-redundancy", "few-check-points"),
-            rejected={entry["id"]: entry["reason"] for entry in report["adjustment"]["rejected"]},
-            outlying={entry["id"]: entry["reason"] for entry in report["adjustment"]["outlying"]},
-            has_loo=any(point["loo_residual"] for point in report["adjustment"]["points"]),
-            provenance=list(flat({**report["scene"]["facts"], **_brief(report["provenance"])})),
-            inputs=report["provenance"].get("inputs") or [],
-            plots={name: drawing.svg() for name, drawing in plots(report).items()},
-            plotted_role=analysed_role(report),
-            plot_style=style_sheet(),
-            preview=base64.b64encode(png).decode() if png else None,
-        )
+    page = render(
+        "report/report.html.j2",
+        report=report,
+        adjustment=report["adjustment"],
+        head=report["headline"],
+        # The headline's notes have said these already.
+        warnings=texts_but(report, "no-redundancy", "few-check-points"),
+        rejected={entry["id"]: entry["reason"] for entry in report["adjustment"]["rejected"]},
+        outlying={entry["id"]: entry["reason"] for entry in report["adjustment"]["outlying"]},
+        has_loo=any(point["loo_residual"] for point in report["adjustment"]["points"]),
+        provenance=list(flat({**report["scene"]["facts"], **_brief(report["provenance"])})),
+        inputs=report["provenance"].get("inputs") or [],
+        plots={name: drawing.svg() for name, drawing in plots(report).items()},
+        plotted_role=analysed_role(report),
+        plot_style=style_sheet(),
+        preview=base64.b64encode(png).decode() if png else None,
     )
     write_text(path, page)
-
-
-@functools.cache
-def page_environment() -> Any:
-    """Return the templates of pages, with the filters that write numbers as people read them."""
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("ortho_pipeline.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {
-        "px": px, "m": metres, "signed": signed, "share": share, "fixed": fixed, "number": short, "plain": plain_size,
-    }  # fmt: skip
-    return environment
 
 
 def _brief(provenance: Mapping[str, Any]) -> dict[str, Any]:

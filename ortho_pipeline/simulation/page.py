@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, round_down, style_sheet
+from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import counted
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.simulation.tables import VERDICTS, is_covered, is_missed
@@ -142,15 +143,9 @@ def page(
     reasons : sequence of Reason
         Tried in order; the rest is said to be unexplained.
     """
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("ortho_pipeline.report"), autoescape=True, undefined=jinja2.StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters["number"] = _number
     curves = [Figure(draw_curve(curve), curve["title"]) for curve in document["curves"]]
-    return environment.get_template("reproduction.html.j2").render(
+    return render(
+        "simulation/reproduction.html.j2",
         document=document,
         heading=heading,
         verdict=verdict(document),
@@ -163,6 +158,7 @@ def page(
         knob_text=knob_text,
         sources=_SOURCES,
         capital=_capital,
+        number=_number,
     )
 
 
