@@ -132,6 +132,8 @@ def test_heavy_libraries_stay_where_they_belong(path: Path) -> None:
             assert name in GDAL_MODULES, f"{name} imports GDAL"
         if library == "numba":
             assert name in NUMBA_MODULES, f"{name} imports numba"
+        if library == "jinja2":
+            assert name == "display.pages", f"{name} imports jinja2: pages are rendered by display/pages.py"
         if library == "matplotlib":
             assert name in MATPLOTLIB_MODULES, f"{name} imports matplotlib"
             assert not at_top, f"{name}: matplotlib only inside functions"
