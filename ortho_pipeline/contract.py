@@ -51,7 +51,7 @@ def sensor_faults(sensor: object) -> Iterator[str]:
         yield f"ortho_sensors returned {type(sensor).__name__} instead of Sensor"
         return
     if not isinstance(sensor.name, str) or not sensor.name or sensor.name != sensor.name.strip():
-        yield f"{sensor.name!r} is no name of a sensor"
+        yield f"{sensor.name!r} is not a name of a sensor"
     said = f"sensor {sensor.name!r}"
     if not callable(sensor.recognises) or not callable(sensor.open_scene):
         yield f"{said}: recognises and open_scene must be callable"

@@ -236,7 +236,9 @@ class Host:
             raise PluginError(f"{self._name(chosen)} failed to open it ({text})", file=path) from error
         if fault and _normalised(self.provenance(chosen.name).distribution) == BUNDLED:
             # The plugins that come along keep the contract with sound files: it is the file that is damaged.
-            raise InputError(f"this is no possible {fault}", file=scene.model_source, field="model", remedy=_COPY_AGAIN)
+            raise InputError(
+                f"this is not a possible {fault}", file=scene.model_source, field="model", remedy=_COPY_AGAIN
+            )
         if fault:
             raise PluginError(f"{self._name(chosen)}: {fault}", file=path, field="scene", remedy=_TEST_IT)
         log.info("%s: sensor %s, models %s from %s", path, chosen.name, ", ".join(scene.models), scene.model_source)

@@ -101,7 +101,7 @@ def bare_counts(source: str) -> list[str]:
                 rf" (?:(?:control|check|tie|more|finite|gross) ){{0,2}}({'|'.join(NOUNS)})\b", str(text.value)
             )
             name = ast.unparse(value.value)
-            # Of a constant it is known that it is not one; words are no numbers.
+            # Of a constant it is known that it is not one; words are not numbers.
             if (
                 noun
                 and not name.lstrip("_").isupper()

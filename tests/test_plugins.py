@@ -190,7 +190,7 @@ def test_hook_without_marker_or_with_other_arguments_is_an_error():
     ("offered", "message"),
     [
         (["alpha"], "returned str instead of Sensor"),
-        ([make_sensor(name=" a ")], "no name"),
+        ([make_sensor(name=" a ")], "not a name"),
         ([make_sensor(recognises=None)], "must be callable"),
         ([make_sensor(options={"band": 3})], "options"),
     ],

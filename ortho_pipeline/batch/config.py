@@ -1,7 +1,7 @@
 """The file of `ortho run`: what it may hold, and how it is read.
 
 The groups ``scene``, ``points``, ``surface`` and ``output`` are made from `options`, field by field; the budget of the
-machine (memory, threads, workers) is no part of the file, because no result depends on it.
+machine (memory, threads, workers) is not a part of the file, because no result depends on it.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ def _parse(content: bytes, path: str | os.PathLike[str]) -> tuple[Any, dict[Plac
         # A pattern such as */a.tif without quotes is an alias to YAML.
         remedy = "put quotes around text that begins with *" if "alphabetic" in problem else _SEE
         field = None if mark is None else f"line {mark.line + 1}"
-        raise InputError(f"this is no YAML ({problem})", file=path, field=field, remedy=remedy) from error
+        raise InputError(f"this is not YAML ({problem})", file=path, field=field, remedy=remedy) from error
     if node is None:
         raise InputError("the file is empty", file=path, remedy=_SEE)
     reader = _Reader(path)
@@ -279,7 +279,7 @@ class _Reader:
                 return int(text)
             return float(text.replace(".inf", "inf").replace(".nan", "nan")) if kind == "float" else text
         except ValueError as error:
-            raise self._error(node, place, f"{text[:20]!r} is no number ({kind})", "correct it") from error
+            raise self._error(node, place, f"{text[:20]!r} is not a number ({kind})", "correct it") from error
 
     def _error(self, node: Any, place: Place, message: str, remedy: str) -> InputError:
         field = f"line {node.start_mark.line + 1}" + (f", {dotted(place)}" if place else "")

@@ -251,7 +251,7 @@ class _Planner:
     def _inside(self, text: str, field: str) -> Path:
         """Return an absolute path, which has to lie in the root wherever its links lead."""
         if "\0" in text or "://" in text or text.startswith("/vsi"):
-            raise InputError(f"{text!r} is no path of a file", file=self.path, field=field, remedy="give a file")
+            raise InputError(f"{text!r} is not a path of a file", file=self.path, field=field, remedy="give a file")
         path = Path(os.path.abspath(self.base / text))
         try:
             resolved = path.resolve()
@@ -259,7 +259,7 @@ class _Planner:
         except (OSError, RuntimeError, ValueError) as error:
             # Names longer than the file system's, links in a circle, surrogates.
             reason = getattr(error, "strerror", None) or error
-            raise InputError(f"{text[:60]!r} is no path of a file ({reason})", file=self.path, field=field,
+            raise InputError(f"{text[:60]!r} is not a path of a file ({reason})", file=self.path, field=field,
                              remedy="check the name, and the links on its way") from error  # fmt: skip
         if not resolved.is_relative_to(self.root):
             raise InputError(
@@ -303,7 +303,7 @@ class _Planner:
         bad = not name or name.startswith(".") or name != name.strip() or len(os.fsencode(name)) > _NAME_BYTES
         if bad or any(letter in "/\\:\0" or not letter.isprintable() for letter in name):
             raise InputError(
-                f"{name!r} is no name of a folder (for {image.name})", file=self.path, field=f"{where}.name",
+                f"{name!r} is not a name of a folder (for {image.name})", file=self.path, field=f"{where}.name",
                 remedy="letters, digits, blanks, dashes; not first a dot",
             )  # fmt: skip
         return name

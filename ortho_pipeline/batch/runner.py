@@ -30,9 +30,9 @@ from ortho_pipeline.warp import mosaic
 
 SCHEMA_VERSION = 1
 EXECUTORS = ("sequential", "processes", "dask")
-#: Larger files beside an image are no metadata.
+#: Larger files beside an image are not metadata.
 _COMPANION_BYTES = 5_000_000
-#: A larger file is no report on a mosaic.
+#: A larger file is not a report on a mosaic.
 _REPORT_BYTES = 50_000_000
 #: Seams from which on they are measured by several processes.
 _MANY_SEAMS = 64
@@ -438,7 +438,7 @@ class _Mosaic:
     def make(self, crew: Executor | Processes) -> dict[str, Any]:
         record = Record.read(self.record)
         if record is not None and record.key == self.key and record.intact(self.output):
-            # A record may lie: what it vouches for is read as any other file, and made again if it is no report.
+            # A record may lie: what it vouches for is read as any other file, and made again if it is not a report.
             with contextlib.suppress(InputError):
                 document = read_json(self.report, _REPORT_BYTES, "run again")
                 if isinstance(document, dict):

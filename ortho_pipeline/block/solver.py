@@ -44,7 +44,7 @@ _STEPS = 50
 
 @dataclass(frozen=True)
 class Pseudo:
-    """An observation of one parameter (column) by itself; `held`: it defines the datum, and is no knowledge."""
+    """An observation of one parameter (column) by itself; `held`: it defines the datum, and is not knowledge."""
 
     column: int
     mean: float
@@ -455,7 +455,7 @@ class BlockProblem:
     def unit_weight(self, solved: Solved) -> tuple[float | None, float]:
         """Return the standard error of unit weight (None without redundancy), and the degrees of freedom.
 
-        What holds the datum, or is fictitious, is no observation; the parameters that it decides are none, either.
+        What holds the datum, or is fictitious, is not an observation; the parameters that it decides are none, either.
         """
         linear, layout = solved.linear, solved.linear.layout
         true = linear.pseudo_true
@@ -561,7 +561,7 @@ class BlockProblem:
                 after = self._square(ahead, layout, selection)
             except InputError:  # a correction that cannot be inverted
                 after = math.nan
-            # Coordinates are rounded to a billionth of a metre: what is added to a square by that is no ascent.
+            # Coordinates are rounded to a billionth of a metre: what is added to a square by that is not an ascent.
             if math.isfinite(after) and after <= square * (1 + 1e-8):
                 return ahead, after, move
         return None, square, whole

@@ -33,7 +33,7 @@ class _Shard(click.ParamType):
             return value
         match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", value)
         if not match or not 1 <= int(match[1]) <= int(match[2]):
-            self.fail(f"{value!r} is no part such as 1/4", param, ctx)
+            self.fail(f"{value!r} is not a part such as 1/4", param, ctx)
         return int(match[1]), int(match[2])
 
 

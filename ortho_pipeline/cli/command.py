@@ -126,7 +126,7 @@ class Megabytes(click.ParamType):
 
 
 def _checked(ctx: click.Context, args: Sequence[str], params: Sequence[click.Parameter]) -> list[str]:
-    """Return the words with pairs of numbers joined; a word with one dash that is no option is an error."""
+    """Return the words with pairs of numbers joined; a word with one dash that is not an option is an error."""
     known = {name: one for one in params if isinstance(one, click.Option) for name in (*one.opts, *one.secondary_opts)}
     words: list[str] = []
     rest = list(args)

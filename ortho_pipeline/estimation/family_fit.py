@@ -150,7 +150,7 @@ def ridge_of(text: str) -> float | str | None:
         weight = math.nan
     if not (math.isfinite(weight) and weight > 0):
         raise InputError(
-            f"{text!r} is no regularisation", field="points.ridge",
+            f"{text!r} is not a regularisation", field="points.ridge",
             remedy=f"auto, none, {', '.join(METHODS)}, or a positive weight such as 1e-5",
         )  # fmt: skip
     return weight

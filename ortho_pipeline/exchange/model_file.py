@@ -93,14 +93,14 @@ def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
     Raises
     ------
     InputError
-        If it is no model file, of a later schema, its model does not fit its kind, or maps no ground.
+        If it is not a model file, of a later schema, its model does not fit its kind, or maps no ground.
     """
     found = read_json(path, _MAX_BYTES, _REMEDY)
     document: dict[str, Any] = found if isinstance(found, dict) else {}
     version = document.get("schema_version")
     if document.get("document") != DOCUMENT or not isinstance(document.get("model"), dict):
         raise InputError(
-            "this is no model file of ortho-pipeline",
+            "this is not a model file of ortho-pipeline",
             file=path,
             remedy="give a <stem>_model.json; RPC files go to `scene.rpc`",
         )
@@ -115,7 +115,9 @@ def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
     if size is not None and not (
         isinstance(size, list) and len(size) == 2 and all(isinstance(n, int) and n > 0 for n in size)
     ):
-        raise InputError(f"{size!r} is no image size", file=path, field="size", remedy="two positive integers, or null")
+        raise InputError(
+            f"{size!r} is not an image size", file=path, field="size", remedy="two positive integers, or null"
+        )
     try:
         model = model_from_dict(document["model"])
         require_view(model)

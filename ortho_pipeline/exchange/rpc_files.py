@@ -165,7 +165,7 @@ def _number(text: str | None, file: str | PathLike[str] | None, field: str) -> f
         raise InputError("this field of the RPC is missing", file=file, field=field)
     token = text.split(maxsplit=1)[0][:60]
     if not _NUMBER.fullmatch(token):
-        raise InputError(f"{token!r} is no number", file=file, field=field)
+        raise InputError(f"{token!r} is not a number", file=file, field=field)
     value = float(token.replace("D", "e").replace("d", "e"))
     if not math.isfinite(value):
         raise InputError(f"{token} is too large for a number", file=file, field=field)
@@ -173,7 +173,7 @@ def _number(text: str | None, file: str | PathLike[str] | None, field: str) -> f
 
 
 def _error(text: str | None, file: str | PathLike[str] | None, field: str) -> float | None:
-    # Negative is how GDAL and the TIFF tag say "unknown"; it is no reason to refuse a model.
+    # Negative is how GDAL and the TIFF tag say "unknown"; it is not a reason to refuse a model.
     if text is None or not text.strip() or text.split()[0].lower().lstrip("+-") == "nan":
         return None
     value = _number(text, file, field)
@@ -254,7 +254,7 @@ def _fields_of_xml(text: str, path: str | PathLike[str]) -> tuple[dict[str, str]
         # As bytes: the declaration may name another encoding than the text has by now.
         root = ElementTree.fromstring(re.sub(r"^\s*<\?xml[^>]{0,300}\?>", "", text, count=1), forbid_dtd=True)
     except (ElementTree.ParseError, DefusedXmlException, ValueError) as error:
-        raise InputError(f"this is no well-formed XML ({error})", file=path) from error
+        raise InputError(f"this is not well-formed XML ({error})", file=path) from error
     parts: dict[str, list] = {}
     for element in root.iter():
         tag = element.tag.rpartition("}")[2] if isinstance(element.tag, str) else ""

@@ -23,7 +23,7 @@ SCHEMES = {"http": "/vsicurl/http://", "https": "/vsicurl/https://", "s3": "/vsi
 _ARCHIVES = ("/vsizip", "/vsitar", "/vsigzip", "/vsi7z", "/vsirar")
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
 _SHOWN = 5
-#: No more is read at once of a file in an archive or behind a URL: a zip of 1 kB may hold milliards of zeros.
+#: No more is read at once of a file in an archive or behind a URL: a zip of 1 kB may hold billions of zeros.
 MAX_READ = 5_000_000
 #: No delivery has more files in a folder; a store behind a URL may.
 MAX_LISTED = 10_000

@@ -66,7 +66,7 @@ def parse_json(data: str | bytes, file: object, remedy: str, *, unique: bool = F
     Raises
     ------
     InputError
-        Names the line, for what is no JSON in UTF-8, ``NaN``, ``Infinity`` and numbers beyond those of a computer.
+        Names the line, for what is not JSON in UTF-8, ``NaN``, ``Infinity`` and numbers beyond those of a computer.
     """
     try:
         text = data.decode("utf-8-sig") if isinstance(data, bytes) else data
@@ -77,7 +77,7 @@ def parse_json(data: str | bytes, file: object, remedy: str, *, unique: bool = F
     except (ValueError, RecursionError) as error:
         line = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else None
         reason = str(error)[:120]
-        raise InputError(f"this is no JSON ({reason})", file=str(file), field=line, remedy=remedy) from error
+        raise InputError(f"this is not JSON ({reason})", file=str(file), field=line, remedy=remedy) from error
 
 
 def read_json(path: str | os.PathLike[str], limit: int, remedy: str, *, unique: bool = False) -> Any:
@@ -96,7 +96,7 @@ def _finite(text: str) -> float:
 
 
 def _whole(text: str) -> int:
-    # Longer ones are no numbers of anything here, and overflow where they become floats.
+    # Longer ones are not numbers of anything here, and overflow where they become floats.
     if len(text) > _DIGITS:
         raise ValueError(f"{text[:20]}... is too large for a number")
     return int(text)

@@ -43,7 +43,7 @@ _FAR = 1.5
 _NEAR, _FLATTEST = 0.4, 0.4
 #: Sectors beyond this many robust standard deviations, and this distance (px), see something else.
 _REJECT_SIGMAS, _REJECT_FLOOR = 3.5, 0.1
-#: An edge that is off its ellipse by more (px, root mean square) is no ellipse.
+#: An edge that is off its ellipse by more (px, root mean square) is not an ellipse.
 _ROUND = 0.25
 #: Gaussian blur (px) of the edge to start with.
 _START_BLUR = 0.6
@@ -441,7 +441,7 @@ def _settled(pixels: Array, shape: _Shape, sign: int, *, rounds: int) -> _Settle
 
 
 def _checked(settled: _Settled, rough: tuple[float, float], radius: float) -> Ellipse:
-    """Return the result, or refuse what is no ellipse."""
+    """Return the result, or refuse what is not an ellipse."""
     shape, sectors, used = settled.shape, settled.sectors, settled.used
     arc = np.hypot(shape.a * np.sin(sectors.t), shape.b * np.cos(sectors.t))
     seen = float(arc[used].sum() / arc.sum())

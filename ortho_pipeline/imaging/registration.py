@@ -72,7 +72,7 @@ class Transform:
             If there is no such transformation, or there are too few points for it.
         """
         if kind not in TRANSFORMS:
-            raise InputError(f"{kind!r} is no transformation", field="transform", remedy=", ".join(TRANSFORMS))
+            raise InputError(f"{kind!r} is not a transformation", field="transform", remedy=", ".join(TRANSFORMS))
         source, target = as_image(reference), as_image(moving)
         if 2 * len(source) < TRANSFORMS[kind]:
             raise TooFewPoints(

@@ -126,7 +126,7 @@ def parse_edge(given: str) -> Segment:
         x1 = y1 = x2 = y2 = math.nan
     if not all(map(math.isfinite, (x1, y1, x2, y2))):
         raise InputError(
-            f"{given!r} is no edge", field="edge", remedy="give columns and rows of both ends, as 120.5,30,140,95"
+            f"{given!r} is not an edge", field="edge", remedy="give columns and rows of both ends, as 120.5,30,140,95"
         )
     return (x1, y1), (x2, y2)
 

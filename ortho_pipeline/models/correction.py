@@ -51,7 +51,7 @@ class ImageCorrection(SensorModel):
     coefficients : (6,)
         In the order of `COEFFICIENTS`; shifts in pixels, the others in pixels per pixel.
     removed : tuple of str
-        Coefficients that are no parameters although the correction has them: found unjustified, and zero.
+        Coefficients that are not parameters although the correction has them: found unjustified, and zero.
     """
 
     kind: ClassVar[str] = "image_correction"

@@ -171,7 +171,7 @@ class MapPlane(SensorModel):
     def ground_to_image(self, ground: ArrayLike) -> Array:
         ground = as_ground(ground)
         at = ground[:, :2] + np.outer(ground[:, 2] - self.plane, self.relief) + self.shift
-        # A height that is no number would leave the other axis alone where the relief is zero.
+        # A height that is not a number would leave the other axis alone where the relief is zero.
         at[~np.isfinite(ground).all(axis=1)] = np.nan
         return (at - self.corner) / self._steps
 
@@ -227,5 +227,5 @@ def _check_map(text: str) -> None:
     crs = parse_crs(text)
     if not crs.is_projected or any(abs(axis.unit_conversion_factor - 1.0) > 1e-12 for axis in crs.axis_info[:2]):
         raise InputError(
-            f"{crs.name!r} is no map projection in metres", field="map_crs", remedy="for example a UTM zone"
+            f"{crs.name!r} is not a map projection in metres", field="map_crs", remedy="for example a UTM zone"
         )

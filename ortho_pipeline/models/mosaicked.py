@@ -76,7 +76,7 @@ class Pieces(SensorModel):
 
     def ground_partials(self, ground: ArrayLike) -> Array:
         ground = as_ground(ground)
-        # Of the piece that each point belongs to: differences across a seam are no slope.
+        # Of the piece that each point belongs to: differences across a seam are not a slope.
         owner = self._seen(ground)[1]
         partials = np.full((len(ground), 2, 3), np.nan)
         for k, model in enumerate(self.models):
@@ -91,7 +91,7 @@ class Pieces(SensorModel):
         for k, (model, offset, size) in enumerate(zip(self.models, self.offsets, self.sizes, strict=True)):
             seen = model.ground_to_image(ground)
             outside = np.maximum(-seen, seen - size).max(axis=1, initial=0.0)
-            better = outside < nearest  # NaN is no number, and not less than any
+            better = outside < nearest  # NaN is not a number, and not less than any
             image[better] = seen[better] + offset
             nearest[better], owner[better] = outside[better], k
         return image, owner

@@ -25,7 +25,7 @@ def model_crs(text: str, points: Points) -> str:
     Raises
     ------
     CrsError
-        If the text is no CRS.
+        If the text is not a CRS.
     """
     name = text.strip().lower()
     if name in (GEOCENTRIC, "epsg:4978"):

@@ -55,7 +55,7 @@ _LARGEST = {
     "lon_off": 540.0, "lat_off": 90.0, "h_off": 1e5, "col_off": 1e9, "row_off": 1e9,
     "lon_scale": 180.0, "lat_scale": 90.0, "h_scale": 1e5, "col_scale": 1e9, "row_scale": 1e9,
 }  # fmt: skip
-#: Sides of a pixel on the ground (m): microscopes and whole continents are no scenes.
+#: Sides of a pixel on the ground (m): microscopes and whole continents are not scenes.
 _PIXEL = (1e-3, 1e5)
 _METRES_PER_DEGREE = 111_320.0
 _DAMAGED = "the RPC is damaged or belongs to another image: ask for its file again"

@@ -13,7 +13,7 @@ _REGIONS = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (0.5, 0.5)]
 
 
 def select_control(points: Points, spec: str) -> Points:
-    """Keep some of the control points and make check points of the others; what is no control point stays as it is.
+    """Keep some of the control points and make check points of the others; what is not a control point stays as it is.
 
     Parameters
     ----------

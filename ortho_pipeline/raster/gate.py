@@ -185,7 +185,7 @@ class _Gate:
         first = None if kind is None else _identified(name, None)
         if kind is None or first not in DRIVERS or (kind == "VRT" and isinstance(path, VsiPath)):
             raise InputError(
-                f"{path.name!r} is no raster of an allowed format, and GDAL would open it "
+                f"{path.name!r} is not a raster of an allowed format, and GDAL would open it "
                 f"({first or kind or 'by whatever driver takes it'})",
                 file=by, field=field, remedy="take it away, or make a GeoTIFF of it (gdal_translate)",
             )  # fmt: skip
@@ -225,10 +225,10 @@ class _Gate:
                 self._must_be_inside(side_car, path, other)
                 if _identified(str(side_car), None) not in _PLAIN:
                     raise InputError(
-                        f"the side-car {other!r} is no plain raster", file=path, field=other,
+                        f"the side-car {other!r} is not a plain raster", file=path, field=other,
                         remedy="take it away; gdaladdo makes new overviews",
                     )  # fmt: skip
-                # Overviews of an HFA file in .rrd are read by that driver alone, and are no raster of their own.
+                # Overviews of an HFA file in .rrd are read by that driver alone, and are not rasters of their own.
                 if rest != ".rrd":
                     self._see(side_car, path, other, frozenset())
 
@@ -279,7 +279,7 @@ class _Gate:
             ) from error  # fmt: skip
         if not plain:
             raise InputError(
-                f"{name or path.name!r} is no file", file=by, field=field, remedy="put a file there, or take it away"
+                f"{name or path.name!r} is not a file", file=by, field=field, remedy="put a file there, or take it away"
             )
 
     def _outside(self, name: str, by: Any, field: str, path: Path | None) -> None:
@@ -380,7 +380,7 @@ def _identified(name: str, drivers: Sequence[str] | None) -> str | None:
 def _header(path: Any, limit: int = _MAX_HEADER) -> str:
     """Return a header as C reads it: up to the first NUL."""
     if not path.is_file():
-        raise InputError("this is no file", file=path, remedy="put a file there, or take it away")
+        raise InputError("this is not a file", file=path, remedy="put a file there, or take it away")
     if path.stat().st_size > limit:
         raise InputError(
             "a header of more than 5 MB is not opened", file=path, remedy="make one file of it (gdal_translate)"
@@ -398,7 +398,7 @@ def _xml(path: Any) -> Any:
         return gdal.ParseXMLString(_header(path))
     except (RuntimeError, UnicodeDecodeError) as error:
         raise InputError(
-            f"this is no well-formed XML ({str(error).strip()})", file=path, remedy="copy the file again"
+            f"this is not well-formed XML ({str(error).strip()})", file=path, remedy="copy the file again"
         ) from error
 
 

@@ -219,7 +219,7 @@ class Grid:
         dx, dy = resolution
         if not all(map(math.isfinite, (xmin, ymin, xmax, ymax, dx, dy))) or not (xmin < xmax and ymin < ymax):
             raise InputError(
-                f"{xmin:.12g} {ymin:.12g} {xmax:.12g} {ymax:.12g} is no extent",
+                f"{xmin:.12g} {ymin:.12g} {xmax:.12g} {ymax:.12g} is not an extent",
                 field="extent",
                 remedy="give xmin ymin xmax ymax",
             )

@@ -62,7 +62,7 @@ def to_geojson(outline: BaseGeometry, crs: pyproj.CRS) -> tuple[dict[str, Any], 
     parts = []
     for polygon in _polygons(outline):
         step = max(polygon.bounds[2] - polygon.bounds[0], polygon.bounds[3] - polygon.bounds[1]) / _STEPS
-        # What is within counts as valid: holes of a mask are no part of a footprint.
+        # What is within counts as valid: holes of a mask are not a part of a footprint.
         ring = shapely.get_coordinates(shapely.segmentize(polygon.exterior, step))
         degrees = to_degrees(np.column_stack([ring, np.zeros(len(ring))]))[:, :2]
         parts += _polygons(shapely.make_valid(shapely.Polygon(_unwrapped(degrees))))

@@ -74,7 +74,7 @@ def open_scene(dataset: gdal.Dataset, *, survey: str | None = None, attitude: st
             remedy="give the whole frame and its own survey",
         )
     if attitude not in ("survey", "zero"):
-        raise InputError(f"{attitude!r} is no source of the attitude", field="attitude", remedy="survey or zero")
+        raise InputError(f"{attitude!r} is not a source of the attitude", field="attitude", remedy="survey or zero")
     model = rigorous_model(read, use_attitude=attitude == "survey")
     warnings = []
     known = read.attitude is not None and attitude == "survey"

@@ -102,7 +102,9 @@ def write_survey(survey: Survey, path: str | PathLike[str]) -> None:
 def _fields(path: str | PathLike[str]) -> dict[str, str]:
     lines = _text(path).splitlines()
     if not lines or lines[0].strip() != MARK:
-        raise InputError("this is no imaging survey", file=path, field="line 1", remedy=f"its first line is {MARK!r}")
+        raise InputError(
+            "this is not an imaging survey", file=path, field="line 1", remedy=f"its first line is {MARK!r}"
+        )
     fields: dict[str, str] = {}
     ended = False
     for number, line in enumerate(lines[1:], start=2):
@@ -116,7 +118,7 @@ def _fields(path: str | PathLike[str]) -> dict[str, str]:
             continue
         key, sign, value = (part.strip() for part in plain.partition("="))
         if not sign or (key not in NUMBERS and key not in TEXTS):
-            raise InputError(f"{key[:60]!r} is no key of a survey", file=path, field=f"line {number}")
+            raise InputError(f"{key[:60]!r} is not a key of a survey", file=path, field=f"line {number}")
         if key in fields:
             raise InputError("this key stands twice", file=path, field=key)
         fields[key] = value
@@ -156,7 +158,7 @@ def _check_time(path: str | PathLike[str], text: str) -> None:
         time = None
     if time is None or time.utcoffset() != datetime.timedelta(0):
         raise InputError(
-            f"{text[:60]!r} is no time in UTC", file=path, field="acquired", remedy="2005-08-03T08:12:31.25Z"
+            f"{text[:60]!r} is not a time in UTC", file=path, field="acquired", remedy="2005-08-03T08:12:31.25Z"
         )
 
 
@@ -175,7 +177,7 @@ def _interior(path: str | PathLike[str], numbers: dict[str, tuple[float, ...]]) 
     (columns,), (rows,) = numbers["columns"], numbers["rows"]
     for key, value in (("columns", columns), ("rows", rows)):
         if value != int(value) or not 0 < value < 1e6:
-            raise InputError(f"{value} is no number of pixels", file=path, field=key)
+            raise InputError(f"{value} is not a number of pixels", file=path, field=key)
     for key, value in (("focal_length_mm", focal), ("pixel_pitch_um", pitch)):
         if not 1e-6 < value < 1e6:
             raise InputError(f"{value} is not possible", file=path, field=key)

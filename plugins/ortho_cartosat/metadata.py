@@ -1,6 +1,6 @@
 """The `_MET.TXT` of a CARTOSAT-1 product: ``key = value`` lines (docs/formats/cartosat.md), read with tolerance.
 
-Blanks are irregular, cases vary, ``-NA-`` stands for what is not known, and lines that are no assignment are titles. A
+Blanks are irregular, cases vary, ``-NA-`` stands for what is not known, and lines without an assignment are titles. A
 key is only judged when somebody asks for it: then a value that is none is an error that names file and key.
 """
 
@@ -70,14 +70,14 @@ class Metadata:
         Raises
         ------
         InputError
-            If the value is no number, or not within `low` and `high`.
+            If the value is not a number, or not within `low` and `high`.
         """
         key = next((key for key in keys if self.text(key) is not None), None)
         if key is None:
             return None
         token = str(self.text(key)).split()[0]
         if not _NUMBER.fullmatch(token):
-            raise InputError(f"{token[:60]!r} is no number", file=self.path, field=key, remedy=_REMEDY)
+            raise InputError(f"{token[:60]!r} is not a number", file=self.path, field=key, remedy=_REMEDY)
         value = float(token)
         if not low <= value <= high or not math.isfinite(value):
             raise InputError(f"{token[:60]} is not possible", file=self.path, field=key, remedy=f"{low:g} to {high:g}")
@@ -162,12 +162,12 @@ def read_metadata(path: str | PathLike[str]) -> Metadata:
     Raises
     ------
     InputError
-        If the file cannot be read, is no text, or holds no assignment.
+        If the file cannot be read, is not text, or holds no assignment.
     """
     path = place(path)
     data = read_bounded(path, MAX_BYTES)
     if len(data) > MAX_BYTES or b"\0" in data:
-        raise InputError("this is no metadata: too large, or no text", file=path)
+        raise InputError("this is not metadata: too large, or no text", file=path)
     fields: dict[str, tuple[str, ...]] = {}
     for line in decoded(data).splitlines():
         key, sign, value = (part.strip() for part in line[:2000].partition("="))

@@ -49,7 +49,7 @@ def soft_sigmas(given: Mapping[str, str | None]) -> SoftSigmas:
             value = math.nan
         if value is not None and not (math.isfinite(value) and value > 0):
             raise InputError(
-                f"{text[:40]!r} is no sigma",
+                f"{text[:40]!r} is not a sigma",
                 field=option,
                 remedy=f"give a positive number, or {NONE} for no constraint",
             )

@@ -151,7 +151,7 @@ def _heights(text: str | None, camera: float) -> tuple[float, float]:
         return low, min(9000.0, camera - 0.1 * (camera - low))
     low, high = _pair(text)
     if not low < high:
-        raise InputError(f"{text!r} is no range of heights", field="heights", remedy="give low,high in metres")
+        raise InputError(f"{text!r} is not a range of heights", field="heights", remedy="give low,high in metres")
     return low, high
 
 
@@ -160,7 +160,7 @@ def _priors(model: FrameCamera, sigmas: str | None) -> dict[str, Prior]:
         return {}
     metres, degrees = _pair(sigmas)
     if not (metres > 0 and degrees > 0):
-        raise InputError(f"{sigmas!r} are no standard deviations", field="sigmas", remedy="give metres,degrees")
+        raise InputError(f"{sigmas!r} are not standard deviations", field="sigmas", remedy="give metres,degrees")
     return priors_at(model, exterior_sigmas(metres, math.radians(degrees)))
 
 

@@ -76,7 +76,7 @@ def read_camera(path: str | PathLike[str], width: int, height: int, name: str | 
     Raises
     ------
     InputError
-        If the file is no camera, a field is missing, unknown or wrong, or the proportions differ.
+        If the file is not a camera, a field is missing, unknown or wrong, or the proportions differ.
     """
     document = _json(path)
     given = _opensfm(path, document, name) if _is_opensfm(document) else _own(path, document)
@@ -281,7 +281,7 @@ def _table(path: str | PathLike[str]) -> tuple[list[str], list[tuple[int, list[s
         try:
             cells = next(csv.reader([line.strip()], delimiter=delimiter, quotechar=quote, skipinitialspace=True))
         except (csv.Error, StopIteration) as error:
-            raise InputError(f"this is no row ({error})", file=path, field=f"line {number}") from error
+            raise InputError(f"this is not a row ({error})", file=path, field=f"line {number}") from error
         rows.append((number, [cell.strip() for cell in cells]))
     return [cell.lower() for cell in rows[0][1]], rows[1:]
 
@@ -313,7 +313,7 @@ def _text(path: str | PathLike[str]) -> str:
     try:
         text = data.decode("utf-8-sig")
     except ValueError as error:
-        raise InputError("this is no text in UTF-8", file=path) from error
+        raise InputError("this is not text in UTF-8", file=path) from error
     if "\0" in text:
-        raise InputError("this is no text", file=path)
+        raise InputError("this is not text", file=path)
     return text

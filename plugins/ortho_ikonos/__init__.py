@@ -86,7 +86,7 @@ def open_scene(
     image = ImageFile.of(path)
     if image is None and (metadata is None or bands != "one"):
         raise InputError(
-            "this is no name of an image of an order", file=path, field="metadata",
+            "this is not a name of an image of an order", file=path, field="metadata",
             remedy="name it po_<order>_<band>_<component of 7 digits>.tif, or give the option metadata=FILE",
         )  # fmt: skip
     delivery = read_metadata(metadata or (image.metadata if image else ""))
@@ -163,7 +163,7 @@ def _heights(text: str | None, position: Position, vendor: RPC | None) -> tuple[
         except ValueError:
             low = high = math.nan
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            raise InputError(f"{text!r} is no range of heights", field="heights", remedy="give low,high in metres")
+            raise InputError(f"{text!r} is not a range of heights", field="heights", remedy="give low,high in metres")
     else:
         low, high = vendor.height_range if vendor else (plane - HALF_RANGE, plane + HALF_RANGE)
     return min(low, plane), max(high, plane)
@@ -174,7 +174,7 @@ def _first(
 ) -> str:
     """Return the name of the model to start from."""
     if geometry not in (None, "rpc", "geo"):
-        raise InputError(f"{geometry!r} is no geometry", field="geometry", remedy="rpc or geo")
+        raise InputError(f"{geometry!r} is not a geometry", field="geometry", remedy="rpc or geo")
     first = geometry or next(iter(models), "geo")
     if first == "rpc" and "rpc" not in models:
         raise InputError("there is no RPC", file=file, field="geometry", remedy="give it with `scene.rpc`, or take geo")

@@ -76,7 +76,7 @@ class Record:
         Raises
         ------
         InputError
-            If it is no number, has another unit, or is out of range.
+            If it is not a number, has another unit, or is out of range.
         """
         value = self.text(*keys)
         if value is None:
@@ -86,7 +86,7 @@ class Record:
         number = float(match[1]) if match else math.nan
         problem = None
         if not math.isfinite(number):
-            problem = f"{shown!r} is no number"
+            problem = f"{shown!r} is not a number"
         elif match is not None and match[2].lower() not in units:
             problem = f"{shown!r} is in {match[2]}, not in {units[-1] or 'plain numbers'}"
         elif not low <= number <= high:
@@ -100,7 +100,7 @@ class Record:
         value = self.number(*keys, units=units, low=0, high=1e7)
         if value is not None and value != int(value):
             raise InputError(
-                f"{value} is no whole number", file=self.file, field=f"{self.name}: {keys[0]}",
+                f"{value} is not whole number", file=self.file, field=f"{self.name}: {keys[0]}",
                 remedy="correct the file",
             )  # fmt: skip
         return None if value is None else int(value)
@@ -449,7 +449,7 @@ def _projection(order: Record) -> tuple[str | None, str | None]:
     zone, hemisphere = order.count("Zone Number", "Zone", units=("",)), (order.text("Hemisphere") or "").upper()[:1]
     if zone is None or not 1 <= zone <= 60 or hemisphere not in ("N", "S"):
         raise InputError(
-            f"zone {zone} {hemisphere or '(no hemisphere)'} is no UTM zone", file=order.file,
+            f"zone {zone} {hemisphere or '(no hemisphere)'} is not a UTM zone", file=order.file,
             field=f"{order.name}: UTM Specific Parameters", remedy="Zone Number 1 to 60, Hemisphere N or S",
         )  # fmt: skip
     return shown, f"EPSG:{(32600 if hemisphere == 'N' else 32700) + zone}"

@@ -92,7 +92,7 @@ class Group:
         """
         value = self.number(key)
         if value != int(value) or not 0 < value < 1e9:
-            raise InputError(f"{self.text(key)} is no count of pixels", file=self.file, field=self.place(key))
+            raise InputError(f"{self.text(key)} is not a count of pixels", file=self.file, field=self.place(key))
         return int(value)
 
     def numbers(self, key: str, count: int) -> tuple[float, ...]:
@@ -124,7 +124,7 @@ class Group:
 
     def _number(self, key: str, text: str) -> float:
         if not _NUMBER.fullmatch(text):
-            raise InputError(f"{text[:40]!r} is no number", file=self.file, field=self.place(key))
+            raise InputError(f"{text[:40]!r} is not a number", file=self.file, field=self.place(key))
         value = float(text.replace("D", "e").replace("d", "e"))
         if not math.isfinite(value):
             raise InputError(f"{text[:40]} is too large for a number", file=self.file, field=self.place(key))
@@ -138,7 +138,7 @@ def read_label(path: str | PathLike[str]) -> Group:
     Raises
     ------
     InputError
-        If the file cannot be read, is cut off, or is no PVL; the field is the group and key (or the line).
+        If the file cannot be read, is cut off, or is not PVL; the field is the group and key (or the line).
     """
     return _Reader(str(path), _text(path)).read()
 
@@ -262,7 +262,7 @@ class _Reader:
             if token.kind == "mark" and token.text in ")}":
                 return tuple(parts)
             if token.kind not in ("word", "quoted"):
-                raise self.wrong(f"{token.text[:40]!r} is no value of a list", place)
+                raise self.wrong(f"{token.text[:40]!r} is not a value of a list", place)
             parts.append(token.text)
             if self.next is not None and self.next.text == ",":
                 self.advance()

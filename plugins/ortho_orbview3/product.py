@@ -185,7 +185,7 @@ def _box(rpc: RPC) -> Array:
 def _positive(group: Group, key: str) -> float:
     value = group.number(key)
     if not value > 0:
-        raise InputError(f"{value:g} is no spacing", file=group.file, field=group.place(key))
+        raise InputError(f"{value:g} is not a spacing", file=group.file, field=group.place(key))
     return value
 
 
@@ -203,7 +203,7 @@ def _time(group: Group, key: str) -> datetime.datetime | None:
     try:
         time = datetime.datetime.fromisoformat(re.sub(r"(\.\d{6})\d+", r"\1", text))
     except ValueError as error:
-        raise InputError(f"{text[:40]!r} is no time", file=group.file, field=group.place(key)) from error
+        raise InputError(f"{text[:40]!r} is not a time", file=group.file, field=group.place(key)) from error
     return time if time.tzinfo is not None else time.replace(tzinfo=datetime.UTC)
 
 

@@ -233,7 +233,7 @@ class Scanner:
 
     @cached_property
     def _sign(self) -> float:
-        """Which way the columns go: seen from above, rows down and columns to the right are no mirror image."""
+        """Which way the columns go: seen from above, rows down and columns to the right are not a mirror image."""
         now = np.zeros(1)
         origin, wanted = self.flight(now)
         scan = np.cross(_unit(self.target(now) - origin), wanted)

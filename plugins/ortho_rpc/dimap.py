@@ -250,7 +250,7 @@ def _angle(file: DimapFile, base: str, name: str) -> Array:
 
 def _possible_period(file: DimapFile, period: float, field: str) -> float:
     if not 0 < period < 1:
-        raise file.error(f"{period} s is no time for a row", field)
+        raise file.error(f"{period} s is not a time for a row", field)
     return period
 
 

@@ -45,7 +45,7 @@ class DimapFile:
         try:
             self.root: Element = ElementTree.fromstring(data, forbid_dtd=True)
         except (ElementTree.ParseError, DefusedXmlException, ValueError, LookupError) as error:
-            raise InputError(f"this is no well-formed XML ({error})", file=path) from error
+            raise InputError(f"this is not well-formed XML ({error})", file=path) from error
 
     def error(self, message: str, field: str, remedy: str | None = "use the RPC") -> InputError:
         """Return the error that a field of this file is."""
@@ -78,7 +78,7 @@ class DimapFile:
         values = []
         for token in tokens:
             if not _NUMBER.fullmatch(token[:60]):
-                raise self.error(f"{token[:60]!r} is no number", field)
+                raise self.error(f"{token[:60]!r} is not a number", field)
             values.append(float(token[:60]))
         if not all(map(math.isfinite, values)):
             raise self.error("a number is too large", field)
@@ -92,7 +92,7 @@ class DimapFile:
         """Return the number of rows or columns in a field."""
         value = self.number(field)
         if value != int(value) or not 0 < value <= MOST_PIXELS:
-            raise self.error(f"{value} is no size of an image", field)
+            raise self.error(f"{value} is not a size of an image", field)
         return int(value)
 
     def polynomial(self, field: str) -> Array:
@@ -114,6 +114,6 @@ class DimapFile:
         except ValueError:
             whole = None
         if found is None or whole is None:
-            raise self.error(f"{text[:60]!r} is no time", field)
+            raise self.error(f"{text[:60]!r} is not a time", field)
         self._midnight = self._midnight or whole.replace(hour=0, minute=0, second=0)
         return (whole - self._midnight).total_seconds() + float(found[2] or 0.0)

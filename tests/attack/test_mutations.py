@@ -151,7 +151,7 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
         ("/".join(["**"] * 8) + "/*.tif", "too long a search"),
         ("../../**/*.tif", "outside of the root"),
         ("/**/*.tif", "outside of the root"),
-        ("a" * 300 + "/*.tif", "no path"),
+        ("a" * 300 + "/*.tif", "not a path"),
         ("b" * 5000, "too long a search"),
     ],
 )
@@ -169,7 +169,7 @@ def test_a_name_longer_than_a_file_system_takes(tmp_path: Path, field: str) -> N
     (tmp_path / "one.tif").touch()
     file = tmp_path / "run.yaml"
     file.write_text(json.dumps({"scenes": [{"image": "one.tif", "scene": {field: "a" * 300}}]}))
-    with pytest.raises(InputError, match="no path of a file") as caught:
+    with pytest.raises(InputError, match="not a path of a file") as caught:
         batch_plan.plan(file)
     assert caught.value.remedy
 

@@ -151,12 +151,12 @@ def test_the_file_has_the_options_of_rectify(settings, options, not_in_the_file)
         ("x: &a [1]\ny: *a\n", "line 2", "aliases are not followed"),
         ("scenes:\n  - images: */*.tif\n", "line 2", "quotes around"),
         ("x: !!python/object/apply:os.system [ls]\n", "line 1, x", "tag"),
-        ("a: [1, 2\n", "line", "no YAML"),
+        ("a: [1, 2\n", "line", "not YAML"),
         ("[" * 100_000, "line 1", "levels"),
         ("[" + "1," * 400_000 + "]", None, "too many"),
         ("", None, "empty"),
-        ("a: \x00", None, "no YAML"),
-        ("x: " + "1" * 5000, "line 1, x", "no number"),
+        ("a: \x00", None, "not YAML"),
+        ("x: " + "1" * 5000, "line 1, x", "not a number"),
         ("x" * 5_000_001, None, "5 MB"),
         ("- 1\n- 2\n", "line 1", "dictionary"),
         ("? [1]\n: 2\n", "line 1", "a key is a word"),
@@ -179,7 +179,7 @@ def test_a_file_that_is_not_there_or_not_utf8(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         batch_config.read_config(tmp_path / "none.yaml")
     (tmp_path / "p.yaml").write_bytes(b"scenes: \xff\xfe\x01")
-    with pytest.raises(InputError, match="no YAML"):
+    with pytest.raises(InputError, match="not YAML"):
         batch_config.read_config(tmp_path / "p.yaml")
     (tmp_path / "p.yaml").write_bytes("scenes:\n  - image: ä.tif\n".encode("utf-16"))
     assert batch_config.read_config(tmp_path / "p.yaml").scenes[0].image == "ä.tif"
@@ -270,7 +270,7 @@ def test_paths_stay_inside_of_the_root(block, change):
     block.scene(str(elsewhere / "x.tif"))
     (block.folder / "linked").symlink_to(elsewhere)
     block.write(FILE.replace(*change))
-    with pytest.raises(InputError, match=r"outside of the root|no path of a file"):
+    with pytest.raises(InputError, match=r"outside of the root|not a path of a file"):
         batch_plan.plan(block.file)
 
 

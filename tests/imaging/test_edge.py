@@ -158,7 +158,7 @@ def test_what_is_no_edge_is_refused():
     noise = np.random.default_rng(0).normal(100.0, 5.0, (64, 64))
     inside = ((20.0, 5.0), (25.0, 60.0))
     for pixels in (noise, np.full((64, 64), 7.0), noise + 12.0 * (np.arange(64) > 22)):
-        with pytest.raises(InputError, match=r"no edge|no step|no straight step|cannot be told"):
+        with pytest.raises(InputError, match=r"no edge|not an edge|no step|no straight step|cannot be told"):
             analyse_edge(pixels, inside)
     for segment in (((-3.0, 5.0), (25.0, 60.0)), ((20.0, 5.0), (25.0, 65.0)), ((math.nan, 5.0), (25.0, 60.0))):
         with pytest.raises(InputError):
@@ -244,8 +244,8 @@ def test_command(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--edge", "1,2,3"), "is no edge"),
-        (("--edge", "1,2,3,inf"), "is no edge"),
+        (("--edge", "1,2,3"), "is not an edge"),
+        (("--edge", "1,2,3,inf"), "is not an edge"),
         (("--edge", "5,5,500,40"), "leaves the image"),
         (("--edge", "5,205,40,215"), "no edge of enough contrast"),
         (("--band", "2"), "has 1 band"),

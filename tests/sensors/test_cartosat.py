@@ -491,5 +491,5 @@ def test_a_sigma_is_a_positive_number_or_none(pair_folder, option, value):
         open_scene(pair_folder / "BANDF.tif", "cartosat", {option: value})
     assert caught.value.field == option
     assert "none" in caught.value.remedy
-    with pytest.raises(InputError, match="is no sigma"):
+    with pytest.raises(InputError, match="is not a sigma"):
         SoftSigmas(rate=-1.0)

@@ -115,9 +115,9 @@ class FrameCamera(SensorModel):
                 raise InputError(f"{values}: not {counted(count, 'finite number')}", field=name)
             object.__setattr__(self, name, values)
         if not self.heights[0] < self.heights[1]:
-            raise InputError(f"heights from {self.heights[0]} to {self.heights[1]} are no range", field="heights")
+            raise InputError(f"heights from {self.heights[0]} to {self.heights[1]} are not a range", field="heights")
         if self.frame not in (TOPOCENTRIC, MAP):
-            raise InputError(f"{self.frame!r} is no working frame", field="frame", remedy=f"{TOPOCENTRIC} or {MAP}")
+            raise InputError(f"{self.frame!r} is not a working frame", field="frame", remedy=f"{TOPOCENTRIC} or {MAP}")
         if (self.frame == TOPOCENTRIC) != (self.ground_crs == GEOGRAPHIC):
             raise InputError(
                 f"a {self.frame} frame does not go with ground in {self.ground_crs}",
@@ -505,5 +505,5 @@ def _require_metres(crs: str) -> None:
     parsed = parse_crs(crs)
     if not parsed.is_projected or abs(parsed.axis_info[0].unit_conversion_factor - 1.0) > 1e-12:
         raise InputError(
-            f"{parsed.name!r} is no map projection in metres", field="CRS", remedy="give a projected CRS such as UTM"
+            f"{parsed.name!r} is not a map projection in metres", field="CRS", remedy="give a projected CRS such as UTM"
         )

@@ -57,7 +57,7 @@ class LineCamera:
 
     def __post_init__(self) -> None:
         if not all(1 <= size <= MOST_PIXELS and size == int(size) for size in (self.width, self.height)):
-            raise InputError(f"{self.width} x {self.height} is no size of an image", field="width, height")
+            raise InputError(f"{self.width} x {self.height} is not a size of an image", field="width, height")
         for name in ("dx", "dy"):
             value = np.array(getattr(self, name), dtype=np.float64).ravel()
             value.setflags(write=False)
@@ -83,7 +83,7 @@ class LineCamera:
         """
         u, v = (np.asarray(value, dtype=np.float64).ravel() for value in (across, along))
         if len(u) < 2 or u[1] == 0:
-            raise InputError("a line whose look angle does not change with the column is no image", field="across")
+            raise InputError("a line whose look angle does not change with the column is not an image", field="across")
         focal, half = 1.0 / float(u[1]), width / 2
         # x = half (1 + xi): the polynomials in xi that the terms beyond the linear one make.
         shifted = np.polynomial.Polynomial([half, half])

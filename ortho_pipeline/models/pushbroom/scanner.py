@@ -118,7 +118,7 @@ class Pushbroom(SensorModel):
         for name in ("orbital", "mounting"):
             axes = getattr(self, name)
             if not are_rotations(axes[None]):
-                raise InputError("this matrix is no rotation", field=name)
+                raise InputError("this matrix is not a rotation", field=name)
             # A matrix with printed digits is none exactly, and its inverse would be another than its transpose.
             if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-12:
                 left, _, right = np.linalg.svd(axes)
@@ -130,7 +130,7 @@ class Pushbroom(SensorModel):
             raise InputError("the line period is positive", field="line_period")
         low, high = (float(value) for value in self.heights)
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            raise InputError(f"heights from {low} to {high} are no range", field="heights")
+            raise InputError(f"heights from {low} to {high} are not a range", field="heights")
         object.__setattr__(self, "heights", (low, high))
         object.__setattr__(self, "free", tuple(self.free))
         unknown = sorted(set(self.free) - set(self._names))
@@ -273,7 +273,7 @@ class Pushbroom(SensorModel):
         ):
             parts += [table.of(spline, start, count) for table in tables]
         found = joined(parts, count)
-        # What no free parameter can change is no observation of one.
+        # What no free parameter can change is not an observation of one.
         kept = found.jacobian[:, columns].any(axis=1)
         return Constraints(
             found.residuals[kept], found.jacobian[kept][:, columns], found.sigma[kept], found.fictitious[kept]

@@ -38,9 +38,9 @@ class Spline:
     def __post_init__(self) -> None:
         breaks, coefficients = (np.array(value, dtype=np.float64) for value in (self.breaks, self.coefficients))
         if not (isinstance(self.degree, int) and isinstance(self.beyond, int)):
-            raise InputError(f"degrees {self.degree} and {self.beyond} are no whole numbers", field="degree, beyond")
+            raise InputError(f"degrees {self.degree} and {self.beyond} are not whole numbers", field="degree, beyond")
         if not 1 <= self.degree <= 5 or not 0 <= self.beyond <= self.degree:
-            raise InputError(f"degree {self.degree}, continued with {self.beyond}, is no spline", field="degree")
+            raise InputError(f"degree {self.degree}, continued with {self.beyond}, is not a spline", field="degree")
         if breaks.ndim != 1 or len(breaks) < 2 or not np.isfinite(breaks).all() or not (np.diff(breaks) > 0).all():
             raise InputError("the knots of a spline are at least two increasing times", field="breaks")
         if coefficients.shape != (len(breaks) - 1 + self.degree, 3) or not np.isfinite(coefficients).all():

@@ -100,7 +100,7 @@ def pushbroom_of_tables(
     times, positions = _table(orbit, (3,), (first_time, last, slack), degree, "orbit")
     turn_times, turns = _table(attitude, (3, 3), (first_time, last, slack), degree, "attitude")
     if not are_rotations(turns):
-        raise InputError("a matrix of this table is no rotation", field="attitude")
+        raise InputError("a matrix of this table is not a rotation", field="attitude")
     # Half an image beyond both ends, as far as the tables go: points outside of the image are legal.
     low, high = max(-last / 2, times[0], turn_times[0]), min(1.5 * last, times[-1], turn_times[-1])
     origin, velocity = _lagrange(times, positions, np.array([last / 2]))
@@ -190,7 +190,7 @@ def _table(
     if not (np.isfinite(times).all() and np.isfinite(values).all() and (np.diff(times) > 0).all()):
         raise InputError("a table has finite values at increasing times", field=name)
     times = times - first
-    # The rim of a row more or less is no reason to refuse a table: vendors' tables end at centres of rows.
+    # The rim of a row more or less is not a reason to refuse a table: vendors' tables end at centres of rows.
     if times[0] > slack or times[-1] < last - slack:
         raise InputError(
             f"it is known from {times[0]:.6g} to {times[-1]:.6g} s after the first row, the image takes {last:.6g} s",
@@ -280,7 +280,7 @@ class SoftSigmas:
         for name, sigma in vars(self).items():
             if sigma is not None and not (math.isfinite(sigma) and sigma > 0):
                 raise InputError(
-                    f"{sigma} is no sigma", field=name, remedy="give a positive number, or None for no constraint"
+                    f"{sigma} is not a sigma", field=name, remedy="give a positive number, or None for no constraint"
                 )
 
 
@@ -414,7 +414,7 @@ def _focal_length(
         across = rows - (rows * looks).sum(axis=1)[:, None] * looks
         focal = float(np.mean(distance / np.linalg.norm(across, axis=1)) * width)
     if not (math.isfinite(focal) and focal > 0):
-        raise InputError(f"{focal} is no focal length", field="focal_length, pixel_size")
+        raise InputError(f"{focal} is not a focal length", field="focal_length, pixel_size")
     return float(sign[0]) * focal
 
 
