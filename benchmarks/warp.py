@@ -141,11 +141,11 @@ class Run:
     memory: float
 
 
-def measure(command: list[str], surroundings: dict[str, str] | None = None) -> Run:
-    """Run a program; its own resource usage comes from the kernel when it ends."""
+def measure(command: list[str], surroundings: dict[str, str] | None = None, folder: Path | None = None) -> Run:
+    """Run a program in a folder; its own resource usage comes from the kernel when it ends."""
     begin = time.perf_counter()
     with tempfile.TemporaryFile() as log:
-        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=surroundings)
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=surroundings, cwd=folder)
         _, status, usage = os.wait4(process.pid, 0)
         wall = time.perf_counter() - begin
         process.returncode = os.waitstatus_to_exitcode(status)
@@ -337,11 +337,13 @@ def against(job: Job, other: Path, pairs: int) -> dict[str, list[tuple[float, fl
         return float(subprocess.run(command, env=places[which], cwd=job.folder, check=True, capture_output=True).stdout)
 
     def whole(which: int) -> float:
-        return measure(ours(job, job.folder / "ours"), places[which]).cpu
+        # Not in the folder of this checkout: with `-m`, what lies there goes before PYTHONPATH.
+        return measure(ours(job, job.folder / "ours"), places[which], job.folder).cpu
 
     def first(which: int) -> float:
         with tempfile.TemporaryDirectory() as cache:
-            return measure(ours(job, job.folder / "ours"), {**places[which], "NUMBA_CACHE_DIR": cache}).cpu
+            empty = {**places[which], "NUMBA_CACHE_DIR": cache}
+            return measure(ours(job, job.folder / "ours"), empty, job.folder).cpu
 
     found: dict[str, list[tuple[float, float]]] = {}
     todo = (("the warp alone", warp, pairs), ("the whole job", whole, pairs), ("the first run", first, min(pairs, 5)))
@@ -483,7 +485,7 @@ def main() -> None:
         parser.add_argument(f"--{option}", action="store_true")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="ortho_bench_") as temporary:
-        folder = arguments.folder or Path(temporary)
+        folder = (arguments.folder or Path(temporary)).resolve()
         folder.mkdir(parents=True, exist_ok=True)
         document: dict[str, object] = {"machine": machine()}
         if arguments.scaling:
