@@ -26,6 +26,7 @@ from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files.locations import VsiPath, archive_of, in_local_archive, located, members
 from ortho_pipeline.files.process_limits import require_memory
 from ortho_pipeline.options import PIXEL_TYPES
+from ortho_pipeline.raster.block_cache import keep_blocks
 from ortho_pipeline.raster.gate import DRIVERS, Block, open_seen
 
 gdal.UseExceptions()
@@ -37,8 +38,6 @@ MAX_SIDE = 4_000_000
 MAX_BLOCK = 1 << 30
 #: Bytes that reading and warping may take where nobody says how many.
 MEMORY = 512_000_000
-#: What GDAL's cache has to hold beside large blocks of an image (bytes).
-_OTHER_BLOCKS = 64_000_000
 #: Endings of files beside an image that GDAL's readers of metadata look for.
 _SIDE_CARS = (".xml", ".txt", ".imd", ".rpb", ".pvl", ".met", ".att", ".eph", ".tfw", ".wld", ".prj", ".hdr", ".ovr",
               ".msk", ".rpc", ".dim")  # fmt: skip
@@ -498,24 +497,3 @@ def _read_as(own: np.dtype[Any], wanted: str | None) -> np.dtype[Any]:
     if wanted is None or pixel_type(wanted) == own:
         return own
     return np.promote_types(np.promote_types(own, pixel_type(wanted)), np.float32)
-
-
-def limit_cache(memory: int, threads: int, *blocks: int) -> int:
-    """Limit GDAL's block cache to a quarter of `memory` (at least 16 MB), or to what holds the blocks of each thread.
-
-    Returns
-    -------
-    int
-        How many threads that allows, at most `threads`: each decodes blocks (of `blocks` bytes) of its own.
-    """
-    held = sum(blocks)
-    threads = max(1, min(threads, memory // max(held, 1)))
-    gdal.SetCacheMax(max(memory // 4, 16_000_000))
-    keep_blocks(threads * held)
-    return threads
-
-
-def keep_blocks(size: int) -> None:
-    """Raise GDAL's block cache to what holds blocks of `size` bytes beside those of the output."""
-    if size > gdal.GetCacheMax() // 2:
-        gdal.SetCacheMax(max(gdal.GetCacheMax(), size + _OTHER_BLOCKS))
