@@ -23,7 +23,8 @@ from ortho_ikonos.simulation import write_product as write_ikonos
 from ortho_orbview3.simulation import write_product as write_orbview3
 from osgeo import gdal
 
-from ortho_pipeline.exchange.rpc import RpcExport, fit_rpc, write_rpc_txt
+from ortho_pipeline.exchange.rpc import write_rpc_txt
+from ortho_pipeline.exchange.rpc_fit import RpcExport, fit_rpc
 from ortho_pipeline.files import whole_or_nothing, write_text
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.models import ImageCorrection

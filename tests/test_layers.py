@@ -47,7 +47,16 @@ cli
 """
 LINE = {name: number for number, line in enumerate(ROOMS.split("\n")) for name in line.split()}
 #: Where GDAL, numba and matplotlib are imported.
-GDAL_MODULES = {"files.locations", "raster.gate", "raster.source", "raster.output", "raster.ortho", "surface.dem_file"}
+GDAL_MODULES = {
+    "files.locations",
+    "raster.gate",
+    "raster.references",
+    "raster.block_cache",
+    "raster.source",
+    "raster.output",
+    "raster.ortho",
+    "surface.dem_file",
+}
 GDAL_MODULES |= {
     "surface.writing",
     "plugins",

@@ -13,7 +13,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,13 @@ from ortho_pipeline import commands
 from ortho_pipeline.batch.executors import Processes, Sequential, completed, dask_executor
 from ortho_pipeline.batch.plan import RUN_FILES, STATE, Job, Plan, for_run, plan, versions
 from ortho_pipeline.batch.records import Digests, FileState, Record, key_of, locked, siblings
+from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_text
 from ortho_pipeline.report.stac import write_catalog
 from ortho_pipeline.warp import mosaic
 
-SCHEMA_VERSION = 1
 EXECUTORS = ("sequential", "processes", "dask")
 #: Larger files beside an image are not metadata.
 _COMPANION_BYTES = 5_000_000
@@ -38,57 +38,6 @@ _REPORT_BYTES = 50_000_000
 _MANY_SEAMS = 64
 #: Checksums that this process has taken.
 _digests = Digests()
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a scene.
-
-    Parameters
-    ----------
-    status : {'done', 'unchanged', 'failed'}
-    facts : mapping
-        JSON values: sensor, model, RMSE, ortho, view.
-    error : mapping, optional
-        Kind, message, file, field, remedy, and the trace of what is no `OrthoError`.
-    """
-
-    name: str
-    status: str
-    seconds: float = 0.0
-    files: Mapping[str, str] = field(default_factory=dict)
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    error: Mapping[str, Any] | None = None
-
-
-@dataclass(frozen=True)
-class BatchResult:
-    """What became of all scenes."""
-
-    scenes: tuple[Outcome, ...]
-    files: Mapping[str, Path]
-    seconds: float
-    mosaic: Mapping[str, Any] | None = None
-
-    def count(self, status: str) -> int:
-        """Return how many scenes ended so."""
-        return sum(scene.status == status for scene in self.scenes)
-
-    @property
-    def failed(self) -> int:
-        """How many scenes, or the mosaic of them, could not be made."""
-        return self.count("failed") + bool(self.mosaic and self.mosaic.get("error"))
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of ``ortho run --json`` (docs/run.md)."""
-        return {
-            "schema_version": SCHEMA_VERSION,
-            "counts": {status: self.count(status) for status in ("done", "unchanged", "failed")},
-            "seconds": self.seconds,
-            "scenes": [dict(vars(scene)) for scene in self.scenes],
-            "mosaic": self.mosaic,
-            "files": {name: str(path) for name, path in self.files.items()},
-        }
 
 
 # -- one scene -------------------------------------------------------------------------------------------------------

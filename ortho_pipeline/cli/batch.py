@@ -17,7 +17,7 @@ from ortho_pipeline.errors import counted
 
 if TYPE_CHECKING:
     from ortho_pipeline.batch.plan import Plan
-    from ortho_pipeline.batch.runner import BatchResult, Outcome
+    from ortho_pipeline.batch.results import BatchResult, Outcome
 
 FAILED, PARTLY_DONE = 1, 3
 #: More scenes than this are only counted, except for those that failed.
@@ -86,12 +86,13 @@ def run(
     if pipeline_file is None:
         raise click.UsageError("Missing argument 'PIPELINE.yaml'.")
     from ortho_pipeline.batch import runner as batch
+    from ortho_pipeline.batch.results import SCHEMA_VERSION
 
     planned = batch.plan(pipeline_file, root)
     if as_list:
         listed = batch.list_scenes(planned)
         if as_json:
-            return print_json({"schema_version": batch.SCHEMA_VERSION, "scenes": listed})
+            return print_json({"schema_version": SCHEMA_VERSION, "scenes": listed})
         for scene in listed:
             click.echo(f"{scene['name']}\t{scene['state']}\t{scene['image']}")
         return None
@@ -115,11 +116,12 @@ def run(
 def _check(planned: Plan, only: Sequence[str], shard: tuple[int, int] | None, as_json: bool) -> None:
     """Print what stands in the way of each scene; exit as a run would if that were all."""
     from ortho_pipeline.batch import runner as batch
+    from ortho_pipeline.batch.results import SCHEMA_VERSION
 
     checked = batch.check_scenes(planned, only, shard)
     failed = [one for one in checked if "error" in one]
     if as_json:
-        print_json({"schema_version": batch.SCHEMA_VERSION, "scenes": checked})
+        print_json({"schema_version": SCHEMA_VERSION, "scenes": checked})
     else:
         for one in checked:
             click.echo(_checked_text(one))

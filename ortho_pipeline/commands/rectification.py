@@ -32,6 +32,7 @@ from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
+from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report import stac as stac_items
@@ -89,7 +90,7 @@ def rectify(
     inputs.require_heights(surface)
     begun = states(inputs.given_files(image, scene, points, surface))
     # Before the DEM is read: left alone, GDAL keeps blocks in a share of the machine's memory.
-    raster.limit_cache(output.memory, 1)
+    limit_cache(output.memory, 1)
     opened = open_adjustable(image, scene, points)
     heights = open_surface(surface, scene, output.memory)
     acquired = _acquired(opened.facts, output)

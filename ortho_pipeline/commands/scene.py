@@ -23,7 +23,8 @@ from ortho_pipeline.errors import InputError, completed, counted
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files import write_text
 from ortho_pipeline.files.documents import json_value
-from ortho_pipeline.geodesy import crs as crs_module
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.proj_grids import grids, proj_info
 from ortho_pipeline.imaging import resolution
 from ortho_pipeline.models import families
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
@@ -62,7 +63,7 @@ def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) 
         crs = footprint.output_crs(model, *size)
         gsd = footprint.ground_sample_distance(model, crs, *size)
     corners = np.array([[0.0, 0.0], [size[0], 0.0], [size[0], size[1]], [0.0, size[1]]])
-    to_geographic = crs_module.ground_transform(model.crs, "EPSG:4979")
+    to_geographic = ground_transform(model.crs, "EPSG:4979")
     ground = to_geographic(model.image_to_ground(corners, model.reference_height))
     return {
         "schema_version": SCHEMA_VERSION,
@@ -203,8 +204,8 @@ def doctor() -> dict[str, Any]:
             "bindings": raster.gdal.__version__,
             "drivers": allowed,
         },
-        "proj": crs_module.proj_info(),
-        "grids": crs_module.grids(),
+        "proj": proj_info(),
+        "grids": grids(),
         "plugins": [entry.to_json() for entry in host.plugins()],
         "sensors": list(host.sensors),
         "broken": [entry.to_json() for entry in host.broken],

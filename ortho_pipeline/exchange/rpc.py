@@ -6,12 +6,8 @@ The text formats are in `ortho_pipeline.exchange.rpc_files`.
 
 from __future__ import annotations
 
-import functools
-import logging
-import math
 import os
 import re
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -20,7 +16,6 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_pipeline import files
-from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, ModelError
 from ortho_pipeline.exchange.rpc_files import (
     TEXT_SUFFIXES,
@@ -30,12 +25,11 @@ from ortho_pipeline.exchange.rpc_files import (
     write_rpb,
     write_rpc_txt,
 )
+from ortho_pipeline.exchange.rpc_fit import RpcExport, box_grid, domain_box, fit_rpc
 from ortho_pipeline.files.locations import VsiPath, place
-from ortho_pipeline.geodesy.crs import GroundTransform
-from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
-from ortho_pipeline.models.rational import RPC, rpc_terms
-from ortho_pipeline.models.rpc_box import has_pole
+from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.raster.output import close, raster_output, written
 from ortho_pipeline.raster.source import open_dataset
 
@@ -56,11 +50,6 @@ __all__ = [
 
 #: Tag and side-car that differ by more than this at the centre (pixels) are not the same model.
 DISAGREEMENT = 1.0
-#: A fitted RPC that is off by more than the first is reported, by more than the second refused (pixels).
-WARN_ERROR, REFUSE_ERROR = 0.02, 0.1
-#: Weight of the penalty on the size of the normalised coefficients in `fit_rpc`, relative to one observation.
-TIKHONOV = 1e-7
-log = logging.getLogger(__name__)
 
 
 # -- reading ---------------------------------------------------------------------------------------------------------
@@ -275,33 +264,13 @@ def _sidecar_names(path: Path) -> list[Path]:
 
 def _check_written(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> None:
     written = rpc_of_fields(dataset.GetMetadata("RPC") or {}, path)
-    ground = _box_grid(*_domain_box(rpc), (5, 5, 3))
+    ground = box_grid(*domain_box(rpc), (5, 5, 3))
     worst = np.nanmax(np.abs(written.ground_to_image(ground) - rpc.ground_to_image(ground)))
     if not worst < 1e-6 or dataset.GetGCPCount():
         raise ModelError(f"the RPC that was written is off by {worst:g} px when it is read again", file=path)
 
 
 # -- RPC of any model ------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class RpcExport:
-    """An RPC that stands for another model.
-
-    Parameters
-    ----------
-    rpc : RPC
-    exact : bool
-        Whether it is the same function of the ground, up to rounding.
-    max_error_px : float
-        Largest difference of the two on an independent grid; 0 where exact.
-    warnings : tuple of Notice
-    """
-
-    rpc: RPC
-    exact: bool
-    max_error_px: float
-    warnings: tuple[Notice, ...] = ()
 
 
 def export_rpc(
@@ -334,7 +303,7 @@ def export_rpc(
     exact = _folded(model)
     if exact is not None:
         return RpcExport(exact, True, 0.0)
-    default_box, default_range = _domain_box(model)
+    default_box, default_range = domain_box(model)
     return fit_rpc(model, box or default_box, height_range or default_range, force=force)
 
 
@@ -359,147 +328,3 @@ def _folded(model: SensorModel) -> RPC | None:
         changes["col_scale"] = float(matrix[0, 0]) * inner.col_scale
         changes["row_scale"] = float(matrix[1, 1]) * inner.row_scale
     return inner._replace(**changes)
-
-
-def fit_rpc(
-    model: SensorModel,
-    box: tuple[float, float, float, float],
-    height_range: tuple[float, float],
-    *,
-    grid: tuple[int, int, int] = (15, 15, 7),
-    force: bool = False,
-) -> RpcExport:
-    """Fit the 80 coefficients of an RPC to any model, on a grid of ground points at several heights.
-
-    The linearised equations ``num - v den = 0`` are iterated with the weight ``1 / den`` (Sanathanan and Koerner 1963)
-    and a small penalty, then verified on a grid of other points.
-
-    Parameters
-    ----------
-    model : SensorModel
-    box : (xmin, ymin, xmax, ymax)
-        Longitudes and latitudes in degrees; xmax beyond 180 for a scene across the antimeridian.
-    height_range : (lo, hi)
-        Ellipsoidal metres.
-    grid : (int, int, int)
-        Points along longitude, latitude and height.
-    force : bool
-        Accept an error of more than 0.1 px.
-
-    Raises
-    ------
-    InputError
-        If the box is empty or mostly outside of the model, or the fit is off by more than 0.1 px without `force`.
-    """
-    centre, half = _centre_and_half(box, height_range)
-    ground, image = _samples(model, box, height_range, grid)
-    middle = (image.min(axis=0) + image.max(axis=0)) / 2
-    scale = np.maximum((image.max(axis=0) - image.min(axis=0)) / 2, 1.0)
-    terms = rpc_terms(*((ground - centre) / half).T).T
-    names = ("col_off", "row_off", "lon_off", "lat_off", "h_off", "col_scale", "row_scale", "lon_scale", "lat_scale")
-    numbers = dict(zip((*names, "h_scale"), map(float, (*middle, *centre, *scale, *half)), strict=True))
-    # A box across the antimeridian may be given beyond 180 degrees; readers of RPCs want the offset within.
-    numbers["lon_off"] = math.remainder(numbers["lon_off"], 360.0)
-    (col_num, col_den), (row_num, row_den) = (_fit_ratio(terms, (image - middle)[:, k] / scale[k]) for k in (0, 1))
-    rpc = RPC(**numbers, col_num=col_num, col_den=col_den, row_num=row_num, row_den=row_den)
-    nx, ny, nh = grid
-    ground, image = _samples(model, box, height_range, (nx + 1, ny + 1, nh + 1))
-    worst = float(np.abs(rpc.ground_to_image(ground) - image).max())
-    if not worst <= REFUSE_ERROR and not force:
-        raise InputError(
-            f"an RPC stands for this model only to {worst:.3g} px",
-            remedy="fit it over a smaller box or height range, or accept the error (force)",
-        )
-    message = Notice("rpc-approximate", f"the RPC stands for the model only to {worst:.3g} px", max_error_px=worst)
-    if worst > WARN_ERROR:
-        log.warning("%s", message)
-    return RpcExport(rpc, False, worst, (message,) if worst > WARN_ERROR else ())
-
-
-def _fit_ratio(terms: Array, values: Array) -> tuple[Array, Array]:
-    """Fit numerator and denominator ``(20,)`` of ``values (N,)`` on ``terms (N, 20)``.
-
-    Where the denominator gets a pole within the points, its coefficients are penalised more, in the end to a plain
-    polynomial: what a ratio cannot follow should not be followed by a ratio with a pole.
-    """
-    for damping in (TIKHONOV, 1e-4, 1e-2):
-        fitted = _iterate_ratio(terms, values, damping)
-        if fitted is not None:
-            return fitted
-    num = np.asarray(np.linalg.lstsq(terms, values, rcond=None)[0], dtype=np.float64)
-    den: Array = np.eye(20)[0]
-    return num, den
-
-
-def _iterate_ratio(terms: Array, values: Array, damping: float, iterations: int = 5) -> tuple[Array, Array] | None:
-    """Return the best of some iterations, None if the first of them has a pole in the box of the terms."""
-    system = np.column_stack([terms, -values[:, None] * terms[:, 1:], values])
-    penalty = np.sqrt(len(terms)) * np.repeat([TIKHONOV, damping], [20, 19])
-    denominator = np.ones(len(terms))
-    best: tuple[float, Array, Array] | None = None
-    for _ in range(iterations):
-        # The right side is the last column, so that R alone holds all that is needed. The penalty enters through the
-        # singular values of R: as more rows of the system it would fill the reflections with denormal numbers.
-        r: Array = np.asarray(np.linalg.qr(system / denominator[:, None], mode="r"))
-        u, size, vt = np.linalg.svd(r[:39, :39] / penalty)
-        solution: Array = vt.T @ (size / (size**2 + 1.0) * (u.T @ r[:39, 39])) / penalty
-        num, den = solution[:20], np.concatenate([[1.0], solution[20:]])
-        denominator = terms @ den
-        if has_pole(den):
-            break
-        worst = float(np.abs(terms @ num / denominator - values).max())
-        if best is None or worst < best[0]:
-            best = worst, num, den
-    return None if best is None else (best[1], best[2])
-
-
-def _samples(
-    model: SensorModel,
-    box: tuple[float, float, float, float],
-    height_range: tuple[float, float],
-    grid: tuple[int, int, int],
-) -> tuple[Array, Array]:
-    ground = _box_grid(box, height_range, grid)
-    with np.errstate(all="ignore"):
-        image = model.ground_to_image(_transform("EPSG:4979", model.crs)(ground))
-    good = np.isfinite(image).all(axis=1)
-    if good.mean() < 0.5:
-        raise InputError(
-            f"the model maps only {good.mean():.0%} of the box to be fitted into the image",
-            field="box",
-            remedy="give a box within the scene",
-        )
-    return ground[good], image[good]
-
-
-@functools.lru_cache(maxsize=8)
-def _transform(source: str, target: str) -> GroundTransform:
-    return GroundTransform(source, target)
-
-
-def _centre_and_half(box: tuple[float, float, float, float], height_range: tuple[float, float]) -> tuple[Array, Array]:
-    low = np.array([box[0], box[1], height_range[0]], dtype=np.float64)
-    high = np.array([box[2], box[3], height_range[1]], dtype=np.float64)
-    if not (np.isfinite(low).all() and np.isfinite(high).all() and (high >= low).all() and (high > low)[:2].all()):
-        raise InputError(f"the box {box} with heights {height_range} is empty", field="box")
-    # A flat box would leave the terms in height undetermined.
-    return (low + high) / 2, np.maximum((high - low) / 2, [0.0, 0.0, 1.0])
-
-
-def _box_grid(
-    box: tuple[float, float, float, float], height_range: tuple[float, float], grid: tuple[int, int, int]
-) -> Array:
-    centre, half = _centre_and_half(box, height_range)
-    axes = [middle + reach * np.linspace(-1.0, 1.0, n) for middle, reach, n in zip(centre, half, grid, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-def _domain_box(model: SensorModel) -> tuple[tuple[float, float, float, float], tuple[float, float]]:
-    """Return the domain of a model as a box in longitude and latitude, and its heights."""
-    centre, half = model.domain
-    signs = np.stack(np.meshgrid(*[(-1.0, 0.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    ground = _transform(model.crs, "EPSG:4979")(centre + signs * half)
-    # Unwrapped about the middle: a scene across the antimeridian is one box.
-    lon = ground[13, 0] + np.remainder(ground[:, 0] - ground[13, 0] + 180.0, 360.0) - 180.0
-    lat = ground[:, 1]
-    return (float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())), model.height_range

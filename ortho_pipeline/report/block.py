@@ -18,7 +18,7 @@ from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.start import Start
-    from ortho_pipeline.exchange.rpc import RpcExport
+    from ortho_pipeline.exchange.rpc_fit import RpcExport
 
 DOCUMENT, SCHEMA_VERSION = "ortho-pipeline block report", 1
 #: Images whose residuals are drawn, rays that are drawn of each, points that are listed on the page.

@@ -40,7 +40,7 @@ from ortho_pipeline.report.wording import headline, summary_text
 if TYPE_CHECKING:
     import pyproj
 
-    from ortho_pipeline.exchange.rpc import RpcExport
+    from ortho_pipeline.exchange.rpc_fit import RpcExport
     from ortho_pipeline.hookspecs import Scene
     from ortho_pipeline.raster.source import Grid
     from ortho_pipeline.surface.base import Surface

@@ -19,8 +19,9 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import CoverageError, DatumError
-from ortho_pipeline.geodesy.crs import Vertical, declared_vertical, ground_transform, parse_crs
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.geodesy.datum import dem_unit, dem_vertical, dem_vertical_remedy
+from ortho_pipeline.geodesy.declared_vertical import declared_vertical
 from ortho_pipeline.surface.base import Array, Excerpt, Surface, Window, parse_fill, positions
 from ortho_pipeline.surface.dem_file import Affine, DemFile, SampleGrid
 from ortho_pipeline.surface.voids import nearest_heights

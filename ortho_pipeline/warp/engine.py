@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.rpc import RpcExport
+from ortho_pipeline.exchange.rpc_fit import RpcExport
 from ortho_pipeline.files.process_limits import Resources, require_memory, startable_threads
 from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, as_written, refuse_empty
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.warp import kernels
 from ortho_pipeline.warp.block_kernel import DemWindow, Target, warp_block
 from ortho_pipeline.warp.gdal_engine import warp_with_gdal

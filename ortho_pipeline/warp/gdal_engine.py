@@ -30,7 +30,8 @@ import numpy as np
 from osgeo import gdal, gdal_array
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.rpc import REFUSE_ERROR, RpcExport, rpc_metadata
+from ortho_pipeline.exchange.rpc import rpc_metadata
+from ortho_pipeline.exchange.rpc_fit import REFUSE_ERROR, RpcExport
 from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.geodesy.crs import GroundTransform, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel

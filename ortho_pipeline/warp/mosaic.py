@@ -20,10 +20,10 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.imaging.registration import details, measure
+from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
 from ortho_pipeline.raster.output import raster_output, written
-from ortho_pipeline.raster.block_cache import limit_cache
-from ortho_pipeline.raster.source import (Grid, RasterSource)
+from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.raster.valid_area import grid_of, valid_outline
 
 #: Part of a pixel by which grids may differ: rounding of coordinates, no more.

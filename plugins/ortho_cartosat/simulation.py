@@ -13,6 +13,7 @@ import numpy as np
 import pyproj
 from osgeo import gdal
 
+from ortho_cartosat import rendering
 from ortho_cartosat import truth as simulated
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import write_rpc_txt
@@ -68,7 +69,7 @@ def write_product(
     for number, (view, band) in enumerate(BANDS.items()):
         files[view] = out / f"{band}.tif"
         files[f"{view}_met"], files[f"{view}_rpc"] = out / f"{band}_MET.TXT", out / f"{band}_RPC.TXT"
-        _write_image(simulated.render(pair.cameras[view], pair.hills, seed=seed + number), files[view])
+        _write_image(rendering.render(pair.cameras[view], pair.hills, seed=seed + number), files[view])
         write_text(files[f"{view}_met"], metadata_text(pair, view))
         write_rpc_txt(pair.rpc(view), files[f"{view}_rpc"])
     files |= {"dem": out / "dem.tif", "points": out / "points.csv", "truth": out / "truth.json"}

@@ -24,7 +24,7 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.rpc import fit_rpc
+from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.points import Points
@@ -106,18 +106,6 @@ class Hills:
         return np.stack(
             [2 * np.pi / lengths * np.cos(angles), 2 * np.pi / lengths * np.sin(angles), phases, amplitudes]
         )
-
-
-def brightness(lon: ArrayLike, lat: ArrayLike, *, finest: float) -> Array:
-    """Return the brightness ``(N,)`` in 0…1 of the ground; `finest` (m) is the shortest wavelength there is."""
-    east, north = local_metres(lon, lat)
-    random = np.random.default_rng(17)
-    lengths = np.geomspace(finest, 60 * finest, 48)
-    angles, phases = random.uniform(0, 2 * np.pi, (2, len(lengths)))
-    value = np.zeros_like(east)
-    for length, angle, phase in zip(lengths, angles, phases, strict=True):
-        value += np.sin(2 * np.pi / length * (np.cos(angle) * east + np.sin(angle) * north) + phase)
-    return np.clip(0.45 + 0.12 * value / np.sqrt(len(lengths) / 2), 0.0, 1.0)
 
 
 def local_metres(lon: ArrayLike, lat: ArrayLike) -> tuple[Array, Array]:
@@ -357,23 +345,6 @@ def biased(camera: Scanner, bias: Bias) -> Scanner:
         errors = errors + np.linalg.solve(jacobian, wanted - off(errors))
     roll, pitch, yaw, roll_rate, pitch_rate = errors * scale
     return replace(camera, attitude=camera.attitude.moved((roll, pitch, yaw), (roll_rate, pitch_rate, 0.0)))
-
-
-def render(camera: Scanner, hills: Hills, *, noise_dn: float = 3.0, seed: int = 0) -> NDArray[np.uint16]:
-    """Make the 10-bit image that a camera takes: every pixel's own ray is followed to the hills."""
-    pixels = np.empty((camera.size, camera.size), dtype=np.uint16)
-    finest = 4.5 * GSD_ALONG * SIZE / camera.size
-    columns = np.arange(camera.size) + 0.5
-    random = np.random.default_rng(seed)
-    block = max(1, 100_000 // camera.size)
-    for first in range(0, camera.size, block):
-        rows = np.arange(first, min(first + block, camera.size)) + 0.5
-        image = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        ground = camera.meet(image, hills, tolerance=0.1)
-        values = 40.0 + 900.0 * brightness(ground[:, 0], ground[:, 1], finest=finest)
-        values += random.normal(0.0, noise_dn, values.shape)
-        pixels[first : first + block] = np.clip(np.rint(values), 1, 1023).reshape(len(rows), -1)
-    return pixels
 
 
 # -- the pair --------------------------------------------------------------------------------------------------------

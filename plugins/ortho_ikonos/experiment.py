@@ -31,7 +31,7 @@ from ortho_ikonos.truth import (
 from ortho_pipeline.errors import OrthoError, counted
 from ortho_pipeline.estimation.family_fit import fit_family, fit_own, prune
 from ortho_pipeline.estimation.fit import Fit, fit
-from ortho_pipeline.exchange.rpc import fit_rpc
+from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.models import family_of
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.correction import ImageCorrection

@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 from osgeo import gdal, osr
 
+from ortho_ikonos import rendering
 from ortho_ikonos import truth as simulated
 from ortho_ikonos.truth import GeoScene, VendorModel
 from ortho_pipeline.errors import InputError, counted
-from ortho_pipeline.exchange.rpc import fit_rpc, write_rpc_txt
+from ortho_pipeline.exchange.rpc import write_rpc_txt
+from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points, write_points
@@ -87,7 +89,7 @@ def write_product(
     cuts = _cut(scene, components)
     files: dict[str, Path] = {}
     for number, band in enumerate(("pan", *MULTISPECTRAL) if multispectral else ("pan",)):
-        pixels = simulated.render(_of_band(scene, band), band, seed=seed + number)
+        pixels = rendering.render(_of_band(scene, band), band, seed=seed + number)
         for cut in cuts:
             files |= _write_image(out, cut, scene, band, pixels, rpc)
     files["metadata"] = out / f"po_{ORDER}_metadata.txt"

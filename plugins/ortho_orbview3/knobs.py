@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ortho_orbview3 import rendering
 from ortho_orbview3 import truth as simulated
 from ortho_pipeline.simulation.tables import Knob
 
@@ -57,7 +58,7 @@ KNOBS = (
         "Highest degree of the attitude error over a scene: periods down to some kilometres.",
     ),
     Knob(
-        "ENHANCEMENT", simulated.ENHANCEMENT, "of the difference to the mean of 3 x 3 pixels", "chosen",
+        "ENHANCEMENT", rendering.ENHANCEMENT, "of the difference to the mean of 3 x 3 pixels", "chosen",
         "Strength of the vendor's edge enhancement, which only the two statements on edges rest upon.",
     ),
     Knob(

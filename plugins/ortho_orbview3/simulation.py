@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from osgeo import gdal
 
+from ortho_orbview3 import rendering
 from ortho_orbview3 import truth as simulated
 from ortho_orbview3.product import COEFFICIENT_KEYS, CORNERS, ERROR_KEYS, SCALAR_KEYS
 from ortho_pipeline.errors import InputError
@@ -70,7 +71,7 @@ def write_product(
         stem = f"3v050620p0000{name}a520000000{index + 1:02d}00m_001{name}"
         own = {"image": ".tif", "label": ".pvl", "rpc": "_rpc.txt", "gcps": "_gcps.csv"}
         paths = {kind: out / f"{stem}{end}" for kind, end in own.items()}
-        _write_image(simulated.render(true[name], coast, seed=seed + index), paths["image"])
+        _write_image(rendering.render(true[name], coast, seed=seed + index), paths["image"])
         rpc = replace(simulated.vendor_rpc(camera), err_bias=simulated.SIGMA_BIAS, err_rand=0.5)
         write_rpc_txt(rpc, paths["rpc"])
         write_text(paths["label"], label(camera, rpc, coast, name))

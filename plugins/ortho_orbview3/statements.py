@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ortho_orbview3 import rendering
 from ortho_orbview3 import truth as simulated
 from ortho_pipeline.estimation.spatial_correlation import CovarianceAnalysis
 from ortho_pipeline.imaging.edge import analyse_edge
@@ -187,7 +188,7 @@ def _on_parameters(findings: Findings) -> Iterator[Statement]:
 
 
 def _on_edges() -> Iterator[Statement]:
-    raw, enhanced = (edges(strength)["fwhm"] for strength in (0.0, simulated.ENHANCEMENT))
+    raw, enhanced = (edges(strength)["fwhm"] for strength in (0.0, rendering.ENHANCEMENT))
     yield Statement(
         "Pixels are two pixels of the image wide.",
         min(raw) > 1.7,
@@ -232,9 +233,9 @@ def edges(enhancement: float) -> dict[str, tuple[float, float]]:
     reach = np.tan(angle) * size / 2
     ends = ((size / 2 + reach, 0.0), (size / 2 - reach, float(size)))
     found = [
-        analyse_edge(simulated.expose(along_line, oversampling, enhancement=enhancement), ends),
+        analyse_edge(rendering.expose(along_line, oversampling, enhancement=enhancement), ends),
         analyse_edge(
-            simulated.expose(along_line.T, oversampling, enhancement=enhancement), (ends[0][::-1], ends[1][::-1])
+            rendering.expose(along_line.T, oversampling, enhancement=enhancement), (ends[0][::-1], ends[1][::-1])
         ),
     ]
     return {"fwhm": (found[0].fwhm, found[1].fwhm), "blur": (found[0].psf_sigma, found[1].psf_sigma)}

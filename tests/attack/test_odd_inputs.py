@@ -14,7 +14,7 @@ from ortho_pipeline import commands
 from ortho_pipeline.batch import plan as batch_plan
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.exchange.rpc import fit_rpc
+from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.simulation.scanner import LineScanner
 

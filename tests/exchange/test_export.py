@@ -160,7 +160,7 @@ def test_rpc_stands_for_any_camera_over_30_km_and_1500_m(camera):
 @pytest.mark.realdata
 @pytest.mark.parametrize("name", REAL_RPCS)
 def test_rpc_stands_for_a_vendors_rpc(real, name):
-    from ortho_pipeline.exchange.rpc import fit_rpc
+    from ortho_pipeline.exchange.rpc_fit import fit_rpc
 
     path = next(real.rglob(Path(name).name))
     model = read_rpc(path)

@@ -12,11 +12,9 @@ import pytest
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.exchange import rpc as rpc_module
 from ortho_pipeline.exchange.rpc import (
     export_rpc,
     files_of,
-    fit_rpc,
     has_rpc,
     read_rpc,
     rpc_metadata,
@@ -26,6 +24,7 @@ from ortho_pipeline.exchange.rpc import (
     write_tagged_copy,
     write_vrt,
 )
+from ortho_pipeline.exchange.rpc_fit import domain_box, fit_rpc
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.models.base import SensorModel, as_ground
 
@@ -663,7 +662,7 @@ def test_real_rpcs_agree_with_gdal_close_and_are_refitted(path, tmp_path):
     centre, half = rpc.domain
     wide = centre + np.random.default_rng(3).uniform(-1.45, 1.45, (20_000, 3)) * half
     assert np.nanmax(unclosed(rpc, wide)) < 1e-10
-    box, heights = rpc_module._domain_box(rpc)
+    box, heights = domain_box(rpc)
     assert fit_rpc(rpc, box, heights).max_error_px < 1e-4
 
 

@@ -19,7 +19,9 @@ from pyproj.database import query_crs_info
 
 from ortho_pipeline.errors import CrsError, DatumError
 from ortho_pipeline.geodesy import crs as module
-from ortho_pipeline.geodesy.crs import GroundTransform, Vertical, declared_vertical, horizontal, parse_crs, utm_crs
+from ortho_pipeline.geodesy.crs import GroundTransform, Vertical, horizontal, parse_crs, utm_crs
+from ortho_pipeline.geodesy.declared_vertical import declared_vertical
+from ortho_pipeline.geodesy.proj_grids import grids, proj_info
 
 EGM96 = Path("/usr/share/proj/egm96_15.gtx")
 needs_egm96 = pytest.mark.skipif(not EGM96.is_file(), reason="Debian's proj-data (egm96_15.gtx) is not installed")
@@ -193,10 +195,10 @@ def test_two_dimensions_declare_no_height(text: str) -> None:
 
 
 def test_grids_for_the_doctor() -> None:
-    rows = {row["datum"]: row for row in module.grids()}
+    rows = {row["datum"]: row for row in grids()}
     assert set(rows) == {"egm96", "egm2008", "egm84"}
     assert rows["egm96"]["found"] is EGM96.is_file() or rows["egm96"]["found"]
-    info = module.proj_info()
+    info = proj_info()
     assert info["network"] is False
     assert info["search_path"]
 

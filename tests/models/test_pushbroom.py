@@ -16,7 +16,7 @@ import pytest
 from ortho_pipeline.errors import DegeneratePoints, InputError
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.estimation.problem import Prior
-from ortho_pipeline.exchange.rpc import fit_rpc
+from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.ellipsoid import geocentric
 from ortho_pipeline.models import Pushbroom, model_from_dict
 from ortho_pipeline.models.base import Array, SensorModel

@@ -23,7 +23,8 @@ from ortho_ikonos.truth import (
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.family_fit import fit_family
-from ortho_pipeline.exchange.rpc import fit_rpc, read_rpc
+from ortho_pipeline.exchange.rpc import read_rpc
+from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.crs import utm_crs
 from ortho_pipeline.simulation.page import text
 from ortho_pipeline.simulation.scanner import geocentric

@@ -8,17 +8,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from ortho_ikonos.metadata import read_metadata
+from ortho_ikonos.rendering import brightness, render
 from ortho_ikonos.simulation import ORDER, write_product
-from ortho_ikonos.truth import (
-    DARK,
-    FINEST,
-    MAP_CRS,
-    REFERENCE_HEIGHT,
-    GeoScene,
-    brightness,
-    render,
-    to_map,
-)
+from ortho_ikonos.truth import DARK, FINEST, MAP_CRS, REFERENCE_HEIGHT, GeoScene, to_map
 
 from ortho_pipeline import commands
 from ortho_pipeline.cli.program import cli

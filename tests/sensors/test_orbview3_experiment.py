@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 from ortho_orbview3 import experiment as orbview3
 from ortho_orbview3 import page as orbview3_page
+from ortho_orbview3 import rendering
 from ortho_orbview3 import statements as orbview3_statements
 from ortho_orbview3 import truth as simulated
 
@@ -163,13 +164,13 @@ def test_the_ground_is_measured_once_and_each_image_by_itself():
 def test_pixels_are_two_pixels_wide_and_moving():
     fine = np.zeros((80, 80))
     fine[36:40, 36:40] = 1.0
-    seen = simulated.expose(fine, 4, enhancement=0.0)
+    seen = rendering.expose(fine, 4, enhancement=0.0)
     # A pixel of light: seen by the columns on either side of its own with half the weight, by rows twice as far.
     np.testing.assert_allclose(seen.sum(), 1.0)
     across, along = seen.sum(axis=0), seen.sum(axis=1)
     np.testing.assert_allclose(across[8:11], [0.25, 0.5, 0.25])
     np.testing.assert_allclose(along[7:12], [0.03125, 0.25, 0.4375, 0.25, 0.03125])
-    np.testing.assert_allclose(simulated.expose(np.ones((24, 24)), 2), 1.0)
+    np.testing.assert_allclose(rendering.expose(np.ones((24, 24)), 2), 1.0)
 
 
 def test_edges_show_the_staggered_lines_until_they_are_enhanced():
@@ -189,8 +190,8 @@ def test_an_edge_of_the_rendered_image_has_that_width(monkeypatch):
 
     monkeypatch.setattr(simulated, "brightness", edge)
     raw, delivered = (
-        simulated.render(camera, simulated.level(100.0), noise_dn=0.5, enhancement=strength).astype(np.float64)
-        for strength in (0.0, simulated.ENHANCEMENT)
+        rendering.render(camera, simulated.level(100.0), noise_dn=0.5, enhancement=strength).astype(np.float64)
+        for strength in (0.0, rendering.ENHANCEMENT)
     )
     found = analyse_edge(raw, ((114.0, 0.0), (86.0, 200.0)))
     assert found.fwhm == pytest.approx(1.9, abs=0.2)

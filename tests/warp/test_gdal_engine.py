@@ -17,7 +17,8 @@ from osgeo import gdal
 from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.family_fit import fit_family
-from ortho_pipeline.exchange.rpc import RpcExport, export_rpc
+from ortho_pipeline.exchange.rpc import export_rpc
+from ortho_pipeline.exchange.rpc_fit import RpcExport
 from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import FrameCamera, ImageCorrection, SensorModel
 from ortho_pipeline.models.lens import Interior

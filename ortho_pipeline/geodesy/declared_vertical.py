@@ -1,0 +1,77 @@
+"""Height systems that rasters declare, in their CRS or in the words of their metadata."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import pyproj
+
+from ortho_pipeline.errors import DatumError
+from ortho_pipeline.geodesy.crs import Vertical
+
+
+@dataclass(frozen=True)
+class DeclaredVertical:
+    """What a CRS says about heights.
+
+    Parameters
+    ----------
+    name : str
+        As written there.
+    vertical : Vertical or None
+        The datum, None if the name says nothing that is known.
+    certain : bool
+        True if an authority code or a grid identifies it, False if only its name does.
+    metres_per_unit : float
+        Length of the unit of the vertical axis.
+    """
+
+    name: str
+    vertical: Vertical | None
+    certain: bool
+    metres_per_unit: float
+
+
+def declared_vertical(crs: pyproj.CRS) -> DeclaredVertical | None:
+    """Return what a system declares about heights; None if it is two-dimensional.
+
+    A 3D geographic, projected or geocentric system declares the ellipsoid; a compound system its vertical part, known
+    by its authority code, by the geoid grid bound to it, or (not certain) by a name such as ``EGM96 height``.
+
+    Raises
+    ------
+    DatumError
+        If the vertical axis points down.
+    """
+    if not crs.is_compound:
+        if len(crs.axis_info) < 3:
+            return None
+        return DeclaredVertical(crs.name, Vertical("ellipsoid"), True, crs.axis_info[2].unit_conversion_factor)
+    part = crs.sub_crs_list[1]
+    plain = part.source_crs if part.is_bound and part.source_crs is not None else part
+    axis = plain.axis_info[0]
+    if axis.direction.lower() == "down":
+        raise DatumError(f"{plain.name!r} counts depths, not heights", field="vertical CRS")
+    authority = plain.to_authority(min_confidence=90)
+    if authority is not None and authority[0] == "EPSG":
+        # PROJ also finds a code by comparing names; only a code that is written there is certain.
+        certain = "id" in plain.to_json_dict()
+        return DeclaredVertical(plain.name, Vertical(":".join(authority)), certain, axis.unit_conversion_factor)
+    bound = list(part.coordinate_operation.grids) if part.is_bound and part.coordinate_operation is not None else []
+    if bound:
+        grid = Vertical(bound[0].short_name)
+        return DeclaredVertical(plain.name, grid, True, axis.unit_conversion_factor)
+    return DeclaredVertical(plain.name, _vertical_of_name(plain.name), False, axis.unit_conversion_factor)
+
+
+def _vertical_of_name(name: str) -> Vertical | None:
+    plain = re.sub(r"[^a-z0-9]", "", name.lower())
+    for pattern, vertical in (
+        (r"(wgs84)?egm(19)?96.*", "EPSG:5773"),
+        (r"(wgs84)?egm(20)?08.*", "EPSG:3855"),
+        (r".*ellipsoid.*", "ellipsoid"),
+    ):
+        if re.fullmatch(pattern, plain):
+            return Vertical(vertical)
+    return None
