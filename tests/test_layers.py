@@ -69,7 +69,22 @@ GDAL_MODULES |= {
 }
 NUMBA_MODULES = {"files.compiled"}
 MATPLOTLIB_MODULES = {"display.drawing"}
-MAX_ENTRIES, MAX_MODULES, MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_PARAMETERS = 26, 12, 600, 250, 50, 12
+MAX_ENTRIES, MAX_MODULES, MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_PARAMETERS = 26, 12, 500, 250, 50, 12
+#: What is still longer (modules in lines, classes in lines, parameters), to be split: it may become shorter only.
+TOO_LONG = {
+    "ortho_pipeline/block/adjustment.py": 600,
+    "ortho_pipeline/block/blunders.py": 520,
+    "ortho_pipeline/block/solver.py": 600,
+    "ortho_pipeline/block/solver.py::BlockProblem": 390,
+    "ortho_pipeline/block/variance_components.py": 520,
+    "ortho_pipeline/models/frame/camera.py::FrameCamera": 400,
+    "ortho_pipeline/models/pushbroom/scanner.py::Pushbroom": 385,
+    "ortho_pipeline/models/pushbroom/start.py::pushbroom_of_metadata": 13,
+    "ortho_pipeline/models/pushbroom/start.py::pushbroom_of_tables": 13,
+    "ortho_pipeline/plugins.py::Host": 320,
+    "ortho_pipeline/surface/dem.py": 600,
+    "ortho_pipeline/surface/dem.py::Surface": 450,
+}
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 PLUGIN_FILES = sorted((ROOT / "plugins").rglob("*.py"))
@@ -163,11 +178,26 @@ def test_the_command_line_defers_heavy_imports() -> None:
 
 @pytest.mark.parametrize("path", FILES + PLUGIN_FILES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_nothing_grows_too_long(path: Path) -> None:
-    text = path.read_text(encoding="utf-8")
-    assert text.count("\n") <= MAX_LINES
+    text, name = path.read_text(encoding="utf-8"), path.relative_to(ROOT).as_posix()
+    over = {name: text.count("\n")} if text.count("\n") > MAX_LINES else {}
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             assert code_lines(node) <= MAX_FUNCTION, f"{node.name} has {code_lines(node)} lines"
+            if parameters(node) > MAX_PARAMETERS:
+                over[f"{name}::{node.name}"] = parameters(node)
+        elif isinstance(node, ast.ClassDef) and (node.end_lineno or 0) - node.lineno >= MAX_CLASS:
+            over[f"{name}::{node.name}"] = (node.end_lineno or 0) - node.lineno + 1
+    excused = {key for key in TOO_LONG if key.partition("::")[0] == name}
+    assert not {key: value for key, value in over.items() if value > TOO_LONG.get(key, 0)}, "split it"
+    if name != "ortho_pipeline/surface/dem.py":  # it is being split
+        assert excused <= set(over), "it is short enough now: take it off TOO_LONG"
+
+
+def parameters(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Count the parameters of a function without `self` and `cls`."""
+    given = node.args
+    names = [one.arg for one in (*given.posonlyargs, *given.args, *given.kwonlyargs, given.vararg, given.kwarg) if one]
+    return len([name for name in names if name not in ("self", "cls")])
 
 
 def code_lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -33,7 +33,8 @@ from ortho_pipeline.models.base import (
     as_ground,
     as_image,
 )
-from ortho_pipeline.models.families import Family, exponents, family_of, points_needed
+from ortho_pipeline.models.families import exponents, family_of, points_needed
+from ortho_pipeline.models.polynomials import layout_of, term_partials, terms_of
 from ortho_pipeline.models.rpc_box import RPC_TERMS, check_numbers, sound_heights
 
 #: From this many points on the compiled kernels are used: loading them takes longer than few points do.
@@ -268,35 +269,6 @@ _POLE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class _Layout:
-    """Where coefficients of a family stand in a table of the rows col, row (numerators), col, row (denominators)."""
-
-    family: Family
-    powers: NDArray[np.int64]  # (T, 3), of all terms that occur
-    places: tuple[tuple[NDArray[np.int64], int], ...]  # for each parameter: its rows of the table, its term
-
-    def table(self, coefficients: Array) -> Array:
-        """Return the coefficients as ``(4, T)``, the constants of the denominators included."""
-        table = np.zeros((4, len(self.powers)))
-        table[2:, 0] = 1.0
-        for value, (rows, term) in zip(coefficients, self.places, strict=True):
-            table[rows, term] = value
-        return table
-
-
-@lru_cache(maxsize=64)
-def _layout(name: str) -> _Layout:
-    family = family_of(name)
-    terms = list(dict.fromkeys(("1", *family.col, *family.row, *family.den)))
-    rows = {"col": [0], "row": [1], "den": [2, 3], "col_den": [2], "row_den": [3]}
-    places = []
-    for parameter in family.param_names:
-        part, _, term = parameter.rpartition("_")
-        places.append((np.array(rows[part]), terms.index(term)))
-    return _Layout(family, np.array([exponents(term) for term in terms]), tuple(places))
-
-
-@dataclass(frozen=True, eq=False)
 class Rational(SensorModel):
     """A classical model: ratio of polynomials of normalised ground coordinates.
 
@@ -334,7 +306,7 @@ class Rational(SensorModel):
     removed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        layout = _layout(self.family)
+        layout = layout_of(self.family)
         shapes = {
             "coefficients": (layout.family.parameters,), "ground_offset": (3,), "ground_scale": (3,),
             "image_offset": (2,), "image_scale": (2,), "box": (2, 3),
@@ -372,7 +344,7 @@ class Rational(SensorModel):
 
     @property
     def param_names(self) -> tuple[str, ...]:
-        names = _layout(self.family).family.param_names
+        names = layout_of(self.family).family.param_names
         return tuple(name for name in names if name not in self.removed) if self.removed else names
 
     @property
@@ -448,16 +420,16 @@ class Rational(SensorModel):
 
     def ground_to_image(self, ground: ArrayLike) -> Array:
         normalised, _ = self.normalise(ground)
-        sums = self._sums(_terms(self.family, normalised))
+        sums = self._sums(terms_of(self.family, normalised))
         image = (sums[:2] / sums[2:]).T * self.image_scale + self.image_offset
         image[~np.isfinite(normalised).all(axis=1)] = np.nan
         return np.ascontiguousarray(image)
 
     def ground_partials(self, ground: ArrayLike) -> Array:
         normalised, slopes = self.normalise(ground)
-        sums = self._sums(_terms(self.family, normalised))
+        sums = self._sums(terms_of(self.family, normalised))
         ratios = sums[:2] / sums[2:]
-        by_axis = self._table @ _term_partials(self.family, normalised)  # type: ignore[attr-defined]
+        by_axis = self._table @ term_partials(self.family, normalised)  # type: ignore[attr-defined]
         partials = np.moveaxis((by_axis[:, :2] - ratios * by_axis[:, 2:]) / sums[2:], (0, 1, 2), (2, 1, 0))
         partials = partials * self.image_scale[:, None] / self.ground_scale
         partials[~np.isfinite(normalised).all(axis=1)] = np.nan
@@ -465,12 +437,12 @@ class Rational(SensorModel):
 
     def param_partials(self, ground: ArrayLike) -> Array:
         normalised, _ = self.normalise(ground)
-        terms = _terms(self.family, normalised)
+        terms = terms_of(self.family, normalised)
         sums = self._sums(terms)
         factors = np.concatenate([1.0 / sums[2:], -sums[:2] / sums[2:] ** 2]) * np.tile(self.image_scale, 2)[:, None]
         free = self._free
         partials = np.zeros((terms.shape[1], 2, len(free)))
-        places = _layout(self.family).places
+        places = layout_of(self.family).places
         for k, index in enumerate(free):
             rows, term = places[index]
             for row in rows:
@@ -483,32 +455,3 @@ class Rational(SensorModel):
         if not isinstance(data.get("family"), str):
             raise InputError("a rational model has the name of its family", field="family")
         return super().from_dict(data)
-
-
-def _powers(name: str, normalised: Array) -> tuple[NDArray[np.int64], list[list[Array]]]:
-    table = _layout(name).powers
-    found = []
-    for axis in range(3):
-        powers = [np.ones(len(normalised))]
-        for _ in range(int(table[:, axis].max())):
-            powers.append(powers[-1] * normalised[:, axis])
-        found.append(powers)
-    return table, found
-
-
-def _terms(name: str, normalised: Array) -> Array:
-    """Return the terms of a family ``(T, N)``."""
-    table, powers = _powers(name, normalised)
-    return np.array([powers[0][i] * powers[1][j] * powers[2][k] for i, j, k in table])
-
-
-def _term_partials(name: str, normalised: Array) -> Array:
-    """Return the derivatives of the terms by the normalised coordinates ``(3, T, N)``."""
-    table, powers = _powers(name, normalised)
-    partials = np.zeros((3, len(table), len(normalised)))
-    for axis in range(3):
-        for term, exponent in enumerate(table):
-            if exponent[axis]:
-                i, j, k = exponent - (np.arange(3) == axis)
-                partials[axis, term] = float(exponent[axis]) * powers[0][i] * powers[1][j] * powers[2][k]
-    return partials

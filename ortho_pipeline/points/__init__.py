@@ -5,16 +5,14 @@ Imports `geodesy` and what is below. A new point format is a module here and a l
 
 from __future__ import annotations
 
+from ortho_pipeline.points.shared_marks import HasGround, marks_warning, one_mark
 from ortho_pipeline.points.table import (
     DEFAULT_SIGMA_IMAGE,
     AnyPoints,
-    HasGround,
     Point,
     Points,
     assign_roles,
     gcps_of_dataset,
-    marks_warning,
-    one_mark,
     read_points,
     write_points,
 )

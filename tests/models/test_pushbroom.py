@@ -22,7 +22,7 @@ from ortho_pipeline.models import Pushbroom, model_from_dict
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.pushbroom.constraints import Observations, OrbitShape
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom.scanner import angles_of, rotations
+from ortho_pipeline.models.pushbroom.rotations import angles_of, rotations
 from ortho_pipeline.models.pushbroom.splines import Spline
 from ortho_pipeline.models.pushbroom.start import (
     mounting_of_angles,

@@ -49,6 +49,7 @@ from ortho_pipeline.geodesy.ellipsoid import (
     rotation_of_angles,
 )
 from ortho_pipeline.models.base import Array, SensorModel, as_ground, as_image
+from ortho_pipeline.models.frame.platform import camera_from_platform
 from ortho_pipeline.models.lens import INTERIOR, Interior
 
 #: Parameters of the exterior orientation: metres and radians in the working frame.
@@ -472,23 +473,6 @@ def exterior_sigmas(position: float | None, angle: float | None) -> dict[str, fl
     """Return standard deviations by parameter: of the position (m) and the angles (rad), as far as they are known."""
     known = {EXTERIOR[:3]: position, EXTERIOR[3:]: angle}
     return {name: sigma for names, sigma in known.items() if sigma is not None for name in names}
-
-
-def camera_from_platform(roll: float, pitch: float, yaw: float) -> Array:
-    """Return the rotation ``(3, 3)`` from north, east, down to camera axes, for a camera that looks down.
-
-    See `FrameCamera.from_roll_pitch_yaw`; for a satellite the same holds from the orbital frame along, right, down.
-    """
-    sr, cr, sp, cp, sy, cy = (f(a) for a in (roll, pitch, yaw) for f in (math.sin, math.cos))
-    platform_from_level = np.array(
-        [
-            [cp * cy, cp * sy, -sp],
-            [sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp],
-            [cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp],
-        ]
-    )
-    camera_from_axes = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    return camera_from_axes @ platform_from_level
 
 
 def _directions(w: Array) -> Array:

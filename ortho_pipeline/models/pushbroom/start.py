@@ -36,7 +36,8 @@ from ortho_pipeline.geodesy.ellipsoid import geocentric, orbital_from_ecef
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.pushbroom.constraints import Observations, OrbitShape
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom.scanner import Pushbroom, angles_of, are_rotations, rotations
+from ortho_pipeline.models.pushbroom.rotations import angles_of, are_rotations, rotations
+from ortho_pipeline.models.pushbroom.scanner import Pushbroom
 from ortho_pipeline.models.pushbroom.splines import Spline
 
 #: Gravity of the Earth, m^3 / s^2.

@@ -1,0 +1,72 @@
+"""Polynomials of ground coordinates: their terms, and the partials of these."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_pipeline.models.base import (
+    Array,
+)
+from ortho_pipeline.models.families import Family, exponents, family_of
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where coefficients of a family stand in a table of the rows col, row (numerators), col, row (denominators)."""
+
+    family: Family
+    powers: NDArray[np.int64]  # (T, 3), of all terms that occur
+    places: tuple[tuple[NDArray[np.int64], int], ...]  # for each parameter: its rows of the table, its term
+
+    def table(self, coefficients: Array) -> Array:
+        """Return the coefficients as ``(4, T)``, the constants of the denominators included."""
+        table = np.zeros((4, len(self.powers)))
+        table[2:, 0] = 1.0
+        for value, (rows, term) in zip(coefficients, self.places, strict=True):
+            table[rows, term] = value
+        return table
+
+
+@lru_cache(maxsize=64)
+def layout_of(name: str) -> Layout:
+    family = family_of(name)
+    terms = list(dict.fromkeys(("1", *family.col, *family.row, *family.den)))
+    rows = {"col": [0], "row": [1], "den": [2, 3], "col_den": [2], "row_den": [3]}
+    places = []
+    for parameter in family.param_names:
+        part, _, term = parameter.rpartition("_")
+        places.append((np.array(rows[part]), terms.index(term)))
+    return Layout(family, np.array([exponents(term) for term in terms]), tuple(places))
+
+
+def _powers(name: str, normalised: Array) -> tuple[NDArray[np.int64], list[list[Array]]]:
+    table = layout_of(name).powers
+    found = []
+    for axis in range(3):
+        powers = [np.ones(len(normalised))]
+        for _ in range(int(table[:, axis].max())):
+            powers.append(powers[-1] * normalised[:, axis])
+        found.append(powers)
+    return table, found
+
+
+def terms_of(name: str, normalised: Array) -> Array:
+    """Return the terms of a family ``(T, N)``."""
+    table, powers = _powers(name, normalised)
+    return np.array([powers[0][i] * powers[1][j] * powers[2][k] for i, j, k in table])
+
+
+def term_partials(name: str, normalised: Array) -> Array:
+    """Return the derivatives of the terms by the normalised coordinates ``(3, T, N)``."""
+    table, powers = _powers(name, normalised)
+    partials = np.zeros((3, len(table), len(normalised)))
+    for axis in range(3):
+        for term, exponent in enumerate(table):
+            if exponent[axis]:
+                i, j, k = exponent - (np.arange(3) == axis)
+                partials[axis, term] = float(exponent[axis]) * powers[0][i] * powers[1][j] * powers[2][k]
+    return partials

@@ -1,0 +1,63 @@
+"""Points that lie on one mark of the ground, measured twice."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import pyproj
+
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.geodesy.crs import (
+    ground_transform,
+)
+from ortho_pipeline.points.table import Array
+
+#: Two points closer than this (m) are one mark; the targets of no survey stand so close together.
+_ONE_MARK = 0.01
+
+
+class HasGround(Protocol):
+    """A table of points with ground: of one image, or of a block."""
+
+    @property
+    def ids(self) -> tuple[str, ...]: ...
+    @property
+    def ground(self) -> Array: ...
+    @property
+    def crs(self) -> pyproj.CRS: ...
+
+
+def one_mark(points: HasGround) -> list[tuple[str, str]]:
+    """Return pairs of ids of points that are within a centimetre on the ground: one mark that was measured twice.
+
+    Of a crowd each point stands in one pair, with its nearest neighbour.
+    """
+    from scipy.spatial import cKDTree
+
+    plan = np.isfinite(points.ground[:, :2]).all(axis=1)
+    place = np.nan_to_num(points.ground[plan])
+    if len(place) < 2:
+        return []
+    place = ground_transform(points.crs, "EPSG:4978")(place)
+    index = np.flatnonzero(plan)[np.isfinite(place).all(axis=1)]
+    place = place[np.isfinite(place).all(axis=1)]
+    distance, neighbour = cKDTree(place).query(place, k=2, distance_upper_bound=_ONE_MARK)
+    # Of points at one place the first neighbour may be the other.
+    other = np.where(neighbour[:, 0] == np.arange(len(place)), neighbour[:, 1], neighbour[:, 0])
+    near = np.flatnonzero(np.isfinite(distance).all(axis=1))
+    pairs = {(min(index[k], index[other[k]]), max(index[k], index[other[k]])) for k in near}
+    return [(points.ids[one], points.ids[two]) for one, two in sorted(pairs)]
+
+
+def marks_warning(control: HasGround) -> list[Notice]:
+    """Return a warning of control points that are one mark: they add no knowledge of its place."""
+    pairs = one_mark(control)
+    if not pairs:
+        return []
+    shown = ", ".join(f"{one} and {two}" for one, two in pairs[:5]) + (" ..." if len(pairs) > 5 else "")
+    text = (
+        f"control points within a centimetre of each other ({shown}): one mark that was measured twice counts as two, "
+        "and redundancy and sigmas are too good by that; keep one of them"
+    )
+    return [Notice("one-mark-twice", text, pairs=[list(pair) for pair in pairs])]
