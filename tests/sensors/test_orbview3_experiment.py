@@ -188,7 +188,7 @@ def test_an_edge_of_the_rendered_image_has_that_width(monkeypatch):
         image = camera.project(np.stack([lon, lat, np.full(len(lon), 100.0)], axis=1))
         return np.where(image[:, 0] - 100 + 0.14 * (image[:, 1] - 100) > 0, 0.8, 0.2)
 
-    monkeypatch.setattr(simulated, "brightness", edge)
+    monkeypatch.setattr(rendering, "brightness", edge)
     raw, delivered = (
         rendering.render(camera, simulated.level(100.0), noise_dn=0.5, enhancement=strength).astype(np.float64)
         for strength in (0.0, rendering.ENHANCEMENT)
