@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,6 +15,13 @@ from osgeo import gdal, osr
 
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.models import RPC
+
+# A shell that starts the tests in the background has its children ignore Ctrl-C; what the tests start must not.
+for _number, _action in (
+    (signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL), (signal.SIGHUP, signal.SIG_DFL),
+):  # fmt: skip
+    if signal.getsignal(_number) == signal.SIG_IGN:
+        signal.signal(_number, _action)
 
 ROOT = Path(__file__).resolve().parent.parent
 REAL = ROOT.parent / "shared" / "data"

@@ -20,6 +20,7 @@ from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, rpc_metadata, rpc_of_fields, write_rpb, write_rpc_txt
+from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import (
     KINDS,
     RPC,
@@ -335,8 +336,8 @@ def test_an_ortho_depends_on_no_tiles_memory_or_threads(
             patch.setattr(warp, "TILE", blocks * warp.BLOCK)
             path = tiny.folder / "ortho.tif"
             warp.rectify(
-                tiny.model, source, surface, grid, path, resampling=kernel, memory=given_memory,
-                threads=given_threads, driver="GTiff",
+                tiny.model, source, surface, grid, path, resampling=kernel, driver="GTiff",
+                resources=Resources(memory=given_memory, threads=given_threads),
             )  # fmt: skip
         found.append(gdal.Open(str(path)).ReadAsArray())
     assert found[0].any()

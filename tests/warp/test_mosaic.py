@@ -110,7 +110,7 @@ def test_a_mosaic_larger_than_its_windows(tmp_path, landscape, monkeypatch):
         ({"off": 0.5}, "off by 0.250 px"),
         ({"step": 2.5}, "2.5 x 2.5"),
         ({"crs": pyproj.CRS("EPSG:32636")}, "zone 36N"),
-        ({"dtype": "uint8"}, "1 bands of uint8"),
+        ({"dtype": "uint8"}, "1 band of uint8"),
         ({"validity": "nodata", "nodata": 0.0}, "valid by nodata"),
     ],
 )
