@@ -33,7 +33,7 @@ from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres, metre_partials, with_reference_height
 from ortho_pipeline.estimation.statistics import student_of
 from ortho_pipeline.geodesy.crs import ground_transform
-from ortho_pipeline.geodesy.ellipsoid import horizon_from_geodetic
+from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
 from ortho_pipeline.models.base import Array
 
 Pair = tuple[float, float]
@@ -239,14 +239,14 @@ def analyse_fit(fit: Fit, *, near: float | None = None) -> dict[str, CovarianceA
 
 
 def _on_the_ground(fit: Fit) -> Array:
-    """Return east and north (m) of the points in the horizon of the first."""
+    """Return east and north (m) of the points in the local ENU frame of the first."""
     ground = with_reference_height(fit.model, fit.points.ground)
     geographic = ground_transform(fit.points.crs, "EPSG:4979")(ground)
     known = np.isfinite(geographic).all(axis=1)
     where = np.full((len(ground), 2), np.nan)
     if known.any():
         # The first point, for longitudes have no mean across the antimeridian.
-        where[known] = horizon_from_geodetic(geographic[known], geographic[known][0])[0][:, :2]
+        where[known] = enu_from_geodetic(geographic[known], geographic[known][0])[0][:, :2]
     return where
 
 

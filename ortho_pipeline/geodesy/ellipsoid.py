@@ -79,10 +79,10 @@ def metres_per_degree(ground: Array) -> Array:
     return np.radians(np.stack([(prime_vertical + ground[:, 2]) * np.cos(lat), meridian + ground[:, 2]], axis=1))
 
 
-def horizon_from_geodetic(ground: Array, origin: Array) -> tuple[Array, Array]:
+def enu_from_geodetic(ground: Array, origin: Array) -> tuple[Array, Array]:
     """Return east, north, up (m) of points ``(N, 3)`` lon, lat (deg), h about an origin, and derivatives ``(N, 3, 3)``.
 
-    A Cartesian system: the geocentric one, turned into the horizon of `origin` ``(3,)`` and moved there.
+    A local ENU frame: the geocentric system, turned to the axes at `origin` ``(3,)`` and moved there.
     """
     turn = enu_from_ecef(origin[None])[0]
     # Columns: how a point moves with longitude, latitude and height.

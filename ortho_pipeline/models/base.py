@@ -285,6 +285,29 @@ def _as_points(points: ArrayLike, columns: int, what: str) -> Array:
     return array
 
 
+def checked_names(free: Iterable[str], known: Iterable[str], where: str) -> tuple[str, ...]:
+    """Return the names of free parameters, which must be different ones of those that are known."""
+    names = tuple(free)
+    unknown = sorted(set(names) - set(known))
+    if unknown or len(set(names)) != len(names):
+        raise InputError(f"free parameters are different names {where}", field=", ".join(unknown) or "free")
+    return names
+
+
+def ground_of_grid(model: SensorModel, size: tuple[int, int], count: int, heights: tuple[float, float]) -> Array:
+    """Return ground points ``(2 count^2, 3)`` of `count` x `count` pixels, rim included, at two ellipsoidal heights."""
+    fractions = np.stack(np.meshgrid(*[np.linspace(0, 1, count)] * 2), axis=-1).reshape(-1, 2)
+    image = fractions * size
+    return np.concatenate([model.image_to_ground(image, height) for height in heights])
+
+
+def box_around(ground: Array, heights: tuple[float, float]) -> tuple[Array, Array]:
+    """Return centre and half-size ``(3,)`` of the box around ground points, between two heights."""
+    low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
+    low[2], high[2] = heights
+    return (low + high) / 2, (high - low) / 2
+
+
 def solve_2x2(matrices: Array, right: Array) -> Array:
     """Solve ``(N, 2, 2)`` systems for ``(N, 2)`` right sides; NaN where singular."""
     a, b, c, d = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1]

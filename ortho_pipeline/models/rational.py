@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.geodesy.ellipsoid import horizon_from_geodetic
+from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
 from ortho_pipeline.models.base import (
     INVERSE_TOLERANCE,
     INVERSE_VERIFIED,
@@ -278,7 +278,7 @@ class Rational(SensorModel):
         Which terms there are: a name of `ortho_pipeline.models.families`.
     ground_crs : str
         CRS of the ground coordinates; ``geocentric`` takes lon, lat, h (EPSG:4979) and turns them into Cartesian
-        coordinates in the horizon of the middle of `box`, an affine change of geocentric ones.
+        coordinates in the local ENU frame of the middle of `box`, an affine change of geocentric ones.
     coefficients : (P,)
         In the order of the family's `param_names`, for normalised coordinates.
     ground_offset, ground_scale : (3,)
@@ -408,7 +408,7 @@ class Rational(SensorModel):
         ground[outside | ~np.isfinite(ground).all(axis=1)] = np.nan
         slopes = None
         if self.ground_crs == GEOCENTRIC:
-            ground, slopes = horizon_from_geodetic(ground, centre)
+            ground, slopes = enu_from_geodetic(ground, centre)
         return (ground - self.ground_offset) / self.ground_scale, slopes
 
     def _sums(self, terms: Array) -> Array:

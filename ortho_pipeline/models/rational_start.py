@@ -7,7 +7,7 @@ import pyproj
 
 from ortho_pipeline.errors import TooFewPoints, counted
 from ortho_pipeline.geodesy.crs import parse_crs, utm_crs
-from ortho_pipeline.geodesy.ellipsoid import horizon_from_geodetic
+from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.families import Family, exponents, family_of
 from ortho_pipeline.models.rational import GEOCENTRIC, Rational
@@ -85,7 +85,7 @@ def start_model(
     box = _box(ground, points.image, usable, size, heights, moved.crs)
     coordinates = ground[usable]
     if ground_crs == GEOCENTRIC:
-        coordinates, _ = horizon_from_geodetic(coordinates, box.mean(axis=0))
+        coordinates, _ = enu_from_geodetic(coordinates, box.mean(axis=0))
     ground_offset, ground_scale = _normalisation(coordinates)
     image_offset, image_scale = _normalisation(points.image[usable])
     coefficients = _coefficients(

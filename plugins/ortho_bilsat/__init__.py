@@ -17,8 +17,8 @@ from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.geodesy.ellipsoid import geodetic, orbital_from_ecef
 from ortho_pipeline.hookspecs import Scene, Sensor, Study, hookimpl
-from ortho_pipeline.models.frame.camera import LOOKS_PAST, FrameCamera, exterior_sigmas
-from ortho_pipeline.models.frame.platform import camera_from_platform
+from ortho_pipeline.models.frame.camera import LOOKS_PAST, FrameCamera
+from ortho_pipeline.models.frame.orientation import camera_from_platform, exterior_sigmas
 
 
 @hookimpl

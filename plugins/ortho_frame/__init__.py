@@ -17,7 +17,9 @@ from ortho_pipeline.estimation.problem import Prior, priors_at
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.models.frame.camera import LOOKS_PAST, TOPOCENTRIC, FrameCamera, exterior_sigmas
+from ortho_pipeline.models.frame.camera import LOOKS_PAST, FrameCamera
+from ortho_pipeline.models.frame.orientation import exterior_sigmas
+from ortho_pipeline.models.frame.working_frame import TOPOCENTRIC
 from ortho_pipeline.models.lens import Interior
 
 OPTIONS = {

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ortho_pipeline.geodesy.ellipsoid import angles_of_rotation, rotation_between, rotation_of_angles
-from ortho_pipeline.models.frame.platform import camera_from_platform
+from ortho_pipeline.models.frame.orientation import camera_from_platform
 from ortho_pipeline.models.pushbroom.rotations import angles_of, rotations
-from ortho_pipeline.models.pushbroom.start import rotations_of_quaternions
+from ortho_pipeline.models.pushbroom.tables import rotations_of_quaternions
 
 TURNS = st.floats(-math.pi, math.pi)
 #: The middle angle is only determined up to here from the pole of the sequence.

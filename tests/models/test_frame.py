@@ -58,7 +58,7 @@ def points_of(ground: np.ndarray, image: np.ndarray, noise: float, crs: str = "E
 def apart(first: FrameCamera, second: FrameCamera) -> tuple[float, float]:
     """Return how far two topocentric cameras are apart (m) and how much one is turned to the other (rad)."""
     shift = geocentric(first.perspective_centre[None]) - geocentric(second.perspective_centre[None])
-    turn = first.rotation @ first._local[0] @ (second.rotation @ second._local[0]).T
+    turn = first.rotation @ first.working_frame.axes @ (second.rotation @ second.working_frame.axes).T
     return float(np.linalg.norm(shift)), float(np.linalg.norm(turn - np.eye(3)) / np.sqrt(2))
 
 

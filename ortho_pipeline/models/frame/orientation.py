@@ -1,12 +1,67 @@
-"""Cameras on a platform that states roll, pitch and yaw."""
+"""Exterior orientations: their parameters, and the ways in which they are stated."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
+from ortho_pipeline.geodesy.ellipsoid import (
+    angles_of_rotation,
+    enu_from_ecef,
+    geocentric,
+    geodetic,
+    rotation_of_angles,
+)
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.models.frame.working_frame import GEOGRAPHIC
+
+#: Parameters of the exterior orientation: metres and radians in the working frame.
+EXTERIOR = ("X_L", "Y_L", "Z_L", "omega", "phi", "kappa")
+
+
+def exterior_of_geocentric(
+    position: ArrayLike, camera_from_ecef: Array | None
+) -> tuple[Array, tuple[float, float, float]]:
+    """Return the topocentric exterior ``(6,)`` of a position in ECEF, and its origin on the ellipsoid below.
+
+    `camera_from_ecef` is the rotation ``(3, 3)`` to camera axes; without it the camera looks straight down with the
+    top of the image to the north.
+    """
+    lon, lat, height = geodetic(np.asarray(position, dtype=np.float64)[None])[0].tolist()
+    axes = enu_from_ecef(np.array([[lon, lat]]))[0]
+    angles = (0.0, 0.0, 0.0) if camera_from_ecef is None else angles_of_rotation(camera_from_ecef @ axes.T)
+    return np.array([0.0, 0.0, height, *angles]), (lon, lat, 0.0)
+
+
+def geocentric_of_map(crs: str, exterior: Array) -> tuple[Array, Array]:
+    """Return the position in ECEF ``(3,)`` and the rotation ``(3, 3)`` from there to the camera of a map's exterior.
+
+    The angles are turned by the meridian convergence at the perspective centre.
+    """
+    to_geographic = ground_transform(crs, GEOGRAPHIC)
+    steps = np.array([[0, 0], [100.0, 0], [-100.0, 0], [0, 100.0], [0, -100.0]])
+    around = to_geographic(np.column_stack([exterior[:2] + steps, np.full(5, exterior[2])]))
+    axes = enu_from_ecef(around[:1])[0]
+    ecef = geocentric(around)
+    east, north = axes @ (ecef[1] - ecef[2]), axes @ (ecef[3] - ecef[4])
+    turn = math.atan2(east[1] - north[0], east[0] + north[1])
+    grid_from_enu = np.array([[math.cos(turn), math.sin(turn), 0], [-math.sin(turn), math.cos(turn), 0], [0, 0, 1]])
+    return ecef[0], rotation_of_angles(*exterior[3:].tolist()) @ grid_from_enu @ axes
+
+
+def geocentric_of_platform(position: ArrayLike, roll: float, pitch: float, yaw: float) -> tuple[Array, Array]:
+    """Return the position in ECEF ``(3,)`` and the rotation ``(3, 3)`` from there to the camera of a platform.
+
+    See `FrameCamera.from_roll_pitch_yaw`.
+    """
+    place = np.asarray(position, dtype=np.float64)[None]
+    axes = enu_from_ecef(place)[0]
+    ned_from_ecef = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]) @ axes
+    return geocentric(place)[0], camera_from_platform(roll, pitch, yaw) @ ned_from_ecef
 
 
 def camera_from_platform(roll: float, pitch: float, yaw: float) -> Array:
@@ -24,3 +79,18 @@ def camera_from_platform(roll: float, pitch: float, yaw: float) -> Array:
     )
     camera_from_axes = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     return camera_from_axes @ platform_from_level
+
+
+def exterior_sigmas(position: float | None, angle: float | None) -> dict[str, float]:
+    """Return standard deviations by parameter: of the position (m) and the angles (rad), as far as they are known."""
+    known = {EXTERIOR[:3]: position, EXTERIOR[3:]: angle}
+    return {name: sigma for names, sigma in known.items() if sigma is not None for name in names}
+
+
+def require_metres(crs: str) -> None:
+    """Raise `InputError` for a CRS that is not a map projection in metres."""
+    parsed = parse_crs(crs)
+    if not parsed.is_projected or abs(parsed.axis_info[0].unit_conversion_factor - 1.0) > 1e-12:
+        raise InputError(
+            f"{parsed.name!r} is not a map projection in metres", field="CRS", remedy="give a projected CRS such as UTM"
+        )

@@ -21,7 +21,9 @@ from numpy.typing import ArrayLike
 from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints, counted
 from ortho_pipeline.geodesy.ellipsoid import angles_of_rotation, rotation_between
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.models.frame.camera import GEOGRAPHIC, MAP, TOPOCENTRIC, FrameCamera
+from ortho_pipeline.models.frame.camera import FrameCamera
+from ortho_pipeline.models.frame.collinearity import rays
+from ortho_pipeline.models.frame.working_frame import GEOGRAPHIC, MAP, TOPOCENTRIC
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.points import Points
 
@@ -67,9 +69,9 @@ def resect(
             remedy=f"give at least {needed}",
         )
     blank = _blank(control, interior, map_crs, refraction)
-    place, bearings = blank._working(control.ground), _bearings(interior, control.image)
+    place, bearings = blank.working_frame.from_ground(control.ground), _bearings(interior, control.image)
     if position is not None:
-        fixed = blank._working(np.asarray(position, dtype=np.float64)[None])[0]
+        fixed = blank.working_frame.from_ground(np.asarray(position, dtype=np.float64)[None])[0]
         starts = [_looking(fixed, place, bearings)]
     else:
         starts = _best(list(_solutions(place, bearings)), place, bearings)
@@ -110,9 +112,8 @@ def _blank(control: Points, interior: Interior, map_crs: str | None, refraction:
 
 def _bearings(interior: Interior, image: Array) -> Array:
     """Return unit vectors ``(N, 3)`` in camera axes of the rays of image points."""
-    u, v = interior.directions_of(image).T
-    rays = np.stack([u, -v, -np.ones_like(u)], axis=1)
-    return rays / np.linalg.norm(rays, axis=1)[:, None]
+    seen = rays(interior, image)
+    return seen / np.linalg.norm(seen, axis=1)[:, None]
 
 
 def _looking(position: Array, place: Array, bearings: Array) -> Array:
