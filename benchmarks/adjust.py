@@ -31,7 +31,7 @@ from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.models import RPC, ImageCorrection
-from ortho_pipeline.models.pushbroom.start import pushbroom_of_metadata
+from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.simulation.scanner import LineScanner
 
 SIDE, GSD, PIXELS = 10, 2.5, 4800

@@ -19,7 +19,7 @@ from ortho_pipeline.batch.config import read_config
 from ortho_pipeline.contract import model_faults
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import export_rpc
-from ortho_pipeline.models.pushbroom.start import pushbroom_of_metadata
+from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.points import read_points
 
 HEADER = b"id,col,row,x,y,h\n"

@@ -76,9 +76,6 @@ TOO_LONG = {
     "ortho_pipeline/block/solver.py": 600,
     "ortho_pipeline/block/solver.py::BlockProblem": 390,
     "ortho_pipeline/block/variance_components.py": 520,
-    "ortho_pipeline/models/pushbroom/scanner.py::Pushbroom": 385,
-    "ortho_pipeline/models/pushbroom/start.py::pushbroom_of_metadata": 13,
-    "ortho_pipeline/models/pushbroom/start.py::pushbroom_of_tables": 13,
 }
 
 FILES = sorted(PACKAGE.rglob("*.py"))

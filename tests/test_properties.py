@@ -38,7 +38,7 @@ from ortho_pipeline.models import (
 )
 from ortho_pipeline.models.frame.camera import PARAMETERS
 from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.models.pushbroom.start import pushbroom_of_metadata
+from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface

@@ -22,7 +22,7 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
-from ortho_pipeline.models.pushbroom.start import SoftSigmas, pushbroom_of_metadata
+from ortho_pipeline.models.pushbroom.metadata import SoftSigmas, pushbroom_of_metadata
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.models.rational_start import start_model
 from ortho_pipeline.points import Points

@@ -10,8 +10,8 @@ import numpy as np
 
 from ortho_cartosat.metadata import TILTS_DEG, Metadata
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.models.pushbroom.metadata import SoftSigmas, pushbroom_of_metadata
 from ortho_pipeline.models.pushbroom.scanner import Pushbroom
-from ortho_pipeline.models.pushbroom.start import SoftSigmas, pushbroom_of_metadata
 
 #: Focal length and pixel size of both cameras in metres: Willneff et al., table 1; and columns of a whole image.
 FOCAL_LENGTH, PIXEL_SIZE, COLUMNS = 1.945, 7e-6, 12000

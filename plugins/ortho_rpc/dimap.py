@@ -37,7 +37,8 @@ from ortho_pipeline.files.locations import place
 from ortho_pipeline.models import require_view
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
 from ortho_pipeline.models.pushbroom.scanner import Pushbroom
-from ortho_pipeline.models.pushbroom.start import pushbroom_of_tables, rotations_of_quaternions
+from ortho_pipeline.models.pushbroom.splines import SplineForm
+from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables, rotations_of_quaternions
 from ortho_rpc.dimap_file import MAX_SIZE, MOST_TERMS, DimapFile
 
 Array = NDArray[np.float64]
@@ -106,7 +107,7 @@ def read_dimap_pushbroom(
             orbit=(scan.orbit[0] - first, scan.orbit[1]),
             attitude=(times - first, turns),
             heights=_heights(file) or heights or HEIGHTS,
-            segments=(None, scan.pieces),
+            splines=SplineForm(3, attitude=scan.pieces),
         )
         require_view(model)  # damaged numbers may well make a camera that looks into the sky
     except InputError as error:

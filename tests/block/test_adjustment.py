@@ -24,7 +24,7 @@ from ortho_pipeline.geodesy.ellipsoid import geocentric
 from ortho_pipeline.models import RPC, FrameCamera, ImageCorrection, SensorModel, start_model
 from ortho_pipeline.models.base import Constraints
 from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.models.pushbroom.start import pushbroom_of_metadata
+from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.points.selection import select_control
 from ortho_pipeline.simulation.scanner import LineScanner
 

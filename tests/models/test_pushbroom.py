@@ -22,15 +22,10 @@ from ortho_pipeline.models import Pushbroom, model_from_dict
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.pushbroom.constraints import Observations, OrbitShape
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
+from ortho_pipeline.models.pushbroom.metadata import mounting_of_angles, pushbroom_of_metadata
 from ortho_pipeline.models.pushbroom.rotations import angles_of, rotations
-from ortho_pipeline.models.pushbroom.splines import Spline
-from ortho_pipeline.models.pushbroom.start import (
-    mounting_of_angles,
-    pushbroom_of_metadata,
-    pushbroom_of_tables,
-    rotations_of_angles,
-    rotations_of_quaternions,
-)
+from ortho_pipeline.models.pushbroom.splines import Spline, SplineForm
+from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables, rotations_of_angles, rotations_of_quaternions
 from ortho_pipeline.points import Points
 from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.testing import check_sensor_model
@@ -160,12 +155,12 @@ def test_it_keeps_the_contract(lon: float | None) -> None:
     ground = sample(camera, 40, 1)[1]
     check_sensor_model(exact(camera), ground)
     check_sensor_model(metadata_start(camera), ground)
-    check_sensor_model(everything(metadata_start(camera, degree=3, segments=2)), ground)
+    check_sensor_model(everything(metadata_start(camera, splines=SplineForm(3, 2, 2))), ground)
 
 
 def test_closed_partials_against_differences_of_a_third_of_a_pixel() -> None:
     """To 1e-6, which a sign or a neglected term would miss by far."""
-    model = everything(metadata_start(scanner(3), degree=3, segments=2))
+    model = everything(metadata_start(scanner(3), splines=SplineForm(3, 2, 2)))
     ground = sample(scanner(3), 30, 1)[1]
     partials = model.param_partials(ground)
     for k, name in enumerate(model.param_names):
@@ -361,7 +356,7 @@ def test_what_is_no_spline(name: str, value: object) -> None:
 
 
 def test_partials_of_the_constraints() -> None:
-    model = everything(metadata_start(scanner(2), degree=3, segments=2))
+    model = everything(metadata_start(scanner(2), splines=SplineForm(3, 2, 2)))
     table = Observations(np.array([0.1, 1.0]), np.zeros((2, 3)), np.ones((2, 3)))
     model = replace(model, path_observations=(table,))
     found = model.constraints()
@@ -397,7 +392,7 @@ def test_what_is_measured_counts_and_what_is_fictitious_does_not() -> None:
     assert soft.redundancy == math.floor(soft.degrees_of_freedom)
     held = fit(metadata_start(camera), points, robust=False, priors={"radial_0": Prior(0.0, 1e4)})
     assert soft.degrees_of_freedom < held.degrees_of_freedom < soft.degrees_of_freedom + 1
-    tables = exact(camera, position_sigma=0.5, angle_sigma=1e-5, segments=(2, 4)).freed("path", "attitude")
+    tables = exact(camera, position_sigma=0.5, angle_sigma=1e-5, splines=SplineForm(3, 2, 4)).freed("path", "attitude")
     hard = fit(tables, points, robust=False)
     assert not tables.constraints().fictitious.any()
     assert hard.redundancy == 24 + len(tables.constraints()) - len(tables.params)
@@ -618,7 +613,7 @@ def test_tables_of_what_is_no_rotation(spoil: object, mounting: Array | None) ->
 @pytest.mark.parametrize("degree", [1, 2, 4, 5])
 def test_tables_by_splines_of_other_degrees(degree: int) -> None:
     image, ground = sample(scanner(13), 50)
-    model = exact(scanner(13), degree=degree)
+    model = exact(scanner(13), splines=SplineForm(degree))
     assert np.abs(model.ground_to_image(ground) - image).max() < (2.0 if degree == 1 else 1e-3)
 
 

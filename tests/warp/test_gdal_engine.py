@@ -23,7 +23,7 @@ from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import FrameCamera, ImageCorrection, SensorModel
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom.start import pushbroom_of_tables
+from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid, RasterSource

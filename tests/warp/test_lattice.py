@@ -19,7 +19,7 @@ from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.frame.camera import FrameCamera
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom.start import pushbroom_of_tables
+from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.surface.base import Surface

@@ -97,6 +97,11 @@ class LineCamera:
         return cls(width, height, -float(u[0]) * focal, line, focal, rest, along_rest)
 
     @property
+    def size(self) -> tuple[int, int]:
+        """Columns and rows of the image."""
+        return self.width, self.height
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of all parameters."""
         return (*PRINCIPAL, *(f"dx_{k}" for k in range(len(self.dx))), *(f"dy_{k}" for k in range(len(self.dy))))

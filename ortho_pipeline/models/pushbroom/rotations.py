@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import Array
 
 
@@ -11,6 +12,24 @@ def are_rotations(turns: Array) -> bool:
     """Tell whether all matrices ``(N, 3, 3)`` are rotations, rounded to six digits or better."""
     miss = np.swapaxes(turns, 1, 2) @ turns - np.eye(3)
     return bool(np.abs(miss).max(initial=0.0) <= 3e-6 and (np.linalg.det(turns) > 0).all())
+
+
+def exact_rotation(matrix: Array, field: str) -> Array:
+    """Return a rotation ``(3, 3)`` whose inverse is its transpose, of one that may have been rounded; not writeable.
+
+    Raises
+    ------
+    InputError
+        If it is not a rotation, with the name of the field.
+    """
+    if not are_rotations(matrix[None]):
+        raise InputError("this matrix is not a rotation", field=field)
+    # A matrix with printed digits is none exactly, and its inverse would be another than its transpose.
+    if np.abs(matrix.T @ matrix - np.eye(3)).max() > 1e-12:
+        left, _, right = np.linalg.svd(matrix)
+        matrix = left @ right
+        matrix.setflags(write=False)
+    return matrix
 
 
 def rotations(angles: Array) -> Array:
@@ -37,3 +56,11 @@ def turning_axes(angles: Array) -> Array:
     (sr, sp, _), (cr, cp, _) = np.sin(angles).T, np.cos(angles).T
     zero, one = np.zeros_like(sr), np.ones_like(sr)
     return np.moveaxis(np.array([[one, zero, -sp], [zero, cr, cp * sr], [zero, -sr, cp * cr]]), -1, 0)
+
+
+def orbital_axes(position: Array, velocity: Array) -> Array:
+    """Return R_O ``(3, 3)``: forward, left, up in ECEF as columns."""
+    up = position / np.linalg.norm(position)
+    left = np.cross(up, velocity)
+    left /= np.linalg.norm(left)
+    return np.column_stack([np.cross(left, up), left, up])

@@ -30,7 +30,6 @@ Source: Willneff et al., equations 3 and 4 and section 3.3; Weser et al. 2007.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Self
@@ -39,23 +38,26 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.geodesy.ellipsoid import (
-    ECCENTRICITY_SQUARED,
-    SEMI_MAJOR,
-    enu_from_ecef,
-    geocentric,
-    meet_height,
-    metres_per_degree,
+from ortho_pipeline.geodesy.ellipsoid import ECCENTRICITY_SQUARED, SEMI_MAJOR, enu_from_ecef, meet_height
+from ortho_pipeline.models.base import (
+    Array,
+    Constraints,
+    SensorModel,
+    as_ground,
+    as_image,
+    box_around,
+    checked_names,
+    ground_of_grid,
 )
-from ortho_pipeline.models.base import Array, Constraints, SensorModel, as_ground, as_image
 from ortho_pipeline.models.pushbroom import kernel as pushbroom_kernel
-from ortho_pipeline.models.pushbroom.constraints import Observations, OrbitShape, joined
+from ortho_pipeline.models.pushbroom.constraints import Observations, OrbitShape
+from ortho_pipeline.models.pushbroom.flight import Flight
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom.rotations import are_rotations, rotations, turning_axes
+from ortho_pipeline.models.pushbroom.parameters import Parameters
+from ortho_pipeline.models.pushbroom.partials import by_ground, by_params, pseudo_observations
+from ortho_pipeline.models.pushbroom.rotations import exact_rotation
 from ortho_pipeline.models.pushbroom.splines import Spline
 
-#: Components of the path (m) and of the attitude (rad).
-PATH, ATTITUDE = ("along", "across", "radial"), ("roll", "pitch", "yaw")
 #: Newton's last step (pixels): what it leaves is far smaller.
 _LAST_STEP = 1e-5
 #: Image points are found as far as this many half-sizes from the middle of the image.
@@ -64,7 +66,7 @@ _REACH = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Pushbroom(SensorModel):
-    """A line scanner; `ortho_pipeline.models.pushbroom.start` makes one of metadata or of the vendor's tables.
+    """A line scanner; `pushbroom.tables` and `pushbroom.metadata` make one of what a vendor delivers.
 
     Parameters
     ----------
@@ -111,21 +113,9 @@ class Pushbroom(SensorModel):
     def __post_init__(self) -> None:
         shapes = {"origin": (3,), "orbital": (3, 3), "mounting": (3, 3), "lever": (3,), "path_line": (2, 3)}
         for name, shape in {**shapes, "attitude_line": (2, 3)}.items():
-            value = np.array(getattr(self, name), dtype=np.float64)
-            if value.shape != shape or not np.isfinite(value).all():
-                raise InputError(f"{shape} finite numbers are needed, not {value.shape}", field=name)
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, _finite(getattr(self, name), shape, name))
         for name in ("orbital", "mounting"):
-            axes = getattr(self, name)
-            if not are_rotations(axes[None]):
-                raise InputError("this matrix is not a rotation", field=name)
-            # A matrix with printed digits is none exactly, and its inverse would be another than its transpose.
-            if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-12:
-                left, _, right = np.linalg.svd(axes)
-                axes = left @ right
-                axes.setflags(write=False)
-                object.__setattr__(self, name, axes)
+            object.__setattr__(self, name, exact_rotation(getattr(self, name), name))
         object.__setattr__(self, "line_period", float(self.line_period))
         if not (math.isfinite(self.line_period) and self.line_period > 0):
             raise InputError("the line period is positive", field="line_period")
@@ -133,10 +123,7 @@ class Pushbroom(SensorModel):
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
             raise InputError(f"heights from {low} to {high} are not a range", field="heights")
         object.__setattr__(self, "heights", (low, high))
-        object.__setattr__(self, "free", tuple(self.free))
-        unknown = sorted(set(self.free) - set(self._names))
-        if unknown or len(set(self.free)) != len(self.free):
-            raise InputError("free parameters are different names of this model", field=", ".join(unknown) or "free")
+        object.__setattr__(self, "free", checked_names(self.free, self.parameters.names, "of this model"))
 
     # -- what the host asks ------------------------------------------------------------------------------------------
 
@@ -157,27 +144,20 @@ class Pushbroom(SensorModel):
     @property
     def corners(self) -> Array:
         """Ground points ``(8, 3)`` of the corners of the image at both ends of `heights`; NaN where none is seen."""
-        return self._seen(2)
+        return ground_of_grid(self, self.camera.size, 2, self.heights)
 
     @cached_property
     def domain(self) -> tuple[Array, Array]:
         """Centre and half-size of the box that the image sees between `heights`."""
-        seen = self._seen(5)
+        seen = ground_of_grid(self, self.camera.size, 5, self.heights)
         if not np.isfinite(seen).any():
             raise InputError("this camera does not see the Earth", field="attitude")
-        low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
-        low[2], high[2] = self.heights
-        return (low + high) / 2, (high - low) / 2
+        return box_around(seen, self.heights)
 
     @property
     def detail(self) -> float:
         """Shortest distance (px) of two knots of path or attitude."""
         return float(min(np.diff(spline.breaks).min() for spline in (self.path, self.attitude)) / self.line_period)
-
-    def _seen(self, count: int) -> Array:
-        fractions = np.stack(np.meshgrid(*[np.linspace(0, 1, count)] * 2), axis=-1).reshape(-1, 2)
-        image = fractions * (self.camera.width, self.camera.height)
-        return np.concatenate([self.image_to_ground(image, height) for height in self.heights])
 
     @property
     def minimum_points(self) -> int:
@@ -187,26 +167,18 @@ class Pushbroom(SensorModel):
     # -- parameters --------------------------------------------------------------------------------------------------
 
     @cached_property
+    def parameters(self) -> Parameters:
+        """Names and order of all parameters, free or not."""
+        return Parameters(self.path.size, self.attitude.size, self.camera.names)
+
+    @property
     def groups(self) -> dict[str, tuple[str, ...]]:
         """Names of all parameters, by the group under which `freed` takes them.
 
         The groups: path, attitude (coefficients of the splines), path_offset, path_drift, attitude_offset,
         attitude_drift, camera.
         """
-
-        def coefficients(names: Sequence[str], count: int) -> tuple[str, ...]:
-            return tuple(f"{name}_{k}" for k in range(count) for name in names)
-
-        lines = {
-            f"{group}_{what}": tuple(f"{name}_{what}" for name in names)
-            for group, names in (("path", PATH), ("attitude", ATTITUDE))
-            for what in ("offset", "drift")
-        }
-        splines = {
-            "path": coefficients(PATH, self.path.size),
-            "attitude": coefficients(ATTITUDE, self.attitude.size),
-        }
-        return {**splines, **lines, "camera": self.camera.names}
+        return self.parameters.groups
 
     def freed(self, *names: str) -> Self:
         """Return this model with these parameters free, and no others; a name is of a group or of a parameter."""
@@ -214,18 +186,8 @@ class Pushbroom(SensorModel):
         return self._replace(free=tuple(dict.fromkeys(free)))
 
     @cached_property
-    def _names(self) -> tuple[str, ...]:
-        return tuple(name for names in self.groups.values() for name in names)
-
-    @cached_property
     def _columns(self) -> list[int]:
-        place = {name: k for k, name in enumerate(self._names)}
-        return [place[name] for name in self.free]
-
-    @cached_property
-    def _starts(self) -> dict[str, int]:
-        ends = np.cumsum([0, *(len(names) for names in self.groups.values())])
-        return dict(zip(self.groups, ends[:-1].tolist(), strict=True))
+        return self.parameters.places(self.free)
 
     @cached_property
     def _values(self) -> Array:
@@ -254,106 +216,42 @@ class Pushbroom(SensorModel):
         values[self._columns] = np.asarray(params, dtype=np.float64)
         if not np.isfinite(values).all():
             raise ValueError("a parameter is not finite")
-        sizes = np.cumsum([3 * self.path.size, 3 * self.attitude.size, 6, 6])
-        path, attitude, path_line, attitude_line, camera = np.split(values, sizes)
+        path, attitude, path_line, attitude_line, camera = self.parameters.split(values)
         return self._replace(
-            path=self.path.with_coefficients(path.reshape(-1, 3)),
-            attitude=self.attitude.with_coefficients(attitude.reshape(-1, 3)),
-            path_line=path_line.reshape(2, 3),
-            attitude_line=attitude_line.reshape(2, 3),
+            path=self.path.with_coefficients(path),
+            attitude=self.attitude.with_coefficients(attitude),
+            path_line=path_line,
+            attitude_line=attitude_line,
             camera=self.camera.with_values(camera),
         )
 
     def constraints(self) -> Constraints:
         """Return the soft constraints of the orbit and the observations of path and attitude."""
-        count, columns = len(self._names), self._columns
-        parts = [self.shape.of(self._position, self._span)]
-        for spline, start, tables in (
-            (self.path, 0, self.path_observations),
-            (self.attitude, self._starts["attitude"], self.attitude_observations),
-        ):
-            parts += [table.of(spline, start, count) for table in tables]
-        found = joined(parts, count)
-        # What no free parameter can change is not an observation of one.
-        kept = found.jacobian[:, columns].any(axis=1)
-        return Constraints(
-            found.residuals[kept], found.jacobian[kept][:, columns], found.sigma[kept], found.fictitious[kept]
-        )
-
-    def _position(self, times: Array, derivative: int) -> tuple[Array, Array]:
-        """Return S or dS/dt in ECEF ``(N, 3)`` and its partials by all parameters ``(N, 3, P)``."""
-        value = self._path(times, derivative) @ self.orbital.T + (0.0 if derivative else self.origin)
-        basis = self._basis(self.path, times, derivative)
-        slopes = np.zeros((len(times), 3, len(self._names)))
-        for first, weights in self._members("path", basis):
-            slopes[:, :, first : first + 3] = self.orbital * weights[:, None, None]
-        return value, slopes
-
-    def _basis(self, spline: Spline, times: Array, derivative: int = 0) -> Array:
-        """Return the weights ``(N, size + 2)`` of the coefficients, the offset and the drift."""
-        line = [np.ones_like(times), times - self._middle] if not derivative else [0 * times, np.ones_like(times)]
-        return np.column_stack([spline.basis(times, derivative), *line])
-
-    def _members(self, group: str, basis: Array) -> list[tuple[int, Array]]:
-        """Return, for each three parameters that move along the three axes, the first one and weights ``(N,)``."""
-        firsts = [self._starts[group] + 3 * k for k in range(basis.shape[1] - 2)]
-        firsts += [self._starts[f"{group}_offset"], self._starts[f"{group}_drift"]]
-        return [(first, basis[:, k]) for k, first in enumerate(firsts)]
+        return pseudo_observations(self)
 
     # -- the map -----------------------------------------------------------------------------------------------------
 
-    @property
-    def _span(self) -> tuple[float, float]:
-        return 0.0, self.camera.height * self.line_period
-
-    @property
-    def _middle(self) -> float:
-        return self.camera.height * self.line_period / 2
-
     @cached_property
-    def _path(self) -> Spline:
-        return self.path.plus_line(self.path_line[0], self.path_line[1], self._middle)
-
-    @cached_property
-    def _attitude(self) -> Spline:
-        return self.attitude.plus_line(self.attitude_line[0], self.attitude_line[1], self._middle)
+    def flight(self) -> Flight:
+        """Path and attitude with their offsets and drifts."""
+        duration = self.camera.height * self.line_period
+        path, attitude = (
+            spline.plus_line(line[0], line[1], duration / 2)
+            for spline, line in ((self.path, self.path_line), (self.attitude, self.attitude_line))
+        )
+        return Flight(self.origin, self.orbital, path, attitude, duration)
 
     @cached_property
     def _limits(self) -> Array:
         """Lowest and highest column and time ``(2, 2)`` that are answered."""
-        size = np.array([self.camera.width, 2 * self._middle])
+        size = np.array([self.camera.width, 2 * self.flight.middle])
         return np.stack([size * (1 - _REACH) / 2, size * (1 + _REACH) / 2], axis=1)
-
-    @cached_property
-    def _compiled(self) -> tuple[Array, ...]:
-        """What the kernel reads of path and attitude: ends, origins and coefficients of their pieces."""
-        splines = (self._path, self._attitude)
-        ends = np.unique(np.concatenate([spline.breaks for spline in splines]))
-        # The first piece holds before the first knot.
-        origins = np.concatenate([[ends[0] - 1.0], ends])
-        degree = max(spline.degree for spline in splines)
-        pieces = np.zeros((len(origins), degree + 1, 6))
-        for k, spline in enumerate(splines):
-            pieces[:, : spline.degree + 1, 3 * k : 3 * k + 3] = spline.pieces(origins)
-        return ends, origins, pieces
 
     def ground_to_image(self, ground: ArrayLike) -> Array:
         """Project ground points ``(N, 3)``; NaN behind the Earth and beyond three half-sizes of the image."""
         ground = as_ground(ground)
         image = np.empty((len(ground), 2))
-        camera = self.camera
-        numbers = np.array(
-            [camera.principal_column, camera.principal_line, camera.focal_length, camera.width, self.line_period,
-             SEMI_MAJOR, ECCENTRICITY_SQUARED, _LAST_STEP]
-        )  # fmt: skip
-        ends, origins, pieces = self._compiled
-        pushbroom_kernel.project(
-            ground,
-            pushbroom_kernel.Trajectory(self.orbital, self.origin, ends, origins, pieces),
-            pushbroom_kernel.Camera(self.mounting, self.lever, numbers, camera.dx, camera.dy),
-            self._limits,
-            image,
-        )
+        pushbroom_kernel.project(ground, self.flight.trajectory, _compiled_camera(self), self._limits, image)
         return image
 
     def rays(self, image: ArrayLike) -> tuple[Array, Array]:
@@ -366,10 +264,7 @@ class Pushbroom(SensorModel):
         column, times = np.where(good, image[:, 0], np.nan), np.where(good, times, np.nan)
         look = np.column_stack([self.camera.directions(column), np.ones(len(image))])
         look /= np.linalg.norm(look, axis=1)[:, None]
-        turn = rotations(self._attitude(times))
-        direction = np.einsum("nij,nj->ni", turn, look @ self.mounting.T) @ self.orbital.T
-        local = self._path(times) + turn @ self.lever
-        return self.origin + local @ self.orbital.T, direction
+        return self.flight.lines(times, look @ self.mounting.T, self.lever)
 
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
         """Follow the rays of image points ``(N, 2)`` to an ellipsoidal height; NaN where they do not get there."""
@@ -377,7 +272,7 @@ class Pushbroom(SensorModel):
         wanted = np.broadcast_to(np.asarray(height, dtype=np.float64), (len(origin),))
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             ground = meet_height(origin, direction, wanted)
-            # Beside the antimeridian, stay on the side of the satellite's foot point.
+            # Beside the antimeridian, stay on the side of the sub-satellite point.
             foot = math.degrees(math.atan2(self.origin[1], self.origin[0]))
             ground[:, 0] = foot + np.remainder(ground[:, 0] - foot + 180.0, 360.0) - 180.0
             # Beyond the satellite's own height the ray is only met where it leaves the Earth again.
@@ -386,39 +281,13 @@ class Pushbroom(SensorModel):
         ground[~good] = np.nan
         return ground
 
-    # -- partials ----------------------------------------------------------------------------------------------------
-
     def ground_partials(self, ground: ArrayLike) -> Array:
         """Return d(image)/d(ground) as ``(N, 2, 3)``, in closed form."""
-        ground = as_ground(ground)
-        state = _State(self, ground)
-        moved = np.swapaxes(enu_from_ecef(ground), 1, 2).copy()
-        moved[:, :, :2] *= metres_per_degree(ground)[:, None, :]
-        by_camera = self.mounting.T @ np.swapaxes(state.turn, 1, 2) @ self.orbital.T
-        return state.image_by(by_camera @ moved)
+        return by_ground(self, as_ground(ground))
 
     def param_partials(self, ground: ArrayLike) -> Array:
         """Return d(image)/d(params) as ``(N, 2, P)``, in closed form."""
-        ground = as_ground(ground)
-        state = _State(self, ground)
-        place = {column: at for at, column in enumerate(self._columns)}
-        by_vector = np.zeros((len(ground), 3, len(place)))
-        groups = (
-            ("path", self.path, -(self.mounting.T @ np.swapaxes(state.turn, 1, 2))),
-            ("attitude", self.attitude, self.mounting.T @ state.by_angles),
-        )
-        for group, spline, slopes in groups:
-            for first, weights in self._members(group, self._basis(spline, state.times)):
-                for axis in range(3):
-                    if (at := place.get(first + axis)) is not None:
-                        by_vector[:, :, at] = slopes[:, :, axis] * weights[:, None]
-        inner = np.zeros((len(ground), 2, len(place)))
-        start = self._starts["camera"]
-        camera = [(column - start, at) for column, at in place.items() if column >= start]
-        if camera:
-            theirs, ours = (list(side) for side in zip(*camera, strict=True))
-            inner[:, :, ours] = self.camera.partials(state.column)[:, :, theirs]
-        return state.image_by(by_vector, inner)
+        return by_params(self, as_ground(ground))
 
     # -- files -------------------------------------------------------------------------------------------------------
 
@@ -446,38 +315,19 @@ class Pushbroom(SensorModel):
         return super().from_dict({**data, **parts})
 
 
-class _State:
-    """Ground points as the camera sees them, and how their image follows from a change of what it sees."""
+def _finite(value: Array, shape: tuple[int, ...], field: str) -> Array:
+    array = np.array(value, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(f"{shape} finite numbers are needed, not {array.shape}", field=field)
+    array.setflags(write=False)
+    return array
 
-    def __init__(self, model: Pushbroom, ground: Array) -> None:
-        image = model.ground_to_image(ground)
-        self.model, self.column, self.times = model, image[:, 0], image[:, 1] * model.line_period
-        angles, rates = model._attitude(self.times), model._attitude(self.times, 1)
-        self.turn = rotations(angles)
-        line = (geocentric(ground) - model.origin) @ model.orbital - model._path(self.times)
-        back = np.swapaxes(self.turn, 1, 2)
-        place = np.einsum("nij,nj->ni", back, line)
-        #: d(vector in platform axes)/d(roll, pitch, yaw)
-        self.by_angles = -np.cross(np.swapaxes(turning_axes(angles), 1, 2), place[:, None, :]).swapaxes(1, 2)
-        self.vector = (place - model.lever) @ model.mounting
-        rate = np.einsum("nij,nj->ni", self.by_angles, rates)
-        rate -= np.einsum("nij,nj->ni", back, model._path(self.times, 1))
-        x, y, z = self.vector.T
-        zero, one = np.zeros_like(z), np.ones_like(z)
-        #: d(u, v)/d(vector in camera axes)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            self.by_vector = (
-                np.stack([one, zero, -x / z, zero, one, -y / z], axis=1).reshape(-1, 2, 3) / z[:, None, None]
-            )
-        flow = np.einsum("nij,nj->ni", self.by_vector, rate @ model.mounting)
-        slopes = model.camera.slopes(self.column)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            # The columns of [d(u, v)/dx, -d(u, v)/dt], inverted.
-            scale = 1 / (slopes[:, 1] * flow[:, 0] - slopes[:, 0] * flow[:, 1])
-            self.solved = np.stack([-flow[:, 1], flow[:, 0], -slopes[:, 1], slopes[:, 0]], axis=1).reshape(-1, 2, 2)
-            self.solved *= scale[:, None, None]
-        self.solved[:, 1] /= model.line_period
 
-    def image_by(self, vector: Array, look: Array | float = 0.0) -> Array:
-        """Return d(image) ``(N, 2, P)`` of changes of the vector ``(N, 3, P)`` and of u, v themselves ``(N, 2, P)``."""
-        return self.solved @ (self.by_vector @ vector - look)
+def _compiled_camera(model: Pushbroom) -> pushbroom_kernel.Camera:
+    """Return the camera as the compiled projection reads it."""
+    camera = model.camera
+    numbers = np.array(
+        [camera.principal_column, camera.principal_line, camera.focal_length, camera.width, model.line_period,
+         SEMI_MAJOR, ECCENTRICITY_SQUARED, _LAST_STEP]
+    )  # fmt: skip
+    return pushbroom_kernel.Camera(model.mounting, model.lever, numbers, camera.dx, camera.dy)

@@ -136,6 +136,15 @@ class Spline:
         return _unit_of(self.degree, tuple(self.breaks.tolist()), self.beyond)
 
 
+@dataclass(frozen=True)
+class SplineForm:
+    """Degree of the splines of path and attitude, and how many polynomials each has; None leaves that to the table."""
+
+    degree: int
+    path: int | None = None
+    attitude: int | None = None
+
+
 class _Unit:
     """The B-splines themselves, which splines on the same knots share."""
 

@@ -1,56 +1,31 @@
-r"""Line scanners from what a vendor delivers: orbit and attitude tables, or a few lines of metadata.
+"""Line scanners from a vendor's tables of orbit and attitude.
 
-**Tables**: positions and rotations with times, in any convention that a `(N, 3, 3)` array of rotations to ECEF can
-express (`rotations_of_quaternions`, `rotations_of_angles`), and a `LineCamera`. The splines fit the tables, which are
-also kept as observations if their sigma is known.
-
-**Metadata**: corners, flying height H, look angles :math:`\alpha` (along) and :math:`\beta` (across). The camera looks
-along :math:`Z_M` in the platform,
-
-.. math::
-
-    Z_M = Z_0 / |Z_0|, \quad Z_0 = (\tan\alpha, -\tan\beta, -1)^T, \quad X_M = (0, \cos\beta, -\sin\beta)^T, \quad
-    Y_M = Z_M \times X_M ,
-
-where the paper prints :math:`\cos\alpha` in X_M, which is then neither of length one nor at a right angle to Z_M. From
-the middles :math:`M_F, M_L` of first and last row the positions :math:`S_j = M_j + \lambda_j g_j` on the sphere of the
-orbit and R_O follow in turn until they stay. Two things go beyond the paper. The platform follows the Earth, so g turns
-with the angle travelled and pitch begins as a straight line, where the paper has zeros and a path that is ten percent
-short. And the four corners tell the skew of the rows (the Earth turns below: four degrees at the equator, which zeros
-would miss by 400 pixels): the platform is yawed to meet it, :math:`g_j = R_O R_Z(yaw) R_Y(\theta_j) Z_M`, until that
-stays too; roll and pitch then take up what is left.
-
-Source: Willneff et al., equation 4 and section 3.3.1.
+Positions and rotations with times, in any convention that a `(N, 3, 3)` array of rotations to ECEF can express
+(`rotations_of_quaternions`, `rotations_of_angles`), and a `LineCamera`. The splines fit the tables, which are also kept
+as observations if their sigma is known.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.geodesy.ellipsoid import geocentric, orbital_from_ecef
+from ortho_pipeline.geodesy.ellipsoid import orbital_from_ecef
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.pushbroom.constraints import Observations, OrbitShape
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom.rotations import angles_of, are_rotations, rotations
+from ortho_pipeline.models.pushbroom.rotations import angles_of, are_rotations, orbital_axes, rotations
 from ortho_pipeline.models.pushbroom.scanner import Pushbroom
-from ortho_pipeline.models.pushbroom.splines import Spline
+from ortho_pipeline.models.pushbroom.splines import Spline, SplineForm
 
-#: Gravity of the Earth, m^3 / s^2.
-EARTH_GM = 3.986004418e14
 #: Positions between those of a table: Lagrange's polynomial through so many neighbours.
 _NEIGHBOURS = 8
 #: A cubic polynomial follows an orbit for so long (seconds) to a micrometre.
 _PATH_PIECE = 2.5
-_ITERATIONS, _SETTLED = 100, 1e-4
-_TURNS = 10
-
-
-# -- vendor tables ---------------------------------------------------------------------------------------------------
+_CUBIC = SplineForm(3)
 
 
 def pushbroom_of_tables(
@@ -63,8 +38,7 @@ def pushbroom_of_tables(
     heights: tuple[float, float] = (0.0, 1000.0),
     mounting: ArrayLike | None = None,
     lever: ArrayLike = (0.0, 0.0, 0.0),
-    degree: int = 3,
-    segments: tuple[int | None, int | None] = (None, None),
+    splines: SplineForm = _CUBIC,
     position_sigma: float | None = None,
     angle_sigma: float | None = None,
     free: tuple[str, ...] = ("attitude_offset", "attitude_drift"),
@@ -76,15 +50,15 @@ def pushbroom_of_tables(
     line_period, first_time : float
         Seconds per row, and the time of the upper edge of the first row (half a period before its centre).
     orbit : (N,), (N, 3)
-        Times and positions (ECEF, m); at least `degree` + 1 rows, around the image.
+        Times and positions (ECEF, m); at least one row more than the degree of the splines, around the image.
     attitude : (N,), (N, 3, 3)
         Times and rotations from the platform to ECEF, as dense as the attitude changes.
     mounting, lever : (3, 3), (3,)
         R_M and C_M. Without `mounting` the rotations are of the camera itself (x along growing columns, y forward,
         z to the ground) and R_M is its attitude in the middle of the image.
-    degree, segments
-        Of the splines; how many polynomials path and attitude have. If None, enough for any orbit, and an attitude
-        that goes through every row of its table.
+    splines : SplineForm
+        If it does not say how many polynomials, path has enough for any orbit, and attitude goes through every row of
+        its table.
     position_sigma, angle_sigma : float, optional
         Sigmas (m, rad) of the tables' random errors: their values then are observations, which hold the coefficients
         when those are freed. Systematic errors are the offsets and drifts.
@@ -96,7 +70,7 @@ def pushbroom_of_tables(
     InputError
         If a table is not ordered in time, too short, or does not cover the image.
     """
-    last = camera.height * line_period
+    degree, last = splines.degree, camera.height * line_period
     slack = max(line_period, 1e-3 * last)
     times, positions = _table(orbit, (3,), (first_time, last, slack), degree, "orbit")
     turn_times, turns = _table(attitude, (3, 3), (first_time, last, slack), degree, "attitude")
@@ -105,8 +79,8 @@ def pushbroom_of_tables(
     # Half an image beyond both ends, as far as the tables go: points outside of the image are legal.
     low, high = max(-last / 2, times[0], turn_times[0]), min(1.5 * last, times[-1], turn_times[-1])
     origin, velocity = _lagrange(times, positions, np.array([last / 2]))
-    orbital = _orbital_axes(origin[0], velocity[0])
-    path_breaks = np.linspace(low, high, 1 + (segments[0] or max(2, math.ceil((high - low) / _PATH_PIECE))))
+    orbital = orbital_axes(origin[0], velocity[0])
+    path_breaks = np.linspace(low, high, 1 + (splines.path or max(2, math.ceil((high - low) / _PATH_PIECE))))
     sites = np.linspace(low, high, 4 * (len(path_breaks) + degree))
     path = Spline.fitted(
         sites, (_lagrange(times, positions, sites)[0] - origin) @ orbital, degree, path_breaks, min(degree, 2)
@@ -117,7 +91,7 @@ def pushbroom_of_tables(
         mounted = body[int(np.argmin(np.abs(turn_times - last / 2)))]
         body = body @ mounted.T
     angles = np.unwrap(angles_of(body), axis=0)
-    turned = _attitude_spline(turn_times, angles, (low, high), degree, segments[1])
+    turned = _attitude_spline(turn_times, angles, (low, high), splines)
     near = (turn_times >= turned.breaks[0]) & (turn_times <= turned.breaks[-1])
     observed = (_lagrange(times, positions, path.sites)[0] - origin) @ orbital
     model = Pushbroom(
@@ -216,24 +190,14 @@ def _lagrange(times: Array, values: Array, wanted: Array) -> tuple[Array, Array]
     return found, rates
 
 
-def _orbital_axes(position: Array, velocity: Array) -> Array:
-    """Return R_O ``(3, 3)``: forward, left, up in ECEF as columns."""
-    up = position / np.linalg.norm(position)
-    left = np.cross(up, velocity)
-    left /= np.linalg.norm(left)
-    return np.column_stack([np.cross(left, up), left, up])
-
-
-def _attitude_spline(
-    times: Array, angles: Array, span: tuple[float, float], degree: int, segments: int | None
-) -> Spline:
+def _attitude_spline(times: Array, angles: Array, span: tuple[float, float], form: SplineForm) -> Spline:
     """Return a spline through the rows of a table around the image, or that fits them with fewer polynomials."""
-    low, high = span
+    (low, high), degree = span, form.degree
     first = int(np.clip(np.searchsorted(times, low, side="right") - 1, 0, len(times) - degree - 1))
     last = max(int(np.searchsorted(times, high)), first + degree)
     near, values = times[first : last + 1], angles[first : last + 1]
-    if segments:
-        return Spline.fitted(near, values, degree, np.linspace(near[0], near[-1], segments + 1), 1)
+    if form.attitude:
+        return Spline.fitted(near, values, degree, np.linspace(near[0], near[-1], form.attitude + 1), 1)
     from scipy.interpolate import make_interp_spline  # takes half of the start-up of a command
 
     through = make_interp_spline(near, values, degree)
@@ -242,244 +206,3 @@ def _attitude_spline(
 
 def _observed(times: Array, values: Array, sigma: float | None) -> tuple[Observations, ...]:
     return () if sigma is None else (Observations(times, values, np.full((len(times), 3), sigma)),)
-
-
-# -- metadata --------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class SoftSigmas:
-    """How well a start from metadata is believed: the sigmas of its pseudo-observations; None leaves one out.
-
-    Willneff et al. have the first two. Those of the flying height and of the attitude are ours: without them nine
-    control points do not determine the eighteen coefficients of a scene (docs/models.md).
-
-    Parameters
-    ----------
-    plane, circular : float, optional
-        Of the orbit's shape (m, rad), see `OrbitShape`.
-    radius : float, optional
-        Of the distance from the Earth's centre (m).
-    attitude : float, optional
-        Of roll, pitch and yaw in the middle of the scene (rad).
-    rate : float, optional
-        Of their rates at first and last row (rad/s).
-
-    Raises
-    ------
-    InputError
-        If one is not positive and finite.
-    """
-
-    plane: float | None = 10.0
-    circular: float | None = 1e-3
-    radius: float | None = 10_000.0
-    attitude: float | None = math.radians(0.5)
-    rate: float | None = 1e-4
-
-    def __post_init__(self) -> None:
-        for name, sigma in vars(self).items():
-            if sigma is not None and not (math.isfinite(sigma) and sigma > 0):
-                raise InputError(
-                    f"{sigma} is not a sigma", field=name, remedy="give a positive number, or None for no constraint"
-                )
-
-
-def pushbroom_of_metadata(
-    corners: ArrayLike,
-    width: int,
-    height: int,
-    *,
-    altitude: float,
-    along_deg: float,
-    across_deg: float = 0.0,
-    focal_length: float | None = None,
-    pixel_size: float | None = None,
-    heights: tuple[float, float] = (0.0, 1000.0),
-    degree: int = 2,
-    segments: int = 1,
-    corrections: tuple[int, int] = (0, 0),
-    sigmas: SoftSigmas | None = None,
-) -> Pushbroom:
-    """Make the start of a line scanner, with its soft constraints, of metadata alone.
-
-    Parameters
-    ----------
-    corners : (4, 2) or (4, 3)
-        Lon, lat (degrees) and perhaps height of: first row left and right, last row right and left. Without heights
-        the middle of `heights`.
-    altitude : float
-        Of the satellite above the ellipsoid, m.
-    along_deg, across_deg : float
-        Look angles: positive looks forward (where rows grow), to the right.
-    focal_length, pixel_size : float, optional
-        In one unit; without them the focal length follows from the length of the rows.
-    degree, segments : int
-        Of the splines of path and attitude; all their coefficients are free.
-    corrections : (int, int)
-        Numbers of coefficients of the camera's corrections along x and y, which begin at zero and are not free.
-
-    Raises
-    ------
-    InputError
-        If the metadata contradict each other.
-    """
-    sigmas = sigmas or SoftSigmas()
-    points = _corner_points(corners, heights)
-    mounting = mounting_of_angles(math.radians(along_deg), math.radians(across_deg))
-    radius = float(np.linalg.norm(geocentric(points.mean(axis=0)[None] * (1.0, 1.0, 0.0)))) + altitude
-    yaw = 0.0
-    for _ in range(_TURNS):
-        ends, orbital, travelled = _orbit_over(geocentric(points), radius, mounting[:, 2], yaw)
-        focal = _focal_length(points, ends, orbital, width, focal_length, pixel_size)
-        camera = LineCamera(width, height, width / 2, 0.0, focal, *map(np.zeros, corrections))
-        level = _level_flight(camera, radius, orbital, mounting, travelled, yaw, heights, (degree, segments))
-        start = _met(level, points)
-        turn = float(start.attitude.coefficients[0, 2]) - yaw
-        yaw += turn
-        if abs(turn) < 1e-5:
-            break
-    shape = OrbitShape(sigmas.plane, sigmas.circular, None if sigmas.radius is None else radius, sigmas.radius)
-    return _softened(start._replace(shape=shape), sigmas)
-
-
-def mounting_of_angles(along: float, across: float) -> Array:
-    """Return R_M ``(3, 3)`` of look angles (rad) along and across the track.
-
-    Source: Willneff et al., equation 4, with the cosine of beta in X_M.
-    """
-    z = np.array([math.tan(along), -math.tan(across), -1.0])
-    z /= np.linalg.norm(z)
-    x = np.array([0.0, math.cos(across), -math.sin(across)])
-    return np.column_stack([x, np.cross(z, x), z])
-
-
-def _corner_points(corners: ArrayLike, heights: tuple[float, float]) -> Array:
-    points = np.asarray(corners, dtype=np.float64)
-    if points.shape == (4, 2):
-        points = np.column_stack([points, np.full(4, sum(heights) / 2)])
-    if points.shape != (4, 3) or not np.isfinite(points).all():
-        raise InputError(f"an image has four corners lon, lat (and height), not {points.shape}", field="corners")
-    if (np.abs(points[:, 1]) > 90).any():
-        raise InputError("a latitude is beyond 90 degrees", field="corners", remedy="give lon, lat")
-    return points
-
-
-def _orbit_over(ground: Array, radius: float, view: Array, yaw: float) -> tuple[Array, Array, float]:
-    """Return where first and last row of an image with these corners are seen from along `view` in a yawed platform.
-
-    Returns
-    -------
-    (2, 3), (3, 3), float
-        Positions on the sphere of the orbit, R_O, and the angle travelled between them.
-    """
-    middles = np.stack([ground[:2].mean(axis=0), ground[2:].mean(axis=0)])
-    ends = middles * (radius / np.linalg.norm(middles, axis=1))[:, None]
-    for _ in range(_ITERATIONS):
-        orbital = _orbital_axes(ends.sum(axis=0), ends[1] - ends[0])
-        half = math.asin(min(1.0, float(np.linalg.norm(ends[1] - ends[0])) / 2 / radius))
-        looks = rotations(np.array([[0.0, -half, yaw], [0.0, half, yaw]])) @ view @ orbital.T
-        down = (middles * looks).sum(axis=1)
-        inside = down**2 - (middles**2).sum(axis=1) + radius**2
-        if not (inside > 0).all() or not (down < 0).all():
-            break
-        before, ends = ends, middles - (down + np.sqrt(inside))[:, None] * looks
-        if np.abs(ends - before).max() < _SETTLED:
-            return ends, orbital, 2 * half
-    raise InputError(
-        "no orbit at this height sees these corners under these look angles",
-        field="corners, altitude, along_deg, across_deg",
-        remedy="check the corners' order and the units: degrees, metres",
-    )
-
-
-def _focal_length(
-    points: Array, ends: Array, orbital: Array, width: int, length: float | None, pixel: float | None
-) -> float:
-    """Return the focal length in pixels, negative where columns run to the right of the flight."""
-    ground = geocentric(points)
-    rows = np.stack([ground[1] - ground[0], ground[2] - ground[3]])
-    sign = np.sign(rows @ orbital[:, 1])
-    if sign[0] * sign[1] <= 0:
-        raise InputError(
-            "first and last row do not run the same way", field="corners", remedy="go around: UL, UR, LR, LL"
-        )
-    if length is not None and pixel:
-        focal = length / pixel
-    elif length is not None or pixel is not None:
-        raise InputError("focal length and pixel size come together", field="focal_length, pixel_size")
-    else:
-        lines = np.stack([ground[:2].mean(axis=0), ground[2:].mean(axis=0)]) - ends
-        distance = np.linalg.norm(lines, axis=1)
-        looks = lines / distance[:, None]
-        across = rows - (rows * looks).sum(axis=1)[:, None] * looks
-        focal = float(np.mean(distance / np.linalg.norm(across, axis=1)) * width)
-    if not (math.isfinite(focal) and focal > 0):
-        raise InputError(f"{focal} is not a focal length", field="focal_length, pixel_size")
-    return float(sign[0]) * focal
-
-
-def _level_flight(
-    camera: LineCamera,
-    radius: float,
-    orbital: Array,
-    mounting: Array,
-    travelled: float,
-    yaw: float,
-    heights: tuple[float, float],
-    kind: tuple[int, int],
-) -> Pushbroom:
-    """Return a line scanner on a circle about the Earth's centre, in a platform that follows the circle."""
-    degree, segments = kind
-    duration = travelled / math.sqrt(EARTH_GM / radius**3)
-    times = np.linspace(0.0, duration, 6 * (degree + segments))
-    angle = travelled * (times / duration - 0.5)
-    zeros, breaks = np.zeros_like(angle), np.linspace(0.0, duration, segments + 1)
-    circle = radius * np.stack([np.sin(angle), zeros, np.cos(angle) - 1], axis=1)
-    turned = np.stack([zeros, angle, zeros + yaw], axis=1)
-    return Pushbroom(
-        camera=camera,
-        line_period=duration / camera.height,
-        origin=radius * orbital[:, 2],
-        orbital=orbital,
-        mounting=mounting,
-        path=Spline.fitted(times, circle, degree, breaks, min(degree, 2)),
-        attitude=Spline.fitted(times, turned, degree, breaks, 1),
-        lever=np.zeros(3),
-        path_line=np.zeros((2, 3)),
-        attitude_line=np.zeros((2, 3)),
-        heights=heights,
-        free=(),
-        shape=OrbitShape(),
-    )
-
-
-def _met(model: Pushbroom, corners: Array) -> Pushbroom:
-    """Return the model with roll, pitch and yaw turned so that the corners are met best."""
-    image = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]) * (model.camera.width, model.camera.height)
-    turned = model.freed("attitude_offset")
-    for _ in range(10):
-        miss = image - turned.ground_to_image(corners)
-        slopes = turned.param_partials(corners).reshape(8, 3)
-        if not np.isfinite(miss).all():
-            raise InputError("the start does not see the corners", field="corners, altitude, along_deg, across_deg")
-        step = np.linalg.lstsq(slopes, miss.ravel(), rcond=None)[0]
-        turned = turned.with_params(turned.params + step)
-        if np.abs(step).max() < 1e-9:
-            break
-    line = turned.attitude_line
-    attitude = turned.attitude.plus_line(line[0], line[1], 0.0)
-    return turned._replace(attitude=attitude, attitude_line=np.zeros((2, 3)))
-
-
-def _softened(model: Pushbroom, sigmas: SoftSigmas) -> Pushbroom:
-    """Return the model with all spline coefficients free and its attitude as observations."""
-    attitude = model.attitude
-    ends = attitude.breaks[[0, -1]]
-    middle = ends.mean(keepdims=True)
-    tables = [
-        Observations(times, attitude(times, derivative), np.full((len(times), 3), sigma), derivative, True)
-        for times, derivative, sigma in ((middle, 0, sigmas.attitude), (ends, 1, sigmas.rate))
-        if sigma is not None
-    ]
-    return model._replace(attitude_observations=tuple(tables)).freed("path", "attitude")
