@@ -22,6 +22,7 @@ from ortho_pipeline.geodesy.ellipsoid import geocentric
 from ortho_pipeline.models import RPC, Pushbroom
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
+from ortho_pipeline.models.pushbroom.splines import SplineForm
 from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import Points
 from ortho_pipeline.testing import check_sensor_model
@@ -149,7 +150,7 @@ def test_fitted_to_a_real_rpc(real: Path, name: str) -> None:
     corners = rpc.image_to_ground(np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size, (low + high) / 2)
     start = pushbroom_of_metadata(
         corners, int(size[0]), int(size[1]), altitude=ALTITUDE, along_deg=along, across_deg=across,
-        heights=(low, high), degree=3, corrections=(4, 0),
+        heights=(low, high), splines=SplineForm(3), corrections=(4, 0),
     )  # fmt: skip
     image, ground = lattice(9, 5)
     assert np.abs(start.ground_to_image(ground) - image).max() < 100

@@ -67,7 +67,7 @@ def test_rigorous_model_recovers_an_independent_camera(tilt):
         assert result.rmse("control")["total"] < 1e-9
         centre = geocentric(result.model.perspective_centre[None])[0]
         assert np.linalg.norm(centre - scene.camera.position) < 1e-6
-        axes = result.model.rotation @ result.model._local[0] * [[1], [-1], [-1]]
+        axes = result.model.rotation @ result.model.working_frame.axes * [[1], [-1], [-1]]
         np.testing.assert_allclose(axes, scene.camera.axes, atol=1e-10)
 
 
