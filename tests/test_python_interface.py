@@ -140,6 +140,8 @@ def test_points_can_be_gone_through(sample: Path) -> None:
         assert point.role == points.roles[k]
         assert point.sigma_image == points.sigma_image[k]
         assert point.sigma_ground == tuple(points.sigma_ground[k])
+        assert np.array_equal(point.covariance_image, points.covariance_image[k])
+        assert point.group == -1
 
 
 def test_points_are_geojson(sample: Path, tmp_path: Path) -> None:

@@ -5,13 +5,12 @@ Imports `geodesy` and what is below. A new point format is a module here and a l
 
 from __future__ import annotations
 
+from ortho_pipeline.points.rows import Point
+from ortho_pipeline.points.selection import AnyPoints, assign_roles
 from ortho_pipeline.points.shared_marks import HasGround, marks_warning, one_mark
 from ortho_pipeline.points.table import (
     DEFAULT_SIGMA_IMAGE,
-    AnyPoints,
-    Point,
     Points,
-    assign_roles,
     gcps_of_dataset,
     read_points,
     write_points,

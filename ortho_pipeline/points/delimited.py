@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.points.image_errors import read_image_errors
 from ortho_pipeline.points.rows import (
+    CSV_ERRORS,
     CSV_IMAGE,
     OF_IMAGE,
     Layout,
@@ -44,6 +46,9 @@ _ALIASES = {
         "sigma_image": "sigmaimage",
         "sigma_xy": "sigmaxy",
         "sigma_h": "sigmah",
+        "var_col": "varcol",
+        "var_row": "varrow",
+        "cov_col_row": "covcolrow",
     }.items()
     for alias in aliases.split()
 }
@@ -91,6 +96,8 @@ def is_header(text: str) -> bool:
 
 def read_csv(path: str | os.PathLike[str], text: str, layout: Layout = OF_IMAGE) -> Table:
     """Read a table with a header: ``id,col,row,x,y,h[,role][,sigma_image][,sigma_xy][,sigma_h][,image]`` or their like.
+
+    Further columns are those of `CSV_ERRORS`.
 
     The delimiter (comma, semicolon, tab, bar, else blanks) is that of the header; where it is not a comma, numbers may
     have a decimal comma, in the whole file. Lines that start with ``#`` are comments; of these ``#CRS: ...`` and
@@ -176,6 +183,41 @@ def _our_names(names: Sequence[str]) -> list[str]:
 # -- a line ----------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class _Cells:
+    """The cells of a line, read by what we call their columns; `marks` are the decimal marks of the file until here."""
+
+    path: str | os.PathLike[str]
+    where: str
+    cells: Sequence[str]
+    header: Header
+    layout: Layout
+    marks: set[str]
+
+    def text(self, name: str) -> str:
+        return self.cells[self.header.place[name]] if name in self.header.place else ""
+
+    def column(self, name: str) -> str:
+        if name not in self.header.place:
+            return self.where
+        return f"{self.where}, column {self.header.names[self.header.place[name]] or name}"
+
+    def plain(self, name: str) -> Any:
+        """Return a cell, if it is not empty with a decimal point."""
+        cell = self.text(name)
+        return _decimal(cell, self.header, self.marks, self.path, self.column(name)) if cell else cell
+
+    def value(self, name: str) -> float:
+        if not self.text(name) and name not in self.layout.needed:
+            return math.nan
+        return number(self.plain(name), self.path, self.column(name))
+
+    def sigma(self, name: str, zero: bool) -> float | None:
+        if not self.text(name):
+            return None
+        return sigma_of(self.plain(name), self.path, self.column(name), zero=zero)
+
+
 def _row(
     path: str | os.PathLike[str], line: Line, header: Header, layout: Layout, marks: set[str]
 ) -> Row | None:  # fmt: skip
@@ -191,42 +233,32 @@ def _row(
         )  # fmt: skip
     if not header.names[-1] and cells[-1]:
         raise InputError(f"{short(cells[-1])} stands under no column name", file=path, field=where)
-
-    def text(name: str) -> str:
-        return cells[header.place[name]] if name in header.place else ""
-
-    def column(name: str) -> str:
-        return f"{where}, column {header.names[header.place[name]] or name}"
-
-    def value(name: str) -> float:
-        if not text(name) and name not in layout.needed:
-            return math.nan
-        return number(_decimal(text(name), header, marks, path, column(name)), path, column(name))
-
-    def sigma(name: str, zero: bool) -> float | None:
-        if not text(name):
-            return None
-        return sigma_of(_decimal(text(name), header, marks, path, column(name)), path, column(name), zero=zero)
-
+    of = _Cells(path, where, cells, header, layout, marks)
     for name, what in (("id", "an id"), (CSV_IMAGE, "an image")):
-        if (name in layout.needed or (name == "id" and "id" in header.place)) and not text(name):
-            raise InputError(f"a point without {what}", file=path, field=column(name))
-    role = role_of(text("role"), path, column("role")) if text("role") else layout.role
-    if text("status"):
-        found = _STATUS.get(text("status").lower(), text("status").lower())
+        if (name in layout.needed or (name == "id" and "id" in header.place)) and not of.text(name):
+            raise InputError(f"a point without {what}", file=path, field=of.column(name))
+    role = role_of(of.text("role"), path, of.column("role")) if of.text("role") else layout.role
+    if of.text("status"):
+        found = _STATUS.get(of.text("status").lower(), of.text("status").lower())
         if found == "i":
             return None
-        role = role_of(found, path, column("status"))
+        role = role_of(found, path, of.column("status"))
+    sigma = of.sigma("sigma_image", False)
+    covariance, group = read_image_errors(
+        [of.plain(name) for name in CSV_ERRORS], path, [of.column(name) for name in CSV_ERRORS], sigma
+    )
     return Row(
         where=where,
-        id=text("id") or None,
-        image=(value("col"), value("row")),
-        ground=(value("x"), value("y"), value("h")),
+        id=of.text("id") or None,
+        image=(of.value("col"), of.value("row")),
+        ground=(of.value("x"), of.value("y"), of.value("h")),
         role=role,
-        sigma_image=sigma("sigma_image", False),
-        sigma_xy=sigma("sigma_xy", True),
-        sigma_h=sigma("sigma_h", True),
-        image_name=text(CSV_IMAGE) or None,
+        sigma_image=sigma,
+        sigma_xy=of.sigma("sigma_xy", True),
+        sigma_h=of.sigma("sigma_h", True),
+        image_name=of.text(CSV_IMAGE) or None,
+        covariance=covariance,
+        group=group,
     )
 
 

@@ -9,12 +9,17 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from ortho_pipeline.errors import CrsError, InputError
 from ortho_pipeline.files import parse_json
+from ortho_pipeline.points.image_errors import read_image_errors, says_more
 from ortho_pipeline.points.rows import (
+    CSV_ERRORS,
     OF_BLOCK,
     OF_IMAGE,
     Layout,
+    Point,
     Row,
     Table,
     number,
@@ -27,9 +32,9 @@ from ortho_pipeline.points.rows import (
 def read_geojson(path: str | os.PathLike[str], text: str, layout: Layout = OF_IMAGE) -> Table:
     """Read points with a property ``ji`` = [column, row] from the *centre* of the first pixel; lon, lat, height.
 
-    Further properties: ``id``, ``role``, ``sigma_image``, ``sigma_xy``, ``sigma_h``, ``filename`` (the image).
-    Heights are ellipsoidal, as the format says. In a block ``ji`` may be a mapping of images to [column, row], and the
-    geometry of a tie point is null; where only ground is wanted, ``ji`` is ignored.
+    Further properties: ``id``, ``role``, ``sigma_image``, ``sigma_xy``, ``sigma_h``, ``filename`` (the image), and
+    those of `CSV_ERRORS`. Heights are ellipsoidal, as the format says. In a block ``ji`` may be a mapping of images to
+    [column, row], and the geometry of a tie point is null; where only ground is wanted, ``ji`` is ignored.
     """
     document = parse_json(text, path, "write a FeatureCollection of Points")
     features = document.get("features") if isinstance(document, dict) else None
@@ -73,15 +78,22 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, layout: Lay
     if name is not None and not isinstance(name, str | int):
         raise InputError(f"{short(name)} is not an id", file=path, field=f"{where}.properties.id")
     role = properties.get("role") or layout.role
+    sigma_image = sigma("sigma_image", False)
+    covariance, group = read_image_errors(
+        [properties.get(one) for one in CSV_ERRORS], path, [f"{where}.properties.{one}" for one in CSV_ERRORS],
+        sigma_image,
+    )  # fmt: skip
     row = Row(
         where=where,
         id=str(name) if name is not None else None,
         image=(math.nan, math.nan),
         ground=ground,
         role=role_of(role, path, f"{where}.properties.role") if role else "",
-        sigma_image=sigma("sigma_image", False),
+        sigma_image=sigma_image,
         sigma_xy=sigma("sigma_xy", True),
         sigma_h=sigma("sigma_h", True),
+        covariance=covariance,
+        group=group,
     )
     if "col" not in layout.needed:
         return [row]
@@ -116,3 +128,31 @@ def _measured(
         column, row = (number(pair[k], path, f"{field}[{k}]") for k in range(2))
         # From the centre of the first pixel to its corner.
         yield image, (column + 0.5, row + 0.5)
+
+
+# -- writing ---------------------------------------------------------------------------------------------------------
+
+
+def feature_of(point: Point) -> dict[str, Any]:
+    """Return the GeoJSON feature of a point whose ground is longitude, latitude and height."""
+    place = list(point.ground if math.isfinite(point.ground[2]) else point.ground[:2])
+    properties = {
+        "id": point.id,
+        "ji": [value - 0.5 for value in point.image],
+        "role": point.role,
+        "sigma_image": point.sigma_image,
+        "sigma_xy": max(point.sigma_ground[:2]),
+        "sigma_h": point.sigma_ground[2],
+        **_error_properties(point),
+    }
+    geometry = {"type": "Point", "coordinates": place} if all(map(math.isfinite, place)) else None
+    return {"type": "Feature", "id": point.id, "properties": properties, "geometry": geometry}
+
+
+def _error_properties(point: Point) -> dict[str, float]:
+    """Return the properties `CSV_ERRORS` of a point that say more than `sigma_image` does."""
+    (column, both), (_, row) = point.covariance_image
+    found: dict[str, float] = {}
+    if says_more(np.array([point.covariance_image]))[0]:
+        found.update(zip(CSV_ERRORS[:3], (column, row, both), strict=True))
+    return {**found, CSV_ERRORS[3]: point.group} if point.group >= 0 else found

@@ -22,10 +22,14 @@ from ortho_pipeline.options import PIXEL_ORIGINS
 #: A point file beyond this is not read (bytes), nor a line beyond that (characters).
 MAX_FILE = 32_000_000
 MAX_LINE = 100_000
+#: A standard deviation beyond this has no square.
+MAX_SIGMA = 1e150
 ROLES = ("control", "check", "tie")
 CSV_COLUMNS = ("id", "col", "row", "x", "y", "h", "role", "sigma_image", "sigma_xy", "sigma_h")
 #: Column of a CSV of several images: the file that a point was measured in.
 CSV_IMAGE = "image"
+#: Columns of points whose errors differ with the direction, or are shared with those of neighbours.
+CSV_ERRORS = ("var_col", "var_row", "cov_col_row", "group")
 
 
 class Layout(NamedTuple):
@@ -37,9 +41,9 @@ class Layout(NamedTuple):
 
 
 #: Points of one image; rays of a block, whose ground may be known; ground whose heights count; ground alone.
-OF_IMAGE = Layout((*CSV_COLUMNS, CSV_IMAGE), CSV_COLUMNS[1:5], "control")
-OF_BLOCK = Layout(("id", CSV_IMAGE, *CSV_COLUMNS[1:]), ("id", CSV_IMAGE, "col", "row"), "")
-OF_HEIGHTS = Layout((*CSV_COLUMNS, CSV_IMAGE), CSV_COLUMNS[3:6], "check")
+OF_IMAGE = Layout((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[1:5], "control")
+OF_BLOCK = Layout(("id", CSV_IMAGE, *CSV_COLUMNS[1:], *CSV_ERRORS), ("id", CSV_IMAGE, "col", "row"), "")
+OF_HEIGHTS = Layout((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[3:6], "check")
 OF_GROUND = Layout(("id", *CSV_COLUMNS[3:7], *CSV_COLUMNS[8:]), ("id", "x", "y"), "")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
@@ -49,9 +53,28 @@ Piece = tuple[float, float, float]
 OWN_IMAGE: Piece = (0.0, 0.0, 1.0)
 
 
+class Point(NamedTuple):
+    """One of the points of a table, in its units; `image` and `sigma_image` in px, sigmas of the ground in metres.
+
+    `covariance_image` (px^2) and `group` are those of its measurement, as in `Points`.
+    """
+
+    id: str
+    image: tuple[float, float]
+    ground: tuple[float, float, float]
+    role: str
+    sigma_image: float
+    sigma_ground: tuple[float, float, float]
+    covariance_image: tuple[tuple[float, float], tuple[float, float]]
+    group: int
+
+
 @dataclass(slots=True)
 class Row:
-    """One point as its file has it; None is what the file does not give. `piece` is where its image lies."""
+    """One point as its file has it; None is what the file does not give. `piece` is where its image lies.
+
+    `covariance` has the variances (px^2) of column and row and their covariance.
+    """
 
     where: str
     id: str | None
@@ -63,6 +86,8 @@ class Row:
     sigma_h: float | None = None
     image_name: str | None = None
     piece: Piece = OWN_IMAGE
+    covariance: tuple[float, float, float] | None = None
+    group: int | None = None
 
     def __post_init__(self) -> None:
         if self.id is not None:
@@ -199,7 +224,7 @@ def role_of(text: Any, path: str | os.PathLike[str], where: str) -> str:
 
 def sigma_of(text: Any, path: str | os.PathLike[str], where: str, *, zero: bool) -> float:
     value = number(text, path, where)
-    if value < 0 or (value == 0 and not zero):
+    if value < 0 or (value == 0 and not zero) or value > MAX_SIGMA:
         raise InputError(f"{short(text)} is not a standard deviation", file=path, field=where)
     return value
 

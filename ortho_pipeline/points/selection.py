@@ -1,8 +1,14 @@
-"""Selection of control points: the rest become check points. This is how the tables of papers are made."""
+"""Selection of control points: the rest become check points. This is how the tables of papers are made.
+
+A few can be made check points instead (`assign_roles`), of one image or of a block.
+"""
 
 from __future__ import annotations
 
+from typing import Protocol, Self, TypeVar
+
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError, TooFewPoints, counted
 from ortho_pipeline.points.table import Array, Points
@@ -105,3 +111,56 @@ def _nearest(places: Array, count: int, group: int, spec: str) -> list[int]:
     low, high = places.min(axis=0), places.max(axis=0)
     seed = low + _REGIONS[group - 1] * (high - low)
     return np.argsort(((places - seed) ** 2).sum(axis=1), kind="stable")[:count].tolist()
+
+
+# -- check points ----------------------------------------------------------------------------------------------------
+
+
+class HasRoles(Protocol):
+    """A table of points with roles: of one image, or of a block."""
+
+    @property
+    def ids(self) -> tuple[str, ...]: ...
+    @property
+    def roles(self) -> NDArray[np.str_]: ...
+    @property
+    def control(self) -> NDArray[np.bool_]: ...
+    @property
+    def source(self) -> str: ...
+    def with_roles(self, roles: ArrayLike) -> Self: ...
+
+
+AnyPoints = TypeVar("AnyPoints", bound=HasRoles)
+
+
+def assign_roles(points: AnyPoints, spec: str) -> AnyPoints:
+    """Make check points of some control points.
+
+    Parameters
+    ----------
+    spec : str
+        ``every:N`` for each N-th control point (the N-th first), or ``ids:a,b,c`` for these points.
+
+    Raises
+    ------
+    InputError
+        If the text is neither, or an id does not exist.
+    """
+    kind, _, rest = spec.partition(":")
+    roles = points.roles.copy()
+    if kind == "every" and rest.strip().isascii() and rest.strip().isdigit() and 0 < int(rest) <= 1_000_000:
+        roles[np.flatnonzero(points.control)[int(rest) - 1 :: int(rest)]] = "check"
+        return points.with_roles(roles)
+    names = [name.strip() for name in rest.split(",") if name.strip()]
+    if kind == "ids" and names:
+        unknown = [name for name in names if name not in points.ids]
+        if unknown:
+            raise InputError(
+                f"there is no point {', '.join(unknown)}",
+                file=points.source or None,
+                field="points.check",
+                remedy=f"the ids are {', '.join(points.ids[:12])}{' ...' if len(points.ids) > 12 else ''}",
+            )
+        roles[np.isin(np.array(points.ids), names)] = "check"
+        return points.with_roles(roles)
+    raise InputError(f"{spec!r} does not choose check points", field="points.check", remedy="give every:N or ids:a,b,c")

@@ -14,7 +14,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self, TypeVar
+from typing import Any
 
 import numpy as np
 import pyproj
@@ -29,24 +29,36 @@ from ortho_pipeline.geodesy.crs import (
     parse_crs,
 )
 from ortho_pipeline.points.formats import read_table
+from ortho_pipeline.points.geojson import feature_of
 from ortho_pipeline.points.ground import ground_of
-from ortho_pipeline.points.rows import CSV_COLUMNS, ROLES, Piece, Row, Table, is_writable, origin_shift, plain_id, short
+from ortho_pipeline.points.image_errors import (
+    checked_covariance,
+    checked_groups,
+    covariance_of,
+    groups_of,
+    reconciled,
+    says_more,
+    sigma_of_covariance,
+    sigmas_of,
+)
+from ortho_pipeline.points.rows import (
+    CSV_COLUMNS,
+    CSV_ERRORS,
+    ROLES,
+    Piece,
+    Point,
+    Row,
+    Table,
+    is_writable,
+    origin_shift,
+    plain_id,
+    short,
+)
 
 Array = NDArray[np.float64]
 
 #: Standard deviation (px) of an image measurement whose file gives none.
 DEFAULT_SIGMA_IMAGE = 0.5
-
-
-class Point(NamedTuple):
-    """One of the points of a table, in its units; `image` and `sigma_image` in px, sigmas of the ground in metres."""
-
-    id: str
-    image: tuple[float, float]
-    ground: tuple[float, float, float]
-    role: str
-    sigma_image: float
-    sigma_ground: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -64,13 +76,19 @@ class Points:
     roles : ndarray (N,) of str
         ``control``, ``check`` or ``tie``.
     sigma_image : ndarray (N,)
-        Standard deviation of the image measurement, px.
+        Standard deviation of the image measurement, px: the root mean square of both axes.
     sigma_ground : ndarray (N, 3)
         Standard deviation of the ground coordinates in metres; 0 is perfect.
     crs : pyproj.CRS
         Horizontal CRS, x first.
     source : str
         Where they come from, for people.
+    covariance_image : ndarray (N, 2, 2), optional
+        Covariance of column and row of the measurement, px^2. Where it is not given, and where it is the same in all
+        directions, it is that of `sigma_image`.
+    groups : ndarray (N,) of int, optional
+        -1 is a point that errs on its own, as one that was measured by hand; points of one number from 0 on share
+        errors, as matched neighbours do.
     """
 
     ids: tuple[str, ...]
@@ -81,6 +99,8 @@ class Points:
     sigma_ground: Array
     crs: pyproj.CRS
     source: str
+    covariance_image: Array = None  # type: ignore[assignment]  # filled below, as `groups` is
+    groups: NDArray[np.int64] = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         count = len(self.ids)
@@ -94,6 +114,10 @@ class Points:
             if array.shape != shape:
                 raise InputError(f"{name} has the shape {array.shape}, not {shape}", field=name)
             object.__setattr__(self, name, array)
+        sigma, covariance = reconciled(self.sigma_image, self.covariance_image)
+        object.__setattr__(self, "sigma_image", sigma)
+        object.__setattr__(self, "covariance_image", covariance)
+        object.__setattr__(self, "groups", checked_groups(self.groups, count))
         roles = np.asarray(self.roles, dtype="<U7")
         if roles.shape != (count,) or not np.isin(roles, ROLES).all():
             raise InputError(f"each point has one role of {', '.join(ROLES)}", field="roles")
@@ -112,8 +136,12 @@ class Points:
     def __iter__(self) -> Iterator[Point]:
         columns = self.image.tolist(), self.ground.tolist(), self.roles.tolist()
         sigmas = self.sigma_image.tolist(), self.sigma_ground.tolist()
-        for name, image, ground, role, sigma, sigma_ground in zip(self.ids, *columns, *sigmas, strict=True):
-            yield Point(name, tuple(image), tuple(ground), role, sigma, tuple(sigma_ground))
+        errors = self.covariance_image.tolist(), self.groups.tolist()
+        for name, image, ground, role, sigma, sigma_ground, both, group in zip(
+            self.ids, *columns, *sigmas, *errors, strict=True
+        ):
+            covariance = tuple(both[0]), tuple(both[1])
+            yield Point(name, tuple(image), tuple(ground), role, sigma, tuple(sigma_ground), covariance, group)
 
     @property
     def __geo_interface__(self) -> dict[str, Any]:
@@ -122,7 +150,7 @@ class Points:
         `ji` are column and row from the centre of the first pixel. A point without a place has no geometry. shapely,
         GeoPandas (``GeoDataFrame.from_features(points, crs=4326)``) and others read it.
         """
-        return {"type": "FeatureCollection", "features": [_feature(point) for point in self.to_crs("EPSG:4979")]}
+        return {"type": "FeatureCollection", "features": [feature_of(point) for point in self.to_crs("EPSG:4979")]}
 
     @property
     def control(self) -> NDArray[np.bool_]:
@@ -145,7 +173,15 @@ class Points:
             roles=self.roles[index],
             sigma_image=self.sigma_image[index],
             sigma_ground=self.sigma_ground[index],
+            covariance_image=self.covariance_image[index],
+            groups=self.groups[index],
         )
+
+    def with_covariance_image(self, covariance: ArrayLike, groups: ArrayLike | None = None) -> Points:
+        """Return these points with other covariances ``(N, 2, 2)`` px^2 of their measurement, and groups if given."""
+        given = checked_covariance(covariance, len(self))
+        changed = replace(self, sigma_image=sigma_of_covariance(given), covariance_image=given)
+        return changed if groups is None else replace(changed, groups=np.asarray(groups))
 
     def with_roles(self, roles: ArrayLike) -> Points:
         """Return these points with other roles ``(N,)``."""
@@ -216,15 +252,18 @@ def read_points(
     image = image * pieces_of[:, 2:] + pieces_of[:, :2]
     ground, plane = ground_of(path, table, crs, vertical)
     _refuse_duplicates(path, [row.where for row in table.rows], image, ground, [row.role for row in table.rows])
+    sigma_image = sigmas_of(table.rows, DEFAULT_SIGMA_IMAGE)
     return Points(
         ids=ids,
         image=image,
         ground=ground,
         roles=np.array([row.role for row in table.rows], dtype="<U7"),
-        sigma_image=np.array([_or(row.sigma_image, DEFAULT_SIGMA_IMAGE) * row.piece[2] for row in table.rows]),
+        sigma_image=sigma_image,
         sigma_ground=np.array([[_or(row.sigma_xy, 0.0)] * 2 + [_or(row.sigma_h, 0.0)] for row in table.rows]),
         crs=plane,
         source=os.fspath(path),
+        covariance_image=covariance_of(table.rows, sigma_image),
+        groups=groups_of(table.rows),
     )
 
 
@@ -315,59 +354,6 @@ def _refuse_duplicates(
                 )
 
 
-# -- roles -----------------------------------------------------------------------------------------------------------
-
-
-class HasRoles(Protocol):
-    """A table of points with roles: of one image, or of a block."""
-
-    @property
-    def ids(self) -> tuple[str, ...]: ...
-    @property
-    def roles(self) -> NDArray[np.str_]: ...
-    @property
-    def control(self) -> NDArray[np.bool_]: ...
-    @property
-    def source(self) -> str: ...
-    def with_roles(self, roles: ArrayLike) -> Self: ...
-
-
-AnyPoints = TypeVar("AnyPoints", bound=HasRoles)
-
-
-def assign_roles(points: AnyPoints, spec: str) -> AnyPoints:
-    """Make check points of some control points.
-
-    Parameters
-    ----------
-    spec : str
-        ``every:N`` for each N-th control point (the N-th first), or ``ids:a,b,c`` for these points.
-
-    Raises
-    ------
-    InputError
-        If the text is neither, or an id does not exist.
-    """
-    kind, _, rest = spec.partition(":")
-    roles = points.roles.copy()
-    if kind == "every" and rest.strip().isascii() and rest.strip().isdigit() and 0 < int(rest) <= 1_000_000:
-        roles[np.flatnonzero(points.control)[int(rest) - 1 :: int(rest)]] = "check"
-        return points.with_roles(roles)
-    names = [name.strip() for name in rest.split(",") if name.strip()]
-    if kind == "ids" and names:
-        unknown = [name for name in names if name not in points.ids]
-        if unknown:
-            raise InputError(
-                f"there is no point {', '.join(unknown)}",
-                file=points.source or None,
-                field="points.check",
-                remedy=f"the ids are {', '.join(points.ids[:12])}{' ...' if len(points.ids) > 12 else ''}",
-            )
-        roles[np.isin(np.array(points.ids), names)] = "check"
-        return points.with_roles(roles)
-    raise InputError(f"{spec!r} does not choose check points", field="points.check", remedy="give every:N or ids:a,b,c")
-
-
 # -- writing ---------------------------------------------------------------------------------------------------------
 
 
@@ -415,35 +401,34 @@ def _csv_text(points: Points, suffix: str, images: Sequence[str] | None = None) 
         lineterminator="\n",
         quoting=csv.QUOTE_ALL if hidden else csv.QUOTE_MINIMAL,
     )
-    writer.writerow(CSV_COLUMNS if images is None else (*CSV_COLUMNS, "image"))
+    extra = _error_columns(points)
+    writer.writerow([*CSV_COLUMNS, *extra, *([] if images is None else ["image"])])
     # One column holds both plan components: the larger one is the careful choice.
     sigma_xy = points.sigma_ground[:, :2].max(axis=1)
     numbers = np.column_stack([points.image, points.ground])
     sigmas = np.column_stack([points.sigma_image, sigma_xy, points.sigma_ground[:, 2]])
     for k, name in enumerate(points.ids):
         cells = ["" if math.isnan(value) else repr(value) for value in numbers[k].tolist()]
-        measured_in = [] if images is None else [images[k]]
-        writer.writerow([name, *cells, str(points.roles[k]), *map(repr, sigmas[k].tolist()), *measured_in])
+        further = [column[k] for column in extra.values()] + ([] if images is None else [images[k]])
+        writer.writerow([name, *cells, str(points.roles[k]), *map(repr, sigmas[k].tolist()), *further])
     return out.getvalue()
+
+
+def _error_columns(points: Points) -> dict[str, list[str]]:
+    """Return cells of the columns `CSV_ERRORS` by their names: of those that say more than `sigma_image` does."""
+    found: dict[str, list[str]] = {}
+    more = says_more(points.covariance_image)
+    if more.any():
+        for name, i, j in zip(CSV_ERRORS[:3], (0, 1, 0), (0, 1, 1), strict=True):
+            values = points.covariance_image[:, i, j].tolist()
+            found[name] = [repr(value) if there else "" for value, there in zip(values, more, strict=True)]
+    if (points.groups >= 0).any():
+        found[CSV_ERRORS[3]] = [str(group) if group >= 0 else "" for group in points.groups.tolist()]
+    return found
 
 
 def _geojson_text(points: Points, suffix: str) -> str:
     return json.dumps(points.__geo_interface__, indent=1, allow_nan=False) + "\n"
-
-
-def _feature(point: Point) -> dict[str, Any]:
-    """Return the GeoJSON feature of a point whose ground is longitude, latitude and height."""
-    place = list(point.ground if math.isfinite(point.ground[2]) else point.ground[:2])
-    properties = {
-        "id": point.id,
-        "ji": [value - 0.5 for value in point.image],
-        "role": point.role,
-        "sigma_image": point.sigma_image,
-        "sigma_xy": max(point.sigma_ground[:2]),
-        "sigma_h": point.sigma_ground[2],
-    }
-    geometry = {"type": "Point", "coordinates": place} if all(map(math.isfinite, place)) else None
-    return {"type": "Feature", "id": point.id, "properties": properties, "geometry": geometry}
 
 
 def _qgis_text(points: Points, suffix: str) -> str:

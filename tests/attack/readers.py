@@ -121,7 +121,7 @@ def _written(write: Callable[[Path], Any]) -> Callable[[Path], bytes]:
 def _points(crs: str | None = None, vertical: str | None = None) -> Callable[[Path], Any]:
     def read(path: Path) -> Any:
         points = read_points(path, crs=crs, vertical=vertical, image_name="one.tif")
-        return [points.image, points.ground, points.sigma_image, points.sigma_ground]
+        return [points.image, points.ground, points.sigma_image, points.sigma_ground, points.covariance_image]
 
     return read
 
@@ -358,6 +358,8 @@ READERS = (
            _frame("reconstruction.json", "reconstruction.json")),
     Reader("points-csv", "text", "p.csv", _sample("gcps.csv"), _points(), unknown=True),
     Reader("points-geojson", "json", "p.geojson", _sample("gcps.geojson"), _points(), unknown=True),
+    Reader("points-matched", "text", "p.csv", _text(seeds.MATCHED), _points(), unknown=True),
+    Reader("points-matched-json", "json", "p.geojson", _text(seeds.MATCHED_JSON), _points(), unknown=True),
     Reader("points-qgis", "text", "p.points", _text(seeds.QGIS), _points(), unknown=True),
     Reader("points-odm", "text", "gcp_list.txt", _text(seeds.ODM), _points(None, "ellipsoid"), unknown=True),
     Reader("points-envi", "text", "p.pts", _text(seeds.ENVI), _points(None, "ellipsoid"), unknown=True),

@@ -210,6 +210,29 @@ OPENSFM = json.dumps(
         }
     ]
 )  # fmt: skip
+MATCHED = """#CRS: EPSG:4979
+#vertical: ellipsoid
+id,col,row,x,y,h,role,sigma_image,var_col,var_row,cov_col_row,group
+m1,10.5,20.25,32.9,39.9,900,control,,0.04,0.09,-0.02,0
+m2,30.5,2.25,32.91,39.91,905,check,0.2,,,,0
+m3,1.5,12.25,32.92,39.89,910,control,0.3,0.09,0.09,0.01,
+"""
+MATCHED_JSON = json.dumps(
+    {
+        "type": "FeatureCollection",
+        "features": [
+            {
+                "type": "Feature",
+                "properties": {
+                    "ji": [10.0, 20.0 + k], "id": f"m{k}", "var_col": 0.04, "var_row": 0.09, "cov_col_row": -0.02,
+                    "group": k,
+                },
+                "geometry": {"type": "Point", "coordinates": [32.9, 39.9 + 0.01 * k, 900.0]},
+            }
+            for k in range(3)
+        ],
+    }
+)  # fmt: skip
 PIPELINE = json.dumps(
     {
         "output": "out",

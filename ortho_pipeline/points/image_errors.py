@@ -1,0 +1,219 @@
+"""What is known of the errors of image measurements: covariance of a point, and groups of points that share errors.
+
+A covariance that is the same in all directions says no more than a standard deviation, and is that one's square.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.points.rows import CSV_ERRORS, Row, number, short, sigma_of
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+#: Column and row that depend on each other beyond this leave no second direction: 1 - correlation^2.
+_SINGULAR = 1e-12
+#: Halves of a covariance that differ by this part of its trace are the same.
+_ROUNDING = 1e-12
+#: A standard deviation agrees with a covariance within this part of it: files round.
+_SAME_SIGMA = 0.01
+
+
+def reconciled(sigma: Array, covariance: ArrayLike | None) -> tuple[Array, Array]:
+    """Return standard deviations ``(N,)`` px and covariances ``(N, 2, 2)`` px^2 that say the same.
+
+    Of a covariance that differs with the direction the standard deviation is the root mean square of both axes;
+    elsewhere `sigma` says all, and its square is the covariance.
+
+    Raises
+    ------
+    InputError
+        If a covariance is not finite, symmetric and positive definite, or contradicts its standard deviation.
+    """
+    square = np.zeros((len(sigma), 2, 2))
+    with np.errstate(over="ignore"):
+        square[:, 0, 0] = square[:, 1, 1] = sigma**2
+    if covariance is None:
+        return sigma, square
+    given = _of_shape(covariance, len(sigma))
+    alike = ((given == square) | np.isnan(given) & np.isnan(square)).all(axis=(1, 2))
+    _refuse_impossible(given[~alike], np.flatnonzero(~alike))
+    more = says_more(given)
+    derived = sigma_of_covariance(given)
+    # A change of scale of points without directions changes sigma alone.
+    wrong = more & ~(np.abs(sigma - derived) <= _SAME_SIGMA * derived)
+    if wrong.any():
+        k = int(np.flatnonzero(wrong)[0])
+        raise InputError(
+            f"sigma_image {sigma[k]:g} of point {k + 1} contradicts covariance_image, whose root mean square per axis "
+            f"is {derived[k]:g}",
+            field="sigma_image", remedy="change both, or give the covariance by with_covariance_image",
+        )  # fmt: skip
+    return np.where(more, derived, sigma), np.where(more[:, None, None], given, square)
+
+
+def checked_covariance(covariance: ArrayLike, count: int) -> Array:
+    """Return covariances ``(N, 2, 2)``, each finite, symmetric and positive definite.
+
+    Raises
+    ------
+    InputError
+        If they are not.
+    """
+    given = _of_shape(covariance, count)
+    _refuse_impossible(given, np.arange(count))
+    return given
+
+
+def _of_shape(covariance: ArrayLike, count: int) -> Array:
+    """Return covariances ``(N, 2, 2)``; what rounding did to their symmetry is undone."""
+    given = np.array(covariance, dtype=float)
+    if given.shape != (count, 2, 2):
+        raise InputError(f"covariance_image has the shape {given.shape}, not {(count, 2, 2)}", field="covariance_image")
+    both = given[:, 0, 1] / 2 + given[:, 1, 0] / 2
+    with np.errstate(invalid="ignore"):
+        rounded = np.abs(given[:, 0, 1] - given[:, 1, 0]) <= _ROUNDING * (given[:, 0, 0] + given[:, 1, 1])
+    given[rounded, 0, 1] = given[rounded, 1, 0] = both[rounded]
+    return given
+
+
+def sigma_of_covariance(covariance: Array) -> Array:
+    """Return the root mean square per axis ``(N,)`` px of covariances ``(N, 2, 2)`` px^2."""
+    return np.sqrt(covariance[:, 0, 0] / 2 + covariance[:, 1, 1] / 2)
+
+
+def says_more(covariance: Array) -> NDArray[np.bool_]:
+    """Return which covariances ``(N, 2, 2)`` differ with the direction."""
+    same = (covariance[:, 0, 0] == covariance[:, 1, 1]) | np.isnan(covariance[:, 0, 0])
+    return ~(same & (covariance[:, 0, 1] == 0) & (covariance[:, 1, 0] == 0))
+
+
+def checked_groups(groups: ArrayLike | None, count: int) -> Index:
+    """Return groups ``(N,)``: -1 for a point that errs on its own, else the same number for those that share errors.
+
+    Raises
+    ------
+    InputError
+        If they are not so many whole numbers from -1 on.
+    """
+    if groups is None:
+        return np.full(count, -1, dtype=np.int64)
+    found = np.asarray(groups)
+    if found.shape != (count,):
+        raise InputError(f"groups has the shape {found.shape}, not {(count,)}", field="groups")
+    if count and (found.dtype.kind not in "iu" or (found < -1).any()):
+        raise InputError("groups are whole numbers, -1 for a point that errs on its own", field="groups")
+    return found.astype(np.int64)
+
+
+def _refuse_impossible(covariance: Array, rows: Index) -> None:
+    if not np.isfinite(covariance).all():
+        k = int(np.flatnonzero(~np.isfinite(covariance).all(axis=(1, 2)))[0])
+        raise InputError(f"covariance_image of point {rows[k] + 1} is not finite", field="covariance_image")
+    skew = covariance[:, 0, 1] != covariance[:, 1, 0]
+    wrong = skew | ~_is_positive_definite(covariance)
+    if wrong.any():
+        k = int(np.flatnonzero(wrong)[0])
+        what = "symmetric" if skew[k] else "positive definite"
+        raise InputError(f"covariance_image of point {rows[k] + 1} is not {what}", field="covariance_image")
+
+
+def _is_positive_definite(covariance: Array) -> NDArray[np.bool_]:
+    column, row = covariance[:, 0, 0], covariance[:, 1, 1]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        correlation = covariance[:, 0, 1] / np.sqrt(column) / np.sqrt(row)
+        return np.asarray((column > 0) & (row > 0) & (1 - correlation**2 > _SINGULAR))
+
+
+# -- files -----------------------------------------------------------------------------------------------------------
+
+
+def read_image_errors(
+    values: Sequence[Any], path: str | os.PathLike[str], where: Sequence[str], sigma: float | None
+) -> tuple[tuple[float, float, float] | None, int | None]:
+    """Return variances and covariance of a measurement, and the group of its point; None for what is not given.
+
+    Parameters
+    ----------
+    values : sequence of four
+        Of `CSV_ERRORS`, as a file has them; None and empty text are not given.
+    where : sequence of four str
+        Where in the file each stands.
+    sigma : float or None
+        The standard deviation beside them, which has to agree.
+
+    Raises
+    ------
+    InputError
+        If only some of a covariance is given, or it is impossible or contradicts the standard deviation.
+    """
+    there = [value is not None and value != "" for value in values]
+    group = _group(values[3], path, where[3]) if there[3] else None
+    if not any(there[:3]):
+        return None, group
+    if not all(there[:3]):
+        missing = CSV_ERRORS[there[:3].index(False)]
+        raise InputError(
+            f"a covariance without {missing}", file=path, field=where[there.index(True)],
+            remedy=f"give {', '.join(CSV_ERRORS[:3])}, or sigma_image alone",
+        )  # fmt: skip
+    column, row = (sigma_of(values[k], path, where[k], zero=False) for k in range(2))
+    both = number(values[2], path, where[2])
+    matrix = np.array([[[column, both], [both, row]]])
+    if not _is_positive_definite(matrix)[0]:
+        raise InputError(
+            f"{short(values[2])} is too large for the covariance of column and row: it is not positive definite",
+            file=path, field=where[2], remedy="its square is below var_col times var_row",
+        )  # fmt: skip
+    derived = float(sigma_of_covariance(matrix)[0])
+    if sigma is not None and not abs(sigma - derived) <= _SAME_SIGMA * derived:
+        raise InputError(
+            f"sigma_image is {sigma:g}, and the covariance beside it has {derived:g}", file=path, field=where[0],
+            remedy="leave sigma_image empty where a covariance is given",
+        )  # fmt: skip
+    return (column, row, both), group
+
+
+def _group(value: Any, path: str | os.PathLike[str], where: str) -> int:
+    found = number(value, path, where)
+    if found != math.floor(found) or not 0 <= found < 2**53:
+        raise InputError(
+            f"{short(value)} is not a group", file=path, field=where,
+            remedy="number the groups from 0 on; leave it empty for a point that errs on its own",
+        )  # fmt: skip
+    return int(found)
+
+
+def covariance_of(rows: Sequence[Row], sigma: Array) -> Array:
+    """Return covariances ``(N, 2, 2)`` px^2 of the rows of a file, from `sigma` where they give none."""
+    found = reconciled(sigma, None)[1]
+    for k, row in enumerate(rows):
+        if row.covariance is not None:
+            column, other, both = row.covariance
+            found[k] = np.array([[column, both], [both, other]]) * row.piece[2] ** 2
+    return found
+
+
+def groups_of(rows: Sequence[Row]) -> Index:
+    """Return the groups ``(N,)`` of the rows of a file."""
+    return np.array([-1 if row.group is None else row.group for row in rows], dtype=np.int64)
+
+
+def sigmas_of(rows: Sequence[Row], default: float) -> Array:
+    """Return standard deviations ``(N,)`` px of the rows of a file; `default` for those that give nothing."""
+    found = np.empty(len(rows))
+    for k, row in enumerate(rows):
+        if row.covariance is not None:
+            sigma = math.sqrt(row.covariance[0] / 2 + row.covariance[1] / 2)
+        else:
+            sigma = default if row.sigma_image is None else row.sigma_image
+        found[k] = sigma * row.piece[2]
+    return found

@@ -1,0 +1,205 @@
+"""Points whose errors differ with the direction, or are shared with those of neighbours: table and files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.points import Points, read_points, write_points
+
+
+def made(count: int = 6, seed: int = 0) -> Points:
+    """Return points of which some have a covariance with a direction, and some a group."""
+    random = np.random.default_rng(seed)
+    plain = Points(
+        ids=tuple(f"p{k}" for k in range(count)),
+        image=random.uniform(0, 1000, (count, 2)),
+        ground=np.column_stack([random.uniform(20, 30, (count, 2)), random.uniform(0, 900, count)]),
+        roles=np.full(count, "control"),
+        sigma_image=random.uniform(0.1, 2, count),
+        sigma_ground=np.zeros((count, 3)),
+        crs=pyproj.CRS(4326),
+        source="made",
+    )
+    covariance = plain.covariance_image.copy()
+    some = random.random(count) < 0.6
+    half = random.normal(0, 1, (count, 2, 2))
+    covariance[some] = (half @ half.transpose(0, 2, 1) + 1e-3 * np.eye(2))[some]
+    groups = np.where(random.random(count) < 0.5, -1, random.integers(0, 9, count))
+    return plain.with_covariance_image(covariance, groups)
+
+
+def assert_same(one: Points, other: Points) -> None:
+    np.testing.assert_array_equal(one.covariance_image, other.covariance_image)
+    np.testing.assert_array_equal(one.sigma_image, other.sigma_image)
+    np.testing.assert_array_equal(one.groups, other.groups)
+
+
+def test_a_point_without_a_covariance_errs_alike_in_all_directions_and_on_its_own() -> None:
+    points = replace(made(), covariance_image=None, groups=None)
+    np.testing.assert_array_equal(points.covariance_image, points.sigma_image[:, None, None] ** 2 * np.eye(2))
+    assert points.groups.tolist() == [-1] * len(points)
+    # A scale of such points is one of sigma alone, as it was before there were covariances.
+    twice = replace(points, sigma_image=2 * points.sigma_image)
+    np.testing.assert_array_equal(twice.covariance_image, (2 * points.sigma_image[:, None, None]) ** 2 * np.eye(2))
+    perfect = replace(points, sigma_image=np.zeros(len(points)), covariance_image=None)
+    assert not replace(perfect, source="again").covariance_image.any()
+
+
+def test_the_scalar_is_the_root_mean_square_of_both_axes() -> None:
+    points = made().with_covariance_image(np.tile([[4.0, 1.0], [1.0, 2.0]], (6, 1, 1)))
+    np.testing.assert_allclose(points.sigma_image, np.sqrt(3.0), rtol=1e-15)
+    for kept in (points.select([4, 1]), points.with_roles(["check"] * 6), points.to_crs("EPSG:32635")):
+        np.testing.assert_array_equal(kept.covariance_image, np.tile([[4.0, 1.0], [1.0, 2.0]], (len(kept), 1, 1)))
+    mixed = made()
+    assert_same(mixed.select([5, 0]), mixed.select([0, 5]).select([1, 0]))
+    assert mixed.select([5, 0]).groups.tolist() == [mixed.groups[5], mixed.groups[0]]
+    point = list(mixed)[3]
+    assert point.covariance_image == tuple(map(tuple, mixed.covariance_image[3].tolist()))
+    assert point.group == mixed.groups[3]
+
+
+@pytest.mark.parametrize(
+    ("covariance", "said"),
+    [
+        ([[1, 2], [2, 1]], "positive definite"),
+        ([[1, 1], [1, 1]], "positive definite"),
+        ([[-1, 0], [0, -1]], "positive definite"),
+        ([[0, 0], [0, 0]], "positive definite"),
+        ([[1, 0.1], [0.2, 1]], "symmetric"),
+        ([[np.nan, 0], [0, 1]], "finite"),
+        ([[np.inf, 0], [0, 1]], "finite"),
+        ([1, 1], "shape"),
+    ],
+)
+def test_what_is_not_a_covariance_is_refused(covariance: list[list[float]], said: str) -> None:
+    points = made(1).with_covariance_image([[[1, 0], [0, 1]]])
+    for make in (points.with_covariance_image, lambda given: replace(points, covariance_image=given)):
+        with pytest.raises(InputError, match=said) as caught:
+            make(np.array([covariance], dtype=float))
+        assert caught.value.field == "covariance_image"
+
+
+def test_a_scalar_that_contradicts_a_covariance_is_refused_and_rounding_is_not() -> None:
+    points = made(1).with_covariance_image([[[4, 1], [1, 2]]])
+    with pytest.raises(InputError, match="contradicts covariance_image") as caught:
+        replace(points, sigma_image=2 * points.sigma_image)
+    assert caught.value.field == "sigma_image"
+    assert replace(points, sigma_image=[1.73]).sigma_image == pytest.approx([np.sqrt(3)], rel=1e-15)
+    skew = points.covariance_image + np.array([[0, 1e-16], [0, 0]])
+    assert points.with_covariance_image(skew).covariance_image[0, 0, 1] == 1.0
+
+
+@pytest.mark.parametrize("groups", [[0], [0.5] * 6, [-2] * 6, ["a"] * 6, [[0] * 6]])
+def test_what_is_not_a_group_is_refused(groups: list[object]) -> None:
+    with pytest.raises(InputError) as caught:
+        replace(made(), groups=groups)
+    assert caught.value.field == "groups"
+
+
+# -- files -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".tsv", ".geojson"])
+@given(seed=st.integers(0, 1000), count=st.integers(1, 8))
+def test_covariances_and_groups_are_read_as_they_were_written(
+    tmp_path: Path, suffix: str, seed: int, count: int
+) -> None:
+    points, path = made(count, seed), tmp_path / f"points{suffix}"
+    write_points(points, path)
+    assert_same(read_points(path), points)
+
+
+def test_files_say_no_more_than_there_is_to_say(tmp_path: Path) -> None:
+    points = made()
+    plain = replace(points, covariance_image=points.sigma_image[:, None, None] ** 2 * np.eye(2), groups=None)
+    write_points(plain, tmp_path / "plain.csv")
+    write_points(plain, tmp_path / "plain.geojson")
+    assert "sigma_h\n" in (tmp_path / "plain.csv").read_text()
+    for feature in json.loads((tmp_path / "plain.geojson").read_text())["features"]:
+        assert set(feature["properties"]) == {"id", "ji", "role", "sigma_image", "sigma_xy", "sigma_h"}
+    write_points(replace(plain, groups=[3, -1, -1, -1, -1, -1]), tmp_path / "groups.csv", images=["a.tif"] * 6)
+    assert "sigma_h,group,image\n" in (tmp_path / "groups.csv").read_text()
+    assert read_points(tmp_path / "groups.csv").groups.tolist() == [3, -1, -1, -1, -1, -1]
+    write_points(points, tmp_path / "all.csv")
+    assert "sigma_h,var_col,var_row,cov_col_row,group\n" in (tmp_path / "all.csv").read_text()
+    kept = {field.name for field in dataclasses.fields(points)}
+    assert {"covariance_image", "groups"} <= kept
+
+
+HEADER = "id,col,row,x,y,h,sigma_image,var_col,var_row,cov_col_row,group\n"
+
+
+def read(path: Path, cells: str) -> Points:
+    path.write_text(HEADER + f"a,1,2,24,-33,100,{cells}\n")
+    return read_points(path, crs="EPSG:4326", vertical="ellipsoid")
+
+
+def test_a_covariance_needs_no_scalar_beside_it(tmp_path: Path) -> None:
+    points = read(tmp_path / "p.csv", ",0.5,0.25,-0.1,7")
+    assert points.covariance_image.tolist() == [[[0.5, -0.1], [-0.1, 0.25]]]
+    assert points.sigma_image == pytest.approx([np.sqrt(0.375)])
+    assert points.groups.tolist() == [7]
+    alike = read(tmp_path / "p.csv", ",0.25,0.25,0,")
+    assert alike.sigma_image.tolist() == [0.5]
+    assert alike.groups.tolist() == [-1]
+
+
+@pytest.mark.parametrize(
+    ("cells", "field"),
+    [
+        (",1,1,,", "column var_col"),
+        (",,,0.5,", "column cov_col_row"),
+        (",1,1,1,", "column cov_col_row"),
+        (",1,0,0,", "column var_row"),
+        (",-1,1,0,", "column var_col"),
+        (",1,1,nan,", "column cov_col_row"),
+        ("0.5,1,1,0.5,", "column var_col"),
+        (",,,,1.5", "column group"),
+        (",,,,-1", "column group"),
+        (",,,,1e30", "column group"),
+        (",,,,cell", "column group"),
+    ],
+)
+def test_bad_covariances_and_groups_in_files_are_named(tmp_path: Path, cells: str, field: str) -> None:
+    with pytest.raises(InputError) as caught:
+        read(tmp_path / "p.csv", cells)
+    assert caught.value.field == f"line 2, {field}"
+    assert caught.value.file is not None
+    assert caught.value.remedy
+
+
+def test_bad_covariances_in_geojson_are_named(tmp_path: Path) -> None:
+    document = made(1).__geo_interface__
+    for properties, field in (
+        ({"var_col": 1.0, "var_row": 1.0}, "var_col"),
+        ({"var_col": 1.0, "var_row": 1.0, "cov_col_row": True}, "cov_col_row"),
+        ({"group": [1]}, "group"),
+        ({"group": -1}, "group"),
+    ):
+        one = document["features"][0]
+        bare = {key: value for key, value in one["properties"].items() if key in ("id", "ji")}
+        (tmp_path / "p.geojson").write_text(
+            json.dumps({**document, "features": [{**one, "properties": {**bare, **properties}}]})
+        )
+        with pytest.raises(InputError) as caught:
+            read_points(tmp_path / "p.geojson")
+        assert caught.value.field == f"features[0].properties.{field}"
+
+
+def test_a_piece_with_larger_pixels_has_larger_errors(tmp_path: Path) -> None:
+    points = made(6, 3)
+    write_points(points, tmp_path / "p.csv", images=["one.tif", *["two.tif"] * 5])
+    found = read_points(tmp_path / "p.csv", image_name="one.tif", pieces={"two.tif": (10.0, 20.0, 4.0)})
+    np.testing.assert_allclose(found.covariance_image[1:], 16 * points.covariance_image[1:], rtol=1e-14)
+    np.testing.assert_allclose(found.sigma_image[1:], 4 * points.sigma_image[1:], rtol=1e-14)
+    assert found.groups.tolist() == points.groups.tolist()
