@@ -5,24 +5,13 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.inputs import has_surface, open_surface
-from ortho_pipeline.commands.results import (
-    CompareResult,
-    FitResult,
-    outputs_together,
-    write_report,
-)
+from ortho_pipeline.commands.results import ENDINGS, CompareResult, FitResult, outputs_together, write_report
 from ortho_pipeline.commands.scene_fit import (
-    Adjusted,
-    adjust,
-    heights_around,
-    heights_where_wanted,
-    on_surface,
-    open_adjustable,
-)
+    Adjusted, adjust, heights_around, heights_where_wanted, on_surface, open_adjustable,
+)  # fmt: skip
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
@@ -30,10 +19,6 @@ from ortho_pipeline.estimation.family_fit import ridge_of
 from ortho_pipeline.models import families
 from ortho_pipeline.options import PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.report import document as report
-
-if TYPE_CHECKING:
-    pass
-from ortho_pipeline.commands.rectification import _ENDINGS
 
 
 def fit(
@@ -121,7 +106,7 @@ def compare(
     if folder is None or best is None or best.fit is None:
         return result
     stem = Path(image).stem
-    files = {name: Path(folder) / f"{stem}{_ENDINGS[name]}" for name in ("residuals", "style", "report", "html")}
+    files = {name: Path(folder) / f"{stem}{ENDINGS[name]}" for name in ("residuals", "style", "report", "html")}
     inputs.check_paths(files, image, scene, points, surface)
     if best.model in {family.name for family in families()}:
         opened = replace(opened, models={best.model: best.fit.model}, model_source="control points")

@@ -10,15 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.inputs import has_surface, open_surface
-from ortho_pipeline.commands.results import (
-    Result,
-    outputs_together,
-    write_report,
-)
-from ortho_pipeline.commands.scene_fit import (
-    adjust,
-    open_adjustable,
-)
+from ortho_pipeline.commands.results import ENDINGS, OF_STAC, Result, outputs_together, write_report
+from ortho_pipeline.commands.scene_fit import adjust, open_adjustable
 from ortho_pipeline.commands.scene_layout import lay_out, source_of
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, completed
@@ -83,7 +76,7 @@ def rectify(
     """
     stem = Path(image).stem
     files = {
-        kind: Path(folder) / f"{stem}{ending}" for kind, ending in _ENDINGS.items() if kind not in _STAC or output.stac
+        kind: Path(folder) / f"{stem}{ending}" for kind, ending in ENDINGS.items() if kind not in OF_STAC or output.stac
     }
     points = inputs.point_options(points)
     inputs.check_paths(files, image, scene, points, surface, overwrite)
@@ -204,22 +197,6 @@ def export(
 
 # -- parts -----------------------------------------------------------------------------------------------------------
 
-_ENDINGS = {
-    "ortho": "_ortho.tif",
-    "model": "_model.json",
-    "rpc": "_RPC.TXT",
-    "vrt": ".vrt",
-    "residuals": "_residuals.geojson",
-    "style": "_residuals.qml",
-    "report": "_report.json",
-    "html": "_report.html",
-    "stac": "_stac.json",
-    "thumbnail": "_thumbnail.png",
-    "overview": "_overview.png",
-}
-#: Outputs that are only made with a STAC item.
-_STAC = ("stac", "thumbnail", "overview")
-
 
 def _of_earlier_run(folder: Path, stem: str, files: Mapping[str, Path], *, all_of_them: bool) -> list[Path]:
     """Return what an earlier run wrote for this scene and this one does not, and side-cars of the ortho it wrote.
@@ -229,8 +206,8 @@ def _of_earlier_run(folder: Path, stem: str, files: Mapping[str, Path], *, all_o
     ours = all_of_them
     if not ours:
         with contextlib.suppress(InputError):
-            ours = bool(report.read_report_json(folder / f"{stem}{_ENDINGS['report']}"))
-    left = [folder / f"{stem}{ending}" for ending in _ENDINGS.values()] if ours else []
+            ours = bool(report.read_report_json(folder / f"{stem}{ENDINGS['report']}"))
+    left = [folder / f"{stem}{ending}" for ending in ENDINGS.values()] if ours else []
     return [*(path for path in left if path not in files.values()), *inputs.old_side_cars(files["ortho"])]
 
 

@@ -22,7 +22,22 @@ from ortho_pipeline.report import document as report
 from ortho_pipeline.report.map_scale import map_scale
 
 SCHEMA_VERSION = 1
-
+#: How the names of a scene's outputs end, after its stem.
+ENDINGS = {
+    "ortho": "_ortho.tif",
+    "model": "_model.json",
+    "rpc": "_RPC.TXT",
+    "vrt": ".vrt",
+    "residuals": "_residuals.geojson",
+    "style": "_residuals.qml",
+    "report": "_report.json",
+    "html": "_report.html",
+    "stac": "_stac.json",
+    "thumbnail": "_thumbnail.png",
+    "overview": "_overview.png",
+}
+#: Outputs that are only made with a STAC item.
+OF_STAC = ("stac", "thumbnail", "overview")
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")

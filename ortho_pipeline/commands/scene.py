@@ -6,18 +6,14 @@ import json
 import os
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyproj
 
 from ortho_pipeline import plugins
 from ortho_pipeline.commands.inputs import open_dem, open_scene
-from ortho_pipeline.commands.results import (
-    SCHEMA_VERSION,
-    Result,
-    outputs_together,
-)
+from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION, Result, outputs_together
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError, completed, counted
 from ortho_pipeline.estimation.ground_residuals import viewing
@@ -32,10 +28,6 @@ from ortho_pipeline.raster import source as raster
 from ortho_pipeline.report import document as report
 from ortho_pipeline.surface import accuracy as dem_accuracy
 from ortho_pipeline.surface import footprint
-
-if TYPE_CHECKING:
-    pass
-from ortho_pipeline.commands.rectification import _ENDINGS
 
 
 def sensors() -> dict[str, Any]:
@@ -108,7 +100,7 @@ def write_plots(report_file: str | os.PathLike[str], folder: str | os.PathLike[s
         stem = Path(report_file).stem
         files = report.write_plots(document, Path(folder), stem, kind)
     return Result(
-        files, {}, f"{counted(len(files), 'plot')} of {Path(report_file).name.removesuffix(_ENDINGS['report'])}"
+        files, {}, f"{counted(len(files), 'plot')} of {Path(report_file).name.removesuffix(ENDINGS['report'])}"
     )
 
 
