@@ -105,7 +105,7 @@ class Record:
             "document": DOCUMENT, "schema_version": SCHEMA_VERSION, **vars(self),
             "inputs": [vars(one) for one in self.inputs], "outputs": [vars(one) for one in self.outputs],
         }  # fmt: skip
-        files.write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+        files.write_json(path, document)
 
     @classmethod
     def read(cls, path: Path) -> Record | None:

@@ -25,7 +25,7 @@ from ortho_pipeline.batch.records import Digests, FileState, Record, key_of, loc
 from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_text
+from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
 from ortho_pipeline.report.stac import write_catalog
 from ortho_pipeline.warp import mosaic
 
@@ -350,7 +350,7 @@ class _Run:
             files |= {"mosaic": Path(made["file"]), "seams": self.planned.output / RUN_FILES["seams"]}
         result = BatchResult(ordered, files, time.monotonic() - self.begin, made)
         if not self.part:
-            write_text(files["summary"], json.dumps(result.to_json(), indent=1, allow_nan=False) + "\n")
+            write_json(files["summary"], result.to_json())
         self.log("run finished", counts=result.to_json()["counts"], seconds=result.seconds)
         return result
 
@@ -400,7 +400,7 @@ class _Mosaic:
             else:
                 mosaic.write_cog(layout, self.path)
             document = {"file": str(self.path), **mosaic.summary(layout, self._seams(layout, crew))}
-            write_text(self.report, json.dumps(document, indent=1, allow_nan=False) + "\n")
+            write_json(self.report, document)
             if record is not None:
                 retire({self.output / one.path for one in record.outputs} - {self.path, self.report})
         made = tuple(FileState.of(role, path, name=path.name) for role, path in

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
-from ortho_pipeline.files import states, together, whole_or_nothing, write_text
+from ortho_pipeline.files import states, together, whole_or_nothing, write_json
 from ortho_pipeline.files.locations import archive_of, located, place
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.band_stack import stack_bands
@@ -88,7 +87,7 @@ def register(
         # Bands in an archive are those of the archive.
         read = {archive_of(str(path)) or Path(path): "band" for path in paths}
         document = _document(opened, chosen, names, done, inputs.hashed(read))
-        write_text(files["table"], json.dumps(document, indent=1, allow_nan=False) + "\n")
+        write_json(files["table"], document)
         inputs.refuse_changed(begun)
     return Result(files, document, _text(chosen, done))
 

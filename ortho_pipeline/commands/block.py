@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -28,7 +27,7 @@ from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
-from ortho_pipeline.files import together, write_text
+from ortho_pipeline.files import json_text, together, write_json, write_text
 from ortho_pipeline.files.documents import json_position, json_value
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import Vertical, parse_crs
@@ -330,7 +329,7 @@ def _write(
         write_model_file(saved, files[f"{label} model"])
         if label in exported:
             rpc.write_rpc_txt(exported[label].rpc, files[f"{label} rpc"])
-    write_text(files["report"], json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    write_json(files["report"], document, ascii_only=False)
     write_text(files["html"], block_report.page(document))
 
 
@@ -372,7 +371,7 @@ def _geojson(rows: Sequence[Mapping[str, Any]]) -> str:
         if "angle_deg" in row:
             properties["angle_deg"] = row["angle_deg"]
         features.append({"type": "Feature", "properties": properties, "geometry": geometry})
-    return json.dumps({"type": "FeatureCollection", "features": features}, indent=1, allow_nan=False) + "\n"
+    return json_text({"type": "FeatureCollection", "features": features})
 
 
 def _csv(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -10,7 +10,12 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.inputs import has_surface, open_surface
 from ortho_pipeline.commands.results import ENDINGS, CompareResult, FitResult, outputs_together, write_report
 from ortho_pipeline.commands.scene_fit import (
-    Adjusted, adjust, heights_around, heights_where_wanted, on_surface, open_adjustable,
+    Adjusted,
+    adjust,
+    heights_around,
+    heights_where_wanted,
+    on_surface,
+    open_adjustable,
 )  # fmt: skip
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import comparison as comparing
@@ -34,10 +39,7 @@ def fit(
     InputError
         If there are no points, or a file is wrong (message names file, field and remedy).
     """
-    if points.gcps is None:
-        raise InputError(
-            "there are no points to fit to", field="points.gcps", remedy="give a file of points with `points.gcps`"
-        )
+    _require_points(points)
     opened = open_adjustable(image, scene, points)
     heights = open_surface(surface, scene) if has_surface(surface) else None
     adjusted = adjust(opened, points, scene, heights)
@@ -72,10 +74,7 @@ def compare(
     InputError
         If there are no points, a model is unknown, or a file is wrong. A model that cannot be fitted is a row.
     """
-    if points.gcps is None:
-        raise InputError(
-            "there are no points to fit to", field="points.gcps", remedy="give a file of points with `points.gcps`"
-        )
+    _require_points(points)
     if points.correction is not None or points.fit_model is not None:
         raise InputError(
             "compare takes its models from `models`", remedy="for example `models=all`",
@@ -119,3 +118,10 @@ def compare(
     )  # fmt: skip
     write_report(document, best.fit, files)
     return replace(result, files=files)
+
+
+def _require_points(points: PointOptions) -> None:
+    if points.gcps is None:
+        raise InputError(
+            "there are no points to fit to", field="points.gcps", remedy="give a file of points with `points.gcps`"
+        )

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.inputs import has_surface, open_surface
+from ortho_pipeline.commands.placement import place_scene, source_of
 from ortho_pipeline.commands.results import ENDINGS, OF_STAC, Result, outputs_together, write_report
 from ortho_pipeline.commands.scene_fit import adjust, open_adjustable
-from ortho_pipeline.commands.scene_layout import lay_out, source_of
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.exchange import export as formats_of_models
@@ -90,8 +90,8 @@ def rectify(
     read = inputs.files_read(image, scene, points, surface, opened)
     begun = states(read) | begun
     with inputs.hashed_beside(read, digest) as hashing:
-        laid = lay_out(opened, points, scene, heights, output)
-        adjusted, model, heights, found, grid = laid
+        placed = place_scene(opened, points, scene, heights, output)
+        adjusted, model, heights, found, grid = placed
         opened = adjusted.scene
         exported, complaints = _as_rpc(model)
         source = source_of(opened, image, scene, output)
@@ -103,7 +103,7 @@ def rectify(
     document = report.build_report(
         scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
         warp=warped, near=points.near, provenance=record,
-        warnings=[*adjusted.warnings(heights), *laid.notes(), *laid.sparse(warped.valid_pixels), *complaints,
+        warnings=[*adjusted.warnings(heights), *found.notes(), *placed.sparse(warped.valid_pixels), *complaints,
                   *warped.notes(output.memory)],
     )  # fmt: skip
     write_report(document, adjusted.fit, files)
@@ -137,9 +137,9 @@ def check(
     inputs.require_heights(surface)
     opened = open_adjustable(image, scene, points)
     _acquired(opened.facts, output)
-    laid = lay_out(opened, points, scene, open_surface(surface, scene, output.memory), output)
-    Profile.of(source_of(laid.scene, image, scene, output), output.dtype, output.nodata)
-    return laid.to_json()
+    placed = place_scene(opened, points, scene, open_surface(surface, scene, output.memory), output)
+    Profile.of(source_of(placed.scene, image, scene, output), output.dtype, output.nodata)
+    return placed.to_json()
 
 
 @outputs_together

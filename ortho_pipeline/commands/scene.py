@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyproj
 
 from ortho_pipeline import plugins
 from ortho_pipeline.commands.inputs import open_dem, open_scene
@@ -17,9 +15,9 @@ from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION, Result, out
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError, completed, counted
 from ortho_pipeline.estimation.ground_residuals import viewing
-from ortho_pipeline.files import write_text
+from ortho_pipeline.files import write_json, write_text
 from ortho_pipeline.files.documents import json_value
-from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.crs import crs_text, ground_transform
 from ortho_pipeline.geodesy.proj_grids import grids, proj_info
 from ortho_pipeline.imaging import resolution
 from ortho_pipeline.models import families
@@ -136,7 +134,7 @@ def edge(
         else {"json": Path(folder) / f"{stem}_edges.json", "svg": Path(folder) / f"{stem}_edge.svg"}
     )
     if files:
-        write_text(files["json"], json.dumps(document, indent=1, allow_nan=False) + "\n")
+        write_json(files["json"], document)
         write_text(files["svg"], resolution.plot(resolution.typical(found)).svg(alone=True) + "\n")
     return Result(files, document, resolution.text(document))
 
@@ -203,9 +201,3 @@ def doctor() -> dict[str, Any]:
         "broken": [entry.to_json() for entry in host.broken],
         "cpus": os.cpu_count(),
     }
-
-
-def crs_text(crs: pyproj.CRS) -> str:
-    """Return ``EPSG:n`` where there is such a code, the name otherwise."""
-    authority = crs.to_authority()
-    return ":".join(authority) if authority else crs.name

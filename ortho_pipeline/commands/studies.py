@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import together, write_text
+from ortho_pipeline.files import together, write_json, write_text
 from ortho_pipeline.hookspecs import Study
 from ortho_pipeline.plugins import Host
 
@@ -37,7 +36,7 @@ def simulate(name: str, folder: str | os.PathLike[str], *, seed: int = 0, **opti
     InputError
         If there is no such simulation or option, such a scene is not possible, or the folder cannot be written.
     """
-    study = _study(name, "simulates")
+    study = _study(name, "simulate")
     known = {option.name for option in study.options}
     for option in options:
         if option not in known:
@@ -74,22 +73,23 @@ def reproduce(
         `document` is the study's own; those of the bundled plugins have paper, settings, summary and tables
         (docs/formats.md).
     """
-    study = _study(name, "reproduces a paper")
+    study = _study(name, "reproduce")
     assert study.reproduce
     found = study.reproduce(realisations or study.realisations, progress=progress)
     if folder is None:
         return Result({}, dict(found.document), found.text)
     files = {ending: Path(folder) / f"{name}.{ending}" for ending in ("json", "html")}
     with together(folder, name):
-        write_text(files["json"], json.dumps(found.document, indent=1, allow_nan=False) + "\n")
+        write_json(files["json"], found.document)
         write_text(files["html"], found.page())
     return Result(files, dict(found.document), found.text)
 
 
-def _study(name: str, what: str) -> Study:
+def _study(name: str, field: Literal["simulate", "reproduce"]) -> Study:
+    """Return the study of a name that can do what the field is for."""
     offered = studies()
-    wanted = "simulate" if what == "simulates" else "reproduce"
-    if name not in offered or getattr(offered[name], wanted) is None:
-        able = ", ".join(key for key, study in offered.items() if getattr(study, wanted)) or "none"
+    if name not in offered or getattr(offered[name], field) is None:
+        able = ", ".join(key for key, study in offered.items() if getattr(study, field)) or "none"
+        what = {"simulate": "simulates", "reproduce": "reproduces a paper"}[field]
         raise InputError(f"no installed study {name!r} {what}", field="name", remedy=f"there are: {able}")
     return offered[name]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,7 +9,7 @@ from importlib import metadata
 from typing import Any
 
 from ortho_pipeline.errors import InputError, PluginError, reads
-from ortho_pipeline.files import read_json, write_text
+from ortho_pipeline.files import read_json, write_json
 from ortho_pipeline.models import model_from_dict, require_view
 from ortho_pipeline.models.base import SensorModel
 
@@ -83,7 +82,7 @@ def write_model_file(saved: SavedModel, path: str | os.PathLike[str]) -> None:
         "model": model,
         "provenance": dict(saved.provenance),
     }
-    write_text(path, json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    write_json(path, document, ascii_only=False)
 
 
 @reads(_REMEDY)

@@ -12,10 +12,12 @@ from ortho_pipeline.files.whole import (
     append_line,
     clear_up,
     confined,
+    json_text,
     retire,
     staged,
     together,
     whole_or_nothing,
+    write_json,
     write_text,
 )
 
@@ -26,6 +28,7 @@ __all__ = [
     "clear_up",
     "confined",
     "decoded",
+    "json_text",
     "parse_json",
     "read_bounded",
     "read_json",
@@ -35,5 +38,6 @@ __all__ = [
     "states",
     "together",
     "whole_or_nothing",
+    "write_json",
     "write_text",
 ]

@@ -16,6 +16,7 @@ import secrets
 from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
+from typing import Any
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.reading import read_bounded
@@ -351,6 +352,27 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write `text` as UTF-8 to `path`, whole or not at all."""
     with whole_or_nothing(path, side_cars=False) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | os.PathLike[str], document: Any, *, ascii_only: bool = True) -> None:
+    """Write a JSON document to `path`, whole or not at all, as `json_text` gives it."""
+    write_text(path, json_text(document, ascii_only=ascii_only))
+
+
+def json_text(document: Any, *, ascii_only: bool = True) -> str:
+    """Return a JSON document as the text of a file: one member a line.
+
+    Parameters
+    ----------
+    ascii_only : bool
+        Escape other characters; without it they stand as they are, in UTF-8.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite: JSON has none such (`documents.json_value` makes them null).
+    """
+    return json.dumps(document, indent=1, allow_nan=False, ensure_ascii=ascii_only) + "\n"
 
 
 def append_line(path: str | os.PathLike[str], line: str) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pyproj
 
 from ortho_pipeline.errors import TooFewPoints, counted
-from ortho_pipeline.geodesy.crs import parse_crs, utm_crs
+from ortho_pipeline.geodesy.crs import crs_definition, parse_crs, utm_crs
 from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.families import Family, exponents, family_of
@@ -36,8 +36,8 @@ def model_crs(text: str, points: Points) -> str:
         plan = points.to_crs("EPSG:4979").ground[:, :2]
         radians = np.radians(plan[np.isfinite(plan).all(axis=1), 0])
         lon = np.degrees(np.arctan2(np.sin(radians).sum(), np.cos(radians).sum()))
-        return _text(utm_crs(float(lon), float(np.nanmean(plan[:, 1]))))
-    return _text(parse_crs(text))
+        return crs_definition(utm_crs(float(lon), float(np.nanmean(plan[:, 1]))))
+    return crs_definition(parse_crs(text))
 
 
 def start_model(
@@ -70,7 +70,7 @@ def start_model(
     """
     chosen = family_of(family)
     chosen = family_of(chosen.variants[0]) if chosen.variants else chosen
-    ground_crs = _text(points.crs) if crs is None else model_crs(crs, points)
+    ground_crs = crs_definition(points.crs) if crs is None else model_crs(crs, points)
     moved = points.to_crs("EPSG:4979" if ground_crs == GEOCENTRIC else ground_crs)
     wraps = bool(moved.crs.is_geographic and np.isclose(moved.crs.axis_info[0].unit_conversion_factor, np.pi / 180))
     ground = _with_heights(moved.ground, chosen, wraps)
@@ -94,11 +94,6 @@ def start_model(
     return Rational(
         chosen.name, ground_crs, coefficients, ground_offset, ground_scale, image_offset, image_scale, box, wraps
     )
-
-
-def _text(crs: pyproj.CRS) -> str:
-    authority = crs.to_authority(min_confidence=100)
-    return ":".join(authority) if authority else str(crs.to_wkt())
 
 
 def _with_heights(ground: Array, family: Family, wraps: bool) -> Array:

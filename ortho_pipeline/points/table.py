@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,9 +20,10 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError, counted, reads
-from ortho_pipeline.files import write_text
+from ortho_pipeline.files import json_text, write_text
 from ortho_pipeline.geodesy.crs import (
     Vertical,
+    crs_definition,
     ground_transform,
     horizontal,
     parse_crs,
@@ -392,7 +392,7 @@ def write_points(
 
 def _csv_text(points: Points, suffix: str, images: Sequence[str] | None = None) -> str:
     out = io.StringIO()
-    out.write(f"#CRS: {_crs_text(points.crs)}\n#vertical: ellipsoid\n")
+    out.write(f"#CRS: {crs_definition(points.crs)}\n#vertical: ellipsoid\n")
     # An id that starts with '#' would read as a comment without quotation marks.
     hidden = any(name.startswith("#") for name in points.ids)
     writer = csv.writer(
@@ -428,16 +428,11 @@ def _error_columns(points: Points) -> dict[str, list[str]]:
 
 
 def _geojson_text(points: Points, suffix: str) -> str:
-    return json.dumps(points.__geo_interface__, indent=1, allow_nan=False) + "\n"
+    return json_text(points.__geo_interface__)
 
 
 def _qgis_text(points: Points, suffix: str) -> str:
-    lines = [f"#CRS: {_crs_text(points.crs)}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
+    lines = [f"#CRS: {crs_definition(points.crs)}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
     for (column, row), (x, y, _) in zip(points.image.tolist(), points.ground.tolist(), strict=True):
         lines.append(f"{x!r},{y!r},{column!r},{-row!r},1,0,0,0")
     return "\n".join(lines) + "\n"
-
-
-def _crs_text(crs: pyproj.CRS) -> str:
-    authority = crs.to_authority(min_confidence=100)
-    return ":".join(authority) if authority else crs.to_wkt().replace("\n", " ")

@@ -8,7 +8,6 @@ the assumption that the DEM is right there.
 from __future__ import annotations
 
 import base64
-import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
@@ -27,9 +26,9 @@ from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.estimation.fit import Fit, root_mean_square
 from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rmse_metres, viewing
 from ortho_pipeline.estimation.spatial_correlation import analyse_fit
-from ortho_pipeline.files import read_json, whole_or_nothing, write_text
+from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
 from ortho_pipeline.files.documents import json_position, json_value
-from ortho_pipeline.geodesy.crs import Vertical, ground_transform
+from ortho_pipeline.geodesy.crs import Vertical, crs_text, ground_transform
 from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.delivered import accuracy_before
@@ -188,9 +187,9 @@ def _undulation_there(ground: Array, crs: pyproj.CRS) -> str:
 
 
 def _ortho(grid: Grid, warp: WarpResult | None) -> dict[str, Any]:
-    authority, unit = grid.crs.to_authority(), grid.crs.axis_info[0].unit_name
+    unit = grid.crs.axis_info[0].unit_name
     return {
-        "crs": ":".join(authority) if authority else grid.crs.name,
+        "crs": crs_text(grid.crs),
         "crs_name": grid.crs.name,
         "unit": {"metre": "m", "degree": "°"}.get(unit, unit),
         "extent": [float(value) for value in grid.extent],
@@ -262,7 +261,7 @@ def residuals_style(report: Mapping[str, Any]) -> str:
 
 def write_report_json(report: Mapping[str, Any], path: str | PathLike[str]) -> None:
     """Write the report as JSON, whole or not at all."""
-    write_text(path, json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    write_json(path, report, ascii_only=False)
 
 
 def read_report_json(path: str | PathLike[str]) -> dict[str, Any]:

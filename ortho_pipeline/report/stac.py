@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import sha256, staged, whole_or_nothing, write_text
+from ortho_pipeline.files import sha256, staged, whole_or_nothing, write_json
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.raster.valid_area import grid_of, to_geojson, valid_outline
@@ -131,7 +131,7 @@ def write_item(
         if key in files and staged(files[key]).is_file():
             item.add_asset(key, pystac.Asset(_href(files[key], path.parent), title, media_type=media, roles=roles))
     document = item.to_dict(include_self_link=False, transform_hrefs=False)
-    write_text(path, json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    write_json(path, document, ascii_only=False)
 
 
 def write_catalog(path: Path, items: Sequence[Path], title: str) -> None:
@@ -144,7 +144,7 @@ def write_catalog(path: Path, items: Sequence[Path], title: str) -> None:
     document = catalog.to_dict(include_self_link=False, transform_hrefs=False)
     document["links"] = [{"rel": "root", "href": f"./{path.name}", "type": "application/json"},
                          *(link for link in document["links"] if link["rel"] == "item")]  # fmt: skip
-    write_text(path, json.dumps(document, indent=1, ensure_ascii=False) + "\n")
+    write_json(path, document, ascii_only=False)
 
 
 def _href(path: Path, folder: Path) -> str:

@@ -20,6 +20,7 @@ import pyproj
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.points.formats import read_block_table
 from ortho_pipeline.points.ground import ground_of
@@ -113,7 +114,7 @@ class DemAccuracy:
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho dem-check --json`` (docs/formats.md)."""
         points = [
-            {"id": name, "difference_m": _number(difference), "slope_deg": _number(slope)}
+            {"id": name, "difference_m": json_value(difference), "slope_deg": json_value(slope)}
             for name, difference, slope in zip(self.ids, self.differences, self.slopes, strict=True)
         ]
         classes = [{"slope_deg": [low, high], **vars(errors)} for low, high, errors in self.by_slope()]
@@ -121,10 +122,6 @@ class DemAccuracy:
             "overall": vars(self.overall), "by_slope": classes, "gross": self.gross(),
             "without_height": int((~np.isfinite(self.differences)).sum()), "points": points,
         }  # fmt: skip
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def check_dem(surface: DemSurface, ground: Array, crs: str | pyproj.CRS, ids: Sequence[str]) -> DemAccuracy:

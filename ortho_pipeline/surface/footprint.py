@@ -16,6 +16,7 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import share
 from ortho_pipeline.errors import CoverageError, InputError, counted
 from ortho_pipeline.geodesy.crs import GroundTransform, ground_transform, utm_crs
@@ -147,14 +148,14 @@ class Footprint:
                 file=file, field="surface.fill", remedy=f"give a DEM that reaches farther, or {wanted}",
             )  # fmt: skip
 
-    def notes(self) -> list[str]:
-        """Return what is to be said of a scene that the DEM does not cover as a whole."""
+    def notes(self) -> list[Notice]:
+        """Return a notice if the DEM does not cover the scene as a whole, or only with heights beyond the model."""
         said = [f"{self.beyond}: such places have no pixels"] if self.beyond else []
-        if self.coverage >= 1.0:
-            return said
-        what = "have no pixels in the ortho" if self.surface.fill in ("error", "mask") else "were filled"
-        inside = f" ({counted(self.voids, 'sample')} without a height within it)" if self.voids else ""
-        return [*said, f"the DEM covers {share(self.coverage)} of the scene{inside}: the other places {what}"]
+        if self.coverage < 1.0:
+            what = "have no pixels in the ortho" if self.surface.fill in ("error", "mask") else "were filled"
+            inside = f" ({counted(self.voids, 'sample')} without a height within it)" if self.voids else ""
+            said.append(f"the DEM covers {share(self.coverage)} of the scene{inside}: the other places {what}")
+        return [Notice("dem-covers-part", "; ".join(said), coverage=self.coverage)] if said else []
 
     def fitted(self, model: SensorModel) -> SensorModel:
         """Return the model, meant for the heights here and a margin, where its own range is no more than a guess."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.geodesy.crs import crs_text
 from ortho_pipeline.imaging.registration import details, measure
 from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
@@ -314,9 +315,8 @@ def summary(layout: Layout, seams: Sequence[Mapping[str, Any]]) -> dict[str, Any
     measured = [seam for seam in seams if seam["patches"]]
     lengths = [math.hypot(*seam["median_px"]) for seam in measured]
     worst = max(zip(lengths, measured, strict=True), key=lambda pair: pair[0], default=None)
-    authority = layout.grid.crs.to_authority()
     return {
-        "crs": ":".join(authority) if authority else layout.grid.crs.name,
+        "crs": crs_text(layout.grid.crs),
         "extent": [float(value) for value in layout.grid.extent],
         "resolution": [layout.grid.dx, layout.grid.dy],
         "size": [layout.grid.width, layout.grid.height],

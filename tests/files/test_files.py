@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import sha256, whole_or_nothing, write_text
+from ortho_pipeline.files import sha256, whole_or_nothing, write_json, write_text
 
 
 def test_a_file_appears_with_the_rights_of_the_user(tmp_path):
@@ -20,6 +20,17 @@ def test_a_file_appears_with_the_rights_of_the_user(tmp_path):
     assert (tmp_path / "new" / "a.txt").read_text(encoding="utf-8") == "grüß"
     assert stat.S_IMODE((tmp_path / "new" / "a.txt").stat().st_mode) & 0o400
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["a.txt"]
+
+
+def test_a_json_file_has_one_member_a_line_and_no_number_that_is_none(tmp_path):
+    path = tmp_path / "a.json"
+    write_json(path, {"a": "ü", "b": [1]})
+    assert path.read_text() == '{\n "a": "\\u00fc",\n "b": [\n  1\n ]\n}\n'
+    write_json(path, {"a": "ü"}, ascii_only=False)
+    assert path.read_text(encoding="utf-8") == '{\n "a": "ü"\n}\n'
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(path, {"a": float("nan")})
+    assert path.read_text(encoding="utf-8") == '{\n "a": "ü"\n}\n'
 
 
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):

@@ -19,12 +19,30 @@ from pyproj.database import query_crs_info
 
 from ortho_pipeline.errors import CrsError, DatumError
 from ortho_pipeline.geodesy import crs as module
-from ortho_pipeline.geodesy.crs import GroundTransform, Vertical, horizontal, parse_crs, utm_crs
+from ortho_pipeline.geodesy.crs import (
+    GroundTransform,
+    Vertical,
+    crs_definition,
+    crs_text,
+    horizontal,
+    parse_crs,
+    utm_crs,
+)  # fmt: skip
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
 from ortho_pipeline.geodesy.proj_grids import grids, proj_info
 
 EGM96 = Path("/usr/share/proj/egm96_15.gtx")
 needs_egm96 = pytest.mark.skipif(not EGM96.is_file(), reason="Debian's proj-data (egm96_15.gtx) is not installed")
+
+
+def test_a_crs_in_words_and_as_it_is_read_again() -> None:
+    # Only a code that is exactly the CRS defines it: this one has another false easting.
+    own = pyproj.CRS.from_proj4("+proj=tmerc +lat_0=0 +lon_0=33 +k=0.9996 +x_0=400000 +y_0=0 +datum=WGS84 +no_defs")
+    assert (crs_text(pyproj.CRS(32636)), crs_definition(pyproj.CRS(32636))) == ("EPSG:32636", "EPSG:32636")
+    assert crs_text(own) == own.name
+    assert "\n" not in crs_definition(own)
+    assert pyproj.CRS(crs_definition(own)) == own
+
 
 # -- heights
 

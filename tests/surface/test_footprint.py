@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,16 @@ def test_the_part_beyond_the_dem_is_laid_at_the_heights_there(tmp_path, west, sh
     masked = surface(tmp_path, west=west, fill="mask")
     (note,) = laid(model, masked).notes()
     assert f"covers {int(found.coverage * 1000) / 10:.1f} % of the scene" in note
+
+
+def test_what_a_dem_does_not_cover_is_one_notice(tmp_path):
+    beyond = "heights under the scene are 0 to 900 m above the ellipsoid, its model is good for 0 to 500 m"
+    found = replace(laid(drone(), surface(tmp_path, west=0.0, fill="mask")), beyond=beyond)
+    (note,) = found.notes()
+    assert (note.code, note.fields["coverage"]) == ("dem-covers-part", found.coverage)
+    assert note.startswith(f"{beyond}: such places have no pixels; the DEM covers 50.0 % of the scene")
+    assert [str(one) for one in replace(found, coverage=1.0).notes()] == [f"{beyond}: such places have no pixels"]
+    assert replace(found, coverage=1.0, beyond="").notes() == []
 
 
 @pytest.mark.parametrize("fill", ["mask", "nearest", "75"])

@@ -8,25 +8,25 @@ from typing import Any, NamedTuple
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import completed, of_option
-from ortho_pipeline.geodesy.crs import map_crs
+from ortho_pipeline.geodesy.crs import crs_text, map_crs
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions
 from ortho_pipeline.raster.source import Grid, RasterSource
-from ortho_pipeline.surface import footprint
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.footprint import Footprint, choose_grid, lay, scene_pixels
 
 #: An ortho with a smaller part of what its scene covers is worth a warning.
 _SPARSE = 0.05
 
 
-class Layout(NamedTuple):
-    """What an ortho is made from; `lay` has how the scene lies on the surface."""
+class Placement(NamedTuple):
+    """Where an ortho lies and what it is made from: the adjusted model, its footprint on the surface, the grid."""
 
     adjusted: Adjusted
     model: SensorModel
     surface: Surface
-    lay: footprint.Footprint
+    footprint: Footprint
     grid: Grid
 
     @property
@@ -34,13 +34,9 @@ class Layout(NamedTuple):
         """The scene with the models that were adjusted."""
         return self.adjusted.scene
 
-    def notes(self) -> list[Notice]:
-        """Return what there is to say of how the scene lies on its surface."""
-        return [Notice("dem-covers-part", text, coverage=self.lay.coverage) for text in self.lay.notes()]
-
     def sparse(self, valid_pixels: int) -> list[Notice]:
         """Return a warning if hardly any of the pixels of the ortho that the scene covers has a value."""
-        part = valid_pixels / max(footprint.scene_pixels(self.model, self.lay, self.grid), 1.0)
+        part = valid_pixels / max(scene_pixels(self.model, self.footprint, self.grid), 1.0)
         if part >= _SPARSE:
             return []
         text = (
@@ -52,24 +48,23 @@ class Layout(NamedTuple):
     def to_json(self) -> dict[str, Any]:
         """Return what is known before the first pixel as JSON values."""
         fit, grid = self.adjusted.fit, self.grid
-        authority = grid.crs.to_authority()
         return {
             "sensor": self.scene.sensor,
             "model": fit.model_name,
             "points": {"control": int(fit.points.control.sum()), "check": int(fit.points.check.sum())},
             "rmse_px": {which: one and one["total"] for which, one in fit.to_json()["rmse"].items()},
-            "coverage": self.lay.coverage,
+            "coverage": self.footprint.coverage,
             "grid": {
-                "crs": ":".join(authority) if authority else grid.crs.name, "size": [grid.width, grid.height],
+                "crs": crs_text(grid.crs), "size": [grid.width, grid.height],
                 "resolution": [grid.dx, grid.dy], "extent": list(grid.extent),
             },
-            **to_document([*self.adjusted.warnings(self.surface), *self.notes()]),
+            **to_document([*self.adjusted.warnings(self.surface), *self.footprint.notes()]),
         }  # fmt: skip
 
 
-def lay_out(
+def place_scene(
     opened: Scene, points: PointOptions, scene: SceneOptions, surface: Surface, output: OutputOptions
-) -> Layout:
+) -> Placement:
     """Adjust a scene to its points, lay it on the surface and choose the grid of its ortho; no pixel is read.
 
     Raises
@@ -80,16 +75,16 @@ def lay_out(
     adjusted = adjust(opened, points, scene, surface)
     model, size = adjusted.model, (opened.width, opened.height)
     with completed(adjusted.scene.model_source, of="model"):
-        lay = footprint.lay(model, surface, *size)
-        lay.require_coverage()
-        model = lay.fitted(model)
+        found = lay(model, surface, *size)
+        found.require_coverage()
+        model = found.fitted(model)
         with of_option("output.crs"):
             crs = map_crs(output.crs) if output.crs else None
-        grid = footprint.choose_grid(
-            model, lay, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
+        grid = choose_grid(
+            model, found, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
         )
-        footprint.scene_pixels(model, lay, grid)
-    return Layout(adjusted, model, lay.surface, lay, grid)
+        scene_pixels(model, found, grid)
+    return Placement(adjusted, model, found.surface, found, grid)
 
 
 def source_of(
