@@ -14,7 +14,7 @@ import numpy as np
 from warp import Job
 
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.surface.rays import intersect
+from ortho_pipeline.surface.rays import meet_surface
 
 POINTS = 2_000_000
 ROUNDS = 5
@@ -42,12 +42,12 @@ def main() -> None:
         heights = random.uniform(500, 900, POINTS)
         ground = model.image_to_ground(image, heights)
         closed = np.abs(model.ground_to_image(ground) - image).max()
-        met = intersect(model, image, surface)
+        met = meet_surface(model, image, surface)
         miss = np.abs(met[:, 2] - surface.heights(met[:, :2], model.crs)).max()
         rows = (
             ("ground -> image", lambda: model.ground_to_image(ground), ""),
             ("image -> ground", lambda: model.image_to_ground(image, heights), f"closes to {closed:.1e} px"),
-            ("image -> DEM", lambda: intersect(model, image, surface), f"ray and DEM within {miss:.1e} m"),
+            ("image -> DEM", lambda: meet_surface(model, image, surface), f"ray and DEM within {miss:.1e} m"),
         )
         for name, work, remark in rows:
             print(f"RPC {name:16s} {rate(work):6.1f} M points / CPU s   {remark}")

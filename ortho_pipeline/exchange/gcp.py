@@ -20,7 +20,7 @@ from ortho_pipeline.points import Points
 from ortho_pipeline.raster.output import close, raster_output, written
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.footprint import image_grid
-from ortho_pipeline.surface.rays import intersect
+from ortho_pipeline.surface.rays import meet_surface
 
 #: Points per side of a grid of control points that stands for a model.
 GCP_SIDE = 11
@@ -65,7 +65,7 @@ def _lonlat(model: SensorModel, image: Array, surface: Surface | None) -> Array:
     if surface is None:
         ground = model.image_to_ground(image, model.reference_height)
     else:
-        ground = intersect(model, image, surface)
+        ground = meet_surface(model, image, surface)
     return ground_transform(model.crs, "EPSG:4979")(ground)
 
 

@@ -25,7 +25,7 @@ from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
 from ortho_pipeline.surface.flat import FlatSurface
-from ortho_pipeline.surface.rays import intersect
+from ortho_pipeline.surface.rays import meet_surface
 
 #: Points per side of the image at which the DEM is asked for.
 _COVERAGE_SIDE = 33
@@ -177,7 +177,7 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
     surface = facing(model, surface, width, height)
     ring = border(width, height)
     image = np.concatenate([image_grid(width, height, _COVERAGE_SIDE), ring])
-    ground = intersect(model, image, surface)
+    ground = meet_surface(model, image, surface)
     met = np.asarray(np.isfinite(ground).all(axis=1), dtype=bool)
     heights, middle = _heights_under(model, surface, ground, met)
     inner, outer = slice(len(image) - len(ring)), slice(len(image) - len(ring), None)

@@ -28,7 +28,7 @@ _MOST_SAMPLES = 64_000_000
 _PROBES = 500
 
 
-def intersect(model: SensorModel, image: ArrayLike, surface: Surface, *, tolerance: float = 1e-3) -> Array:
+def meet_surface(model: SensorModel, image: ArrayLike, surface: Surface, *, tolerance: float = 1e-3) -> Array:
     """Intersect the rays of image points with a surface.
 
     The ray comes down from above the highest terrain in steps of at most one DEM sample in plan, so that the first,

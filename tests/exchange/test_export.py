@@ -256,9 +256,9 @@ def test_geolocation_arrays_map_as_the_model(tiny, tmp_path, with_dem):
     assert all(good)
     model = fitted(tiny)
     if with_dem:
-        from ortho_pipeline.surface.rays import intersect
+        from ortho_pipeline.surface.rays import meet_surface
 
-        expected = intersect(model, image, open_surface(surface))
+        expected = meet_surface(model, image, open_surface(surface))
     else:
         expected = model.image_to_ground(image, 500.0)
     # A pixel is about 5e-5 degrees.

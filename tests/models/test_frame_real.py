@@ -19,7 +19,7 @@ from ortho_pipeline.models.frame.camera import MAP, TOPOCENTRIC, FrameCamera
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.surface.rays import intersect
+from ortho_pipeline.surface.rays import meet_surface
 from ortho_pipeline.warp.engine import rectify
 
 pytestmark = pytest.mark.realdata
@@ -203,7 +203,7 @@ def test_a_drone_scene_is_usable_by_default(real, tmp_path):
     assert 0.11 <= step <= 0.18
     surface = Surface.open(folder / "odm_dem" / "dsm.tif", "ellipsoid")
     rays = np.random.default_rng(2).uniform(0, 1, (4000, 2)) * (1368, 912)
-    met = np.isfinite(intersect(saved, rays, surface)).all(axis=1).mean()
+    met = np.isfinite(meet_surface(saved, rays, surface)).all(axis=1).mean()
     assert report["surface"]["coverage"] == pytest.approx(met, abs=0.03)
     percent = int(report["surface"]["coverage"] * 1000) / 10
     said = [text for text in (*report["warnings"], result.summary) if "covers" in text]

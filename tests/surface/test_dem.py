@@ -25,7 +25,7 @@ from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import TILE, Tiles
 from ortho_pipeline.surface.dem_file import DemFile
 from ortho_pipeline.surface.footprint import image_grid, lay
-from ortho_pipeline.surface.rays import intersect
+from ortho_pipeline.surface.rays import meet_surface
 
 gdal.UseExceptions()
 EGM96 = Path("/usr/share/proj/egm96_15.gtx")
@@ -375,7 +375,7 @@ def test_rays_that_stand_far_apart_read_every_tile_once(tmp_path: Path, monkeypa
         return inside(self, left, top, width, height, unit)
 
     monkeypatch.setattr(DemFile, "read", read)
-    ground = intersect(model, image_grid(5000, 5000, 33) + 50.0, surface)
+    ground = meet_surface(model, image_grid(5000, 5000, 33) + 50.0, surface)
     assert np.isfinite(ground).all()
     # The whole DEM for the range of heights, the tiles, and the wide surroundings of a few that lie on the void.
     assert sum(reads) < 3 * side**2 + 30 * (2 * surface.nearest_reach + TILE) ** 2
@@ -504,7 +504,7 @@ def test_rays_meet_the_terrain(tmp_path: Path, lean: float) -> None:
     model = Oblique(lean=lean)
     rng = np.random.default_rng(2)
     image = rng.uniform([1500, 500], [6000, 5500], (300, 2)) - [lean * 300, 0]
-    ground = intersect(model, image, surface)
+    ground = meet_surface(model, image, surface)
     assert np.isfinite(ground).all()
     assert model.ground_to_image(ground) == pytest.approx(image, abs=1e-6)
     assert surface.heights(ground[:, :2]) == pytest.approx(ground[:, 2], abs=1e-3)
@@ -521,7 +521,7 @@ def test_the_visible_side_of_a_ridge_is_found(tmp_path: Path) -> None:
     # The sensor is in the east: coming down, a ray goes west and meets the top or the eastern face of the wall first.
     model = Oblique(lean=1.0)
     west = np.array([[4050.0 + k - 500.0, 3000.0] for k in (0.0, 60.0, 150.0, 300.0)])
-    ground = intersect(model, west, surface)
+    ground = meet_surface(model, west, surface)
     assert np.isfinite(ground).all()
     heights = np.linspace(700, 0, 20001)
     for k in range(len(west)):
@@ -532,15 +532,15 @@ def test_the_visible_side_of_a_ridge_is_found(tmp_path: Path) -> None:
 
 def test_rays_that_leave_the_dem_are_nan(tmp_path: Path) -> None:
     surface = Surface.open(write_dem(tmp_path / "d.tif", hills()), "ellipsoid")
-    ground = intersect(Oblique(), np.array([[-500.0, 100.0], [4000.0, 3000.0], [np.nan, 1.0]]), surface)
+    ground = meet_surface(Oblique(), np.array([[-500.0, 100.0], [4000.0, 3000.0], [np.nan, 1.0]]), surface)
     assert np.isnan(ground[[0, 2]]).all()
     assert np.isfinite(ground[1]).all()
-    assert intersect(Oblique(), np.zeros((0, 2)), surface).shape == (0, 3)
-    assert np.isnan(intersect(Oblique(), np.array([[-50000.0, 100.0]]), surface)).all()
+    assert meet_surface(Oblique(), np.zeros((0, 2)), surface).shape == (0, 3)
+    assert np.isnan(meet_surface(Oblique(), np.array([[-50000.0, 100.0]]), surface)).all()
 
 
 def test_rays_meet_a_plane() -> None:
-    ground = intersect(Oblique(lean=0.5), np.array([[100.0, 50.0]]), Surface.constant(200.0))
+    ground = meet_surface(Oblique(lean=0.5), np.array([[100.0, 50.0]]), Surface.constant(200.0))
     assert ground.tolist() == [[UTM_BOX[0] + 200, UTM_BOX[1] - 50, 200.0]]
 
 

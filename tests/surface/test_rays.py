@@ -12,7 +12,7 @@ from osgeo import gdal
 from ortho_pipeline.models import RPC
 from ortho_pipeline.surface import rays
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.surface.rays import MANY, intersect
+from ortho_pipeline.surface.rays import MANY, meet_surface
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +57,9 @@ def test_many_rays_are_the_rays_one_by_one(model, surface, monkeypatch):
     used = []
     original = rays._march_many
     monkeypatch.setattr(rays, "_march_many", lambda *given: used.append(original(*given)) or used[-1])
-    many = intersect(model, image, surface)
+    many = meet_surface(model, image, surface)
     assert used[0] is not None
-    few = np.concatenate([intersect(model, part, surface) for part in np.array_split(image, 4)])
+    few = np.concatenate([meet_surface(model, part, surface) for part in np.array_split(image, 4)])
     np.testing.assert_array_equal(np.isnan(many), np.isnan(few))
     # Both stop within 1 mm of the terrain; a ray that grazes a slope is 1 mm away from it over some centimetres.
     good = np.isfinite(many[:, 0])
@@ -72,7 +72,7 @@ def test_many_rays_are_the_rays_one_by_one(model, surface, monkeypatch):
 
 def test_points_far_apart_fall_back_to_the_exact_way(model, surface):
     image = image_points()
-    ground = intersect(model, image, surface)
+    ground = meet_surface(model, image, surface)
     assert np.isnan(ground[::500]).all()
     assert np.isnan(ground[1::500]).all()
     assert np.isfinite(ground[2::500]).all()
@@ -87,7 +87,7 @@ def test_the_surface_may_be_in_any_crs(tmp_path, model, surface):
     dataset.WriteArray(np.full((100, 100), 512.5))
     dataset = None
     image = np.random.default_rng(2).uniform(100, 500, (MANY, 2))
-    ground = intersect(model, image, Surface.open(path, "ellipsoid"))
+    ground = meet_surface(model, image, Surface.open(path, "ellipsoid"))
     np.testing.assert_allclose(ground, model.image_to_ground(image, 512.5), atol=2e-8)
 
 
@@ -98,7 +98,7 @@ def test_a_fill_rule_goes_on_beyond_the_dem_for_many_points_too(model, surface, 
     gdal.Translate(path, surface.provenance["path"], srcWin=[0, 0, 65, 130])
     half = Surface.open(path, "ellipsoid", fill=fill)
     image = np.random.default_rng(3).uniform(20, 580, (MANY, 2))
-    ground = intersect(model, image, half)
+    ground = meet_surface(model, image, half)
     # The compiled inverse of many points and the one of few agree to rounding.
-    np.testing.assert_allclose(ground[:2000], intersect(model, image[:2000], half), atol=1e-9)
+    np.testing.assert_allclose(ground[:2000], meet_surface(model, image[:2000], half), atol=1e-9)
     assert np.isfinite(ground).all()
