@@ -193,7 +193,7 @@ class RPC(SensorModel):
 
         ground = np.empty((len(image), 3))
         heights = np.ascontiguousarray(np.broadcast_to(np.asarray(height, dtype=np.float64), len(image)))
-        rpc_kernel.intersect(
+        rpc_kernel.image_to_ground(
             image, heights, *self._tables(), self._inverse_start(), np.array([DOMAIN_LIMIT, *self._reach]),
             INVERSE_TOLERANCE, INVERSE_VERIFIED, 25, ground,
         )  # fmt: skip
@@ -208,7 +208,7 @@ class RPC(SensorModel):
         return offsets, scales, coefficients * np.repeat(np.sign(coefficients[1::2, :1]), 2, axis=0)
 
     def _inverse_start(self) -> Array:
-        """Return first approximations ``(2, 6)`` of the inverse: see `rpc_kernel.intersect`."""
+        """Return first approximations ``(2, 6)`` of the inverse: see `rpc_kernel.image_to_ground`."""
         steps = np.linspace(-1.0, 1.0, 5)
         lon, lat, h = (axis.ravel() for axis in np.meshgrid(steps, steps, steps))
         ground = np.stack(

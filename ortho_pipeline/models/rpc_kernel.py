@@ -68,7 +68,7 @@ def project(ground, offsets, scales, coefficients, limits, image):
 
 
 @compiled
-def intersect(image, heights, offsets, scales, coefficients, start, limits, tolerance, verified, steps, ground):
+def image_to_ground(image, heights, offsets, scales, coefficients, start, limits, tolerance, verified, steps, ground):
     """Fill `ground` ``(N, 3)`` with the points at ellipsoidal `heights` ``(N,)`` whose projections are `image`.
 
     `start` ``(2, 6)`` gives first longitudes and latitudes (normalised) as polynomials 1, c, r, z, cz, rz of normalised
