@@ -111,11 +111,6 @@ class BlockFit:
         """Standard deviations of the adjusted ground ``(N, 3)``: metres east, north, up."""
         return sigmas_of(self.ground_covariance)
 
-    def covariance_of(self, image: str) -> Array:
-        """Return the covariance of the parameters of one image."""
-        rows = [k for k, (name, _) in enumerate(self.parameters) if name == image]
-        return self.covariance[np.ix_(rows, rows)]
-
     def ground_in(self, crs: str | pyproj.CRS) -> Array:
         """Return the adjusted ground ``(N, 3)`` in another CRS (EPSG:4978 is geocentric)."""
         return ground_transform(GEODETIC, crs)(self.ground)
