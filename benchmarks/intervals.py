@@ -33,7 +33,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import pyproj
 
-from ortho_pipeline.block.adjustment import BlockFit, adjust
+from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.local_frame import GroundFrame
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.errors import DegeneratePoints
@@ -94,7 +95,7 @@ def block(
 def moved(ground: np.ndarray, metres: np.ndarray) -> np.ndarray:
     """Return ground ``(n, 3)`` lon, lat, h moved by metres ``(n, 3)`` east, north, up."""
     frame = GroundFrame.about(ground)
-    turned = frame.horizons(ground).swapaxes(1, 2) @ metres[:, :, None]
+    turned = frame.enu_at(ground).swapaxes(1, 2) @ metres[:, :, None]
     return frame.geodetic(frame.of_geodetic(ground) + turned[:, :, 0])
 
 
@@ -102,7 +103,7 @@ def covered(found: BlockFit, truth: dict[str, ImageCorrection], ground: np.ndarr
     """Return the shares of 95 % intervals that contain the truth."""
     wanted = np.concatenate([model.params for model in truth.values()])
     frame = GroundFrame.about(ground)
-    apart = frame.horizons(ground) @ (frame.of_geodetic(found.ground) - frame.of_geodetic(ground))[:, :, None]
+    apart = frame.enu_at(ground) @ (frame.of_geodetic(found.ground) - frame.of_geodetic(ground))[:, :, None]
     inside = np.abs(apart[:, :, 0] / found.ground_sigmas) < 1.96
     control = found.points.control
     return {

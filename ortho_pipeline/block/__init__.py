@@ -1,4 +1,5 @@
-"""Many images in one adjustment: their points, the solver, its blunders and variances, intersection.
+"""Many images in one adjustment: their points and local frame, datum, fit, and the intersection of their rays.
 
-Imports `estimation` and what is below; no raster.
+Rooms in it, bottom to top: `equations` (least squares), `variances` (sigmas of observations), `reliability` (gross
+errors). Imports `estimation` and what is below; no raster.
 """

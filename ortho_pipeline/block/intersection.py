@@ -109,7 +109,7 @@ def intersect(models: Mapping[str, SensorModel], points: BlockPoints, *, scaled:
     misfit, rows = _equations(frame, chosen, points, used, local)
     freedom = 2 * int(used.sum()) - 3 * int(found.sum())
     sigma0 = math.sqrt(float((misfit**2).sum()) / freedom) if freedom > 0 else None
-    axes = frame.horizons(places.geodetic)
+    axes = frame.enu_at(places.geodetic)
     covariance = np.full((len(points), 3, 3), np.nan)
     normal = _per_point(points, rows.swapaxes(1, 2) @ rows)
     covariance[found] = np.linalg.inv(normal[found])

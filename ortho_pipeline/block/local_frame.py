@@ -1,7 +1,7 @@
-"""One Cartesian ground frame in which models of any CRS meet: east, north, up about the middle of the points.
+"""The local ENU frame in which models of any CRS meet: east, north, up (m) about the middle of the points.
 
 A bundle adjustment has one set of coordinates per point while each model wants its own CRS. The frame is the geocentric
-system turned into the horizon of its origin, so it is exact over any extent, metres on all axes, and well conditioned.
+system rotated and moved, so it is exact over any extent, metres on all axes, and well conditioned.
 Derivatives follow by the chain rule: in closed form to longitude, latitude and height, by differences from there to
 other systems.
 """
@@ -24,7 +24,7 @@ _STEP = 10.0
 
 @dataclass(frozen=True, eq=False)
 class GroundFrame:
-    """East, north, up (m) about `origin` ``(3,)`` lon, lat (degrees), h."""
+    """Local ENU frame (m) about `origin` ``(3,)`` lon, lat (degrees), h."""
 
     origin: Array
 
@@ -50,9 +50,14 @@ class GroundFrame:
         """Return points ``(N, 3)`` of the frame as lon, lat (degrees), h."""
         return geodetic(local @ self.turn + geocentric(self.origin[None]))
 
-    def horizons(self, ground: Array) -> Array:
-        """Return the rotations ``(N, 3, 3)`` from the frame to east, north, up at the points lon, lat, h themselves."""
+    def enu_at(self, ground: Array) -> Array:
+        """Return the rotations ``(N, 3, 3)`` from the frame to the local ENU frames of points lon, lat, h."""
         return enu_from_ecef(ground) @ self.turn.T
+
+    def apart(self, ground: Array, local: Array) -> Array:
+        """Return points lon, lat, h minus points of the frame ``(N, 3)`` in the local ENU frames of the former."""
+        apart: Array = (self.enu_at(ground) @ (self.of_geodetic(ground) - local)[:, :, None])[:, :, 0]
+        return apart
 
     def places(self, local: Array) -> Places:
         """Return points ``(N, 3)`` of the frame as they are in the systems of models."""
@@ -60,7 +65,7 @@ class GroundFrame:
 
 
 class Places:
-    """Points of a frame, in the system of any model, each system computed once."""
+    """Points of a frame in the CRS of any model, each computed once."""
 
     def __init__(self, frame: GroundFrame, local: Array) -> None:
         self.frame, self.local = frame, local
@@ -93,7 +98,7 @@ class Places:
 
     def _geodetic_partials(self) -> Array:
         if self._slopes is None:
-            axes = self.frame.horizons(self.geodetic)
+            axes = self.frame.enu_at(self.geodetic)
             axes[:, :2] /= metres_per_degree(self.geodetic)[:, :, None]
             self._slopes = axes
         return self._slopes

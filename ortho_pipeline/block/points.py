@@ -332,7 +332,7 @@ def _refuse_twice(path: str | os.PathLike[str], rows: Sequence[Row]) -> None:
 
 
 class _Joined:
-    """What the lines of one or two files say of each point, refused where they contradict each other."""
+    """Statements of one or two files on each point, refused where they contradict each other."""
 
     def __init__(self) -> None:
         self.index: dict[str, int] = {}

@@ -1,4 +1,4 @@
-"""What the adjustment of one image starts from."""
+"""An image of a block before it is adjusted."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ortho_pipeline.models import SensorModel
 
 @dataclass(frozen=True)
 class Start:
-    """What the adjustment of one image starts from: its scene, the model and its name, and what is known of it."""
+    """An image before its adjustment: its scene, the model with its name and source, and priors of its parameters."""
 
     scene: Scene
     model: SensorModel

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline import plugins
-from ortho_pipeline.block.adjustment import BlockFit
 from ortho_pipeline.block.adjustment import adjust as adjust_block
+from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.intersection import Intersection
 from ortho_pipeline.block.intersection import intersect as intersect_rays
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
@@ -399,9 +399,7 @@ def _apart(points: BlockPoints, ground: Array) -> Array:
     if not np.isfinite(known).all(axis=1).any():
         return np.full((len(points), 3), np.nan)
     frame = GroundFrame.about(known)
-    apart = frame.of_geodetic(known) - frame.of_geodetic(ground)
-    turned: Array = (frame.horizons(known) @ apart[:, :, None])[:, :, 0]
-    return turned
+    return frame.apart(known, frame.of_geodetic(ground))
 
 
 def _median_residual(found: Intersection) -> float | None:

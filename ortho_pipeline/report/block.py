@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ortho_pipeline.block.adjustment import BlockFit
+from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import fixed, flat, metres, px

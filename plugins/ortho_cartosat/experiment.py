@@ -17,7 +17,8 @@ import numpy as np
 from ortho_cartosat import truth as simulated
 from ortho_cartosat.statements import statements
 from ortho_cartosat.truth import StereoPair
-from ortho_pipeline.block.adjustment import BlockFit, adjust
+from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.models.base import Array, SensorModel

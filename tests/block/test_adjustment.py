@@ -9,12 +9,13 @@ import pyproj
 import pytest
 from ortho_cartosat.truth import StereoPair
 
-from ortho_pipeline.block import solver as block_solver
-from ortho_pipeline.block.adjustment import BlockFit, adjust
+from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.equations import solver as block_solver
+from ortho_pipeline.block.equations.steps import Steps
+from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.intersection import intersect
 from ortho_pipeline.block.local_frame import GroundFrame
 from ortho_pipeline.block.points import BlockPoints
-from ortho_pipeline.block.steps import Steps
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.estimation.problem import Prior
@@ -223,7 +224,7 @@ def test_sigmas_are_honest(rpcs: dict[str, RPC]) -> None:
         wanted = np.concatenate([model.params for model in truth.values()])
         orientation.append((found.values - wanted) / found.sigmas)
         frame = GroundFrame.about(ground)
-        apart = (frame.horizons(ground) @ (frame.of_geodetic(found.ground) - frame.of_geodetic(ground))[:, :, None])[
+        apart = (frame.enu_at(ground) @ (frame.of_geodetic(found.ground) - frame.of_geodetic(ground))[:, :, None])[
             :, :, 0
         ]
         ground_ratio.append(apart / found.ground_sigmas)
@@ -302,7 +303,7 @@ def test_how_well_ties_agree_says_nothing_about_the_datum(rpcs: dict[str, RPC]) 
         assert found.sigma0 == pytest.approx(0.2, abs=0.1)
         orientation.append((found.values - np.concatenate([model.params for model in truth.values()])) / found.sigmas)
         apart = frame.of_geodetic(found.ground) - frame.of_geodetic(ground)
-        misses.append((frame.horizons(ground) @ apart[:, :, None])[:, :, 0] / found.ground_sigmas)
+        misses.append((frame.enu_at(ground) @ apart[:, :, None])[:, :, 0] / found.ground_sigmas)
     # Forty draws of four shifts: their spread is known to about a tenth.
     assert np.std(orientation) == pytest.approx(1.0, abs=0.25)
     assert np.std(misses) == pytest.approx(1.0, abs=0.25)
@@ -455,7 +456,7 @@ def surveyed(
     random = np.random.default_rng(seed + 900)
     frame = GroundFrame.about(ground)
     wrong = random.normal(0, 1, (control, 3)) * (sigma[0], sigma[0], sigma[1])
-    east = frame.horizons(ground[:control]).swapaxes(1, 2)
+    east = frame.enu_at(ground[:control]).swapaxes(1, 2)
     known = points.ground.copy()
     known[:control] = frame.geodetic(frame.of_geodetic(ground[:control]) + (east @ wrong[:, :, None])[:, :, 0])
     points = replace(points, ground=known)
@@ -466,7 +467,7 @@ def ratios(found: BlockFit, truth: dict[str, ImageCorrection], ground: np.ndarra
     """Return (found - true) / sigma of parameters, and of the ground of all points but control."""
     wanted = np.concatenate([model.params for model in truth.values()])
     frame = GroundFrame.about(ground)
-    apart = frame.horizons(ground) @ (frame.of_geodetic(found.ground) - frame.of_geodetic(ground))[:, :, None]
+    apart = frame.enu_at(ground) @ (frame.of_geodetic(found.ground) - frame.of_geodetic(ground))[:, :, None]
     return (found.values - wanted) / found.sigmas, (apart[:, :, 0] / found.ground_sigmas)[~found.points.control]
 
 
@@ -576,7 +577,7 @@ def test_a_wrong_check_point_is_named_and_kept(rpcs: dict[str, RPC], axis: int, 
     good = adjust(starts(truth), points)
     assert good.outlying == ()
     frame = GroundFrame.about(points.ground)
-    local, turn = frame.of_geodetic(points.ground), frame.horizons(points.ground)[20]
+    local, turn = frame.of_geodetic(points.ground), frame.enu_at(points.ground)[20]
     local[20] += turn[axis] * size * np.hypot(0.3, good.ground_sigmas[20, axis])
     found = adjust(starts(truth), replace(points, ground=frame.geodetic(local)))
     assert [(one.point, one.role, one.what) for one in found.outlying] == [("p20", "check", what)]
@@ -593,7 +594,7 @@ def test_control_of_little_weight_that_is_off_is_named(rpcs: dict[str, RPC]) -> 
     sigma = points.sigma_ground.copy()
     sigma[3] = 20.0
     frame = GroundFrame.about(points.ground)
-    local, turn = frame.of_geodetic(points.ground), frame.horizons(points.ground)[3]
+    local, turn = frame.of_geodetic(points.ground), frame.enu_at(points.ground)[3]
     local[3] += turn[0] * 120.0
     weak = replace(points, sigma_ground=sigma, ground=frame.geodetic(local))
     kept = adjust(starts(truth), weak, robust=False)
@@ -744,9 +745,7 @@ def test_intersection_closes_and_its_sigmas_are_honest(rpcs: dict[str, RPC]) -> 
     noisy = intersect(rpcs, measured(rpcs, ground, "tie", noise=0.3))
     assert noisy.sigma0 == pytest.approx(0.6, abs=0.05)
     frame = GroundFrame.about(ground)
-    apart = (frame.horizons(ground) @ (frame.of_geodetic(noisy.ground) - frame.of_geodetic(ground))[:, :, None])[
-        :, :, 0
-    ]
+    apart = (frame.enu_at(ground) @ (frame.of_geodetic(noisy.ground) - frame.of_geodetic(ground))[:, :, None])[:, :, 0]
     np.testing.assert_allclose((apart / noisy.sigmas).std(axis=0), 1.0, atol=0.12)
 
 

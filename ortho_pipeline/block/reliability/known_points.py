@@ -12,9 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ortho_pipeline.block.blunders import tests_of_ground
-from ortho_pipeline.block.solver import BlockProblem, Solved
-from ortho_pipeline.block.variance_components import Variances
+from ortho_pipeline.block.equations.problem import BlockProblem
+from ortho_pipeline.block.equations.solver import Solved
+from ortho_pipeline.block.equations.unknowns import Mask
+from ortho_pipeline.block.reliability.standardised import standardised_ground
+from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.models.base import Array
 
@@ -55,12 +57,7 @@ class Outlying:
 
 
 def outlying(
-    problem: BlockProblem,
-    solved: Solved,
-    variances: Variances,
-    residuals: Array,
-    covariance: Array,
-    used: np.ndarray,
+    solved: Solved, variances: Variances, residuals: Array, covariance: Array, used: Mask
 ) -> tuple[Outlying, ...]:
     """Return the check points, and the control points that were used, which the block contradicts.
 
@@ -75,7 +72,7 @@ def outlying(
     """
     from scipy.special import fdtrc
 
-    points = problem.points
+    problem, points = solved.problem, solved.problem.points
     own = _sigmas(problem, variances)
     freedom = max(variances.redundancy[0], 1.0)
     found: list[tuple[int, str, float, float, float]] = []
@@ -91,7 +88,7 @@ def outlying(
             else:
                 chance = float(fdtrc(len(axes), freedom, square))
             found.append((int(k), what, math.hypot(*apart), math.sqrt(square), chance))
-    squares, ranks = tests_of_ground(problem, solved)
+    squares, ranks = standardised_ground(solved)
     for k in np.flatnonzero(used & (ranks > 0)):
         of = min(freedom, variances.freedom) if problem.unstated[k].any() else freedom
         apart, square = residuals[k, np.isfinite(residuals[k])], float(squares[k] / ranks[k])

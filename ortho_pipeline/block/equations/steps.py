@@ -30,7 +30,7 @@ class Steps:
 
     @property
     def length(self) -> float:
-        """How much the last step promised to change."""
+        """Length of the change that the last step promised."""
         return float(np.linalg.norm(self.changes[-1])) if self.changes else np.inf
 
     def extrapolated(self, change: Array, step: Array) -> Array | None:

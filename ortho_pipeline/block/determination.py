@@ -1,0 +1,102 @@
+"""Determination of the parameters: blocks whose points leave images open are refused, with names and a remedy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ortho_pipeline.block.equations.elimination import weakest
+from ortho_pipeline.block.equations.problem import BlockProblem, Selection
+from ortho_pipeline.block.equations.solver import Solved
+from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.errors import DegeneratePoints, TooFewPoints, counted
+from ortho_pipeline.estimation.fit import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING
+from ortho_pipeline.estimation.problem import CONDITION_LIMIT
+
+
+def refuse_too_few(problem: BlockProblem, selection: Selection) -> None:
+    """Refuse images with fewer equations than parameters, by name."""
+    points = problem.points
+    rays = selection.rays & problem.active(selection)[points.point]
+    if not rays.any():
+        raise TooFewPoints(
+            "no point was measured in two images, or in one with known ground", file=points.source or None,
+            remedy="points of one id are one point: check the ids and the names of the images",
+        )  # fmt: skip
+    for image, model in enumerate(problem.models):
+        columns = problem.columns.of_image(image)
+        measured = int((rays & (points.image == image)).sum())
+        known = len(model.constraints()) + sum(int(one.column) in columns for one in problem.pseudo)
+        least = math.ceil((len(columns) - known) / 2)
+        if 2 * measured + known < len(columns):
+            raise TooFewPoints(
+                f"{counted(measured, 'point')} in the image {points.images[image]!r} cannot determine its "
+                f"{counted(len(columns), 'parameter')}",
+                file=points.source or None,
+                remedy=f"measure at least {counted(least, 'point')} in it, or take a simpler model",
+            )
+
+
+def refuse_undetermined(solved: Solved) -> None:
+    """Refuse a block whose points leave parameters open, and name these."""
+    problem = solved.problem
+    if solved.condition <= CONDITION_LIMIT or not problem.size:
+        return
+    names = _weakest(solved)
+    raise DegeneratePoints(
+        f"the points do not determine {names} (condition {solved.condition:.1e})", file=problem.points.source or None,
+        remedy="give control points that are spread over the images, take a simpler model or correction, or hold the "
+        "orientation near its start values",
+    )  # fmt: skip
+
+
+def _weakest(solved: Solved) -> str:
+    """Return the names of the parameters that the least determined combination consists of, by image."""
+    problem, vector = solved.problem, np.abs(weakest(solved.linear))
+    strong = np.flatnonzero(vector >= 0.3 * vector.max())
+    parts = []
+    for image, name in enumerate(problem.points.images):
+        columns = problem.columns.of_image(image)
+        mine = [problem.models[image].param_names[k - columns[0]] for k in strong if k in columns]
+        if mine:
+            parts.append(f"{', '.join(mine)} of the image {name!r}")
+    shown = "; ".join(parts[:4])
+    return f"{shown}; and those of {counted(len(parts) - 4, 'more image')}" if len(parts) > 4 else shown
+
+
+def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
+    """Refuse images that are far less certain where their own points are than these, and warn of uncertain corners.
+
+    Points count as measured as they were `stated` even where they turned out better: constraints of the models are
+    stated too, and bound what is known of the images.
+    """
+    problem = solved.problem
+    found, held = [], any(one.held for one in problem.pseudo)
+    for image, model in enumerate(solved.state.models):
+        columns = problem.columns.of_image(image)
+        used = solved.linear.ordering.rays_of_image[image]
+        partials = solved.linear.by_params[used][:, :, : len(columns)]
+        if not len(columns) or not len(used):
+            continue
+        cofactors = solved.cofactors[np.ix_(columns, columns)]
+        of_image = problem.points.image == image
+        measured = float(np.median(problem.points.sigma_image[of_image]))
+        sigma = max(measured, float(np.median(stated.sigma_image[of_image])))
+        inside = float(np.sqrt(np.median(((partials @ cofactors) * partials).sum(axis=2)))) * measured / sigma
+        name = problem.points.images[image]
+        if inside > EXTRAPOLATION_LIMIT and not held:
+            raise DegeneratePoints(
+                f"the points do not determine the image {name!r}: at its own points it is {inside:.0f} times less "
+                "certain than these were measured", file=problem.points.source or None,
+                remedy="give more control points in it, spread in plan and height, or take a simpler model",
+            )  # fmt: skip
+        at_corners = model.param_partials(model.corners)
+        at_corners = at_corners[np.isfinite(at_corners).all(axis=(1, 2))]
+        spread = np.sqrt(((at_corners @ cofactors) * at_corners).sum(axis=2))
+        factor = float(spread.max(initial=0.0)) / sigma
+        if factor > EXTRAPOLATION_WARNING and not held:
+            text = f"at a corner {factor:.0f} times less certain than a measured point"
+            found.append(Notice("uncertain-at-edge", text, factor=factor).in_image(name))
+    return found

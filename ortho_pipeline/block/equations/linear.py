@@ -1,0 +1,62 @@
+"""Observation equations of a block: its misfits at a state, with their partials."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ortho_pipeline.block.equations.problem import BlockProblem, Misfits, Selection, State
+from ortho_pipeline.block.equations.unknowns import Mask, Ordering
+from ortho_pipeline.models.base import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Misfits over their sigma, and their partials, at a state; zero for what takes no part.
+
+    `by_params` has as many columns as the image with the most parameters; those that an image does not have are zero.
+    """
+
+    problem: BlockProblem
+    state: State
+    ordering: Ordering
+    weights: Selection
+    misfits: Misfits
+    by_params: Array  # (M, 2, p)
+    by_point: Array  # (M, 2, 3)
+    ground_by_point: Array  # (N, 3, 3)
+    pseudo_rows: Array  # (k, P)
+    pseudo_true: Mask  # (k,) observations; the others hold a datum or are fictitious
+
+    @classmethod
+    def at(cls, problem: BlockProblem, state: State, weights: Selection, ordering: Ordering | None = None) -> Linear:
+        """Return the observation equations of a problem at a state; `ordering` is given where it is known."""
+        points = problem.points
+        ordering = problem.ordering(weights) if ordering is None else ordering
+        misfits = problem.misfits(state, ordering, weights)
+        pseudo = problem.pseudo_equations(state)
+        places = problem.frame.places(state.local)
+        root = np.sqrt(weights.ray_weights) / points.sigma_image
+        by_point = np.zeros((points.rays, 2, 3))
+        by_params = np.zeros((points.rays, 2, problem.columns.widest))
+        for model, used in zip(state.models, ordering.rays_of_image, strict=True):
+            rows, scale = points.point[used], root[used][:, None, None]
+            by_point[used] = places.ground_partials(model, rows) * scale
+            if count := len(model.params):
+                by_params[used, :, :count] = model.param_partials(places.in_crs(model.crs)[rows]) * scale
+        ground_by_point, rows = np.zeros((len(points), 3, 3)), ordering.grounded
+        scale = np.sqrt(weights.ground_weights[rows])[:, None] / problem.ground_sigmas[rows]
+        ground_by_point[rows] = problem.enu[rows] * scale[:, :, None]
+        return cls(
+            problem, state, ordering, weights, misfits, by_params, by_point, ground_by_point, pseudo.rows, pseudo.true
+        )
+
+    def changes(self, step: Array, shift: Array) -> Misfits:
+        """Return what a step of the parameters ``(P,)`` and of the points ``(N, 3)`` takes off, to first order."""
+        points = self.problem.points
+        padded = np.append(step, 0.0)[self.problem.columns.padded[points.image]]
+        rays = (self.by_params @ padded[:, :, None])[:, :, 0]
+        rays += (self.by_point @ shift[points.point][:, :, None])[:, :, 0]
+        ground = (self.ground_by_point @ shift[:, :, None])[:, :, 0]
+        return Misfits(rays, ground, self.pseudo_rows @ step)

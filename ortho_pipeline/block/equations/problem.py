@@ -1,0 +1,210 @@
+"""Everything that is observed of a block, and how far it is from what models and points at some state predict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ortho_pipeline.block.equations.unknowns import Columns, Mask, Ordering
+from ortho_pipeline.block.local_frame import GroundFrame
+from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.models.base import Array, SensorModel
+
+#: Ground is never weighted with less than this sigma (m): far below any pixel, far above rounding.
+PERFECT_GROUND = 1e-5
+
+
+@dataclass(frozen=True)
+class Pseudo:
+    """An observation of one parameter (column) by itself; `held`: it defines the datum, and is not knowledge."""
+
+    column: int
+    mean: float
+    sigma: float
+    held: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Models and ground points ``(N, 3)`` in the frame, as they are in one iteration."""
+
+    models: tuple[SensorModel, ...]
+    local: Array
+
+    @property
+    def params(self) -> Array:
+        """Parameters of all models ``(P,)``."""
+        return np.concatenate([np.zeros(0), *(model.params for model in self.models)])
+
+    def moved(self, step: Array, shift: Array) -> State:
+        """Return the state after a step of the parameters ``(P,)`` and of the points ``(N, 3)``."""
+        models, begin = [], 0
+        for model in self.models:
+            count = len(model.params)
+            models.append(model.with_params(model.params + step[begin : begin + count]) if count else model)
+            begin += count
+        return State(tuple(models), self.local + shift)
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Rays ``(M,)`` and ground coordinates ``(N,)`` that take part, with their weights (robust estimation)."""
+
+    rays: Mask
+    ground: Mask
+    ray_weights: Array
+    ground_weights: Array
+
+    @classmethod
+    def of(cls, rays: Mask, ground: Mask) -> Selection:
+        """Return a selection of equal weights."""
+        return cls(rays, ground, np.ones(len(rays)), np.ones(len(ground)))
+
+
+@dataclass(frozen=True, eq=False)
+class Misfits:
+    """Observed minus predicted over sigma: rays ``(M, 2)``, ground ``(N, 3)``, pseudo-observations ``(k,)``.
+
+    Zero for what takes no part; weights enter by their root.
+    """
+
+    rays: Array
+    ground: Array
+    pseudo: Array
+
+    @property
+    def square(self) -> float:
+        """Sum of their squares."""
+        return float(sum((part**2).sum() for part in (self.rays, self.ground, self.pseudo)))
+
+    @property
+    def vector(self) -> Array:
+        """All of them, one after the other."""
+        return np.concatenate([self.rays.ravel(), self.ground.ravel(), self.pseudo])
+
+    def minus(self, other: Misfits) -> Misfits:
+        """Return what is left when others are taken away."""
+        return Misfits(self.rays - other.rays, self.ground - other.ground, self.pseudo - other.pseudo)
+
+
+@dataclass(frozen=True, eq=False)
+class PseudoEquations:
+    """Equations of priors, datum and the models' constraints: misfits ``(k,)``, rows ``(k, P)``.
+
+    `true` ``(k,)`` are observations; the others hold a datum or are fictitious.
+    """
+
+    misfit: Array
+    rows: Array
+    true: Mask
+
+
+@dataclass(frozen=True, eq=False)
+class BlockProblem:
+    """Everything that is observed; `known` ``(N, 3)`` is the ground of control as lon, lat, h (NaN: not observed).
+
+    `assumed` are the sigmas (m) in plan and height of known ground that states none. `target` ``(N, 3)`` is known
+    ground in the frame, `enu` ``(N, 3, 3)`` turns from the frame to east, north, up there.
+    """
+
+    points: BlockPoints
+    models: tuple[SensorModel, ...]
+    frame: GroundFrame
+    known: Array
+    pseudo: tuple[Pseudo, ...] = ()
+    assumed: tuple[float, float] = (PERFECT_GROUND, PERFECT_GROUND)
+    columns: Columns = field(init=False)
+    target: Array = field(init=False)
+    enu: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        # East and north of a point are the same from any height above a place, so an unknown height may be zero.
+        place = np.where(np.isfinite(self.known), self.known, (np.nan, np.nan, 0.0))
+        object.__setattr__(self, "target", self.frame.of_geodetic(place))
+        object.__setattr__(self, "enu", self.frame.enu_at(place))
+        object.__setattr__(self, "columns", Columns.of([len(model.params) for model in self.models]))
+
+    @property
+    def size(self) -> int:
+        """Number of parameters P."""
+        return self.columns.size
+
+    def with_pseudo(self, more: Sequence[Pseudo]) -> BlockProblem:
+        """Return this problem with further pseudo-observations."""
+        return replace(self, pseudo=(*self.pseudo, *more))
+
+    # -- what takes part ---------------------------------------------------------------------------------------------
+
+    def active(self, selection: Selection) -> Mask:
+        """Return the points ``(N,)`` that are determined by two rays, or by one with known ground."""
+        counts = np.bincount(self.points.point[selection.rays], minlength=len(self.points))
+        return np.asarray((counts >= 2) | ((counts >= 1) & self._grounded(selection)))
+
+    def _grounded(self, selection: Selection) -> Mask:
+        return np.asarray(selection.ground & np.isfinite(self.known[:, :2]).all(axis=1))
+
+    def ordering(self, selection: Selection) -> Ordering:
+        """Return the order in which the unknowns of the active points and of the models are eliminated."""
+        rays = selection.rays & self.active(selection)[self.points.point]
+        return Ordering.of(self.points, rays, self._grounded(selection))
+
+    # -- sigmas ------------------------------------------------------------------------------------------------------
+
+    @property
+    def ground_sigmas(self) -> Array:
+        """Sigmas ``(N, 3)`` of known ground in metres; infinite for a height that is not known."""
+        stated, (plan, height) = self.points.sigma_ground, self.assumed
+        sigmas = np.maximum(np.where(stated > 0, stated, (plan, plan, height)), PERFECT_GROUND)
+        return np.where(np.isfinite(self.known), sigmas, np.inf)
+
+    def factor_of(self, points: BlockPoints) -> float:
+        """Return the factor between the sigmas of measurements of these points and those that they stated."""
+        return float(self.points.sigma_image[0] / points.sigma_image[0]) if self.points.rays else 1.0
+
+    @property
+    def unstated(self) -> Mask:
+        """Known ground ``(N, 3)`` that states no sigma."""
+        return np.asarray(np.isfinite(self.known) & (self.points.sigma_ground == 0))
+
+    # -- misfits -----------------------------------------------------------------------------------------------------
+
+    def misfits(self, state: State, ordering: Ordering, weights: Selection) -> Misfits:
+        """Return the misfits of everything that takes part."""
+        points = self.points
+        places = self.frame.places(state.local)
+        rays = np.zeros((points.rays, 2))
+        for model, used in zip(state.models, ordering.rays_of_image, strict=True):
+            predicted = places.project(model, points.point[used])
+            rays[used] = (points.measured[used] - predicted) / points.sigma_image[used][:, None]
+        rays *= np.sqrt(weights.ray_weights)[:, None]
+        ground, rows = np.zeros((len(points), 3)), ordering.grounded
+        apart = (self.enu[rows] @ (self.target[rows] - state.local[rows])[:, :, None])[:, :, 0]
+        ground[rows] = apart / self.ground_sigmas[rows] * np.sqrt(weights.ground_weights[rows])[:, None]
+        return Misfits(rays, ground, self.pseudo_equations(state).misfit)
+
+    def pseudo_equations(self, state: State) -> PseudoEquations:
+        """Return the equations of priors, datum and the models' constraints at a state."""
+        params = state.params
+        rows = np.zeros((len(self.pseudo), self.size))
+        for k, one in enumerate(self.pseudo):
+            rows[k, one.column] = 1.0 / one.sigma
+        parts, true = [rows], [np.array([not one.held for one in self.pseudo], dtype=bool)]
+        values = [np.array([(one.mean - params[one.column]) / one.sigma for one in self.pseudo], dtype=float)]
+        for image, model in enumerate(state.models):
+            known = model.constraints()
+            if not len(known):
+                continue
+            wide = np.zeros((len(known), self.size))
+            wide[:, self.columns.of_image(image)] = known.jacobian / known.sigma[:, None]
+            parts.append(wide)
+            values.append(known.residuals / known.sigma)
+            true.append(~known.fictitious)
+        return PseudoEquations(np.concatenate(values), np.vstack(parts), np.concatenate(true))
+
+    def square(self, state: State, selection: Selection) -> float:
+        """Return the sum of the squared misfits at a state; infinite where something cannot be computed."""
+        found = self.misfits(state, self.ordering(selection), selection).square
+        return found if math.isfinite(found) else math.inf

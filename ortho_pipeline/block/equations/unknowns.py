@@ -1,0 +1,121 @@
+"""Places of the unknowns: columns of the parameters of each image, and the order in which points are eliminated."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_pipeline.block.points import BlockPoints, Index
+
+Mask = NDArray[np.bool_]
+#: Points that are eliminated at once.
+_CHUNK = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Columns of the design matrix that the parameters of each image take, image by image.
+
+    `offsets` ``(images + 1,)`` are where they begin; `padded` ``(images, p)`` has one row for each image, as long as
+    for the image with the most parameters, and -1 for those that an image does not have.
+    """
+
+    offsets: Index
+    padded: Index
+
+    @classmethod
+    def of(cls, counts: Sequence[int]) -> Columns:
+        """Return the columns of images with so many parameters each."""
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        padded = np.full((len(counts), max(counts, default=0)), -1, dtype=np.int64)
+        for image, count in enumerate(counts):
+            padded[image, :count] = offsets[image] + np.arange(count)
+        return cls(offsets, padded)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters P."""
+        return int(self.offsets[-1])
+
+    @property
+    def widest(self) -> int:
+        """Number of parameters p of the image that has the most."""
+        return self.padded.shape[1]
+
+    def of_image(self, image: int) -> Index:
+        """Return the columns of the parameters of an image."""
+        return np.arange(self.offsets[image], self.offsets[image + 1])
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """Points ``(n,)`` with the same number of rays ``(n, k)`` in images ``(n, k)``, and whether known ground weighs in.
+
+    Points of one set of images stand together: `groups` are their slices.
+    """
+
+    points: Index
+    rays: Index
+    images: Index
+    ground: bool
+    groups: tuple[slice, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Ordering:
+    """Order in which the unknowns are eliminated: points in chunks, then the parameters of all images.
+
+    `rays_of_image` are the rays of each image that take part, `grounded` the points whose known ground weighs in.
+    """
+
+    chunks: tuple[Chunk, ...]
+    rays_of_image: tuple[Index, ...]
+    grounded: Index
+
+    @classmethod
+    def of(cls, points: BlockPoints, taking_part: Mask, grounded: Mask) -> Ordering:
+        """Sort points by the number of their rays and by the images that show them.
+
+        Parameters
+        ----------
+        taking_part : ndarray (M,) of bool
+            Rays.
+        grounded : ndarray (N,) of bool
+            Points whose ground is known; those without rays do not take part.
+        """
+        rays = np.flatnonzero(taking_part)
+        rays = rays[np.lexsort((points.image[rays], points.point[rays]))]
+        counts = np.bincount(points.point[rays], minlength=len(points))
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        chunks = []
+        for count in np.unique(counts[counts > 0]):
+            for ground in (False, True):
+                rows = np.flatnonzero((counts == count) & (grounded == ground))
+                table = rays[starts[rows][:, None] + np.arange(count)]
+                order = np.lexsort(points.image[table].T[::-1])
+                for begin in range(0, len(order), _CHUNK):
+                    part = order[begin : begin + _CHUNK]
+                    images = points.image[table[part]]
+                    chunks.append(Chunk(rows[part], table[part], images, ground, _groups(images)))
+        of_image = tuple(rays[points.image[rays] == image] for image in range(len(points.images)))
+        return cls(tuple(chunks), of_image, np.flatnonzero((counts > 0) & grounded))
+
+    @property
+    def observations(self) -> int:
+        """Number of image coordinates."""
+        return 2 * sum(len(rays) for rays in self.rays_of_image)
+
+    @property
+    def points(self) -> int:
+        """Number of points that take part."""
+        return sum(len(chunk.points) for chunk in self.chunks)
+
+
+def _groups(images: Index) -> tuple[slice, ...]:
+    """Return the slices of rows ``(n, k)`` that are the same."""
+    ends = np.flatnonzero((images[1:] != images[:-1]).any(axis=1)) + 1
+    return tuple(slice(a, b) for a, b in itertools.pairwise([0, *ends.tolist(), len(images)]))

@@ -1,0 +1,216 @@
+"""Suspects of gross errors, judged: each is asked which of its parts agree with everything that is trusted.
+
+These are all of its parts, all but one ray, all but its known ground, or none.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ortho_pipeline.block.equations.elimination import Eliminated, eliminate
+from ortho_pipeline.block.equations.linear import Linear
+from ortho_pipeline.block.equations.problem import Selection
+from ortho_pipeline.block.equations.solver import Solved
+from ortho_pipeline.block.equations.unknowns import Mask
+from ortho_pipeline.block.intersection import PARALLEL
+from ortho_pipeline.block.variances.components import Variances
+from ortho_pipeline.estimation.blunders import BLUNDER_RISK
+from ortho_pipeline.models.base import Array
+
+#: The chance at which a good part is rejected, for ground whose sigma is estimated: few points never reach a smaller
+#: one, and a gross error that stays does more harm than a good point that goes.
+_GROUND_RISK = 0.01
+#: The part of a suspect that is its known ground; the others are its rays, counted from 0.
+_GROUND = -1
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """A part of a block that was left out of its adjustment as a gross error.
+
+    Parameters
+    ----------
+    point : str
+        Its id.
+    what : {'ray', 'ground', 'point'}
+        One measurement, the known ground of a control point, or the point as a whole.
+    image : str or None
+        Of a ray.
+    reason : str
+        For people.
+    """
+
+    point: str
+    what: str
+    image: str | None
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Trusted:
+    """The solution of everything but the suspects, with the sigmas that its observations have by themselves."""
+
+    solved: Solved
+    variances: Variances
+
+
+def judged(trusted: Trusted, selection: Selection, suspects: Mask) -> tuple[Selection, dict[int, Rejected]]:
+    """Return the selection without the parts of suspects that contradict the trusted solution, and these by point."""
+    problem, solved = trusted.solved.problem, trusted.solved
+    of_suspects = suspects[problem.points.point]
+    alone = Selection.of(selection.rays & of_suspects, selection.ground & suspects)
+    rays, ground = selection.rays.copy(), selection.ground.copy()
+    rejected: dict[int, Rejected] = {}
+    linear = Linear.at(problem, solved.state, alone)
+    limits = _Limits.of(trusted, selection)
+    estimated = trusted.variances.of_ground(problem)
+    for rows in eliminate(linear):
+        suspect = _Suspects(rows, solved.cofactors)
+        agree, agree_without = limits.verdicts(suspect, estimated[rows.chunk.points])
+        for k in np.flatnonzero(~agree).tolist():
+            culprits = [part for part in suspect.parts if agree_without[part][k]]
+            number = int(rows.chunk.points[k])
+            rejected[number] = suspect.rejected(k, culprits)
+            bad = culprits if len(culprits) == 1 else list(suspect.parts)
+            rays[[rows.chunk.rays[k, part] for part in bad if part != _GROUND]] = False
+            ground[number] &= _GROUND not in bad
+    return Selection.of(rays, ground), rejected
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """Limits of the squares of contradictions, by their degrees of freedom.
+
+    What contradicts ground of an estimated sigma is judged with all the sigmas that are possible, and its risk is
+    shared by the control points alone.
+    """
+
+    freedom: float
+    risk: float
+    ground_risk: float
+    variances: Variances
+
+    @classmethod
+    def of(cls, trusted: Trusted, selection: Selection) -> _Limits:
+        _, freedom = trusted.solved.unit_weight()
+        active = trusted.solved.problem.active(selection)
+        count, control = int(active.sum()), max(int((active & selection.ground).sum()), 1)
+        return cls(max(freedom, 1.0), BLUNDER_RISK / count, _GROUND_RISK / control, trusted.variances)
+
+    def verdicts(self, suspect: _Suspects, estimated: Mask) -> tuple[Mask, dict[int, Mask]]:
+        """Return which points agree with the trusted, and which do without each of their parts."""
+        found = {part: suspect.contradictions(part) for part in suspect.parts}
+        whole, redundancy = suspect.contradictions(None)
+        agree = self.passes(whole, redundancy)
+        agree_without = {part: self.passes(*found[part]) for part in found}
+        if _GROUND not in suspect.parts or not estimated.any():
+            return agree, agree_without
+        of_rays = found[_GROUND][1]
+        for k in np.flatnonzero(estimated):
+            placed = suspect.ground_apart(int(k)) if of_rays > 0 else None
+            if placed is None:
+                agree[k] = self.passes_ground(whole[k], redundancy)
+                continue
+            apart, spread, axes = placed
+            likely = self.variances.chance_of(apart, spread, axes) >= self.ground_risk
+            agree[k] = likely and agree_without[_GROUND][k]
+        for part, (squares, freedom) in found.items():
+            if part != _GROUND:
+                agree_without[part] = np.where(estimated, self.passes_ground(squares, freedom), agree_without[part])
+        return agree, agree_without
+
+    def passes(self, squares: Array, redundancy: int) -> Mask:
+        """Return whether squares are small enough for measurements and ground of stated sigmas."""
+        return self._passes(squares, redundancy, self.freedom, self.risk)
+
+    def passes_ground(self, squares: Array, redundancy: int) -> Mask:
+        """Return whether squares are small enough for ground of an estimated sigma."""
+        return self._passes(squares, redundancy, min(self.freedom, self.variances.freedom), self.ground_risk)
+
+    def _passes(self, squares: Array, redundancy: int, freedom: float, risk: float) -> Mask:
+        from scipy.special import fdtri
+
+        limit = redundancy * fdtri(redundancy, freedom, 1 - risk) if redundancy > 0 else -1.0
+        return np.asarray(squares <= limit)
+
+
+class _Suspects:
+    """The rows of points of a chunk; their parts are their rays, and their ground if that is known."""
+
+    def __init__(self, rows: Eliminated, cofactors: Array) -> None:
+        self.problem, self.rows = rows.linear.problem, rows
+        self.design, self.misfit = rows.q @ rows.r, rows.misfit
+        self.parts = {c: np.arange(2 * c, 2 * c + 2) for c in range(rows.chunk.rays.shape[1])}
+        if rows.chunk.ground:
+            self.parts[_GROUND] = np.arange(self.misfit.shape[1] - 3, self.misfit.shape[1])
+        self.spread = np.tile(np.eye(self.misfit.shape[1]), (len(self.misfit), 1, 1))
+        for group in rows.chunk.groups:
+            columns, real = rows.columns(group)
+            by_params = rows.design(group)[:, :, real]
+            self.spread[group] += by_params @ cofactors[columns[:, None], columns] @ by_params.swapaxes(1, 2)
+
+    def contradictions(self, without: int | None) -> tuple[Array, int]:
+        """Return the squares ``(n,)`` by which all parts but one miss each other and the block, and their freedom."""
+        keep = self._all_but(without)
+        redundancy = len(keep) - 3
+        if redundancy < 1:
+            return np.full(len(self.misfit), math.inf), 0
+        half = np.linalg.cholesky(self.spread[:, keep[:, None], keep])
+        q, _ = np.linalg.qr(np.linalg.solve(half, self.design[:, keep]))
+        misfit = np.linalg.solve(half, self.misfit[:, keep, None])
+        left = misfit - q @ (q.swapaxes(1, 2) @ misfit)
+        return (left**2).sum(axis=(1, 2)), redundancy
+
+    def ground_apart(self, k: int) -> tuple[Array, Array, tuple[int, ...]] | None:
+        """Return how far known ground is from where its rays and the block put it: metres, covariance, known axes.
+
+        None where parallel rays put it nowhere.
+        """
+        sigmas = self.problem.ground_sigmas[self.rows.chunk.points[k]]
+        axes = tuple(np.flatnonzero(np.isfinite(sigmas)).tolist())
+        known = self.parts[_GROUND][list(axes)]
+        rays = self._all_but(_GROUND)
+        weights = np.linalg.inv(self.spread[k][np.ix_(rays, rays)])
+        design, sigma = self.design[k, rays], sigmas[list(axes)]
+        normal = design.T @ weights @ design
+        if np.linalg.cond(normal) > PARALLEL**2:
+            return None
+        inverse = np.linalg.inv(normal)
+        place = inverse @ design.T @ weights @ self.misfit[k, rays]
+        turned = self.design[k, known] * sigma[:, None]
+        return sigma * self.misfit[k, known] - turned @ place, turned @ inverse @ turned.T, axes
+
+    def _all_but(self, without: int | None) -> np.ndarray:
+        return np.concatenate([part for name, part in self.parts.items() if name != without])
+
+    def rejected(self, k: int, culprits: list[int]) -> Rejected:
+        """Return what is said of a point when it is these parts, each by itself, that could be wrong."""
+        points, chunk = self.problem.points, self.rows.chunk
+        name = points.ids[chunk.points[k]]
+        known = _GROUND in self.parts
+        if len(culprits) != 1:
+            who = "its ground and its measurements contradict each other" if known else "its rays miss each other"
+            size = float(np.abs(self._apart(k, None)[: 2 * chunk.rays.shape[1]]).max())
+            sigma = float(points.sigma_image[chunk.rays[k]].max())
+            reason = f"gross error: {who} by {size * sigma:.1f} px, and it cannot be decided which is wrong"
+            return Rejected(name, "point", None, reason)
+        culprit = culprits[0]
+        apart = self._apart(k, culprit)[self.parts[culprit]]
+        if culprit == _GROUND:
+            sigmas = self.problem.ground_sigmas[chunk.points[k]]
+            metres = float(np.linalg.norm((apart * sigmas)[np.isfinite(sigmas)]))
+            return Rejected(name, "ground", None, f"gross error: {metres:.1f} m from where its rays meet")
+        ray = chunk.rays[k, culprit]
+        size = float(np.hypot(*apart) * points.sigma_image[ray])
+        image = points.images[points.image[ray]]
+        return Rejected(name, "ray", image, f"gross error: {size:.1f} px from where the other rays and points put it")
+
+    def _apart(self, k: int, without: int | None) -> Array:
+        """Return the misfits of all rows of a point at the place that all parts but one give."""
+        keep = self._all_but(without)
+        place = np.linalg.lstsq(self.design[k, keep], self.misfit[k, keep], rcond=None)[0]
+        apart: Array = self.misfit[k] - self.design[k] @ place
+        return apart

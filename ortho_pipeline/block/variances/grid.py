@@ -1,0 +1,262 @@
+r"""Variance components of a block: how good the measurements are, and how good the ground that states no sigma.
+
+Sigmas of measurements are often guessed, those of control points often missing; an error of a control point is one
+error on the ground, the same in all images, which no residual of an image can stand for. So three standard deviations
+are estimated apart from the observations themselves: a factor of the sigmas of the measurements, and the unstated
+sigmas of the ground in plan and in height. What is stated of the ground, or of parameters, is taken as it is stated.
+
+With few points the components are uncertain, and plugging in one value of them would claim too much. They are
+integrated out instead: restricted likelihood times a weak prior, on a grid. The covariance is the mean over that grid,
+with the spread of the estimates; for a single component of :math:`\nu` degrees of freedom it is
+:math:`\nu / (\nu - 2)` times that of the plain estimate, and 1.96 sigmas hold as often as Student's intervals.
+
+Only control enters point by point: with parameters :math:`z` in which the cofactors of a solution are the unit matrix,
+the normal equations of everything else are the rest of the unit matrix, so a node of the grid costs next to nothing.
+
+Source: Patterson and Thompson 1971 (restricted likelihood); Gelman 2006 (priors of variances); Koch 2007 (in geodesy).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from ortho_pipeline.block.equations.problem import PERFECT_GROUND, Selection
+from ortho_pipeline.block.equations.solver import Solved, solve
+from ortho_pipeline.block.variances.components import Posterior, Variances
+from ortho_pipeline.block.variances.control import ControlEquations, Node
+from ortho_pipeline.errors import NotConverged
+from ortho_pipeline.models.base import Array
+
+#: Errors of the ground below this part of what a point's own rays leave open change nothing that could be seen: the
+#: prior is even in log sigma above it, and even in sigma below.
+_UNSEEN = 0.25
+#: Ground that is wrong by more than so many pixels is hardly taken as control: there the prior falls.
+_WORST_PIXELS = 20.0
+#: Plan and height of one survey are alike within a factor of four (two standard deviations of the log of their ratio).
+_ALIKE = math.log(2.0)
+#: The same for the factor of the measurements: below a tenth and above ten times what was stated the prior falls.
+_IMAGE_LOW, _IMAGE_HIGH = 0.1, 10.0
+#: Step of the grid in log sigma; how much less likely than the best (log) a node may be to count.
+_COARSE, _COUNTS = 0.5, 12.0
+#: Matrices of points by nodes that are worth while; parameters beyond which nodes are dear; nodes of one pass.
+_BUDGET, _DEAR, _PASS = 40_000, 100, 256
+#: With so much redundancy the measurements' factor is as good as known.
+_KNOWN = 200.0
+#: Below this redundancy a component is not estimated.
+_LEAST = 0.5
+#: Steps of the factor of the measurements to its best value, the ground's sigmas being given.
+_ROUNDS = 4
+#: Sigmas of measurements that change by less than this part are the same.
+_SAME = 0.03
+
+
+def estimate(solved: Solved) -> Variances:
+    """Return the variance components at a solution, which was found with sigmas near enough to linearise there."""
+    return _Grid(ControlEquations(solved)).variances()
+
+
+def posterior(solved: Solved) -> Posterior:
+    """Return the variance components at a solution, and covariances with their uncertainty."""
+    grid = _Grid(ControlEquations(solved))
+    return grid.posterior(grid.variances())
+
+
+def reweighed(solved: Solved, selection: Selection, variances: Variances) -> Solved:
+    """Return the solution with these standard deviations; as it is if nothing much changes.
+
+    Where that does not converge, as with cameras that few points hardly determine, it stays as it is, too; `posterior`
+    then counts how far the solution is from the best.
+    """
+    if not variances.estimated and abs(variances.image - 1.0) < _SAME:
+        return solved
+    try:
+        return solve(variances.applied(solved.problem), solved.state, selection)
+    except NotConverged:
+        return solved
+
+
+class _Grid:
+    """The nodes at which the components are tried: logs of the standard deviations of image, plan and height."""
+
+    def __init__(self, equations: ControlEquations) -> None:
+        self.equations = equations
+        self.free = [bool(equations.unstated[:, :2].any()), bool(equations.unstated[:, 2].any())]
+        self.separable = True
+        far = np.log([[1.0, 1e3 * equations.pixel, 1e3 * equations.pixel]])
+        alone = equations.redundancy(self._at(far))[0]
+        if any(self.free) and alone < _LEAST:
+            # One image, or no redundancy: an error of the ground is one of the measurement.
+            self.free, self.separable = [False, False], False
+        self.unseen = self._unseen()
+        self.centre = self._centre()
+
+    def _at(self, logs: Array) -> Node:
+        nodes = np.exp(2.0 * logs)
+        if not self.separable:
+            nodes[:, 1:] = PERFECT_GROUND**2
+        return self.equations.at(nodes)
+
+    def _unseen(self) -> float:
+        """Return the sigma (m) of ground below which nothing could be seen of it, times the factor of measurements."""
+        if not any(self.free):
+            return 1.0
+        values = np.linalg.eigvalsh(self.equations.u)
+        middle = float(np.median(values[:, 1]))
+        return _UNSEEN / math.sqrt(middle) if middle > 0 else _UNSEEN * self.equations.pixel
+
+    def _prior(self, logs: Array) -> Array:
+        sigma = np.exp(logs)
+        found = -np.log1p(_IMAGE_LOW / sigma[:, 0]) - np.log1p((sigma[:, 0] / _IMAGE_HIGH) ** 2)
+        for axis, free in enumerate(self.free, start=1):
+            if free:
+                low, high = self.unseen * sigma[:, 0], _WORST_PIXELS * self.equations.pixel
+                found = found - np.log1p(low / sigma[:, axis]) - np.log1p((sigma[:, axis] / high) ** 2)
+        if all(self.free):
+            found = found - 0.5 * ((logs[:, 1] - logs[:, 2]) / _ALIKE) ** 2
+        return np.asarray(found)
+
+    def passes(self, logs: Array) -> Iterator[tuple[slice, Node]]:
+        """Solve at nodes ``(b, 3)``, some at a time."""
+        step = max(1, min(_PASS, int(4e6 / (max(len(self.equations.rows), 1) * 3 * (self.equations.size + 3)))))
+        for begin in range(0, len(logs), step):
+            part = slice(begin, min(begin + step, len(logs)))
+            yield part, self._at(logs[part])
+
+    def chances(self, logs: Array) -> Array:
+        """Return log likelihood plus log prior ``(b,)`` at nodes ``(b, 3)``."""
+        found = np.concatenate([node.likelihood for _, node in self.passes(logs)]) + self._prior(logs)
+        return np.where(np.isfinite(found), found, -np.inf)
+
+    def _centre(self) -> Array:
+        """Return the logs ``(3,)`` near the best, found by turns for the ground and for the measurements."""
+        equations = self.equations
+        redundancy = max(equations.redundancy(self._at(np.zeros((1, 3))))[0], 1.0)
+        centre = np.array([self._log_of(equations.square / redundancy), 0.0, 0.0])
+        for _ in range(_ROUNDS):
+            if any(self.free):
+                logs = self._plane(centre[0], self._span(centre[0]))
+                centre = logs[int(np.argmax(self.chances(logs)))]
+            node = self._at(centre[None])
+            redundancy = equations.redundancy(node)[0]
+            if redundancy < _LEAST:
+                return np.array([0.0, *centre[1:]])
+            # Measured minus predicted after the step; the ground's part of the square is not the measurements'.
+            square = self._image_square(node, centre)
+            before, centre[0] = centre[0], self._log_of(square / redundancy)
+            if abs(centre[0] - before) < 0.01:
+                break
+        return centre
+
+    def _log_of(self, square: float) -> float:
+        return max(0.5 * math.log(max(square, 1e-300)), self.equations.finest)
+
+    def _image_square(self, node: Node, logs: Array) -> float:
+        """Return the sum of squares of the measurements' misfits (over the sigmas they have) at a node."""
+        equations, z = self.equations, node.z[0]
+        left = (equations.d - node.shift[0]) ** 2 * node.weights[0]
+        ground = float(left[equations.observed].sum())
+        scale = math.exp(2.0 * logs[0])
+        # The quadratic form of everything, less the ground's and the pseudo-observations' parts.
+        total = equations.square / scale + float((node.weights[0] * equations.d**2).sum())
+        b = equations.ue / scale + node.weights[0] * equations.d
+        met = (node.inverse[0] @ b[:, :, None])[:, :, 0]
+        flat = equations.k.reshape(met.size, equations.size)
+        right = (equations.image_right - met.ravel() @ flat) / scale + equations.pseudo_right
+        total -= float((b * met).sum()) + float(right @ z)
+        pseudo = float(z @ equations.pseudo @ z) - 2.0 * float(z @ equations.pseudo_right)
+        return max(total - ground - pseudo, 0.0) * scale
+
+    def _span(self, image: float) -> tuple[Array, Array]:
+        low = math.log(self.unseen / 8.0) + image
+        worst = max(_WORST_PIXELS * self.equations.pixel, float(np.abs(self.equations.d).max(initial=0.0)))
+        axis = np.arange(min(low, math.log(worst) - 1.0), math.log(4.0 * worst) + _COARSE, self._step())
+        return axis, axis
+
+    def _step(self) -> float:
+        return _COARSE if self.equations.size <= _DEAR and len(self.equations.rows) <= 100 else 2.0 * _COARSE
+
+    def _plane(self, image: float, axes: tuple[Array, Array]) -> Array:
+        grids = [axis if free else np.zeros(1) for axis, free in zip(axes, self.free, strict=True)]
+        x, y = np.meshgrid(*grids, indexing="ij")
+        return np.column_stack([np.full(x.size, image), x.ravel(), y.ravel()])
+
+    def _nodes(self) -> tuple[Array, Array]:
+        """Return the nodes ``(b, 3)`` that count, and their weights ``(b,)``, which sum up to one."""
+        redundancy = self.equations.redundancy(self._at(self.centre[None]))[0]
+        known = redundancy > _KNOWN or redundancy < _LEAST
+        images = np.zeros(1) if known else np.linspace(-3.5, 3.5, 7) / math.sqrt(2.0 * redundancy)
+        if not any(self.free) and not known:
+            images = np.linspace(-4.0, 6.0, 31) / math.sqrt(2.0 * redundancy)
+        axes = self._axes(len(images))
+        logs = np.concatenate([self._plane(self.centre[0] + shift, axes) for shift in images])
+        chances = self.chances(logs)
+        weights = np.exp(chances - chances.max())
+        return logs, weights / weights.sum()
+
+    def _axes(self, images: int) -> tuple[Array, Array]:
+        """Return finer axes over what counts of the coarse ones."""
+        if not any(self.free):
+            return np.zeros(1), np.zeros(1)
+        coarse = self._plane(self.centre[0], self._span(self.centre[0]))
+        chances = self.chances(coarse)
+        good = coarse[chances > chances.max() - _COUNTS]
+        dear = self.equations.size > _DEAR
+        side = math.sqrt(_BUDGET / images / max(len(self.equations.rows), 20)) if all(self.free) else 31.0
+        number = 7 if dear else int(np.clip(side, 7, 17))
+        low, high = good.min(axis=0) - _COARSE, good.max(axis=0) + _COARSE
+        return np.linspace(low[1], high[1], number), np.linspace(low[2], high[2], number)
+
+    def variances(self) -> Variances:
+        """Return the components: of the measurements the usual estimate, of the ground the means of their logs."""
+        self.logs, self.chance = self._nodes()
+        self.mean = np.array([self.centre[0], *(self.chance @ self.logs)[1:]])
+        equations = self.equations
+        node = self._at(self.mean[None])
+        xy, h = (float(math.exp(value)) if free else None for value, free in zip(self.mean[1:], self.free, strict=True))
+        unstated = int(equations.unstated[:, :2].any(axis=1).sum()), int(equations.unstated[:, 2].sum())
+        parts = equations.redundancy(node)
+        if not self.separable:
+            parts = (parts[0] + parts[1] + parts[2], 0.0, 0.0)
+        likely = self.chance > 1e-8
+        nodes = np.exp(2.0 * (self.logs[likely] - (self.mean[0], 0.0, 0.0)))
+        return Variances(
+            math.exp(self.mean[0]), xy, h, parts, unstated, self.separable, self._freedom(), nodes, self.chance[likely]
+        )
+
+    def _freedom(self) -> float:
+        """Return the degrees of freedom that variances of the ground's misfits have, by the spread of their logs.
+
+        That of a variance with n degrees of freedom is trigamma(n / 2), nearly 2 / n + 2 / n².
+        """
+        if not any(self.free):
+            return math.inf
+        values = np.linalg.eigvalsh(self.equations.u)
+        own = np.median(1.0 / np.maximum(values, 1e-6 * values[:, 2:]), axis=0)
+        squares, found = np.exp(2.0 * self.logs), math.inf
+        for axis, of_rays in ((1, own[1]), (2, own[0])):
+            logs = np.log(squares[:, 0] * of_rays + (squares[:, axis] if self.free[axis - 1] else 0.0))
+            spread = float(self.chance @ (logs - self.chance @ logs) ** 2)
+            found = min(found, (1.0 + math.sqrt(1.0 + 2.0 * spread)) / spread if spread > 0 else math.inf)
+        return found
+
+    def posterior(self, variances: Variances) -> Posterior:
+        """Return covariances that contain the uncertainty of the components."""
+        equations = self.equations
+        middle = self._at(self.mean[None])
+        # About the solution itself, not about the mean: what is added is how far that may be from the best.
+        cofactors = np.zeros((equations.size, equations.size))
+        ground = np.zeros((len(equations.rows), 3, 3))
+        counts = self.chance > 1e-6
+        logs, chance = self.logs[counts], self.chance[counts] / self.chance[counts].sum()
+        for part, node in self.passes(logs):
+            w = chance[part]
+            apart, shift = node.z, node.shift
+            cofactors += np.tensordot(w, node.cofactors, 1) + (apart * w[:, None]).T @ apart
+            ground += np.tensordot(w, equations.ground(node) + shift[..., None] * shift[..., None, :], 1)
+        return Posterior(
+            variances, equations.root @ cofactors @ equations.root.T, float(chance @ np.exp(2.0 * logs[:, 0])),
+            equations.rows, ground, float(np.abs(middle.z).max(initial=0.0)),
+        )  # fmt: skip
