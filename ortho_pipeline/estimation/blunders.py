@@ -37,6 +37,8 @@ _MEDIAN_OF_TWO = 2 * math.log(2)
 REJECTED_LIMIT = 0.3
 #: Residuals are never tested at a finer scale than this part of their stated sigma (noise-free simulations).
 _SCALE_FLOOR = 1e-3
+#: A point without an image is so far off (px): its square is still a number.
+_FAR = 1e150
 _SUBSETS = 500
 #: Bound on the residuals of all subsets that are in memory together.
 _RESIDUALS_AT_ONCE = 1_000_000
@@ -54,7 +56,7 @@ def find_blunders(problem: Problem, ridge: float | str | None = None) -> tuple[n
     keep = np.ones(count, dtype=bool)
     few = len(problem.model.params) <= _FEW_PARAMETERS and not problem.ridge
     solution = _common(problem) if few else problem.solve(keep, linear=True)
-    if solution.redundancy < 2 * 2:  # a single spare point can contradict, but not say who is wrong
+    if solution.redundancy < 2 * 2:  # a single point too many can contradict, but not say who is wrong
         return keep, {}
     if few:
         keep = _median_start(problem, solution)
@@ -102,14 +104,14 @@ def _median_start(problem: Problem, solution: Solution) -> np.ndarray:
         linear = solution.residuals - solution.jacobian @ step
         residuals = problem.image - found.model.ground_to_image(problem.ground)
         with np.errstate(invalid="ignore"):
-            bent = ~(np.abs(residuals - linear) / problem.sigma < 0.1).all(axis=1)
+            bent = ~(np.abs(residuals - linear) / problem.errors.sigma < 0.1).all(axis=1)
         if not bent.any() or not np.isfinite(residuals).all():
             return keep
         # The common solution was so far off that the model is not linear on the way: look again from the clean one.
         jacobian = found.model.param_partials(problem.ground)
         solution = Solution(
-            found.model, jacobian, residuals, problem.sigma, found.cofactors, found.freedom, found.effective,
-            found.sigma0, found.condition,
+            found.model, jacobian, residuals, problem.errors, found.cofactors, found.freedom, found.effective,
+            found.sigma0, found.condition, problem.groups,
         )  # fmt: skip
         again = _median_subset(solution, len(problem.priors))
         if (again == keep).all():
@@ -120,7 +122,7 @@ def _median_start(problem: Problem, solution: Solution) -> np.ndarray:
 
 def _median_subset(solution: Solution, priors: int) -> np.ndarray:
     """Return a clean subset ``(n,)`` by least median of squares on the linearised problem."""
-    jacobian, residuals = solution.jacobian / solution.sigma[:, :, None], solution.residuals / solution.sigma
+    jacobian, residuals = (solution.errors.whitened(values) for values in (solution.jacobian, solution.residuals))
     count, params = len(jacobian), jacobian.shape[2]
     size = max(1, solution.model.minimum_points, math.ceil((params - priors) / 2))
     if priors:
@@ -161,11 +163,11 @@ def _snooping_start(
     keep = np.ones(count, dtype=bool) if keep is None else keep.copy()
     # One more than may be rejected: the caller then says that there are too many.
     while (~keep).sum() <= REJECTED_LIMIT * count:
-        spare = solution.spare()
-        standardised = solution.residuals / solution.sigma
-        good = np.linalg.det(spare) > 1e-6
-        squares = np.zeros(len(spare))
-        solved = np.linalg.solve(spare[good], standardised[good][:, :, None])[:, :, 0]
+        redundancy = solution.redundancy_blocks()
+        standardised = solution.errors.whitened(solution.residuals)
+        good = np.linalg.det(redundancy) > 1e-6
+        squares = np.zeros(len(redundancy))
+        solved = np.linalg.solve(redundancy[good], standardised[good][:, :, None])[:, :, 0]
         squares[good] = (standardised[good] * solved).sum(axis=1)
         freedom = solution.freedom - 2
         if solution.sigma0 is None or freedom < 1:
@@ -194,10 +196,10 @@ def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
         return np.ones(len(keep)), np.zeros(len(keep))
     miss = problem.image - solution.model.ground_to_image(problem.ground)
     miss[~np.isfinite(miss).all(axis=1)] = np.inf
-    jacobian = solution.model.param_partials(problem.ground) / problem.sigma[:, :, None]
+    jacobian = problem.errors.whitened(solution.model.param_partials(problem.ground))
     jacobian[~np.isfinite(jacobian).all(axis=(1, 2))] = 0.0
     spread = np.eye(2) + jacobian @ solution.cofactors @ jacobian.transpose(0, 2, 1)
-    standardised = np.minimum(miss / problem.sigma, 1e150)
+    standardised = np.minimum(problem.errors.whitened(np.minimum(miss, _FAR)), _FAR)
     distance = (standardised * np.linalg.solve(spread, standardised[:, :, None])[:, :, 0]).sum(axis=1)
     freedom = max(solution.freedom, 1.0)
     scale = max(solution.sigma0 or 0.0, _SCALE_FLOOR)
@@ -225,7 +227,7 @@ class Outlying:
 
     @property
     def reason(self) -> str:
-        """What is to be said of it, without its name."""
+        """The sentence about it, without its name."""
         said = f"{self.distance:.3g} px from where the others put it, {self.expected:.2g} px expected"
         if self.role == "check":
             return f"{said}: measure it again, for it counts in the RMSE of the check points all the same"
@@ -251,25 +253,27 @@ def outlying(solution: Solution, points: Points, used: np.ndarray) -> tuple[Outl
 def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> list[Outlying]:
     from scipy.special import fdtrc
 
-    spare = solution.spare()
-    standardised = solution.residuals / solution.sigma
+    redundancy = solution.redundancy_blocks()
+    standardised = solution.errors.whitened(solution.residuals)
     freedom = solution.freedom - 2
-    good = np.linalg.det(spare) > 1e-6
+    good = np.linalg.det(redundancy) > 1e-6
     if freedom < 1 or not good.any():
         return []
-    left = solution.leave_one_out()
+    left = solution.leave_each_out()
+    inverses = np.zeros_like(redundancy)
+    inverses[good] = np.linalg.inv(redundancy[good])
+    spreads = solution.errors.mean_square(inverses)
     rows = np.flatnonzero(used)
     found = []
     for i in np.flatnonzero(good).tolist():
-        square = float(standardised[i] @ np.linalg.solve(spare[i], standardised[i]))
+        square = float(standardised[i] @ np.linalg.solve(redundancy[i], standardised[i]))
         others = max((float(solution.sigma0 or 0) ** 2 * solution.freedom - square) / freedom, _SCALE_FLOOR**2)
         chance = float(fdtrc(2, freedom, square / 2 / others))
         if chance < OUTLYING_RISK / len(rows):
-            spread = np.trace(np.linalg.inv(spare[i]) * np.outer(solution.sigma[i], solution.sigma[i]))
             found.append(
                 Outlying(
-                    points.ids[rows[i]], "control", float(np.hypot(*left[i])), math.sqrt(others * spread), chance,
-                    float(1 - np.trace(spare[i]) / 2),
+                    points.ids[rows[i]], "control", float(np.hypot(*left[i])), math.sqrt(others * float(spreads[i])),
+                    chance, float(1 - np.trace(redundancy[i]) / 2),
                 )
             )  # fmt: skip
     return found
@@ -284,11 +288,11 @@ def _outlying_checks(solution: Solution, points: Points, sigma0: float) -> list[
     problem = Problem.of(solution.model, points, usable, {})
     miss = problem.image - solution.model.ground_to_image(problem.ground)
     if len(solution.model.params):
-        jacobian = solution.model.param_partials(problem.ground) / problem.sigma[:, :, None]
+        jacobian = problem.errors.whitened(solution.model.param_partials(problem.ground))
     else:
         jacobian = np.zeros((len(miss), 2, 0))
     spread = np.eye(2) + jacobian @ solution.cofactors @ jacobian.transpose(0, 2, 1)
-    standardised = miss / problem.sigma
+    standardised = problem.errors.whitened(miss)
     squares = (standardised * np.linalg.solve(spread, standardised[:, :, None])[:, :, 0]).sum(axis=1)
     scale, freedom = max(sigma0, _SCALE_FLOOR) ** 2, max(solution.freedom, 1.0)
     own = float(np.median(squares)) / _MEDIAN_OF_TWO
@@ -296,7 +300,7 @@ def _outlying_checks(solution: Solution, points: Points, sigma0: float) -> list[
         # The median of n is about as certain as a mean square of half as many.
         scale, freedom = own, float(len(squares))
     chances = fdtrc(2, freedom, squares / 2 / scale)
-    expected = np.sqrt(scale * (np.diagonal(spread, axis1=1, axis2=2) * problem.sigma**2).sum(axis=1))
+    expected = np.sqrt(scale * problem.errors.mean_square(spread))
     return [
         Outlying(
             points.ids[problem.rows[i]], "check", float(np.hypot(*miss[i])), float(expected[i]), float(chances[i]), 0.0

@@ -261,7 +261,7 @@ def _again(found: Fit, without: str) -> Fit:
 
 
 def k_fold(found: Fit, k: int = 10, seed: int = 0) -> Array:
-    """Return the residuals ``(N, 2)`` px that points would have had, had their group of one k-th taken no part.
+    """Return the residuals ``(N, 2)`` px that points would have had, had their part of one k-th taken no part.
 
     From the hat matrix, so exact for models that are linear in their parameters, and to first order for the others.
     Points that took no part in the fit, and groups without which it is not determined, are NaN.
@@ -280,7 +280,15 @@ def k_fold(found: Fit, k: int = 10, seed: int = 0) -> Array:
     if found.ridge is not None:
         problem, _ = regularised(problem, np.ones(len(rows), dtype=bool), found.ridge)
     solution = problem.solve(np.ones(len(rows), dtype=bool))
-    order = np.random.default_rng(seed).permutation(len(rows))
+    # Points that share errors stay together; without any, each is a unit of its own.
+    names = np.where(problem.groups >= 0, problem.groups, -1 - np.arange(len(rows)))
+    units = list(dict.fromkeys(names.tolist()))
+    if len(units) < k:
+        raise InputError(f"{counted(len(units), 'group')} of points cannot be divided into {k}", field="k")
+    order = np.random.default_rng(seed).permutation(len(units))
     left = np.full((len(found.points), 2), np.nan)
-    left[rows] = solution.leave_out(np.array_split(order, k))
+    parts = np.array_split(order, k)
+    left[rows] = solution.leave_out(
+        [np.concatenate([np.flatnonzero(names == units[i]) for i in part]) for part in parts]
+    )
     return left

@@ -412,11 +412,11 @@ def _corner_ratio(solution: Solution, source: str, strength: float | None) -> fl
     One that is much less certain is refused, but never a regularised one: what the points leave open, the user has
     decided.
     """
-    if not len(solution.model.params) or not len(solution.sigma):
+    if not len(solution.model.params) or not len(solution.residuals):
         return 0.0
     partials = solution.model.param_partials(solution.model.corners)
     spread = np.sqrt(((partials @ solution.cofactors) * partials).sum(axis=2))
-    factor = float(np.nanmax(spread, initial=0.0) / np.median(solution.sigma))
+    factor = float(np.nanmax(spread, initial=0.0) / np.median(solution.errors.sigma))
     if np.isnan(spread).all() and strength is None:
         raise DegeneratePoints(
             "how certain the model is cannot be said: no corner of the ground that it is meant for has an image",

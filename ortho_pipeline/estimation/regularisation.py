@@ -65,7 +65,7 @@ def regularised(
 
 def _weight(problem: Problem, model: Rational) -> float:
     """Return how many sigmas of the image a coefficient of one moves the edge of the image."""
-    return float(model.image_scale.mean() / np.median(problem.sigma))
+    return float(model.image_scale.mean() / np.median(problem.errors.sigma))
 
 
 def _sigmas(problem: Problem, model: Rational, strength: float) -> dict[str, float]:
@@ -94,10 +94,10 @@ def _chosen(problem: Problem, keep: np.ndarray, method: str, model: Rational, ro
 
 
 def _choice(problem: Problem, keep: np.ndarray, method: str, model: Rational) -> float:
-    ground, sigma = problem.ground[keep], problem.sigma[keep]
+    ground, errors = problem.ground[keep], problem.errors[keep]
     count = len(model.params)
-    design = (model.param_partials(ground) / sigma[:, :, None]).reshape(-1, count)
-    observed = ((problem.image[keep] - model.ground_to_image(ground)) / sigma).ravel() + design @ model.params
+    design = errors.whitened(model.param_partials(ground)).reshape(-1, count)
+    observed = errors.whitened(problem.image[keep] - model.ground_to_image(ground)).ravel() + design @ model.params
     drawn = np.isin(np.array(model.param_names), model.penalised)
     q, _ = np.linalg.qr(design[:, ~drawn])
     grades = np.array([_grade(name) for name in model.penalised]) * _weight(problem, model)

@@ -98,7 +98,7 @@ class CovarianceFunction:
 
 @dataclass(frozen=True)
 class CovarianceAnalysis:
-    """What residuals of one kind of points (control or check, never both) say about each other.
+    """How alike residuals of one kind of points (control or check, never both) are.
 
     Pairs of numbers are per axis, in the unit of the residuals. `relative` and `correlation` are those of pairs closer
     than `near` (m), None where there is none; `functions` are None for an axis without a covariance that falls with
