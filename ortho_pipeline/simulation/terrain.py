@@ -15,6 +15,8 @@ import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
 
+from ortho_pipeline.simulation.waves import Waves
+
 Array = NDArray[np.float64]
 
 # -- the terrain -----------------------------------------------------------------------------------------------------
@@ -65,10 +67,7 @@ class Terrain:
         """Return the heights ``(N,)`` without the lake."""
         along, across = self.valley(xy)
         rise = 1 - np.exp(-((across / 620.0) ** 2))
-        waves = self._waves
-        hills = np.zeros(len(xy))
-        for kx, ky, phase, amplitude in waves:
-            hills += amplitude * np.sin(kx * (xy[:, 0] - self.x0) + ky * (xy[:, 1] - self.y0) + phase)
+        hills = self._waves(xy[:, 0] - self.x0, xy[:, 1] - self.y0)
         basin = 48.0 * np.exp(-(((along + 820.0) / 420.0) ** 2) - ((across + 70.0) / 300.0) ** 2)
         floor = self.lake_level + 14.0 + 0.012 * along
         return floor - basin + self.relief * rise * (0.62 + 0.16 * hills) + 2.0 * hills
@@ -90,15 +89,8 @@ class Terrain:
         )
 
     @cached_property
-    def _waves(self) -> Array:
-        """Wave numbers (2), phase and amplitude of each wave ``(M, 4)``."""
-        rng = np.random.default_rng(self.seed)
-        lengths = np.geomspace(2600.0, 150.0, 36)
-        angles, phases = rng.uniform(0, 2 * np.pi, (2, len(lengths)))
-        amplitudes = lengths**1.25
-        amplitudes *= np.sqrt(2 / (amplitudes**2).sum())
-        k = 2 * np.pi / lengths
-        return np.stack([k * np.cos(angles), k * np.sin(angles), phases, amplitudes], axis=1)
+    def _waves(self) -> Waves:
+        return Waves.drawn(self.seed, 2600.0, 150.0, 36, power=1.25)
 
 
 _TRANSFORMERS: dict[str, pyproj.Transformer] = {}

@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.points import Points
-from ortho_pipeline.simulation.scanner import EARTH_A, EARTH_GM, EARTH_RATE, geocentric, geodetic
+from ortho_pipeline.simulation.earth import EARTH_A, EARTH_GM, EARTH_RATE, geocentric, geodetic
+from ortho_pipeline.simulation.waves import LocalPlane, Waves, texture
 
 Array = NDArray[np.float64]
 
@@ -30,6 +31,7 @@ ALTITUDE, INCLINATION_DEG = 686e3, 98.0
 FOCAL_LENGTH, SIZE, PIXEL = 0.180, 2048, 27.6
 PITCH = PIXEL * FOCAL_LENGTH / ALTITUDE
 LON, LAT = 32.85, 39.92
+PLANE = LocalPlane(LON, LAT)
 LOW, HIGH = 700.0, 1900.0
 POINTS = 44
 MAP_CRS = "EPSG:32636"
@@ -63,25 +65,15 @@ class Hills:
 
     def __call__(self, lon: ArrayLike, lat: ArrayLike) -> Array:
         """Return the ellipsoidal heights ``(N,)`` at geographic coordinates in degrees."""
-        east, north = _local_metres(lon, lat)
-        kx, ky, phase, amplitude = self._waves
-        waves = np.zeros_like(east)
-        for k in range(len(kx)):
-            waves += amplitude[k] * np.sin(kx[k] * east + ky[k] * north + phase[k])
+        east, north = PLANE.metres(lon, lat)
+        waves = self._waves(east, north)
         mountains = np.exp(-((east - 18e3) ** 2 + (north + 12e3) ** 2) / (2 * 6e3**2))
         # Squashed between the bounds without ever reaching them.
         return self.low + (self.high - self.low) / (1 + np.exp(-(ROUGHNESS * waves - 1.4 + 3.0 * mountains)))
 
     @cached_property
-    def _waves(self) -> Array:
-        random = np.random.default_rng(self.seed)
-        lengths = np.geomspace(40e3, 1.5e3, 24)
-        angles, phases = random.uniform(0, 2 * np.pi, (2, len(lengths)))
-        amplitudes = lengths**1.1
-        amplitudes *= np.sqrt(2 / (amplitudes**2).sum())
-        return np.stack(
-            [2 * np.pi / lengths * np.cos(angles), 2 * np.pi / lengths * np.sin(angles), phases, amplitudes]
-        )
+    def _waves(self) -> Waves:
+        return Waves.drawn(self.seed, 40e3, 1.5e3, 24)
 
 
 def brightness(lon: ArrayLike, lat: ArrayLike, band: str = "red", *, finest: float = 120.0) -> Array:
@@ -89,7 +81,7 @@ def brightness(lon: ArrayLike, lat: ArrayLike, band: str = "red", *, finest: flo
 
     `finest` is the shortest wavelength (m) there is: some pixels, so that an image is not aliased.
     """
-    east, north = _local_metres(lon, lat)
+    east, north = PLANE.metres(lon, lat)
     value = _texture(east, north, 11, finest)
     if OWN[band]:
         own = _texture(east, north, 12 + list(OWN).index(band), finest)
@@ -98,19 +90,9 @@ def brightness(lon: ArrayLike, lat: ArrayLike, band: str = "red", *, finest: flo
 
 
 def _texture(east: Array, north: Array, seed: int, finest: float) -> Array:
-    random = np.random.default_rng(seed)
     lengths = np.geomspace(finest, 50 * finest, 60)
-    angles, phases = random.uniform(0, 2 * np.pi, (2, len(lengths)))
-    value = np.zeros_like(east)
-    for length, angle, phase in zip(lengths, angles, phases, strict=True):
-        value += np.sin(2 * np.pi / length * (np.cos(angle) * east + np.sin(angle) * north) + phase)
-    return value / np.sqrt(len(lengths) / 2)
-
-
-def _local_metres(lon: ArrayLike, lat: ArrayLike) -> tuple[Array, Array]:
-    metre = np.pi / 180 * EARTH_A
-    east = (np.asarray(lon, dtype=np.float64) - LON) * metre * np.cos(np.radians(LAT))
-    return east, (np.asarray(lat, dtype=np.float64) - LAT) * metre
+    angles, phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, (2, len(lengths)))
+    return texture(east, north, lengths, angles, phases) / np.sqrt(len(lengths) / 2)
 
 
 # -- the camera ------------------------------------------------------------------------------------------------------
@@ -284,8 +266,7 @@ class BilsatScene:
         random = np.random.default_rng(seed)
         count = len(self.image)
         metres = random.normal(0, sigma_ground, (count, 3))
-        metre = 180 / np.pi / EARTH_A
-        ground = self.ground + metres * (metre / np.cos(np.radians(LAT)), metre, 1.0)
+        ground = PLANE.moved(self.ground, metres)
         return Points(
             ids=tuple(f"P{k + 1:02d}" for k in range(count)),
             image=self.image + random.normal(0, sigma_image, (count, 2)),

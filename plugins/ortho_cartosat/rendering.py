@@ -5,18 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_cartosat.truth import GSD_ALONG, SIZE, Array, Hills, Scanner, local_metres
+from ortho_cartosat.truth import GSD_ALONG, PLANE, SIZE, Array, Hills, Scanner
+from ortho_pipeline.simulation.waves import texture
 
 
 def brightness(lon: ArrayLike, lat: ArrayLike, *, finest: float) -> Array:
     """Return the brightness ``(N,)`` in 0…1 of the ground; `finest` (m) is the shortest wavelength there is."""
-    east, north = local_metres(lon, lat)
-    random = np.random.default_rng(17)
+    east, north = PLANE.metres(lon, lat)
     lengths = np.geomspace(finest, 60 * finest, 48)
-    angles, phases = random.uniform(0, 2 * np.pi, (2, len(lengths)))
-    value = np.zeros_like(east)
-    for length, angle, phase in zip(lengths, angles, phases, strict=True):
-        value += np.sin(2 * np.pi / length * (np.cos(angle) * east + np.sin(angle) * north) + phase)
+    angles, phases = np.random.default_rng(17).uniform(0, 2 * np.pi, (2, len(lengths)))
+    value = texture(east, north, lengths, angles, phases)
     return np.clip(0.45 + 0.12 * value / np.sqrt(len(lengths) / 2), 0.0, 1.0)
 
 

@@ -28,7 +28,8 @@ from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.points import Points
-from ortho_pipeline.simulation.scanner import EARTH_A, EARTH_GM, EARTH_RATE, geocentric, geodetic, spin
+from ortho_pipeline.simulation.earth import EARTH_GM, EARTH_RATE, geocentric, geodetic, spin
+from ortho_pipeline.simulation.waves import LocalPlane, Waves
 
 Array = NDArray[np.float64]
 
@@ -37,6 +38,7 @@ FOCAL_LENGTH, PITCH, SIZE, GSD_ALONG = 1.945, 7e-6, 12000, 2.54
 TILTS_DEG = {"fore": 26.0, "aft": -5.0}
 #: Middle of the scene; Hobart lies in its upper left quarter.
 LON, LAT = 147.425, -42.955
+PLANE = LocalPlane(LON, LAT)
 LOW, HIGH = 0.0, 1260.0
 #: Heights for which the vendor fits his RPCs.
 RPC_HEIGHTS = (-50.0, 1400.0)
@@ -86,33 +88,16 @@ class Hills:
 
     def __call__(self, lon: ArrayLike, lat: ArrayLike) -> Array:
         """Return the ellipsoidal heights ``(N,)`` at geographic coordinates in degrees."""
-        east, north = local_metres(lon, lat)
-        kx, ky, phase, amplitude = self._waves
-        waves = np.zeros_like(east)
-        for k in range(len(kx)):
-            waves += amplitude[k] * np.sin(kx[k] * east + ky[k] * north + phase[k])
+        east, north = PLANE.metres(lon, lat)
+        waves = self._waves(east, north)
         # Mount Wellington stands 15 km west and 7 km north of the middle.
         mountain = np.exp(-((east + 14.6e3) ** 2 + (north - 6.5e3) ** 2) / (2 * 3.2e3**2))
         # Squashed between the bounds without ever reaching them.
         return self.low + (self.high - self.low) / (1 + np.exp(3.4 - self.roughness * waves - 8.5 * mountain))
 
     @cached_property
-    def _waves(self) -> Array:
-        random = np.random.default_rng(self.seed)
-        lengths = np.geomspace(20e3, 1.5e3, 24)
-        angles, phases = random.uniform(0, 2 * np.pi, (2, len(lengths)))
-        amplitudes = lengths**1.1
-        amplitudes *= np.sqrt(2 / (amplitudes**2).sum())
-        return np.stack(
-            [2 * np.pi / lengths * np.cos(angles), 2 * np.pi / lengths * np.sin(angles), phases, amplitudes]
-        )
-
-
-def local_metres(lon: ArrayLike, lat: ArrayLike) -> tuple[Array, Array]:
-    """Return metres to east and north ``(N,)`` of the middle of the scene, on a sphere: for terrain only."""
-    metre = np.pi / 180 * EARTH_A
-    east = (np.asarray(lon, dtype=np.float64) - LON) * metre * np.cos(np.radians(LAT))
-    return east, (np.asarray(lat, dtype=np.float64) - LAT) * metre
+    def _waves(self) -> Waves:
+        return Waves.drawn(self.seed, 20e3, 1.5e3, 24)
 
 
 # -- the cameras -----------------------------------------------------------------------------------------------------
@@ -439,8 +424,7 @@ class StereoPair:
         random = np.random.default_rng([seed, 2])
         count = len(self.ground)
         metres = random.normal(0, 1, (count, 3)) * sigma_ground
-        metre = 180 / np.pi / EARTH_A
-        ground = self.ground + metres * (metre / np.cos(np.radians(LAT)), metre, 1.0)
+        ground = PLANE.moved(self.ground, metres)
         tables = {}
         for view in self.cameras:
             noise = random.normal(0, 1, (count, 2)) * (sigma_column, rows[view])

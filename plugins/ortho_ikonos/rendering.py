@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_ikonos.truth import BRIGHT, DARK, FINEST, OWN, Array, GeoScene, local_metres
+from ortho_ikonos.truth import BRIGHT, DARK, FINEST, OWN, PLANE, Array, GeoScene
+from ortho_pipeline.simulation.waves import texture
 
 
 def brightness(lon: ArrayLike, lat: ArrayLike, band: str = "pan", *, finest: float = 4.5) -> Array:
@@ -14,18 +15,16 @@ def brightness(lon: ArrayLike, lat: ArrayLike, band: str = "pan", *, finest: flo
     `finest` is the shortest wavelength (m) there is: some pixels, so that an image is not aliased. What is longer is
     the same at all sizes of pixel, so that pan and multispectral bands, and crops, fit upon each other.
     """
-    east, north = local_metres(lon, lat)
+    east, north = PLANE.metres(lon, lat)
     own = OWN[band]
     blocks = (1 - own) * _blocks(east, north, 21, finest) + own * _blocks(
         east, north, 22 + list(OWN).index(band), finest
     )
-    random = np.random.default_rng(20)
-    texture = np.zeros_like(east)
-    for length in np.geomspace(4.5, 3000.0, 96):
-        angle, phase = random.uniform(0, 2 * np.pi, 2)
-        if length >= finest:
-            texture += np.sin(2 * np.pi / length * (np.cos(angle) * east + np.sin(angle) * north) + phase)
-    return np.clip(0.22 + 0.36 * blocks + 0.022 * texture, 0.0, 1.0)
+    lengths = np.geomspace(4.5, 3000.0, 96)
+    angles, phases = np.random.default_rng(20).uniform(0, 2 * np.pi, (len(lengths), 2)).T
+    kept = lengths >= finest
+    waves = texture(east, north, lengths[kept], angles[kept], phases[kept])
+    return np.clip(0.22 + 0.36 * blocks + 0.022 * waves, 0.0, 1.0)
 
 
 def _blocks(east: Array, north: Array, salt: int, finest: float, side: float = 110.0) -> Array:

@@ -29,12 +29,14 @@ from numpy.typing import ArrayLike, NDArray
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.points import Points
-from ortho_pipeline.simulation.scanner import EARTH_A, EARTH_GM, EARTH_RATE, geocentric, geodetic
+from ortho_pipeline.simulation.earth import EARTH_A, EARTH_GM, EARTH_RATE, geocentric, geodetic
+from ortho_pipeline.simulation.waves import LocalPlane, Waves
 
 Array = NDArray[np.float64]
 
 ALTITUDE, INCLINATION_DEG = 681e3, 98.1
 LON, LAT = 51.42, 35.74
+PLANE = LocalPlane(LON, LAT)
 LOW, HIGH, REFERENCE_HEIGHT = 1050.0, 1800.0, 1300.0
 MAP_CRS = "EPSG:32639"
 #: Side of the scene (m): one swath of the camera at nadir.
@@ -78,31 +80,15 @@ class Slope:
 
     def __call__(self, lon: ArrayLike, lat: ArrayLike) -> Array:
         """Return the ellipsoidal heights ``(N,)`` at geographic coordinates in degrees."""
-        east, north = local_metres(lon, lat)
-        hills = np.zeros_like(east)
-        for kx, ky, phase, amplitude in self._waves:
-            hills += amplitude * np.sin(kx * east + ky * north + phase)
+        east, north = PLANE.metres(lon, lat)
+        hills = self._waves(east, north)
         rise = STEEPNESS * north / EXTENT - self.bend + self.roughness * hills
         # Squashed between the bounds without ever reaching them.
         return LOW + (HIGH - LOW) / (1 + np.exp(-rise))
 
     @cached_property
-    def _waves(self) -> Array:
-        """Wave numbers (2), phase and amplitude of each wave ``(M, 4)``."""
-        random = np.random.default_rng(self.seed)
-        lengths = np.geomspace(25e3, 400.0, 24)
-        angles, phases = random.uniform(0, 2 * np.pi, (2, len(lengths)))
-        amplitudes = lengths**1.1
-        amplitudes *= np.sqrt(2 / (amplitudes**2).sum())
-        wave = 2 * np.pi / lengths
-        return np.stack([wave * np.cos(angles), wave * np.sin(angles), phases, amplitudes], axis=1)
-
-
-def local_metres(lon: ArrayLike, lat: ArrayLike) -> tuple[Array, Array]:
-    """Return metres east and north of the middle of the scene, ``(N,)`` each, by plate carree."""
-    metre = np.pi / 180 * EARTH_A
-    east = (np.asarray(lon, dtype=np.float64) - LON) * metre * np.cos(np.radians(LAT))
-    return east, (np.asarray(lat, dtype=np.float64) - LAT) * metre
+    def _waves(self) -> Waves:
+        return Waves.drawn(self.seed, 25e3, 400.0, 24)
 
 
 # -- the satellite ---------------------------------------------------------------------------------------------------

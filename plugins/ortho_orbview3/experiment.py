@@ -246,7 +246,7 @@ def _geometry(cameras: dict[str, simulated.Scanner]) -> dict[str, float]:
     for camera in cameras.values():
         ends = [(column, row) for column in (0.0, 1.0) for row in (0.0, 0.5, 1.0)]
         seen = camera.meet(np.array(ends) * (camera.width, camera.height), simulated.level(simulated.LEVEL))
-        xy = np.stack(simulated.local_metres(seen[:, 0], seen[:, 1]), axis=1)
+        xy = np.stack(simulated.PLANE.metres(seen[:, 0], seen[:, 1]), axis=1)
         widths = np.linalg.norm(xy[:3] - xy[3:], axis=1)
         sagittas.append(abs(float(widths[1] - (widths[0] + widths[2]) / 2)))
     radius = first.radius

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_orbview3.truth import ALTITUDE, PIXEL, Array, Coast, Scanner, local_metres
+from ortho_orbview3.truth import ALTITUDE, PIXEL, PLANE, Array, Coast, Scanner
 
 #: Width of a pixel in distances of neighbouring ones, for the two CCD lines are staggered by half a pixel.
 STAGGERED = 2
@@ -19,7 +19,7 @@ def brightness(lon: ArrayLike, lat: ArrayLike, coast: Coast, pixel: float = PIXE
 
     `pixel` (m) says how large the parcels are, some 24 pixels.
     """
-    east, north = local_metres(lon, lat)
+    east, north = PLANE.metres(lon, lat)
     value = np.full(east.shape, 0.35)
     for turn, size, share in ((0.31, 1.0, 0.28), (1.02, 2.7, 0.2), (0.77, 9.0, 0.12)):
         along, across = np.cos(turn) * east + np.sin(turn) * north, np.cos(turn) * north - np.sin(turn) * east

@@ -28,7 +28,8 @@ from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.points import Points
-from ortho_pipeline.simulation.scanner import EARTH_A, EARTH_GM, EARTH_RATE, geocentric, geodetic, spin
+from ortho_pipeline.simulation.earth import EARTH_A, EARTH_GM, EARTH_RATE, geocentric, geodetic, spin
+from ortho_pipeline.simulation.waves import LocalPlane, Waves
 
 Array = NDArray[np.float64]
 Surface = Callable[[Array, Array], Array]
@@ -37,6 +38,7 @@ ALTITUDE, INCLINATION_DEG = 470e3, 97.25
 COLUMNS, LINES, LINES_PER_SECOND, PIXEL = 8016, 20_000, 5000.0, 1.0
 #: Middle of both scenes, and the height (m) at which the line of sight follows the parallel.
 LON, LAT, LEVEL = 31.80, 41.44, 180.0
+PLANE = LocalPlane(LON, LAT)
 MAP_CRS = "EPSG:32636"
 #: Seconds between the satellite abeam and the middle of the scene, and the scan: west (-1) or east.
 SCENES = {"471890": (-19.1, -1), "443940": (25.0, 1)}
@@ -77,11 +79,8 @@ class Coast:
 
     def __call__(self, lon: ArrayLike, lat: ArrayLike) -> Array:
         """Return the ellipsoidal heights ``(N,)`` at geographic coordinates in degrees."""
-        east, north = local_metres(lon, lat)
-        kx, ky, phase, amplitude = self._waves
-        waves = np.zeros_like(east)
-        for k in range(len(kx)):
-            waves += amplitude[k] * np.sin(kx[k] * east + ky[k] * north + phase[k])
+        east, north = PLANE.metres(lon, lat)
+        waves = self._waves(east, north)
         inland = self.inland(east, north)
         rise = -np.expm1(-np.logaddexp(0.0, inland / 150.0) * 150.0 / 6000.0)
         # The geoid lies about 36 m above the ellipsoid here, and so does the sea.
@@ -95,21 +94,8 @@ class Coast:
         return 3300.0 - across + 500.0 * np.sin(east / 1900.0) + 180.0 * np.sin(east / 610.0 + 1.0)
 
     @cached_property
-    def _waves(self) -> Array:
-        random = np.random.default_rng(self.seed)
-        lengths = np.geomspace(9e3, 700.0, 20)
-        angles, phases = random.uniform(0, 2 * np.pi, (2, len(lengths)))
-        amplitudes = lengths**1.1
-        amplitudes *= np.sqrt(2 / (amplitudes**2).sum())
-        k = 2 * np.pi / lengths
-        return np.stack([k * np.cos(angles), k * np.sin(angles), phases, amplitudes])
-
-
-def local_metres(lon: ArrayLike, lat: ArrayLike) -> tuple[Array, Array]:
-    """Return metres to the east and north of the middle, nearly: for terrain and brightness, not for the camera."""
-    metre = np.pi / 180 * EARTH_A
-    east = (np.asarray(lon, dtype=np.float64) - LON) * metre * np.cos(np.radians(LAT))
-    return east, (np.asarray(lat, dtype=np.float64) - LAT) * metre
+    def _waves(self) -> Waves:
+        return Waves.drawn(self.seed, 9e3, 700.0, 20)
 
 
 # -- the camera ------------------------------------------------------------------------------------------------------
@@ -443,11 +429,10 @@ def measure(
     count = len(ground)
     metres = np.random.default_rng([seed, 3]).normal(0, sigma_ground, (count, 3))
     noise = np.random.default_rng([seed, 4, image_number]).normal(0, sigma_image, (count, 2))
-    metre = 180 / np.pi / EARTH_A
     return Points(
         ids=tuple(f"P{k + 1:02d}" for k in range(count)),
         image=camera.project(ground) + noise,
-        ground=ground + metres * (metre / np.cos(np.radians(LAT)), metre, 1.0),
+        ground=PLANE.moved(ground, metres),
         roles=np.full(count, "control", dtype="<U7"),
         sigma_image=np.full(count, sigma_image),
         sigma_ground=np.full((count, 3), sigma_ground),

@@ -12,7 +12,7 @@ import pytest
 from ortho_cartosat import truth as simulated
 from ortho_cartosat.layout import partner_of, rpc_of
 from ortho_cartosat.metadata import read_metadata
-from ortho_cartosat.truth import BIASES, Attitude, Scanner, StereoPair, aim, local_metres
+from ortho_cartosat.truth import BIASES, PLANE, Attitude, Scanner, StereoPair, aim
 from osgeo import gdal
 
 from ortho_pipeline.errors import DegeneratePoints, InputError
@@ -24,7 +24,8 @@ from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
 from ortho_pipeline.points.selection import select_control
 from ortho_pipeline.raster.source import open_dataset
-from ortho_pipeline.simulation.scanner import EARTH_A, LineScanner
+from ortho_pipeline.simulation.earth import EARTH_A
+from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.testing import check_sensor
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -70,7 +71,7 @@ def test_the_cameras_see_what_the_paper_says(view, width):
     image = np.array([(0, 0), (size, 0), (0, size), (size, size), (size / 2, size / 2), (3000.3, 777.7)])
     ground = camera.meet(image, level(100.0))
     assert np.abs(camera.project(ground) - image).max() < 1e-6
-    east, north = local_metres(*ground.T[:2])
+    east, north = PLANE.metres(*ground.T[:2])
     assert np.hypot(east[1] - east[0], north[1] - north[0]) / 1e3 == pytest.approx(width, abs=0.4)
     assert np.hypot(east[2] - east[0], north[2] - north[0]) / size == pytest.approx(2.54, abs=0.02)
     np.testing.assert_allclose([east[4], north[4]], 0.0, atol=60.0)

@@ -26,8 +26,8 @@ from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.exchange.rpc import read_rpc
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.crs import utm_crs
+from ortho_pipeline.simulation.earth import geocentric
 from ortho_pipeline.simulation.page import text
-from ortho_pipeline.simulation.scanner import geocentric
 
 
 def on_map(ground):

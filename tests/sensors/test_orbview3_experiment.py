@@ -18,8 +18,8 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.imaging.edge import analyse_edge
+from ortho_pipeline.simulation.earth import geocentric
 from ortho_pipeline.simulation.page import text
-from ortho_pipeline.simulation.scanner import geocentric
 from ortho_pipeline.simulation.tables import is_missed, is_within
 
 SCENES = tuple(simulated.SCENES)
@@ -135,7 +135,7 @@ def test_points_lie_on_land_in_both_scenes():
     coast = simulated.Coast()
     for seed in range(20):
         ground = simulated.places(simulated.POINTS, coast, seed)
-        assert (coast.inland(*simulated.local_metres(*ground[:, :2].T)) > 0).all()
+        assert (coast.inland(*simulated.PLANE.metres(*ground[:, :2].T)) > 0).all()
         for name in SCENES:
             image = simulated.scanner(name).project(ground)
             assert (image > 0).all()

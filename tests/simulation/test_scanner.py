@@ -10,7 +10,8 @@ import pytest
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models import KINDS
-from ortho_pipeline.simulation.scanner import LineScanner, geocentric, geodetic, meet_terrain, render, simulate_points
+from ortho_pipeline.simulation.earth import geocentric, geodetic
+from ortho_pipeline.simulation.scanner import LineScanner, meet_terrain, render, simulate_points
 from ortho_pipeline.simulation.terrain import Landscape, Terrain
 from ortho_pipeline.testing import check_sensor_model
 
