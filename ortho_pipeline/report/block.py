@@ -190,7 +190,7 @@ def page(document: Mapping[str, Any]) -> str:
 
 
 def plot_rays(document: Mapping[str, Any], label: str) -> Drawing | None:
-    """Draw the residuals of an image over its frame: of known points as back-projected, of ties as adjusted."""
+    """Draw reprojection residuals of an image over its frame: those of known ground, of ties those of the adjusted."""
     roles = {point["id"]: point["role"] for point in document["adjustment"]["points"]}
     shown = []
     for ray in document["adjustment"]["rays"]:

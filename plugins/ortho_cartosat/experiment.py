@@ -343,7 +343,7 @@ def _total(result: BlockFit | None) -> float:
 
 
 def error_vectors(model: str, seed: int = 0) -> tuple[Array, Array]:
-    """Return image points and back-projection errors ``(60, 2)`` in fore of a model with nine control points."""
+    """Return image points and reprojection residuals ``(60, 2)`` in fore of a model with nine control points."""
     result = Block.make(seed).fit(model, "even:9")
     if result is None:
         raise InputError(f"nine points do not determine {model!r}", field="model")

@@ -20,8 +20,8 @@ import numpy as np
 from ortho_pipeline.block.equations.problem import BlockProblem, Selection
 from ortho_pipeline.block.equations.solver import Solved, attempt, once, solve
 from ortho_pipeline.block.equations.unknowns import Mask
-from ortho_pipeline.block.reliability.standardised import SCALE_FLOOR, Standardised, standardised
-from ortho_pipeline.block.reliability.suspects import Rejected, Trusted, judged
+from ortho_pipeline.block.reliability.standardised_residuals import SCALE_FLOOR, StandardisedResiduals, standardise
+from ortho_pipeline.block.reliability.suspects import Rejected, Trusted, judge
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.block.variances.grid import estimate, reweighed
 from ortho_pipeline.errors import DegeneratePoints, counted
@@ -59,13 +59,13 @@ def find_blunders(solved: Solved, selection: Selection) -> Found:
     DegeneratePoints
         If more than 30 % of the control points, or of the others, would have to go.
     """
-    problem, tests = solved.problem, standardised(solved)
+    problem, tests = solved.problem, standardise(solved)
     variances = estimate(solved)
     significant = _significant(solved, tests, variances)
     if not significant.any() and not _suspects(problem, tests, variances, _DOUBT).any():
         return Found(selection)
     problem, robust = _robust(solved, selection, tests, variances)
-    tests = standardised(robust)
+    tests = standardise(robust)
     suspects = _suspects(problem, tests, variances, _SUSPECT)
     worst = _worst(problem, tests, variances)
     trusted = _trusted(problem, (robust, solved), selection, suspects)
@@ -80,10 +80,10 @@ def find_blunders(solved: Solved, selection: Selection) -> Found:
             if suspects[problem.active(selection) & selection.ground].all():
                 _refuse_many(problem, selection, doubted)
             return Found(kept, tuple(rejected.values()), tuple(problem.points.ids[i] for i in doubted))
-        kept, rejected = judged(trusted, selection, suspects)
+        kept, rejected = judge(trusted, selection, suspects)
         _refuse_many(problem, selection, list(rejected))
         solved = solve(trusted.solved.problem, trusted.solved.state, kept)
-        more = _significant(solved, standardised(solved), trusted.variances)
+        more = _significant(solved, standardise(solved), trusted.variances)
         if variances.estimated:
             # Suspects were the worst, and without them a sigma is found too small: the others return into it.
             more[list(rejected)] = True
@@ -117,7 +117,7 @@ def _trusted(problem: BlockProblem, starts: tuple[Solved, ...], selection: Selec
 
 
 def _robust(
-    solved: Solved, selection: Selection, tests: Standardised, variances: Variances
+    solved: Solved, selection: Selection, tests: StandardisedResiduals, variances: Variances
 ) -> tuple[BlockProblem, Solved]:
     """Return a solution that gross errors have little part in, and the problem with the sigmas that it has by itself.
 
@@ -135,7 +135,7 @@ def _robust(
             if not (math.isfinite(found.condition) and np.isfinite(found.linear.misfits.rays).all()):
                 return problem, replace(solved, linear=replace(solved.linear, state=state))
             solved, state = found, ahead
-            tests = standardised(solved)
+            tests = standardise(solved)
             if np.abs(weights.ray_weights - before).mean() < _SETTLED:
                 break
             before = weights.ray_weights
@@ -163,14 +163,14 @@ def _points_of(problem: BlockProblem, rays: Mask, ground: Mask) -> Mask:
     return found
 
 
-def _suspects(problem: BlockProblem, tests: Standardised, variances: Variances, limit: float) -> Mask:
+def _suspects(problem: BlockProblem, tests: StandardisedResiduals, variances: Variances, limit: float) -> Mask:
     """Return the points with a part that lies far off by the robust scale."""
     estimated = variances.of_ground(problem)
     rays, ground = tests.sizes(estimated)
     return _points_of(problem, rays > _SUSPECT, ground > np.where(estimated, limit, _SUSPECT))
 
 
-def _worst(problem: BlockProblem, tests: Standardised, variances: Variances) -> Mask:
+def _worst(problem: BlockProblem, tests: StandardisedResiduals, variances: Variances) -> Mask:
     """Return the point alone whose ground, of an estimated sigma, is farthest off; none if that is not far."""
     found = np.zeros(len(problem.points), dtype=bool)
     estimated = variances.of_ground(problem)
@@ -180,7 +180,7 @@ def _worst(problem: BlockProblem, tests: Standardised, variances: Variances) -> 
     return found
 
 
-def _significant(solved: Solved, tests: Standardised, variances: Variances) -> Mask:
+def _significant(solved: Solved, tests: StandardisedResiduals, variances: Variances) -> Mask:
     """Return the points with a part that the others contradict."""
     from scipy.special import fdtrc
 

@@ -15,7 +15,7 @@ import numpy as np
 from ortho_pipeline.block.equations.problem import BlockProblem
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.equations.unknowns import Mask
-from ortho_pipeline.block.reliability.standardised import standardised_ground
+from ortho_pipeline.block.reliability.standardised_residuals import standardise_ground
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.models.base import Array
@@ -88,7 +88,7 @@ def outlying(
             else:
                 chance = float(fdtrc(len(axes), freedom, square))
             found.append((int(k), what, math.hypot(*apart), math.sqrt(square), chance))
-    squares, ranks = standardised_ground(solved)
+    squares, ranks = standardise_ground(solved)
     for k in np.flatnonzero(used & (ranks > 0)):
         of = min(freedom, variances.freedom) if problem.unstated[k].any() else freedom
         apart, square = residuals[k, np.isfinite(residuals[k])], float(squares[k] / ranks[k])

@@ -57,8 +57,8 @@ class Trusted:
     variances: Variances
 
 
-def judged(trusted: Trusted, selection: Selection, suspects: Mask) -> tuple[Selection, dict[int, Rejected]]:
-    """Return the selection without the parts of suspects that contradict the trusted solution, and these by point."""
+def judge(trusted: Trusted, selection: Selection, suspects: Mask) -> tuple[Selection, dict[int, Rejected]]:
+    """Take the parts of suspects that contradict the trusted solution out of a selection, and name these by point."""
     problem, solved = trusted.solved.problem, trusted.solved
     of_suspects = suspects[problem.points.point]
     alone = Selection.of(selection.rays & of_suspects, selection.ground & suspects)

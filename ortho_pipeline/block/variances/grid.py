@@ -26,7 +26,7 @@ import numpy as np
 from ortho_pipeline.block.equations.problem import PERFECT_GROUND, Selection
 from ortho_pipeline.block.equations.solver import Solved, solve
 from ortho_pipeline.block.variances.components import Posterior, Variances
-from ortho_pipeline.block.variances.control import ControlEquations, Node
+from ortho_pipeline.block.variances.control_equations import ControlEquations, Node
 from ortho_pipeline.errors import NotConverged
 from ortho_pipeline.models.base import Array
 

@@ -25,7 +25,7 @@ _MEDIANS = np.array([np.nan, 0.4549, 1.3863, 2.3660])
 
 
 @dataclass(frozen=True, eq=False)
-class Standardised:
+class StandardisedResiduals:
     """Squared standardised residuals of rays ``(M,)`` and ground ``(N,)``, and their degrees of freedom."""
 
     rays: Array
@@ -52,8 +52,8 @@ def _root_median(ratio: Array) -> float:
     return max(math.sqrt(float(np.median(ratio))) if len(ratio) else 1.0, SCALE_FLOOR)
 
 
-def standardised(solved: Solved) -> Standardised:
-    """Return the standardised residuals of everything that takes part, one by one."""
+def standardise(solved: Solved) -> StandardisedResiduals:
+    """Standardise the residuals of everything that takes part, one by one."""
     points, linear = solved.problem.points, solved.linear
     rays, ray_rank = np.zeros(points.rays), np.zeros(points.rays, dtype=np.int64)
     ground, ground_rank = np.zeros(len(points)), np.zeros(len(points), dtype=np.int64)
@@ -67,16 +67,16 @@ def standardised(solved: Solved) -> Standardised:
             cross = own @ product[:, c * wide : (c + 1) * wide] @ q.swapaxes(1, 2)
             own = own @ _of_images(solved, rows.chunk.images[:, c]) @ own.swapaxes(1, 2)
             hat = q @ core @ q.swapaxes(1, 2) + own - cross - cross.swapaxes(1, 2)
-            rays[used], ray_rank[used] = _standardised(hat, linear.misfits.rays[used])
+            rays[used], ray_rank[used] = _standardise(hat, linear.misfits.rays[used])
         if rows.chunk.ground:
             used = rows.chunk.points
             ground[used], ground_rank[used] = _of_ground(rows, core)
     weights = linear.weights
-    return Standardised(rays / weights.ray_weights, ray_rank, ground / weights.ground_weights, ground_rank)
+    return StandardisedResiduals(rays / weights.ray_weights, ray_rank, ground / weights.ground_weights, ground_rank)
 
 
-def standardised_ground(solved: Solved) -> tuple[Array, Index]:
-    """Return the squared standardised residuals ``(N,)`` of known ground alone, and their degrees of freedom."""
+def standardise_ground(solved: Solved) -> tuple[Array, Index]:
+    """Return squared standardised residuals ``(N,)`` of known ground alone, and their degrees of freedom."""
     count = len(solved.problem.points)
     ground, rank = np.zeros(count), np.zeros(count, dtype=np.int64)
     for rows in solved.eliminated:
@@ -88,7 +88,7 @@ def standardised_ground(solved: Solved) -> tuple[Array, Index]:
 
 def _of_ground(rows: Eliminated, core: Array) -> tuple[Array, Index]:
     q = rows.q[:, -3:]
-    return _standardised(q @ core @ q.swapaxes(1, 2), rows.linear.misfits.ground[rows.chunk.points])
+    return _standardise(q @ core @ q.swapaxes(1, 2), rows.linear.misfits.ground[rows.chunk.points])
 
 
 def _of_images(solved: Solved, images: Index) -> Array:
@@ -100,7 +100,7 @@ def _of_images(solved: Solved, images: Index) -> Array:
     return found
 
 
-def _standardised(hat: Array, misfit: Array) -> tuple[Array, Index]:
+def _standardise(hat: Array, misfit: Array) -> tuple[Array, Index]:
     """Return squared standardised residuals ``(n,)`` of parts with a hat matrix, and their degrees of freedom."""
     redundancy, axes = np.linalg.eigh(np.eye(hat.shape[1]) - hat)
     turned = (axes.swapaxes(1, 2) @ misfit[:, :, None])[:, :, 0]
