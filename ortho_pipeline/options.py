@@ -8,6 +8,7 @@ line shows its flag.
 
 # Annotations are read from the classes: as values, not as text.
 import inspect
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -31,6 +32,25 @@ Kind = Literal[
     "integers", "folders", "keys",
 ]  # fmt: skip
 PathLike = str | os.PathLike[str]
+
+
+def is_usable(number: float) -> bool:
+    """Tell whether a number can be computed with: it is 0, or its cube and that of its inverse are numbers too."""
+    return number == 0 or 1e-100 <= abs(number) <= 1e100
+
+
+def number_of(text: str | float) -> float:
+    """Return the number that a user gave; NaN for what is none, or none to compute with (`is_usable`)."""
+    try:
+        number = float(text)
+    except (ValueError, OverflowError):
+        return math.nan
+    return number if is_usable(number) else math.nan
+
+
+def numbers_of(text: str) -> list[float]:
+    """Return the numbers that a user gave with commas between, each as `number_of` has it."""
+    return [number_of(part) for part in text.split(",")]
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,15 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import read_bounded
-from ortho_pipeline.options import Option, OutputOptions, PointOptions, SceneOptions, SurfaceOptions, options_of
+from ortho_pipeline.options import (
+    Option,
+    OutputOptions,
+    PointOptions,
+    SceneOptions,
+    SurfaceOptions,
+    is_usable,
+    options_of,
+)
 
 _MAX_BYTES = 5_000_000
 _MAX_DEPTH, _MAX_EVENTS = 20, 300_000
@@ -36,12 +44,19 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
+def _usable(number: float) -> float:
+    if not is_usable(number):
+        raise ValueError(f"{number:g} is not a number to compute with")
+    return number
+
+
 def _type(option: Option) -> Any:
     """Return the type of an option in the file."""
     if option.choices:
         return Literal[tuple(option.choices)]
     bounds: dict[str, Any] = {"gt": option.above, "lt": option.below}
-    number: Any = float if option.above is option.below is None else Annotated[float, Field(**bounds)]
+    bounded: Any = float if option.above is option.below is None else Annotated[float, Field(**bounds)]
+    number: Any = Annotated[bounded, pydantic.AfterValidator(_usable)]
     whole: Any = int if option.above is None else Annotated[int, Field(ge=int(option.above) + 1)]
     return {
         "text": str,

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ortho_pipeline.errors import InputError, counted, reads
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, same_crs
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options import is_usable
 from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE, Points
 from ortho_pipeline.points.formats import read_block_table
 from ortho_pipeline.points.ground import ground_of
@@ -191,7 +192,7 @@ class BlockPoints:
     def with_ground_sigma(self, plan: float, height: float | None = None) -> BlockPoints:
         """Return these points with standard deviations (m) for ground that states none; height as plan if not given."""
         height = plan if height is None else height
-        if not (math.isfinite(plan) and plan > 0 and math.isfinite(height) and height > 0):
+        if not (is_usable(plan) and plan > 0 and is_usable(height) and height > 0):
             raise InputError(
                 "standard deviations of the ground are positive numbers", field="points.ground_sigma",
                 remedy="give metres in plan, or in plan and height, such as 0.5,1",

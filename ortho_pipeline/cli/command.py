@@ -17,10 +17,13 @@ import click
 
 from ortho_pipeline.cli.flags import name_as_typed
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.options import is_usable
 
 _WORD = re.compile(r"-[A-Za-z_]\S")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
+#: The largest whole number that an option takes: libraries count in 32 bits.
+_WHOLE = 2**31 - 1
 #: What is said of gdalwarp's options that have no counterpart under their name.
 HINTS: Mapping[str, str] = {
     "-s_srs": "the model says where the image lies: leave it out",
@@ -71,6 +74,8 @@ class Command(click.Command):
         # click would say 'unexpected extra argument' and not what to do.
         ctx.allow_extra_args = True
         super().parse_args(ctx, words)
+        if not ctx.resilient_parsing:
+            _refuse_numbers(ctx, self.get_params(ctx))
         if ctx.args and not ctx.resilient_parsing:
             shown = " ".join(ctx.args[:3]) + (" ..." if len(ctx.args) > 3 else "")
             ctx.fail(f"'{ctx.info_name}' does not take {shown!r} too." + (f" {self.one}" if self.one else ""))
@@ -122,7 +127,20 @@ class Megabytes(click.ParamType):
         size = number * unit[(match[2] or "").upper()]
         if size < 16_000_000:
             self.fail(f"{value!r} is less than 16 MB.", param, ctx)
+        if size >= 2**60:
+            self.fail(f"{value!r} is more than a machine has.", param, ctx)
         return size
+
+
+def _refuse_numbers(ctx: click.Context, params: Sequence[click.Parameter]) -> None:
+    """Refuse numbers that computing with goes wrong, whatever option of whatever command they are given to."""
+    for one in params:
+        value = ctx.params.get(str(one.name))
+        for number in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(number, int) and not isinstance(one.type, Megabytes) and abs(number) > _WHOLE:
+                raise click.BadParameter(f"{number} is beyond {_WHOLE}.", ctx, one)
+            if isinstance(number, float) and not is_usable(number):
+                raise click.BadParameter(f"{number:g} is not a number to compute with.", ctx, one)
 
 
 def _checked(ctx: click.Context, args: Sequence[str], params: Sequence[click.Parameter]) -> list[str]:

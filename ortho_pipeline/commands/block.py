@@ -33,7 +33,7 @@ from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import Vertical, parse_crs
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options import BlockOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import BlockOptions, PointOptions, SceneOptions, SurfaceOptions, numbers_of
 from ortho_pipeline.points import assign_roles
 from ortho_pipeline.report import block as block_report
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
@@ -186,11 +186,8 @@ def _read(
 
 def _sigmas(text: str) -> list[float]:
     """Return what ``XY`` or ``XY,H`` says."""
-    try:
-        found = [float(part) for part in text.split(",")]
-    except ValueError:
-        found = []
-    if len(found) not in (1, 2):
+    found = numbers_of(text)
+    if len(found) not in (1, 2) or not all(sigma > 0 for sigma in found):
         raise InputError(
             f"{text!r} is not one sigma, or two", field="points.ground_sigma",
             remedy="give metres in plan, or in plan and height, such as 0.5,1",

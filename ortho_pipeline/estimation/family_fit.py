@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -15,6 +14,7 @@ from ortho_pipeline.estimation.problem import Problem
 from ortho_pipeline.estimation.regularisation import METHODS, regularised
 from ortho_pipeline.models import family_of, start_model
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.options import number_of
 from ortho_pipeline.points import Points
 
 SensorModelT = TypeVar("SensorModelT", bound=SensorModel)
@@ -144,11 +144,8 @@ def ridge_of(text: str) -> float | str | None:
         return text
     if text == "none":
         return None
-    try:
-        weight = float(text)
-    except ValueError:
-        weight = math.nan
-    if not (math.isfinite(weight) and weight > 0):
+    weight = number_of(text)
+    if not weight > 0:
         raise InputError(
             f"{text!r} is not a regularisation", field="points.ridge",
             remedy=f"auto, none, {', '.join(METHODS)}, or a positive weight such as 1e-5",

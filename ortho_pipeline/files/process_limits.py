@@ -20,6 +20,8 @@ from ortho_pipeline.errors import OrthoError
 LEAST = 256 << 20
 #: Bytes of address space that a thread takes: its stack and its part of the heap.
 _PER_THREAD = 72 << 20
+#: Threads beyond which no work is shared out: a system that lets a process have more is kept from its other work.
+MOST_THREADS = 512
 #: Seconds in which a thread has begun, if it ever does.
 _PATIENCE = 10.0
 
@@ -73,7 +75,9 @@ def require_memory(size: int = LEAST, threads: int = 0) -> None:
 
 
 def startable_threads(wanted: int) -> int:
-    """Return how many threads can run at once beside those that do, at most `wanted`; found by starting them.
+    """Return how many threads can run at once beside those that do, found by starting them.
+
+    At most `wanted`, and `MOST_THREADS`.
 
     Raises
     ------
@@ -90,7 +94,7 @@ def startable_threads(wanted: int) -> int:
 
     count = 0
     try:
-        while count < wanted:
+        while count < min(wanted, MOST_THREADS):
             # Not `Thread.start`, which waits without end for a thread that fails before it has begun.
             _thread.start_new_thread(wait, ())
             if not begun.acquire(timeout=_PATIENCE):

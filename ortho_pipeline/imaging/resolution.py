@@ -19,6 +19,7 @@ import numpy as np
 from ortho_pipeline.display.drawing import Axes, Drawing
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.imaging.edge import HALF_WIDTH, Array, Edge, Segment, analyse_edge, said
+from ortho_pipeline.options import numbers_of
 from ortho_pipeline.raster.source import RasterSource
 
 SCHEMA_VERSION = 1
@@ -120,15 +121,12 @@ def parse_edge(given: str) -> Segment:
     InputError
         If it is not four finite numbers.
     """
-    try:
-        x1, y1, x2, y2 = (float(part) for part in given.split(","))
-    except ValueError:
-        x1 = y1 = x2 = y2 = math.nan
-    if not all(map(math.isfinite, (x1, y1, x2, y2))):
+    found = numbers_of(given)
+    if len(found) != 4 or any(map(math.isnan, found)):
         raise InputError(
             f"{given!r} is not an edge", field="edge", remedy="give columns and rows of both ends, as 120.5,30,140,95"
         )
-    return (x1, y1), (x2, y2)
+    return (found[0], found[1]), (found[2], found[3])
 
 
 def measure(

@@ -216,14 +216,14 @@ class Grid:
         """Return the grid of an extent (xmin, ymin, xmax, ymax), widened to multiples of the resolution if `align`."""
         xmin, ymin, xmax, ymax = (float(value) for value in extent)
         dx, dy = resolution
-        if not all(map(math.isfinite, (xmin, ymin, xmax, ymax, dx, dy))) or not (xmin < xmax and ymin < ymax):
+        if not (0 < dx < 1e12 and 0 < dy < 1e12):
+            raise InputError(f"no pixel is {dx:g} x {dy:g} large", field="resolution", remedy="correct it")
+        # Beyond that many pixels from the origin a number does not tell one pixel from the next.
+        if not (xmin < xmax and ymin < ymax and max(map(abs, (xmin, ymin, xmax, ymax))) / min(dx, dy) < 2**52):
             raise InputError(
-                f"{xmin:.12g} {ymin:.12g} {xmax:.12g} {ymax:.12g} is not an extent",
-                field="extent",
+                f"{xmin:.12g} {ymin:.12g} {xmax:.12g} {ymax:.12g} is not an extent", field="extent",
                 remedy="give xmin ymin xmax ymax",
-            )
-        if not (dx > 0 and dy > 0):
-            raise InputError("a pixel has a positive size", field="resolution")
+            )  # fmt: skip
         if align:
             # A hair of tolerance keeps an extent that is already aligned from growing by a pixel of rounding.
             xmin, ymin = math.floor(xmin / dx + 1e-6) * dx, math.floor(ymin / dy + 1e-6) * dy

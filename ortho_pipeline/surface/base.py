@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ortho_pipeline.display.numbers import metres, share
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import Vertical
+from ortho_pipeline.options import number_of
 
 if TYPE_CHECKING:
     from ortho_pipeline.surface.dem import DemSurface
@@ -214,11 +215,8 @@ def parse_fill(fill: str | float) -> str | float:
     """
     if isinstance(fill, str) and fill in ("error", "mask", "nearest"):
         return fill
-    try:
-        height = float(fill)
-    except ValueError:
-        height = math.nan
-    if not math.isfinite(height):
+    height = number_of(fill)
+    if math.isnan(height):
         raise InputError(
             f"{fill!r} does not say how to fill voids",
             field="surface.fill",

@@ -12,6 +12,7 @@ from ortho_cartosat.metadata import TILTS_DEG, Metadata
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.pushbroom.metadata import SoftSigmas, pushbroom_of_metadata
 from ortho_pipeline.models.pushbroom.scanner import Pushbroom
+from ortho_pipeline.options import is_usable, number_of
 
 #: Focal length and pixel size of both cameras in metres: Willneff et al., table 1; and columns of a whole image.
 FOCAL_LENGTH, PIXEL_SIZE, COLUMNS = 1.945, 7e-6, 12000
@@ -43,11 +44,8 @@ def soft_sigmas(given: Mapping[str, str | None]) -> SoftSigmas:
         name, unit, _ = SOFT[option]
         if text is None:
             continue
-        try:
-            value = None if text.strip().lower() == NONE else float(text) * unit
-        except ValueError:
-            value = math.nan
-        if value is not None and not (math.isfinite(value) and value > 0):
+        value = None if text.strip().lower() == NONE else number_of(text) * unit
+        if value is not None and not (is_usable(value) and value > 0):
             raise InputError(
                 f"{text[:40]!r} is not a sigma",
                 field=option,

@@ -21,6 +21,7 @@ from ortho_pipeline.models.frame.camera import LOOKS_PAST, FrameCamera
 from ortho_pipeline.models.frame.orientation import exterior_sigmas
 from ortho_pipeline.models.frame.working_frame import TOPOCENTRIC
 from ortho_pipeline.models.lens import Interior
+from ortho_pipeline.options import numbers_of
 
 OPTIONS = {
     "camera": "camera file: JSON (docs/formats/frame.md) or OpenSfM's cameras.json or reconstruction.json",
@@ -167,12 +168,9 @@ def _priors(model: FrameCamera, sigmas: str | None) -> dict[str, Prior]:
 
 
 def _pair(text: str) -> tuple[float, float]:
-    """Return two finite numbers; NaN for what is none."""
-    try:
-        first, second = (float(part) for part in text.split(","))
-    except ValueError:
-        return math.nan, math.nan
-    return (first, second) if math.isfinite(first) and math.isfinite(second) else (math.nan, math.nan)
+    """Return two numbers; NaN for what is none."""
+    found = numbers_of(text)
+    return (found[0], found[1]) if len(found) == 2 else (math.nan, math.nan)
 
 
 def _facts(model: FrameCamera, pose: Pose | Shot, heights: str | None) -> dict[str, object]:

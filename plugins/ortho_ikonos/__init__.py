@@ -25,6 +25,7 @@ from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.hookspecs import Piece, Scene, Sensor, Study, hookimpl
 from ortho_pipeline.models import MapPlane, SensorModel
 from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.options import numbers_of
 from ortho_pipeline.raster.source import open_dataset
 
 OPTIONS = {
@@ -158,12 +159,10 @@ def _plane(dataset: gdal.Dataset, position: Position, source: SourceImage, heigh
 def _heights(text: str | None, position: Position, vendor: RPC | None) -> tuple[float, float]:
     plane = position.reference_height or 0.0
     if text is not None:
-        try:
-            low, high = (float(part) for part in text.split(","))
-        except ValueError:
-            low = high = math.nan
-        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        given = numbers_of(text)
+        if len(given) != 2 or not given[0] < given[1]:
             raise InputError(f"{text!r} is not a range of heights", field="heights", remedy="give low,high in metres")
+        low, high = given
     else:
         low, high = vendor.height_range if vendor else (plane - HALF_RANGE, plane + HALF_RANGE)
     return min(low, plane), max(high, plane)

@@ -15,7 +15,9 @@ BAD = "no such thing!"
 
 
 def options(group: click.Group, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], click.Option]]:
-    for name, command in group.commands.items():
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
         if isinstance(command, click.Group):
             yield from options(command, (*words, name))
             continue
@@ -93,3 +95,99 @@ def test_what_would_have_no_effect_is_refused(tiny, tmp_path, command, words, fl
     assert error["field"] == flag
     assert error["remedy"]
     assert not (tmp_path / "out").exists()
+
+
+#: More or less than numbers hold, or than squares and products of numbers do.
+BEYOND = ("nan", "inf", "-inf", "Infinity", "1e400", "-1e400", "9" * 400, "9" * 5000, "1e-320", "-1e-320", "1e308",
+          "-1e300", "1e-300")  # fmt: skip
+#: Numbers that stand in a text: the words around them.
+IN_TEXTS = {
+    "--check": "every:{}", "--select": "even:{}", "--ridge": "{}", "--dem-fill": "{}", "--ground-sigma": "{}",
+    "--crop-offset": "{},0", "--shard": "1/{}", "--edge": "0,0,{},5", "--resolution": "{},{}", "--memory": "{}",
+}  # fmt: skip
+NUMERIC = (click.types.FloatParamType, click.types.IntParamType, click.IntRange, click.FloatRange)
+
+
+def required(words: tuple[str, ...], but: click.Option) -> list[str]:
+    """Return words for what a command has to be given, besides one option."""
+    command: click.Command = cli
+    for word in words:
+        command = command.get_command(click.Context(command), word)
+    found = []
+    for one in command.params:
+        if one.required and one is not but:
+            found += [one.opts[0], BAD] if isinstance(one, click.Option) else [BAD]
+    return found
+
+
+def of_numbers() -> Iterator[tuple[tuple[str, ...], click.Option, str]]:
+    for words, one in options(cli):
+        form = "{}" if isinstance(one.type, NUMERIC) else IN_TEXTS.get(one.opts[0])
+        # The others are read by the command itself.
+        if form is not None and not (isinstance(one.type, click.types.StringParamType) and one.callback is None):
+            yield words, one, form
+
+
+def test_no_number_beyond_numbers_is_taken_by_any_option():
+    tried = set()
+    for words, one, form in of_numbers():
+        # What reads a value is shared by the commands that have an option.
+        for text in BEYOND[::6] if one.opts[0] in tried else BEYOND:
+            given = [form.format(text, text)] * max(one.nargs, 1)
+            error = document([*words, *required(words, one), one.opts[0], *given])
+            assert named(error, one), (words, one.opts, text[:10], error)
+            assert error["remedy"], (words, one.opts, text[:10], error)
+        tried.add(one.opts[0])
+    # Nodata alone may be NaN; it is no option of the kinds above.
+    assert len(tried) >= 20, tried
+
+
+@pytest.mark.parametrize("text", [text for text in BEYOND if text != "nan"])
+def test_nodata_may_be_nan_and_nothing_else_of_that_kind(tmp_path, text):
+    error = document(["rectify", "a.tif", "-o", str(tmp_path / "out"), "--nodata", text])
+    assert error["field"] == "--nodata"
+
+
+def test_more_memory_than_a_machine_has_is_a_misprint(tmp_path):
+    for command in (["rectify", "a.tif", "-o", str(tmp_path / "out")], ["run", "a.yaml"]):
+        assert document([*command, "--memory", f"{10**15 - 1}GB"])["field"] == "--memory"
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "field"),
+    [
+        ("fit", ("--ridge", "{}", "--fit-model", "rfm1"), "--ridge"),
+        ("fit", ("--check", "every:{}"), "--check"),
+        ("fit", ("--select", "even:{}"), "--select"),
+        ("fit", ("--select", "random:3:{}"), "--select"),
+        ("fit", ("--dem", "DEM", "--dem-vertical", "ellipsoid", "--dem-fill", "{}"), "--dem-fill"),
+        ("edge", ("--edge", "0,0,{},5"), "--edge"),
+    ],
+)
+def test_no_number_beyond_numbers_is_taken_within_a_text(tiny, command, words, field):
+    points = ["--gcps", str(tiny.gcps), "--points-crs", "EPSG:4979", "--points-vertical", "ellipsoid"]
+    for text in BEYOND:
+        given = [str(tiny.dem) if word == "DEM" else word.format(text) for word in words]
+        error = document([command, str(tiny.image), *(points if command == "fit" else ()), *given])
+        assert named({**error, "field": f"--{error['field'].lstrip('-')}"}, click.Option([field])), (words, text, error)
+        assert error["remedy"]
+
+
+def test_no_number_beyond_numbers_is_a_sigma_of_ground(sample, tmp_path):
+    stereo = [str(sample / "cartosat" / name) for name in ("BANDF.tif", "BANDA.tif")]
+    rays = ["--points", str(sample / "cartosat" / "points.csv"), "--model", "rpc", "-o", str(tmp_path / "out")]
+    for text in BEYOND[::4]:
+        assert document(["adjust", *stereo, *rays, "--ground-sigma", f"1,{text}"])["field"] == "--ground-sigma"
+
+
+@pytest.mark.parametrize("text", ["1e99", "1e13"])
+def test_a_pixel_larger_than_the_earth_is_none(tiny, tmp_path, text):
+    box = ["-te", "530600", "4122000", "530700", "4122100"]
+    words = ["rectify", str(tiny.image), "--height", "500", *box, "-o", str(tmp_path / "out"), "--resolution", text]
+    assert "no pixel is" in document(words)["message"]
+
+
+@pytest.mark.parametrize("box", [("-1e99", "0", "1e99", "1"), ("0", "0", "1e60", "1"), ("1e20", "0", "2e20", "1")])
+def test_an_extent_beyond_what_numbers_tell_apart_is_none(tiny, tmp_path, box):
+    words = ["rectify", str(tiny.image), "--height", "500", "-tr", "5", "5", "-o", str(tmp_path / "out"), "-te", *box]
+    assert "is not an extent" in document(words)["message"]

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from ortho_pipeline.errors import OrthoError
-from ortho_pipeline.files.process_limits import require_memory, startable_threads
+from ortho_pipeline.files.process_limits import MOST_THREADS, require_memory, startable_threads
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 EXTENT = ("530600", "4122000", "530800", "4122200")
@@ -54,6 +54,11 @@ def test_less_memory_than_the_budget_is_said_before_the_work():
     finally:
         resource.setrlimit(resource.RLIMIT_AS, before)
     assert "`output.memory=MB`" in str(raised.value.remedy)
+
+
+def test_a_count_that_no_system_has_does_not_take_all_that_it_has():
+    # Some 30,000 threads were tried for `--threads 2147483647`, for minutes.
+    assert 1 <= startable_threads(2**31) <= MOST_THREADS
 
 
 def test_threads_that_are_tried_are_gone_afterwards():
