@@ -19,6 +19,7 @@ from ortho_pipeline.errors import DegeneratePoints, InputError, counted
 from ortho_pipeline.estimation.blunders import REJECTED_LIMIT, Outlying, find_blunders, outlying
 from ortho_pipeline.estimation.problem import Prior, Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
+from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors, shared_errors
 from ortho_pipeline.estimation.statistics import correlation_of, student_of, total_correlation_of
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.models.base import Array, SensorModel
@@ -50,7 +51,8 @@ class Fit:
     strength `ridge`, the points determine `effective_parameters`, and `condition` is that of the design without it.
     `corner_ratio` tells how many times less certain the model is at a corner of the scene than a measured point.
     `outlying` are points that contradict the fit and were not left out: check points, and control points that the
-    search for gross errors does not take for such.
+    search for gross errors does not take for such. Where points have groups, `shared_errors` says what neighbours err
+    together, and `covariance` has grown by it.
     """
 
     model: SensorModel
@@ -74,6 +76,7 @@ class Fit:
     significance: float = SIGNIFICANCE
     corner_ratio: float = 0.0
     outlying: tuple[Outlying, ...] = ()
+    shared_errors: SharedErrors | None = None
 
     @property
     def reservations(self) -> tuple[str, ...]:
@@ -84,6 +87,11 @@ class Fit:
         if not self.corner_ratio <= EXTRAPOLATION_WARNING:
             found.append("uncertain at a corner")
         return tuple(found)
+
+    @property
+    def effective_points(self) -> float:
+        """Number of independent points that would determine a shift as well as the used ones."""
+        return float(self.used.sum()) if self.shared_errors is None else self.shared_errors.effective_points
 
     @property
     def param_names(self) -> tuple[str, ...]:
@@ -167,6 +175,7 @@ class Fit:
             "ridge": self.ridge,
             "condition": json_value(self.condition),
             "corner_ratio": json_value(self.corner_ratio),
+            **({} if self.shared_errors is None else {"shared_errors": self.shared_errors.to_json()}),
         }
 
     def __repr__(self) -> str:
@@ -356,10 +365,12 @@ def _result(
     loo = np.full((len(points), 2), np.nan)
     loo[used] = solution.leave_one_out()
     sigma0 = solution.sigma0
+    shared = shared_errors(solution, points.image[used])
+    usual = solution.cofactors * (1.0 if sigma0 is None else sigma0**2)
     return Fit(
         model=solution.model,
         model_name=str(name or getattr(solution.model, "family", solution.model.kind)),
-        covariance=solution.cofactors * (1.0 if sigma0 is None else sigma0**2),
+        covariance=usual if shared is None else shared[1],
         points=points,
         used=used,
         predicted=predicted,
@@ -375,6 +386,7 @@ def _result(
         effective_parameters=solution.effective,
         ridge=strength,
         priors=priors,
+        shared_errors=None if shared is None else shared[0],
     )
 
 

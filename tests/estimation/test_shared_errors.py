@@ -1,0 +1,159 @@
+"""Errors that neighbours share: simulated scenes whose correlation is known, and what a fit then claims."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pyproj
+import pytest
+
+from ortho_pipeline.estimation.fit import Fit, fit
+from ortho_pipeline.estimation.spatial.shared_errors import MOST_POINTS
+from ortho_pipeline.models import RPC, ImageCorrection
+from ortho_pipeline.points import Points
+
+SIZE = 10_000.0
+
+
+@pytest.fixture(scope="module")
+def rpc() -> RPC:
+    one, zero = np.eye(20)[0], np.zeros(20)
+    col, row = zero.copy(), zero.copy()
+    col[1], row[2] = 1.0, -1.0
+    half = SIZE / 2
+    return RPC(half, half, 20.0, -30.0, 500.0, half, half, 0.05, 0.05, 300.0, col, one, row, one)
+
+
+class Scene:
+    """Points at random, and errors of which a share is common to neighbours: a range in parts of the scene."""
+
+    def __init__(self, rpc: RPC, count: int, share: float, part: float, seed: int, tilt: float = 0.0) -> None:
+        random = np.random.default_rng([seed, count])
+        self.ground = np.column_stack([random.uniform(-1, 1, (count, 2)) * 0.05 + (20, -30), np.full(count, 500.0)])
+        self.image = rpc.ground_to_image(self.ground)
+        distance = np.linalg.norm(self.image[:, None] - self.image, axis=2)
+        whole = (1 - share) * np.eye(count) + share * np.exp(-distance / (part * SIZE))
+        self.root, self.random = np.linalg.cholesky(whole), random
+        # Where the errors lie: with a tilt, three times as large along a line of sight as across it.
+        axis = np.array([[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]])
+        self.factor = 0.3 * axis.T @ np.diag([3.0, 1.0] if tilt else [1.0, 1.0])
+
+    def points(self) -> Points:
+        count = len(self.image)
+        errors = self.root @ self.random.normal(0, 1, (count, 2)) @ self.factor.T
+        made = Points(
+            ids=tuple(map(str, range(count))), image=self.image + errors, ground=self.ground,
+            roles=np.full(count, "control"), sigma_image=np.ones(count), sigma_ground=np.zeros((count, 3)),
+            crs=pyproj.CRS(4326), source="",
+        )  # fmt: skip
+        cells = np.minimum(self.image // (SIZE / 12), 11).astype(int)
+        covariance = np.broadcast_to(self.factor @ self.factor.T, (count, 2, 2))
+        return made.with_covariance_image(covariance, 12 * cells[:, 1] + cells[:, 0])
+
+
+def adjusted(rpc: RPC, points: Points, kind: str = "shift") -> Fit:
+    return fit(ImageCorrection.identity(rpc, kind, (SIZE / 2, SIZE / 2)), points, robust=False)
+
+
+def spread(rpc: RPC, kind: str, count: int, share: float, part: float, repeats: int, tilt: float = 0.0) -> np.ndarray:
+    """Return the root mean square of (estimate - truth) / sigma over scenes, as claimed and as usual ``(2, P)``."""
+    claimed, usual = [], []
+    for seed in range(repeats // 5):
+        scene = Scene(rpc, count, share, part, seed, tilt)
+        for _ in range(5):
+            points = scene.points()
+            found = adjusted(rpc, points, kind)
+            plain = adjusted(rpc, replace(points, groups=None), kind)
+            claimed.append(found.values / found.sigmas)
+            usual.append(plain.values / plain.sigmas)
+    return np.sqrt(np.mean(np.square([claimed, usual]), axis=1))
+
+
+@pytest.mark.parametrize(("share", "part"), [(0.9, 0.1), (0.9, 0.5)])
+def test_sigmas_cover_though_neighbours_err_alike(rpc: RPC, share: float, part: float) -> None:
+    """Independent points would claim 3 and 10 times too little; here never too little by more than a third.
+
+    Sixty draws know a spread to about 15 %.
+    """
+    claimed, usual = spread(rpc, "shift", 200, share, part, 60)
+    assert (usual > 2.3).all()
+    assert (claimed < 1.5).all(), claimed
+    assert (claimed > 0.4).all(), claimed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["shift", "affine"])
+@pytest.mark.parametrize("count", [200, 1000])
+@pytest.mark.parametrize(("share", "part"), [(0.2, 0.02), (0.2, 0.5), (0.5, 0.1), (0.9, 0.02), (0.9, 0.25), (0.9, 0.5)])
+def test_sigmas_cover_at_all_ranges(rpc: RPC, kind: str, count: int, share: float, part: float) -> None:
+    claimed, usual = spread(rpc, kind, count, share, part, 100)
+    assert (claimed <= 1.0001 * usual).all()
+    assert (claimed < 1.5).all(), claimed
+    assert (claimed > 0.35).all(), claimed
+
+
+def test_errors_along_a_line_of_sight_are_found_in_its_direction(rpc: RPC) -> None:
+    claimed, _ = spread(rpc, "shift", 150, 0.8, 0.15, 20, tilt=0.6)
+    assert (claimed < 1.7).all(), claimed
+
+
+def test_independent_points_that_are_said_to_share_errors_lose_little(rpc: RPC) -> None:
+    found = adjusted(rpc, Scene(rpc, 400, 0.0, 0.1, 3).points())
+    assert found.shared_errors is not None
+    assert 400 / 16 < found.effective_points <= 400
+
+
+def test_points_on_their_own_are_as_before(rpc: RPC) -> None:
+    points = Scene(rpc, 60, 0.9, 0.3, 1).points()
+    alone = adjusted(rpc, replace(points, groups=None))
+    assert alone.shared_errors is None
+    assert alone.effective_points == 60
+    assert "shared_errors" not in alone.to_json()["statistics"]
+    shared = adjusted(rpc, points)
+    np.testing.assert_array_equal(shared.values, alone.values)
+    assert shared.sigma0 == alone.sigma0
+    assert (np.linalg.eigvalsh(shared.covariance - alone.covariance) > -1e-12 * np.trace(shared.covariance)).all()
+    said = json.loads(json.dumps(shared.to_json()))["statistics"]["shared_errors"]
+    assert said["points"] == 60
+    assert said["effective_points"] == shared.effective_points < 60
+
+
+def test_groups_too_few_to_estimate_count_as_one_point_each(rpc: RPC) -> None:
+    points = replace(Scene(rpc, 12, 0.5, 0.1, 1).points(), groups=np.repeat([0, 1, 2, 3], 3))
+    found, alone = adjusted(rpc, points), adjusted(rpc, replace(points, groups=None))
+    assert found.shared_errors is not None
+    assert found.shared_errors.range_px is None
+    assert found.effective_points == 4
+    np.testing.assert_allclose(found.sigmas, np.sqrt(3) * alone.sigmas, rtol=1e-12)
+
+
+def test_surveyed_points_among_matched_ones_count_as_they_are(rpc: RPC) -> None:
+    """Few sharp points on their own beside many that share errors: sigmas stay near those of the few."""
+    points = Scene(rpc, 200, 0.9, 0.4, 5).points()
+    covariance = points.covariance_image.copy()
+    covariance[:8] *= 1e-4
+    groups = points.groups.copy()
+    groups[:8] = -1
+    image = points.image.copy()
+    image[:8] = Scene(rpc, 200, 0.9, 0.4, 5).image[:8] + 0.003 * np.random.default_rng(0).normal(0, 1, (8, 2))
+    found = adjusted(rpc, replace(points, image=image).with_covariance_image(covariance, groups))
+    few = adjusted(rpc, replace(points, image=image).with_covariance_image(covariance, groups).select(range(8)))
+    assert (found.sigmas < 3 * few.sigmas).all()
+
+
+def test_the_order_of_the_points_does_not_matter(rpc: RPC) -> None:
+    points = Scene(rpc, 80, 0.8, 0.2, 2).points()
+    found = adjusted(rpc, points)
+    again = adjusted(rpc, points.select(np.random.default_rng(0).permutation(80)))
+    np.testing.assert_allclose(again.covariance, found.covariance, rtol=1e-6, atol=1e-9 * np.trace(found.covariance))
+
+
+def test_many_points_are_thinned_and_claim_the_same(rpc: RPC) -> None:
+    """Where errors are shared over a third of the scene, more points than are looked at add nothing."""
+    scene = Scene(rpc, 2 * MOST_POINTS, 0.9, 0.3, 4)
+    points = scene.points()
+    many = adjusted(rpc, points)
+    few = adjusted(rpc, points.select(np.arange(0, 2 * MOST_POINTS, 2)))
+    np.testing.assert_allclose(many.sigmas, few.sigmas, rtol=0.35)
