@@ -203,6 +203,9 @@ class RasterWriter:
             for i in range(profile.count):
                 _describe(dataset.GetRasterBand(i + 1), profile, i)
             if profile.validity == "mask":
+                # On a full disk it fails here, and the dataset can be closed; GDAL 3.13 ends the process where one is
+                # closed whose mask it began without room for the directory in front.
+                dataset.FlushCache()
                 dataset.CreateMaskBand(gdal.GMF_PER_DATASET)
             failed.pop_all()
         return dataset

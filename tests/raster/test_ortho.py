@@ -95,7 +95,10 @@ def test_no_write_limit_leaves_a_broken_file(tmp_path):
         [sys.executable, "-c", code, str(tmp_path)], check=False, capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 0, done.stdout + done.stderr
+    # The TIFF library in GDAL 3.13 prints lines of its own, "_tiffSeekProc: No space left on device", which GDAL's
+    # handlers of errors are not told of. They are true, and stand in front of the error; a traceback would not.
     assert "Exception ignored" not in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_what_gdal_says_when_it_closes_a_file_is_not_lost(tmp_path):
