@@ -23,6 +23,7 @@ from ortho_pipeline.options import is_usable
 from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE, Points
 from ortho_pipeline.points.formats import read_block_table
 from ortho_pipeline.points.ground import ground_of
+from ortho_pipeline.points.image_errors import sigmas_of
 from ortho_pipeline.points.rows import OF_GROUND, ROLES, Row, Table, origin_shift
 
 #: Two statements of one point's ground are the same within this (degrees or metres): files round.
@@ -381,7 +382,7 @@ class _Joined:
             ids=tuple(self.index), ground=ground, roles=np.array(roles, dtype="<U7"),
             sigma_ground=np.array([[one.get("sigma_xy", 0.0)] * 2 + [one.get("sigma_h", 0.0)] for one in said]),
             crs=crs, images=images, point=point, image=image, measured=measured,
-            sigma_image=np.array([DEFAULT_SIGMA_IMAGE if row.sigma_image is None else row.sigma_image for row in rows]),
+            sigma_image=sigmas_of(rows, DEFAULT_SIGMA_IMAGE),
             source=os.fspath(path),
         )  # fmt: skip
 

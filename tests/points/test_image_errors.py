@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ortho_pipeline.block.points import read_block_points
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.points import Points, read_points, write_points
 
@@ -203,3 +204,13 @@ def test_a_piece_with_larger_pixels_has_larger_errors(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.covariance_image[1:], 16 * points.covariance_image[1:], rtol=1e-14)
     np.testing.assert_allclose(found.sigma_image[1:], 4 * points.sigma_image[1:], rtol=1e-14)
     assert found.groups.tolist() == points.groups.tolist()
+
+
+def test_a_block_takes_the_scalar_of_a_covariance(tmp_path: Path) -> None:
+    path = tmp_path / "rays.csv"
+    path.write_text(
+        "id,image,col,row,x,y,h,sigma_image,var_col,var_row,cov_col_row,group\n"
+        "a,one.tif,1,2,24,-33,100,,0.5,0.25,-0.1,7\nb,one.tif,3,2,24,-33.1,100,0.3,,,,\n"
+    )
+    points = read_block_points(path, crs="EPSG:4326", vertical="ellipsoid")
+    assert points.sigma_image == pytest.approx([np.sqrt(0.375), 0.3])
