@@ -8,7 +8,7 @@ from ortho_pipeline.files.compiled import compiled, inlined
 
 
 @inlined
-def _clearance(u, v, t, heights, left, top, middle, half):
+def clearance(u, v, t, heights, left, top, middle, half):
     """Height of the ray above the terrain at the normalised height t; NaN off the DEM and beside a void.
 
     `u` and `v` are polynomials of five coefficients in t.
@@ -54,10 +54,10 @@ def march(image, nodes, origin, spacing, heights, left, top, middle, half, toler
         if not length < 1e5:
             continue
         steps = int(length) + 1
-        high, above = 1.0, _clearance(u, v, 1.0, heights, left, top, middle, half)
+        high, above = 1.0, clearance(u, v, 1.0, heights, left, top, middle, half)
         for step in range(1, steps + 1):
             low = 1.0 - 2.0 * step / steps
-            below = _clearance(u, v, low, heights, left, top, middle, half)
+            below = clearance(u, v, low, heights, left, top, middle, half)
             if below <= 0.0:
                 break
             high, above = low, below
@@ -65,7 +65,7 @@ def march(image, nodes, origin, spacing, heights, left, top, middle, half, toler
             continue
         for turn in range(60):
             t = 0.5 * (high + low) if turn % 3 == 2 else high - above * (low - high) / (below - above)
-            miss = _clearance(u, v, t, heights, left, top, middle, half)
+            miss = clearance(u, v, t, heights, left, top, middle, half)
             if abs(miss) <= tolerance:
                 found[k] = middle + half * t
                 break

@@ -1,0 +1,20 @@
+"""Matching: control points from a reference orthoimage, tie points between scenes, without a hand.
+
+Imports `surface` and what is below; a sensor model is only asked where it puts things.
+"""
+
+from ortho_pipeline.imaging.matching.chips import View
+from ortho_pipeline.imaging.matching.matcher import REASONS, Matches, MatchSettings, match
+from ortho_pipeline.imaging.matching.targets import OtherScene, Reference, Target, open_references
+
+__all__ = [
+    "REASONS",
+    "MatchSettings",
+    "Matches",
+    "OtherScene",
+    "Reference",
+    "Target",
+    "View",
+    "match",
+    "open_references",
+]

@@ -1,0 +1,102 @@
+"""Where to look: the cells of a scene, and in each the place with the most structure in two directions.
+
+Source: Foerstner and Guelch 1987 (interest operator: the smaller eigenvalue of the structure tensor).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ortho_pipeline.imaging.matching.chips import View
+from ortho_pipeline.models.base import Array
+
+#: Largest window (chip px) that is looked at in a cell: so the cost does not depend on the size of the scene.
+_WINDOW = 128
+#: Share of saturated pixels in a chip above which it is taken for a cloud or a roof in the sun.
+_SATURATED = 0.2
+#: Parts of the border that are left free (chip px).
+_RIM = 2
+
+
+def cells_of(width: int, height: int, count: int) -> tuple[int, int]:
+    """Return columns and rows of a grid of about `count` cells that are nearly squares."""
+    columns = max(1, round(math.sqrt(count * width / height)))
+    return columns, max(1, round(count / columns))
+
+
+def candidates(
+    view: View, cells: tuple[int, int], size: int, factor: int, inside: NDArray[np.bool_]
+) -> tuple[NDArray[np.int_], NDArray[np.int_], Array]:
+    """Return first pixels ``(n, 2)`` of chips, their cells ``(n,)``, and their structure ``(n,)``, one of each cell.
+
+    Parameters
+    ----------
+    cells : (int, int)
+        Columns and rows of the grid.
+    size, factor : int
+        A chip has `size` x `size` means of `factor` x `factor` pixels.
+    inside : (rows, columns) of bool
+        Cells that are looked at.
+    """
+    width, height = view.size
+    found = []
+    for number in np.flatnonzero(inside.ravel()).tolist():
+        row, column = divmod(number, cells[0])
+        left, right = width * column / cells[0], width * (column + 1) / cells[0]
+        top, bottom = height * row / cells[1], height * (row + 1) / cells[1]
+        place = _best(view, (left, top, right, bottom), size, factor)
+        if place is not None:
+            found.append((*place[0], number, place[1]))
+    table = np.array(found, dtype=float).reshape(-1, 4)
+    return table[:, :2].astype(int), table[:, 2].astype(int), table[:, 3]
+
+
+def _best(
+    view: View, cell: tuple[float, float, float, float], size: int, factor: int
+) -> tuple[tuple[int, int], float] | None:
+    """Return the first pixel of the chip with the most structure whose centre lies in a cell, and that structure."""
+    width, height = view.size
+    middle = (cell[0] + cell[2]) / 2, (cell[1] + cell[3]) / 2
+    # Centres of chips: within the cell, and not so near to the border that a chip does not fit.
+    reach = [
+        min((last - first) / 2, (_WINDOW - size) / 2 * factor)
+        for first, last in ((cell[0], cell[2]), (cell[1], cell[3]))
+    ]
+    half = (size / 2 + _RIM) * factor
+    low = [max(centre - part, half) for centre, part in zip(middle, reach, strict=True)]
+    high = [min(centre + part, extent - half) for centre, part, extent in zip(middle, reach, view.size, strict=True)]
+    if low[0] > high[0] + 1 or low[1] > high[1] + 1:
+        return None
+    left, top = (int(value - size / 2 * factor) for value in low)
+    columns, rows = (int((last - first) // factor) + size for first, last in zip(low, high, strict=True))
+    columns, rows = min(columns, (width - left) // factor), min(rows, (height - top) // factor)
+    if columns < size or rows < size:
+        return None
+    pixels = view.intensity.read(left, top, columns, rows, factor)
+    value = _structure(pixels, size, view.intensity.saturated)
+    if not np.isfinite(value).any():
+        return None
+    j, i = np.unravel_index(int(np.nanargmax(value)), value.shape)
+    return (left + int(i) * factor, top + int(j) * factor), float(value[j, i])
+
+
+def _structure(pixels: NDArray[np.float32], size: int, saturated: float) -> Array:
+    """Return the smaller eigenvalue of the mean structure tensor of each chip; NaN where a pixel of it is not valid."""
+    valid = np.isfinite(pixels)
+    filled = np.where(valid, pixels, 0.0).astype(float)
+    down, across = np.gradient(ndimage.gaussian_filter(filled, 1.0))
+
+    def mean(values: Array) -> Array:
+        whole = ndimage.uniform_filter(values, size, mode="constant", origin=0)
+        first = size // 2
+        return whole[first : first + values.shape[0] - size + 1, first : first + values.shape[1] - size + 1]
+
+    xx, yy, xy = mean(across**2), mean(down**2), mean(across * down)
+    value = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
+    whole = mean(valid.astype(float)) > 1 - 0.5 / size**2
+    bright = mean((filled >= saturated).astype(float)) > _SATURATED
+    return np.where(whole & ~bright & (value > 0), value, np.nan)

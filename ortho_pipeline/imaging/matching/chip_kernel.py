@@ -1,0 +1,104 @@
+"""Compiled rendering of chips: where the pixels of one image fall in another one, and what is there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ortho_pipeline.files.compiled import compiled
+from ortho_pipeline.surface.ray_kernel import clearance
+
+#: Powers of height in the polynomials of a node, as `surface.ray_kernel` has them.
+LEVELS = 5
+
+
+@compiled
+def positions(nodes, heights, left, top, middle, half, tolerance, out):
+    """Fill `out` ``(rows, columns, 2)`` with the target's coordinates of a chip's pixels; NaN where nothing is seen.
+
+    `nodes` ``(m, m, 5, 4)`` are, at a lattice over the chip, polynomials in normalised height of the DEM's sample
+    coordinates (u, v) and of the target's (column, row). The ray of each pixel is followed from above to its first
+    intersection with the `heights`, whose first sample is (`left`, `top`).
+    """
+    rows, columns = out.shape[:2]
+    last = nodes.shape[0] - 1
+    u, v, s, t = np.empty(LEVELS), np.empty(LEVELS), np.empty(LEVELS), np.empty(LEVELS)
+    for row in range(rows):
+        y = (row + 0.5) / rows * last
+        j = min(int(y), last - 1)
+        fy = y - j
+        for column in range(columns):
+            out[row, column, 0] = out[row, column, 1] = np.nan
+            x = (column + 0.5) / columns * last
+            i = min(int(x), last - 1)
+            fx = x - i
+            w00, w10, w01, w11 = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
+            for k in range(LEVELS):
+                a, b, c, d = nodes[j, i, k], nodes[j, i + 1, k], nodes[j + 1, i, k], nodes[j + 1, i + 1, k]
+                u[k] = w00 * a[0] + w10 * b[0] + w01 * c[0] + w11 * d[0]
+                v[k] = w00 * a[1] + w10 * b[1] + w01 * c[1] + w11 * d[1]
+                s[k] = w00 * a[2] + w10 * b[2] + w01 * c[2] + w11 * d[2]
+                t[k] = w00 * a[3] + w10 * b[3] + w01 * c[3] + w11 * d[3]
+            length = 2.0 * np.hypot(u[1] + u[3], v[1] + v[3])
+            if not length < 1e5:
+                continue
+            steps = int(length) + 1
+            high, above = 1.0, clearance(u, v, 1.0, heights, left, top, middle, half)
+            low, below = high, above
+            for step in range(1, steps + 1):
+                low = 1.0 - 2.0 * step / steps
+                below = clearance(u, v, low, heights, left, top, middle, half)
+                if below <= 0.0:
+                    break
+                high, above = low, below
+            if not (below <= 0.0 and above > 0.0):
+                continue
+            for turn in range(40):
+                z = 0.5 * (high + low) if turn % 3 == 2 else high - above * (low - high) / (below - above)
+                miss = clearance(u, v, z, heights, left, top, middle, half)
+                if abs(miss) <= tolerance:
+                    out[row, column, 0] = s[0] + z * (s[1] + z * (s[2] + z * (s[3] + z * s[4])))
+                    out[row, column, 1] = t[0] + z * (t[1] + z * (t[2] + z * (t[3] + z * t[4])))
+                    break
+                if miss > 0.0:
+                    high, above = z, miss
+                elif miss <= 0.0:
+                    low, below = z, miss
+                else:
+                    break
+
+
+@compiled
+def sample(pixels, left, top, factor, places, out):
+    """Fill `out` ``(rows, columns)`` with intensities at `places` ``(rows, columns, 2)``, by cubic convolution.
+
+    `pixels` are means of `factor` x `factor` pixels of the target from the pixel (`left`, `top`) on. NaN beside what
+    is not valid: an interpolation from fewer pixels would move an edge.
+    """
+    height, width = pixels.shape
+    wx, wy = np.empty(4), np.empty(4)
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            out[row, column] = np.nan
+            x = (places[row, column, 0] - left) / factor - 0.5
+            y = (places[row, column, 1] - top) / factor - 0.5
+            if not (1.0 <= x < width - 2 and 1.0 <= y < height - 2):
+                continue
+            i, j = int(x), int(y)
+            _cubic(x - i, wx)
+            _cubic(y - j, wy)
+            total = 0.0
+            for n in range(4):
+                line = 0.0
+                for m in range(4):
+                    line += wx[m] * pixels[j - 1 + n, i - 1 + m]
+                total += wy[n] * line
+            out[row, column] = total
+
+
+@compiled
+def _cubic(f, weights):
+    """Fill the four weights of cubic convolution (Keys 1981, a = -1/2) at the fraction `f`."""
+    weights[0] = ((-0.5 * f + 1.0) * f - 0.5) * f
+    weights[1] = (1.5 * f - 2.5) * f * f + 1.0
+    weights[2] = ((-1.5 * f + 2.0) * f + 0.5) * f
+    weights[3] = (0.5 * f - 0.5) * f * f

@@ -1,0 +1,212 @@
+"""Chips: small windows of a scene, and what a target shows there, rendered into the geometry of the scene.
+
+The target is brought into the scene's own pixels through model and surface, so that both chips differ by a shift and
+by nothing else: no rotation, no scale, no relief displacement. A chip has a lattice of its own that gives, as
+polynomials in height, positions in the DEM and in the target; compiled code follows the ray of each pixel. So the cost
+does not depend on the sensor model.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_pipeline.errors import CoverageError
+from ortho_pipeline.imaging.matching import chip_kernel
+from ortho_pipeline.imaging.matching.targets import Target
+from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.raster.intensity import EXACT, Intensity
+from ortho_pipeline.surface.base import Surface
+
+Pixels = NDArray[np.float32]
+#: Nodes per side of a chip's lattice, tried until it is this exact (pixels of the target).
+_NODES, _EXACT = (3, 5, 9, 17), 0.01
+#: Rays meet the surface within this height (m): a hundredth of a pixel where a metre moves a third of one.
+_TOLERANCE = 0.03
+#: Larger windows of a target or a DEM than this are not read for one chip: its model leads far away.
+_LARGEST = 64_000_000
+#: Chips whose lattice is held against the model.
+_PROBED = 24
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A scene as a matcher sees it.
+
+    Parameters
+    ----------
+    intensity : Intensity
+    model : SensorModel
+    surface : Surface
+    """
+
+    intensity: Intensity
+    model: SensorModel
+    surface: Surface
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Columns and rows."""
+        return self.intensity.width, self.intensity.height
+
+
+def scene_chips(view: View, origins: NDArray[np.int_], size: int, factor: int) -> Pixels:
+    """Return intensities ``(n, size, size)`` of chips of `size` means of `factor` x `factor` pixels.
+
+    Parameters
+    ----------
+    origins : (n, 2)
+        Column and row of their first pixels.
+    """
+    read = [view.intensity.read(int(column), int(row), size, size, factor) for column, row in origins]
+    return np.array(read, dtype=np.float32).reshape(len(origins), size, size)
+
+
+def resolution_ratio(view: View, target: Target, image: Array) -> Array:
+    """Return pixels of the target per pixel of the scene ``(n,)`` at image points; NaN where it shows nothing."""
+    heights = np.full(len(image), view.model.reference_height)
+    around = [
+        target.project(view.model.image_to_ground(image + step, heights), view.model.crs)
+        for step in ((0.0, 0.0), (8.0, 0.0), (0.0, 8.0))
+    ]
+    across, down = (around[1] - around[0]) / 8, (around[2] - around[0]) / 8
+    return np.sqrt(np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]))
+
+
+def rendered_chips(view: View, target: Target, origins: NDArray[np.int_], size: int, factor: int) -> Pixels:
+    """Return what the target shows at chips of the scene ``(n, size, size)``; NaN where it shows nothing."""
+    out = np.full((len(origins), size, size), np.nan, dtype=np.float32)
+    if not len(origins):
+        return out
+    nodes = _Nodes(view, target, np.asarray(origins, dtype=float), size * factor)
+    places = np.empty((size, size, 2))
+    for k in nodes.seen:
+        left, top, right, bottom = nodes.windows[k]
+        if (right - left) * (bottom - top) > _LARGEST:
+            continue
+        heights = view.surface.window(left, top, right - left, bottom - top)
+        chip_kernel.positions(
+            nodes.coefficients[k], heights, left, top, nodes.middle[k], nodes.half[k], _TOLERANCE, places
+        )  # fmt: skip
+        _read(target, places, out[k])
+    return out
+
+
+def _read(target: Target, places: Array, out: Pixels) -> None:
+    """Fill `out` with the intensities of a target at places ``(rows, columns, 2)``."""
+    finite = places[np.isfinite(places).all(axis=2)]
+    if len(finite) < 4:
+        return
+    low, high = np.floor(finite.min(axis=0)), np.ceil(finite.max(axis=0))
+    size = target.intensity.width, target.intensity.height
+    if (high < 0).any() or low[0] > size[0] or low[1] > size[1]:
+        return
+    # Pixels of the target in one of the chip: more than one are averaged, or detail would appear as false structure.
+    steps = [np.abs(np.diff(places, axis=axis)).sum(axis=2) for axis in (0, 1)]
+    step = math.sqrt(float(np.nanmedian(steps[0])) * float(np.nanmedian(steps[1])))
+    factor = max(1, round(step)) if math.isfinite(step) else 1
+    left, top = (int(value) - 3 * factor for value in low)
+    columns, rows = (math.ceil((last - first) / factor) + 7 for first, last in zip(low, high, strict=True))
+    if columns * rows * min(factor, EXACT) ** 2 > _LARGEST:
+        return
+    pixels = target.intensity.read(left, top, columns, rows, factor)
+    chip_kernel.sample(pixels, float(left), float(top), float(factor), places, out)
+
+
+class _Nodes:
+    """The lattices of chips: `coefficients` ``(n, m, m, 5, 4)``, the windows of the DEM, and their heights."""
+
+    def __init__(self, view: View, target: Target, origins: Array, extent: int) -> None:
+        self._view, self._target, self._origins, self._extent = view, target, origins, extent
+        self._sampler = view.surface.sampler(view.model.crs)
+        count = len(origins)
+        self.windows: list[tuple[int, int, int, int]] = [(0, 0, 0, 0)] * count
+        self.middle, self.half = np.zeros(count), np.ones(count)
+        self.seen = self._heights()
+        self.coefficients = np.zeros((count, _NODES[0], _NODES[0], chip_kernel.LEVELS, 4))
+        for nodes in _NODES:
+            self.coefficients = self._evaluate(np.arange(count), nodes)
+            if self._error(nodes) <= _EXACT:
+                break
+        finite = np.atleast_1d(np.isfinite(self.coefficients).all(axis=(1, 2, 3, 4)))
+        self.seen = [k for k in self.seen if finite[k]]
+
+    def _heights(self) -> list[int]:
+        """Find the heights that the rays of each chip may meet; return the chips that meet any."""
+        model, surface = self._view.model, self._view.surface
+        low, high = (np.full(len(self._origins), value) for value in model.height_range)
+        limits = model.height_limits
+        corners = self._origins[:, None] + self._extent * np.array([(0, 0), (1, 0), (0, 1), (1, 1)], dtype=float)
+        left = np.arange(len(self._origins))
+        found: list[int] = []
+        for turn in range(4):
+            samples = self._samples(corners[left], low[left], high[left])
+            again = []
+            for k, part in zip(left.tolist(), samples, strict=True):
+                window = surface.window_under(part)
+                if window is None or (window[2] - window[0]) * (window[3] - window[1]) > _LARGEST:
+                    continue
+                try:
+                    lowest, highest = surface.range_within(
+                        window[0], window[1], window[2] - window[0], window[3] - window[1]
+                    )
+                except CoverageError:
+                    continue
+                narrow = max(lowest - 1.0, limits[0]), min(highest + 1.0, limits[1])
+                if not narrow[0] < narrow[1]:
+                    continue
+                inside = low[k] <= narrow[0] and narrow[1] <= high[k]
+                self.windows[k] = window
+                # Once more between the heights that are there: their window is smaller, and polynomials are better.
+                low[k], high[k] = narrow if inside else (min(low[k], narrow[0]), max(high[k], narrow[1]))
+                if inside and turn:
+                    found.append(k)
+                else:
+                    again.append(k)
+            left = np.array(again, dtype=int)
+            if not len(left):
+                break
+        self.middle, self.half = (low + high) / 2, (high - low) / 2
+        return sorted(found)
+
+    def _samples(self, corners: Array, low: Array, high: Array) -> Array:
+        """Return DEM sample coordinates ``(n, 8, 2)`` of corners ``(n, 4, 2)`` at two heights."""
+        image = np.concatenate([corners, corners], axis=1).reshape(-1, 2)
+        heights = np.concatenate([np.repeat(low[:, None], 4, 1), np.repeat(high[:, None], 4, 1)], axis=1).ravel()
+        ground = self._view.model.image_to_ground(image, heights)
+        return np.asarray(self._sampler(ground)).reshape(-1, 8, 2)
+
+    def _evaluate(self, chips: NDArray[np.int_], nodes: int) -> Array:
+        levels = -np.cos(np.pi * np.arange(chip_kernel.LEVELS) / (chip_kernel.LEVELS - 1))
+        steps = np.linspace(0.0, self._extent, nodes)
+        columns, rows = np.meshgrid(steps, steps)
+        offsets = np.stack([columns, rows], axis=-1)
+        image = self._origins[chips][:, None, None] + offsets
+        image = np.broadcast_to(image[:, :, :, None], (*image.shape[:3], len(levels), 2))
+        heights = self.middle[chips][:, None] + self.half[chips][:, None] * levels
+        heights = np.broadcast_to(heights[:, None, None], image.shape[:4])
+        values = self._exact(image.reshape(-1, 2), heights.ravel()).reshape(*image.shape[:4], 4)
+        polynomial = np.linalg.inv(np.vander(levels, increasing=True))
+        return np.ascontiguousarray(np.einsum("kl,nijla->nijka", polynomial, values))
+
+    def _exact(self, image: Array, heights: Array) -> Array:
+        """Return positions in DEM and target ``(N, 4)`` of image points at heights."""
+        ground = self._view.model.image_to_ground(image, heights)
+        return np.column_stack([self._sampler(ground), self._target.project(ground, self._view.model.crs)])
+
+    def _error(self, nodes: int) -> float:
+        """Return the largest error of positions in the target (px) between the nodes of some chips."""
+        if not self.seen:
+            return 0.0
+        chips = np.array(self.seen)[np.linspace(0, len(self.seen) - 1, min(_PROBED, len(self.seen))).astype(int)]
+        cell = self._extent / (nodes - 1)
+        image = self._origins[chips] + cell * 0.5
+        heights = self.middle[chips] + 0.7 * self.half[chips]
+        found = self.coefficients[chips][:, :2, :2].mean(axis=(1, 2))
+        powers = 0.7 ** np.arange(chip_kernel.LEVELS)
+        error = np.abs(np.einsum("k,nka->na", powers, found) - self._exact(image, heights))[:, 2:]
+        error = error[np.isfinite(error).all(axis=1)]
+        return float(error.max(initial=0.0))

@@ -1,0 +1,414 @@
+"""Control points without hands: a scene is matched with targets, and the matches become points with covariances."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_pipeline.errors import InputError, TooFewPoints, counted
+from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
+from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
+from ortho_pipeline.imaging.matching.chips import View, resolution_ratio, scene_chips
+from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
+from ortho_pipeline.imaging.matching.least_squares import measure
+from ortho_pipeline.imaging.matching.search import Level, agreed, best_rendered, place
+from ortho_pipeline.imaging.matching.targets import Target
+from ortho_pipeline.imaging.matching.weights import Components, components
+from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.points import Points
+from ortho_pipeline.surface.rays import intersect
+
+#: Side of a chip (chip px), and radius of the last search about the corrected model.
+SIDE, _RADIUS = 40, 4
+#: A second peak of more than this part of the first: the place is not unique.
+_UNIQUE = 0.85
+#: Correlation of orientations below which a match could as well be noise.
+_LEAST_SCORE = 0.25
+#: Forward and backward match differ by less than this (chip px).
+_BACK = 0.7
+#: A match within so many chip px of the correction that most agree on belongs to them; and within so many sigmas.
+_NEAR, _SIGMAS = 2.5, 3.5
+#: Part of a chip that the target shows at least.
+_SEEN = 0.8
+#: Resolutions of scene and target differ by at most this factor.
+_RATIO = 8.0
+#: Points per side at which it is asked what a target shows of the scene.
+_SAMPLES = 32
+#: Rounds of rendering and measuring; the last is the one whose correction moves by less than this (px).
+_ROUNDS, _STANDS = 3, 0.02
+#: Radius (chip px) of what is rendered to measure in, and rounds of judging.
+_MEASURED, _JUDGED = 4, 6
+#: Fewer matches than this are no control.
+FEWEST = 12
+#: Chips that are worked on together.
+_BATCH = 32
+#: Why a match was not kept, in words.
+REASONS = {
+    "hidden": "the target shows too little of the chip",
+    "weak": "the chips do not look alike",
+    "ambiguous": "a second place fits nearly as well",
+    "backward": "the match back leads elsewhere",
+    "not measured": "least-squares matching did not converge",
+    "contradicts": "contradicts the other matches",
+}
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """What a user may choose.
+
+    Parameters
+    ----------
+    search : float
+        How far (m on the ground) the model may be off.
+    points : int
+        About how many are wanted.
+    dem_sigma : float
+        Standard deviation (m) of the DEM's heights.
+    reference_sigma : float
+        Standard deviation (m) per axis of the reference's own places.
+    threads : int
+    """
+
+    search: float
+    points: int = 500
+    dem_sigma: float = 0.0
+    reference_sigma: float = 0.0
+    threads: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """All that was tried, in image order.
+
+    Parameters
+    ----------
+    image : (n, 2)
+        Centre of the scene's chip, px.
+    offset : (n, 2)
+        Where the model as delivered puts the same ground, minus `image`; NaN where nothing was measured.
+    score : (n,)
+        Correlation of the chips after matching, -1 to 1.
+    reason : (n,) of str
+        Why it was not kept, a key of `REASONS`; empty if it was.
+    cell : (n,)
+        The cell of the scene that it lies in.
+    scene, target : (n, s, s)
+        The chips as they were compared.
+    factor : int
+        Pixels of the scene in a chip pixel.
+    levels : tuple of Level
+        How the search went.
+    components : Components
+        What the covariances are made of.
+    points : Points
+        The matches that were kept, with covariances and groups.
+    """
+
+    image: Array
+    offset: Array
+    score: Array
+    reason: NDArray[np.str_]
+    cell: NDArray[np.int_]
+    scene: NDArray[np.float32]
+    target: NDArray[np.float32]
+    factor: int
+    levels: tuple[Level, ...]
+    components: Components
+    points: Points
+
+
+def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Matches:
+    """Match a scene with targets.
+
+    Raises
+    ------
+    InputError
+        If there is no overlap, no place stands out, or what was found could be an accident; with the reason.
+    """
+    shown = _shown(view, targets)
+    base = _base(view, targets, shown)
+    reach = max(settings.search / metres_per_pixel(view), 2.0 * base)
+    correction, levels = place(view, targets, reach, base)
+    share = len(shown) / _SAMPLES**2
+    grid = cells_of(*view.size, min(round(settings.points / share), 20 * settings.points))
+    origins, cells, _ = candidates(view, grid, SIDE, base, _cells_shown(view, targets, grid))
+    tried = _Tried(view, targets, origins, cells, base, settings.threads)
+    tried.search(correction)
+    for _ in range(_ROUNDS):
+        correction = tried.agreed(correction)
+        tried.measure(correction)
+        if tried.moved(correction) < _STANDS:
+            break
+    tried.judge(targets)
+    return tried.matches(settings, tuple(levels))
+
+
+def _shown(view: View, targets: Sequence[Target]) -> Array:
+    """Return those of points ``(n, 2)`` spread over the scene that a target shows, as the model has it.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    columns, rows = np.meshgrid(steps * view.size[0], steps * view.size[1])
+    image = np.column_stack([columns.ravel(), rows.ravel()])
+    inside = _inside(view, targets, image)
+    if inside.sum() < _SAMPLES:
+        raise InputError(
+            f"the reference shows {'nothing' if not inside.any() else 'next to nothing'} of the scene",
+            file=targets[0].path, field="match.reference",
+            remedy="give a reference of this place; if it is, the model of the scene leads elsewhere (`ortho info`)",
+        )  # fmt: skip
+    return image[inside]
+
+
+def _inside(view: View, targets: Sequence[Target], image: Array) -> NDArray[np.bool_]:
+    """Tell which image points ``(n,)`` fall into a target."""
+    ground = intersect(view.model, image, view.surface)
+    # Where the model is off, the surface may end too soon: its reference height stands in.
+    lost = np.isnan(ground).any(axis=1)
+    ground[lost] = view.model.image_to_ground(image[lost], view.model.reference_height)
+    found = np.zeros(len(image), dtype=bool)
+    for target in targets:
+        places = target.project(ground, view.model.crs)
+        with np.errstate(invalid="ignore"):
+            found |= ((places >= 0) & (places <= (target.intensity.width, target.intensity.height))).all(axis=1)
+    return found
+
+
+def _cells_shown(view: View, targets: Sequence[Target], grid: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return the cells ``(rows, columns)`` whose centre a target shows."""
+    columns, rows = np.meshgrid(
+        (np.arange(grid[0]) + 0.5) / grid[0] * view.size[0], (np.arange(grid[1]) + 0.5) / grid[1] * view.size[1]
+    )
+    return _inside(view, targets, np.column_stack([columns.ravel(), rows.ravel()])).reshape(rows.shape)
+
+
+def _base(view: View, targets: Sequence[Target], shown: Array) -> int:
+    """Return how many pixels of the scene are as large as one of the target, at least 1.
+
+    Raises
+    ------
+    InputError
+        If the resolutions are too different to be compared.
+    """
+    ratios = np.concatenate([resolution_ratio(view, target, shown) for target in targets])
+    ratio = float(np.nanmedian(ratios))
+    if not 1 / _RATIO <= ratio <= _RATIO:
+        raise InputError(
+            f"a pixel of the scene is {ratio:.3g} pixels of the reference", file=targets[0].path,
+            field="match.reference", remedy=f"give a reference of a resolution within 1/{_RATIO:.0f} to {_RATIO:.0f} "
+            "times that of the scene",
+        )  # fmt: skip
+    return max(1, round(1 / ratio))
+
+
+def metres_per_pixel(view: View) -> float:
+    """Return the size (m) of a pixel on the ground in the middle of the scene."""
+    middle = np.array(view.size) / 2
+    image = middle + np.array([(0.0, 0.0), (8.0, 0.0), (0.0, 8.0)])
+    ground = view.model.image_to_ground(image, view.model.reference_height)
+    placed = ground_transform(view.model.crs, "EPSG:4978")(ground)
+    across, down = placed[1] - placed[0], placed[2] - placed[0]
+    return math.sqrt(float(np.linalg.norm(np.cross(across, down)))) / 8
+
+
+class _Tried:
+    """The chips that are tried, and how far each has come."""
+
+    def __init__(
+        self, view: View, targets: Sequence[Target], origins: NDArray[np.int_], cells: NDArray[np.int_], factor: int,
+        threads: int,
+    ) -> None:  # fmt: skip
+        self.view, self.targets, self.origins, self.cells, self.factor = view, targets, origins, cells, factor
+        self.threads = threads
+        count = len(origins)
+        self.centres = origins + SIDE * factor / 2
+        self.scene = scene_chips(view, origins, SIDE, factor)
+        self.target = np.full_like(self.scene, np.nan)
+        self.reason = np.full(count, "hidden", dtype="<U12")
+        self.score = np.zeros(count)
+        self.offset = np.full((count, 2), np.nan)  # px, against the correction of the last step
+        self.covariance = np.full((count, 2, 2), np.nan)
+        self.ground = np.full((count, 3), np.nan)
+
+    def _rendered(self, correction: SensorModel, index: NDArray[np.int_], radius: int) -> NDArray[np.float32]:
+        seen = View(self.view.intensity, correction, self.view.surface)
+        return best_rendered(
+            seen, self.targets, self.origins[index] - radius * self.factor, SIDE + 2 * radius, self.factor
+        )  # fmt: skip
+
+    def _in_batches(self, work: Callable[[NDArray[np.int_]], None], index: NDArray[np.int_]) -> None:
+        batches = [index[first : first + _BATCH] for first in range(0, len(index), _BATCH)]
+        with ThreadPoolExecutor(self.threads) as pool:
+            list(pool.map(work, batches))
+
+    def search(self, correction: SensorModel) -> None:
+        """Find each chip to a chip px about where the correction puts it."""
+
+        def work(index: NDArray[np.int_]) -> None:
+            wide = self._rendered(correction, index, 2 * _RADIUS)
+            inner = wide[:, _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
+            fields = orientation(self.scene[index]), orientation(wide)
+            found = peaks(surfaces(fields[0], fields[1][:, _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]))
+            back = self._backward(correction, index, wide, found.shift)
+            self.score[index] = found.score
+            self.offset[index] = found.shift * self.factor
+            seen = np.isfinite(inner).mean(axis=(1, 2)) >= _SEEN
+            for name, passed in (
+                ("backward", back <= _BACK),
+                ("ambiguous", found.inside & (found.ratio <= _UNIQUE)),
+                ("weak", found.score >= _LEAST_SCORE),
+                ("hidden", seen),
+            ):
+                self.reason[index[~passed]] = name
+            passed = seen & (found.score >= _LEAST_SCORE) & found.inside & (found.ratio <= _UNIQUE) & (back <= _BACK)
+            self.reason[index[passed]] = ""
+
+        self._in_batches(work, np.arange(len(self.origins)))
+
+    def _backward(
+        self, correction: SensorModel, index: NDArray[np.int_], wide: NDArray[np.float32], shift: Array
+    ) -> Array:
+        """Return how far (chip px) from where it began the way back from the target ends ``(n,)``."""
+        whole = np.clip(np.round(shift), -_RADIUS, _RADIUS).astype(int)
+        start = 2 * _RADIUS + whole
+        there = np.stack([
+            chip[row : row + SIDE, column : column + SIDE] for chip, (column, row) in zip(wide, start, strict=True)
+        ])  # fmt: skip
+        around = scene_chips(self.view, self.origins[index] - _RADIUS * self.factor, SIDE + 2 * _RADIUS, self.factor)
+        found = peaks(surfaces(orientation(there), orientation(around)))
+        return np.hypot(*(found.shift + (shift - whole)).T)
+
+    def agreed(self, correction: ImageCorrection) -> ImageCorrection:
+        """Return the correction that most offsets agree on; the others are of no use any more."""
+        good = np.flatnonzero(self.reason == "")
+        if len(good) < FEWEST:
+            raise self._too_few()
+        better, agreeing = agreed(
+            correction, self.centres[good], self.offset[good], self.score[good], _NEAR * self.factor
+        )  # fmt: skip
+        self.reason[good[~agreeing]] = "contradicts"
+        step = better.ground_to_image(self._some(correction, good)) - correction.ground_to_image(
+            self._some(correction, good)
+        )
+        self.offset[good] += step
+        return better
+
+    def _some(self, correction: SensorModel, index: NDArray[np.int_]) -> Array:
+        return correction.image_to_ground(self.centres[index], self.view.model.reference_height)
+
+    def measure(self, correction: SensorModel) -> None:
+        """Measure each chip that is still of use to a part of a pixel, rendered anew where the correction puts it."""
+
+        def work(index: NDArray[np.int_]) -> None:
+            radius = _MEASURED
+            wide = self._rendered(correction, index, radius)
+            start = np.nan_to_num(self.offset[index] / self.factor)
+            start = np.where(np.abs(start) < radius - 2, start, 0.0)
+            found = measure(self.scene[index], wide, start)
+            self.target[index] = wide[:, radius:-radius, radius:-radius]
+            self.offset[index] = found.shift * self.factor
+            self.covariance[index] = found.covariance * self.factor**2
+            self.score[index] = found.correlation
+            bad = ~np.isfinite(found.shift).all(axis=1)
+            self.reason[index[bad]] = "not measured"
+
+        good = np.flatnonzero(self.reason == "")
+        self._in_batches(work, good)
+        good = np.flatnonzero(self.reason == "")
+        self.ground[good] = intersect(correction, self.centres[good] + self.offset[good], self.view.surface)
+        self.reason[good[np.isnan(self.ground[good]).any(axis=1)]] = "hidden"
+
+    def moved(self, correction: SensorModel) -> float:
+        """Return how far (px) the matches still lie from the correction in the mean."""
+        good = self.reason == ""
+        return float(np.hypot(*np.median(self.offset[good], axis=0))) if good.any() else 0.0
+
+    def judge(self, targets: Sequence[Target]) -> None:
+        """Estimate what the covariances are made of, and leave out what contradicts the others by its own."""
+        origin = np.array(self.view.size) / 2
+        for _ in range(_JUDGED):
+            good = np.flatnonzero(self.reason == "")
+            if len(good) < FEWEST:
+                raise self._too_few()
+            # Of the model as it was delivered: what the user's own correction has to explain.
+            delivered = self.view.model.ground_to_image(self.ground[good])
+            off = delivered - self.centres[good]
+            design = np.column_stack([np.ones(len(good)), (self.centres[good] - origin) / origin.max()])
+            along = self.view.model.ground_partials(self.ground[good])[:, :, 2]
+            self.along = along
+            residuals = off - design @ _robust(design, off)
+            self.components = components(residuals, self.covariance[good], along)
+            total = self.components.covariance(self.covariance[good], along)
+            distance = np.einsum("ni,ni->n", residuals, np.linalg.solve(total, residuals[:, :, None])[:, :, 0])
+            bad = distance > _SIGMAS**2
+            if not bad.any():
+                return
+            self.reason[good[bad]] = "contradicts"
+
+    def _too_few(self) -> InputError:
+        counts = {name: int((self.reason == name).sum()) for name in REASONS}
+        why = ", ".join(f"{count} {REASONS[name]}" for name, count in counts.items() if count)
+        return TooFewPoints(
+            f"{counted(int((self.reason == '').sum()), 'match')} of {len(self.reason)} tried"
+            f"{': ' + why if why else ''}", file=self.targets[0].path, field="match.reference",
+            remedy="give a reference that is more alike (season, resolution), or control points by hand",
+        )  # fmt: skip
+
+    def matches(self, settings: MatchSettings, levels: tuple[Level, ...]) -> Matches:
+        """Return all that was tried, and the points."""
+        good = np.flatnonzero(self.reason == "")
+        along = self.view.model.ground_partials(self.ground[good])[:, :, 2]
+        parts = self.components
+        covariance = parts.covariance(self.covariance[good], along)
+        _, roles = held_out(self.centres[good], self.view.size, len(good))
+        delivered = np.full(self.offset.shape, np.nan)
+        delivered[good] = self.view.model.ground_to_image(self.ground[good]) - self.centres[good]
+        crs = parse_crs(self.view.model.crs)
+        names = ", ".join(os.path.basename(target.path) for target in self.targets)
+        points = Points(
+            ids=tuple(f"m{cell}" for cell in self.cells[good]), image=self.centres[good], ground=self.ground[good],
+            roles=roles, sigma_image=np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2),
+            sigma_ground=np.zeros((len(good), 3)), crs=crs, source=f"matched with {names}",
+        )  # fmt: skip
+        return Matches(
+            self.centres, delivered, self.score, self.reason, self.cells, self.scene, self.target, self.factor,
+            levels, parts, points,
+        )  # fmt: skip
+
+
+def _robust(design: Array, values: Array) -> Array:
+    """Return the coefficients ``(k, 2)`` of a fit that large residuals count little in (Huber's weights)."""
+    weight = np.ones(len(values))
+    found = np.zeros((design.shape[1], 2))
+    for _ in range(15):
+        root = np.sqrt(weight)[:, None]
+        found = np.linalg.lstsq(root * design, root * values, rcond=None)[0]
+        length = np.hypot(*(values - design @ found).T)
+        scale = max(1.2 * float(np.median(length)), 1e-9)
+        weight = np.minimum(1.0, scale / np.maximum(length, 1e-12))
+    return found
+
+
+def held_out(image: Array, size: tuple[int, int], count: int) -> tuple[NDArray[np.int_], NDArray[np.str_]]:
+    """Return the groups ``(n,)`` that points share errors within, and their roles: every fifth cell checks.
+
+    Cells hold some ten points each, so that check points are not the neighbours of control points. Those that check
+    lie a knight's move apart: five of them in any five by five.
+    """
+    columns, rows = cells_of(*size, int(np.clip(count / 10, 10, 100)))
+    column = np.clip((image[:, 0] / size[0] * columns).astype(int), 0, columns - 1)
+    row = np.clip((image[:, 1] / size[1] * rows).astype(int), 0, rows - 1)
+    roles = np.where((column + 2 * row) % 5 == 2, "check", "control")
+    return row * columns + column, roles

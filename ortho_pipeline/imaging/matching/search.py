@@ -1,0 +1,289 @@
+"""The search: how far a model is off, coarse to fine, and whether what was found can be believed.
+
+Coarse chips all over the scene are compared with wide windows of the target. A model is off by much the same
+everywhere, so the mean of all correlation surfaces has one peak, far above what any single chip shows. It is
+believed if
+
+- it is *unique*: over the chips, the correlation there is better than at the best other place by a paired t-test, which
+  stripes, chessboards and rows of equal roofs do not pass;
+- it is *no accident*: at each finer level so many chips agree on a smooth correction that it would happen by chance,
+  over all places searched, once in a million times (binomial test).
+
+Source: Moisan and Stival 2004 (a-contrario consensus).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, stats
+
+from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.imaging.matching.chips import View, rendered_chips, scene_chips
+from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
+from ortho_pipeline.imaging.matching.targets import Target
+from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.models.base import Array
+
+#: Side of a coarse chip (chip px), and the least that is worth a try.
+_SIDE, _LEAST_SIDE = 48, 24
+#: Coarse chips per side of the scene, at most; and at least so many in all.
+_PER_SIDE, _FEWEST = 6, 5
+#: Radii of the coarsest search (chip px).
+_COMFORTABLE, _LARGEST_RADIUS = 40, 160
+#: Radius (chip px) of the searches after the first.
+_NEXT = 4
+#: The mean surface is blurred by so much (chip px): corrections are not the same everywhere.
+_SMEAR = 1.5
+#: Places nearer than this (chip px) are the same peak.
+_APART = 6
+#: Chance at which the best place passes for better than the second best one, and chips for agreeing by accident.
+_UNIQUE, _ACCIDENT = 1e-3, 1e-6
+#: Chips agree within this (chip px).
+_AGREE = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """What one level of the search found.
+
+    Parameters
+    ----------
+    factor : int
+        Pixels of the scene in one of its chips.
+    radius : int
+        Of the search, chip px.
+    chips, agreeing : int
+        Chips that were compared, and those that agree with the correction.
+    shift : (float, float)
+        Column and row (px of the scene) by which the model was off in the mean.
+    """
+
+    factor: int
+    radius: int
+    chips: int
+    agreeing: int
+    shift: tuple[float, float]
+
+
+def place(view: View, targets: Sequence[Target], reach: float, base: int) -> tuple[ImageCorrection, list[Level]]:
+    """Return the model of a view with the correction under which the targets agree with it, to a few chip px.
+
+    Parameters
+    ----------
+    reach : float
+        How far (px of the scene) the model may be off.
+    base : int
+        Pixels of the scene in a chip pixel at the finest level.
+
+    Raises
+    ------
+    InputError
+        If no place within reach stands out, with the reason.
+    """
+    width, height = view.size
+    correction = ImageCorrection.identity(view.model, "affine", (width / 2, height / 2))
+    factor, side, radius = _coarsest(view, reach, base)
+    levels: list[Level] = []
+    first = True
+    while True:
+        corrected = View(view.intensity, correction, view.surface)
+        origins = _spread(view, side, factor)
+        shown = _correlated(corrected, targets, origins, side, factor, radius)
+        if len(shown.centres) < (_FEWEST if first else 3):
+            raise _no_overlap(targets, len(shown.centres))
+        if first:
+            shift = _common(shown, radius, targets, reach, factor)
+            shown = shown.about(shift, min(radius, _NEXT + 2))
+        found = peaks(shown.surface, 2)
+        offsets = shown.start + found.shift
+        correction, agreeing = agreed(correction, shown.centres, offsets * factor, found.score, _AGREE * factor)
+        _refuse_accident(int(agreeing.sum()), len(offsets), min(radius, _NEXT + 2), targets, reach, radius)
+        mean = correction.coefficients[[0, 3]]
+        levels.append(Level(factor, radius, len(offsets), int(agreeing.sum()), (float(mean[0]), float(mean[1]))))
+        if factor <= base:
+            return correction, levels
+        factor, radius, first = max(base, factor // 2), _NEXT, False
+        side = min(_SIDE, min(width, height) // factor)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """Correlation surfaces ``(n, k, k)`` of chips about `centres` (px of the scene); their middle is `start`."""
+
+    centres: Array
+    surface: NDArray[np.float32]
+    start: Array
+
+    def about(self, shift: Array, radius: int) -> _Shown:
+        """Return the part of the surfaces around a shift (whole chip px) that is `radius` wide."""
+        half = (self.surface.shape[1] - 1) // 2
+        column, row = (int(np.clip(round(value) + half, radius, 2 * half - radius)) for value in shift)
+        part = self.surface[:, row - radius : row + radius + 1, column - radius : column + radius + 1]
+        return _Shown(self.centres, part, np.array([column - half, row - half], dtype=float))
+
+
+def _coarsest(view: View, reach: float, base: int) -> tuple[int, int, int]:
+    """Return factor, side and radius of the coarsest level: the largest pixels that still give several chips."""
+    smaller, larger = min(view.size), max(view.size)
+    factor = base
+    while reach / factor > _COMFORTABLE or factor == base:
+        next_factor = factor * 2
+        across, along = smaller // next_factor, larger // next_factor
+        if (across // _LEAST_SIDE) * (along // _LEAST_SIDE) < _FEWEST + 4 or factor >= reach:
+            break
+        factor = next_factor
+    side = max(_LEAST_SIDE, min(_SIDE, smaller // factor // 3))
+    radius = max(_NEXT, math.ceil(reach / factor) + 2)
+    if radius > _LARGEST_RADIUS:
+        raise InputError(
+            f"a search over {reach:.0f} px is too wide for an image of {view.size[0]} x {view.size[1]} px",
+            field="match.search", remedy="search less far, or give control points by hand",
+        )  # fmt: skip
+    return factor, min(side, smaller // factor), radius
+
+
+def _spread(view: View, side: int, factor: int) -> NDArray[np.int_]:
+    """Return first pixels ``(n, 2)`` of chips that are spread over the scene and do not overlap."""
+    places = []
+    for extent in view.size:
+        count = max(1, min(_PER_SIDE, extent // (side * factor)))
+        cell = extent / count
+        places.append([int(cell * (k + 0.5) - side * factor / 2) for k in range(count)])
+    columns, rows = np.meshgrid(*places)
+    return np.column_stack([columns.ravel(), rows.ravel()])
+
+
+def _correlated(
+    view: View, targets: Sequence[Target], origins: NDArray[np.int_], side: int, factor: int, radius: int
+) -> _Shown:
+    """Correlate chips with the targets, each with the first that shows enough there."""
+    wide = side + 2 * radius
+    scene = scene_chips(view, origins, side, factor)
+    shown = best_rendered(view, targets, origins - radius * factor, wide, factor)
+    surface = surfaces(orientation(scene), orientation(shown))
+    known = (surface != 0).mean(axis=(1, 2)) > 0.2
+    centres = origins + side * factor / 2
+    return _Shown(centres[known], surface[known], np.zeros(2))
+
+
+def best_rendered(
+    view: View, targets: Sequence[Target], origins: NDArray[np.int_], side: int, factor: int
+) -> NDArray[np.float32]:
+    """Return what the targets show at chips ``(n, side, side)``: of each chip the first that shows nearly all of it."""
+    shown = np.full((len(origins), side, side), np.nan, dtype=np.float32)
+    share = np.zeros(len(origins))
+    for target in targets:
+        left = np.flatnonzero(share < 0.95)
+        if not len(left):
+            break
+        rendered = rendered_chips(view, target, origins[left], side, factor)
+        seen = np.isfinite(rendered).mean(axis=(1, 2))
+        better = seen > share[left]
+        shown[left[better]], share[left[better]] = rendered[better], seen[better]
+    return shown
+
+
+def _common(shown: _Shown, radius: int, targets: Sequence[Target], reach: float, factor: int) -> Array:
+    """Return the shift (chip px) that stands out in the mean of all surfaces.
+
+    Raises
+    ------
+    InputError
+        If none does.
+    """
+    smooth = ndimage.gaussian_filter(shown.surface, (0, _SMEAR, _SMEAR), mode="nearest")
+    mean = smooth.mean(axis=0)
+    row, column = np.unravel_index(int(mean.argmax()), mean.shape)
+    rows, columns = np.indices(mean.shape)
+    elsewhere = np.maximum(np.abs(rows - row), np.abs(columns - column)) > _APART
+    if not elsewhere.any():
+        return np.array([column - radius, row - radius], dtype=float)
+    second = np.unravel_index(int(np.where(elsewhere, mean, -2.0).argmax()), mean.shape)
+    difference = smooth[:, row, column] - smooth[:, second[0], second[1]]
+    chance = float(stats.ttest_1samp(difference, 0.0, alternative="greater").pvalue)
+    # So many places could have been the highest by accident.
+    places = mean.size / (2 * math.pi * (_SMEAR**2 + 1))
+    if not chance * 1.0 < _UNIQUE:
+        raise InputError(
+            f"no place within {reach:.0f} px stands out: the best of {places:.0f} is no better than another one "
+            f"(correlation {mean[row, column]:.2f} and {mean[second]:.2f} in the mean of "
+            f"{counted(len(shown.centres), 'chip')})",
+            file=targets[0].path, field="match.reference",
+            remedy="check that the reference shows this place, search farther (`match.search`) if the model may be "
+            "off by more, or give control points by hand where the ground is uniform or repeats itself",
+        )  # fmt: skip
+    return np.array([column - radius, row - radius], dtype=float)
+
+
+def agreed(
+    correction: ImageCorrection, centres: Array, offsets: Array, score: Array, tolerance: float
+) -> tuple[ImageCorrection, NDArray[np.bool_]]:
+    """Return a better correction, fitted to most of the offsets ``(n, 2)`` (px), and which of them agree with it.
+
+    A chip at p shows what the model puts at p + offset, so that the model has to put it `offset` earlier.
+    """
+    middle = np.median(offsets, axis=0)
+    agreeing = np.hypot(*(offsets - middle).T) <= 3 * tolerance
+    origin = np.array(correction.origin)
+    design = np.column_stack([np.ones(len(centres)), centres - origin])
+    # Three numbers per axis want many chips all over the scene; with few of them only the mean is believed.
+    slopes = agreeing.sum() >= 12 and np.ptp(centres[agreeing], axis=0).min() > 0
+    design = design if slopes else design[:, :1]
+    fitted = np.broadcast_to(middle, offsets.shape)
+    coefficients = np.zeros((design.shape[1], 2))
+    coefficients[0] = middle
+    for _ in range(10):
+        if agreeing.sum() < design.shape[1] + 1:
+            break
+        weight = np.sqrt(np.maximum(score[agreeing], 0.0))[:, None]
+        coefficients = np.linalg.lstsq(weight * design[agreeing], weight * offsets[agreeing], rcond=None)[0]
+        fitted = design @ coefficients
+        again = np.hypot(*(offsets - fitted).T) <= tolerance
+        if (again == agreeing).all():
+            break
+        agreeing = again
+    agreeing = np.hypot(*(offsets - fitted).T) <= tolerance
+    # corrected(p) = p - offset(p), put after the correction that there is.
+    step = np.zeros(6)
+    step[[0, 3]] = -coefficients[0]
+    if slopes:
+        step[1:3], step[4:6] = -coefficients[1:, 0], -coefficients[1:, 1]
+    return followed_by(correction, step), agreeing
+
+
+def followed_by(correction: ImageCorrection, step: Array) -> ImageCorrection:
+    """Return the affine correction that a second one, of coefficients `step` about the same origin, makes of it."""
+    second = np.eye(2) + step[[1, 2, 4, 5]].reshape(2, 2)
+    matrix = second @ correction.matrix
+    shift = second @ correction.coefficients[[0, 3]] + step[[0, 3]]
+    slopes = (matrix - np.eye(2)).ravel()
+    coefficients = np.array([shift[0], slopes[0], slopes[1], shift[1], slopes[2], slopes[3]])
+    return ImageCorrection(correction.model, "affine", correction.origin, coefficients)
+
+
+def _refuse_accident(
+    agreeing: int, chips: int, radius: int, targets: Sequence[Target], reach: float, first_radius: int
+) -> None:
+    """Raise an error if as many chips could as well agree by chance."""
+    share = min(1.0, math.pi * _AGREE**2 / (2 * radius + 1) ** 2)
+    chance = float(stats.binom.sf(agreeing - 1, chips, share)) * (2 * first_radius + 1) ** 2
+    if chance > _ACCIDENT:
+        raise InputError(
+            f"the scene and the reference do not agree: {agreeing} of {counted(chips, 'chip')} fit together within "
+            f"{reach:.0f} px of where the model puts them, which chance does as well",
+            file=targets[0].path, field="match.reference",
+            remedy="check that the reference shows this place, search farther (`match.search`) if the model may be "
+            "off by more, or give control points by hand",
+        )  # fmt: skip
+
+
+def _no_overlap(targets: Sequence[Target], count: int) -> InputError:
+    return InputError(
+        f"the reference shows too little of the scene ({counted(count, 'chip')} in both)", file=targets[0].path,
+        field="match.reference", remedy="give references that cover the scene, and heights that do",
+    )  # fmt: skip
