@@ -53,6 +53,7 @@ GDAL_MODULES = {
     "raster.references",
     "raster.block_cache",
     "raster.source",
+    "raster.intensity",
     "raster.output",
     "raster.ortho",
     "surface.dem_file",

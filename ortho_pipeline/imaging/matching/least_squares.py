@@ -93,6 +93,6 @@ def _shifts(scene: NDArray[np.float32], target: NDArray[np.float32], start: Arra
     shift, covariance, correlation = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count)
     shift_kernel.shifts(
         np.ascontiguousarray(scene), np.ascontiguousarray(target), np.ascontiguousarray(start, dtype=float), offset,
-        RIM, _STEPS, _SMALL, _FARTHEST, shift, covariance, correlation,
+        RIM, np.array([_STEPS, _SMALL, _FARTHEST]), shift, covariance, correlation,
     )  # fmt: skip
     return Measured(shift, covariance, correlation, np.full(count, not offset))

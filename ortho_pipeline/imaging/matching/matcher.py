@@ -6,13 +6,14 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError, TooFewPoints, counted
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
+from ortho_pipeline.geodesy.ellipsoid import units_per_metre
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
 from ortho_pipeline.imaging.matching.chips import View, resolution_ratio, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
@@ -23,7 +24,8 @@ from ortho_pipeline.imaging.matching.weights import Components, components
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points
-from ortho_pipeline.surface.rays import intersect
+from ortho_pipeline.points.image_errors import sigma_of_covariance
+from ortho_pipeline.surface.rays import meet_surface
 
 #: Side of a chip (chip px), and radius of the last search about the corrected model.
 SIDE, _RADIUS = 40, 4
@@ -174,7 +176,7 @@ def _shown(view: View, targets: Sequence[Target]) -> Array:
 
 def _inside(view: View, targets: Sequence[Target], image: Array) -> NDArray[np.bool_]:
     """Tell which image points ``(n,)`` fall into a target."""
-    ground = intersect(view.model, image, view.surface)
+    ground = meet_surface(view.model, image, view.surface)
     # Where the model is off, the surface may end too soon: its reference height stands in.
     lost = np.isnan(ground).any(axis=1)
     ground[lost] = view.model.image_to_ground(image[lost], view.model.reference_height)
@@ -233,7 +235,7 @@ class _Tried:
         self.view, self.targets, self.origins, self.cells, self.factor = view, targets, origins, cells, factor
         self.threads = threads
         count = len(origins)
-        self.centres = origins + SIDE * factor / 2
+        self.centres = np.asarray(origins + SIDE * factor / 2, dtype=np.float64)
         self.scene = scene_chips(view, origins, SIDE, factor)
         self.target = np.full_like(self.scene, np.nan)
         self.reason = np.full(count, "hidden", dtype="<U12")
@@ -327,7 +329,7 @@ class _Tried:
         good = np.flatnonzero(self.reason == "")
         self._in_batches(work, good)
         good = np.flatnonzero(self.reason == "")
-        self.ground[good] = intersect(correction, self.centres[good] + self.offset[good], self.view.surface)
+        self.ground[good] = meet_surface(correction, self.centres[good] + self.offset[good], self.view.surface)
         self.reason[good[np.isnan(self.ground[good]).any(axis=1)]] = "hidden"
 
     def moved(self, correction: SensorModel) -> float:
@@ -347,7 +349,6 @@ class _Tried:
             off = delivered - self.centres[good]
             design = np.column_stack([np.ones(len(good)), (self.centres[good] - origin) / origin.max()])
             along = self.view.model.ground_partials(self.ground[good])[:, :, 2]
-            self.along = along
             residuals = off - design @ _robust(design, off)
             self.components = components(residuals, self.covariance[good], along)
             total = self.components.covariance(self.covariance[good], along)
@@ -369,18 +370,23 @@ class _Tried:
     def matches(self, settings: MatchSettings, levels: tuple[Level, ...]) -> Matches:
         """Return all that was tried, and the points."""
         good = np.flatnonzero(self.reason == "")
-        along = self.view.model.ground_partials(self.ground[good])[:, :, 2]
-        parts = self.components
-        covariance = parts.covariance(self.covariance[good], along)
-        _, roles = held_out(self.centres[good], self.view.size, len(good))
+        partials = self.view.model.ground_partials(self.ground[good])
+        # What neighbours share is not in the residuals: what is known of the heights is the least that they have.
+        parts = replace(self.components, height=max(self.components.height, settings.dem_sigma))
+        covariance = parts.covariance(self.covariance[good], partials[:, :, 2])
+        if settings.reference_sigma > 0:
+            spread = settings.reference_sigma * units_per_metre(parse_crs(self.view.model.crs), self.ground[good])
+            plan = partials[:, :, :2] * spread[:, None, :2]
+            covariance = covariance + plan @ plan.transpose(0, 2, 1)
+        groups, roles = held_out(self.centres[good], self.view.size, len(good))
         delivered = np.full(self.offset.shape, np.nan)
         delivered[good] = self.view.model.ground_to_image(self.ground[good]) - self.centres[good]
         crs = parse_crs(self.view.model.crs)
         names = ", ".join(os.path.basename(target.path) for target in self.targets)
         points = Points(
             ids=tuple(f"m{cell}" for cell in self.cells[good]), image=self.centres[good], ground=self.ground[good],
-            roles=roles, sigma_image=np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2),
-            sigma_ground=np.zeros((len(good), 3)), crs=crs, source=f"matched with {names}",
+            roles=roles, sigma_image=sigma_of_covariance(covariance), sigma_ground=np.zeros((len(good), 3)), crs=crs,
+            source=f"matched with {names}", covariance_image=covariance, groups=groups,
         )  # fmt: skip
         return Matches(
             self.centres, delivered, self.score, self.reason, self.cells, self.scene, self.target, self.factor,
@@ -391,10 +397,10 @@ class _Tried:
 def _robust(design: Array, values: Array) -> Array:
     """Return the coefficients ``(k, 2)`` of a fit that large residuals count little in (Huber's weights)."""
     weight = np.ones(len(values))
-    found = np.zeros((design.shape[1], 2))
+    found: Array = np.zeros((design.shape[1], 2))
     for _ in range(15):
         root = np.sqrt(weight)[:, None]
-        found = np.linalg.lstsq(root * design, root * values, rcond=None)[0]
+        found = np.asarray(np.linalg.lstsq(root * design, root * values, rcond=None)[0], dtype=np.float64)
         length = np.hypot(*(values - design @ found).T)
         scale = max(1.2 * float(np.median(length)), 1e-9)
         weight = np.minimum(1.0, scale / np.maximum(length, 1e-12))

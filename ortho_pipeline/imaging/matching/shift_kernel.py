@@ -8,11 +8,12 @@ from ortho_pipeline.files.compiled import compiled
 
 
 @compiled
-def shifts(scene, target, start, offset, rim, steps, small, farthest, shift, covariance, correlation):
+def shifts(scene, target, start, offset, rim, limits, shift, covariance, correlation):
     """Fill `shift` ``(n, 2)``, `covariance` ``(n, 2, 2)`` and `correlation` ``(n,)``; NaN where none was found.
 
     `scene` ``(n, c, s, s)`` and `target` ``(n, c, s + 2r, s + 2r)`` are layers of chips, NaN where not valid. With
-    `offset` there is a gain of either sign and an offset between them, else a positive gain.
+    `offset` there is a gain of either sign and an offset between them, else a positive gain. `limits` are the number of
+    steps, the length of the last one, and how far a shift may lie from the start.
     """
     count, layers, size, _ = scene.shape
     inner = size - 2 * rim
@@ -20,81 +21,73 @@ def shifts(scene, target, start, offset, rim, steps, small, farthest, shift, cov
     chip, moved = np.empty((layers, inner, inner)), np.empty((layers, inner, inner))
     slopes = np.empty((2, layers, inner, inner))
     seen, whole = np.empty((inner, inner), dtype=np.bool_), np.empty((inner, inner), dtype=np.bool_)
-    weights, derived = np.empty((2, 4)), np.empty((2, 4))
+    weights, derived, found = np.empty((2, 4)), np.empty((2, 4)), np.empty(6)
     for k in range(count):
         shift[k, :] = np.nan
         covariance[k, :, :] = np.nan
         correlation[k] = 0.0
         _inner(scene[k], rim, chip, whole)
-        d = start[k].copy()
-        for _ in range(steps):
-            if not (abs(d[0]) < reach - 2 and abs(d[1]) < reach - 2):
+        x, y = start[k, 0], start[k, 1]
+        for _ in range(int(limits[0])):
+            if not (abs(x) < reach - 2 and abs(y) < reach - 2):
                 break
-            if abs(d[0] - start[k, 0]) > farthest or abs(d[1] - start[k, 1]) > farthest:
+            if abs(x - start[k, 0]) > limits[2] or abs(y - start[k, 1]) > limits[2]:
                 break
-            left, top = int(np.floor(d[0])), int(np.floor(d[1]))
-            _weights(d[0] - left, weights[0], derived[0])
-            _weights(d[1] - top, weights[1], derived[1])
+            left, top = int(np.floor(x)), int(np.floor(y))
+            _weights(x - left, weights[0], derived[0])
+            _weights(y - top, weights[1], derived[1])
             first = reach + rim
             used = _moved(target[k], first + left, first + top, weights, derived, whole, moved, slopes, seen)
-            if 2 * used < inner * inner:
+            if 2 * used < inner * inner or not _step(chip, moved, slopes, seen, offset, found):
                 break
-            a_mean, b_mean = 0.0, 0.0
-            if offset:
-                for m in range(layers):
-                    for i in range(inner):
-                        for j in range(inner):
-                            if seen[i, j]:
-                                a_mean += chip[m, i, j]
-                                b_mean += moved[m, i, j]
-                a_mean /= used * layers
-                b_mean /= used * layers
-            aa, bb, ab = 0.0, 0.0, 0.0
-            for m in range(layers):
-                for i in range(inner):
-                    for j in range(inner):
-                        if seen[i, j]:
-                            a, b = chip[m, i, j] - a_mean, moved[m, i, j] - b_mean
-                            aa += a * a
-                            bb += b * b
-                            ab += a * b
-            if not (aa > 1e-9 and bb > 1e-9) or ab == 0.0 or (ab < 0.0 and not offset):
+            x += found[0]
+            y += found[1]
+            if abs(found[0]) < limits[1] and abs(found[1]) < limits[1]:
+                shift[k, 0], shift[k, 1] = x, y
+                covariance[k, 0, 0], covariance[k, 1, 1] = found[2], found[3]
+                covariance[k, 0, 1] = covariance[k, 1, 0] = found[4]
+                correlation[k] = found[5]
                 break
-            gain = ab / bb
-            xx, yy, xy, xr, yr, rr, sx, sy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for m in range(layers):
-                for i in range(inner):
-                    for j in range(inner):
-                        if seen[i, j]:
-                            gx, gy = gain * slopes[0, m, i, j], gain * slopes[1, m, i, j]
-                            r = chip[m, i, j] - a_mean - gain * (moved[m, i, j] - b_mean)
-                            xx += gx * gx
-                            yy += gy * gy
-                            xy += gx * gy
-                            xr += gx * r
-                            yr += gy * r
-                            rr += r * r
-                            sx += gx
-                            sy += gy
-            if offset:
-                # The offset is an unknown as well: what the gradients have in common is its.
-                total = used * layers
-                xx -= sx * sx / total
-                yy -= sy * sy / total
-                xy -= sx * sy / total
-            det = xx * yy - xy * xy
-            if not det > 1e-9 * (xx + yy) ** 2:
-                break
-            step_x, step_y = (yy * xr - xy * yr) / det, (xx * yr - xy * xr) / det
-            d[0] += step_x
-            d[1] += step_y
-            if abs(step_x) < small and abs(step_y) < small:
-                variance = rr / max(used * layers - 4, 1)
-                shift[k, 0], shift[k, 1] = d[0], d[1]
-                covariance[k, 0, 0], covariance[k, 1, 1] = variance * yy / det, variance * xx / det
-                covariance[k, 0, 1] = covariance[k, 1, 0] = -variance * xy / det
-                correlation[k] = ab / np.sqrt(aa * bb)
-                break
+
+
+@compiled
+def _step(chip, moved, slopes, seen, offset, found):
+    """Fill one step of the shift, its covariance (xx, yy, xy) and the correlation; False where there is none."""
+    number, a_mean, b_mean = 0, 0.0, 0.0
+    for m in range(chip.shape[0]):
+        for i in range(chip.shape[1]):
+            for j in range(chip.shape[2]):
+                if seen[i, j]:
+                    number += 1
+                    a_mean += chip[m, i, j]
+                    b_mean += moved[m, i, j]
+    a_mean, b_mean = (a_mean / number, b_mean / number) if offset else (0.0, 0.0)
+    aa, bb, ab, xa, ya, xb, yb, xx, yy, xy, sx, sy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for m in range(chip.shape[0]):
+        for i in range(chip.shape[1]):
+            for j in range(chip.shape[2]):
+                if seen[i, j]:
+                    a, b = chip[m, i, j] - a_mean, moved[m, i, j] - b_mean
+                    gx, gy = slopes[0, m, i, j], slopes[1, m, i, j]
+                    aa, bb, ab = aa + a * a, bb + b * b, ab + a * b
+                    xa, ya, xb, yb = xa + gx * a, ya + gy * a, xb + gx * b, yb + gy * b
+                    xx, yy, xy, sx, sy = xx + gx * gx, yy + gy * gy, xy + gx * gy, sx + gx, sy + gy
+    if not (aa > 1e-9 and bb > 1e-9) or ab == 0.0 or (ab < 0.0 and not offset):
+        return False
+    gain = ab / bb
+    if offset:
+        # The offset is an unknown as well: what the gradients have in common is its.
+        xx, yy, xy = xx - sx * sx / number, yy - sy * sy / number, xy - sx * sy / number
+    xx, yy, xy = gain * gain * xx, gain * gain * yy, gain * gain * xy
+    xr, yr = gain * (xa - gain * xb), gain * (ya - gain * yb)
+    determinant = xx * yy - xy * xy
+    if not determinant > 1e-9 * (xx + yy) ** 2:
+        return False
+    variance = (aa - gain * ab) / max(number - 4, 1)
+    found[0], found[1] = (yy * xr - xy * yr) / determinant, (xx * yr - xy * xr) / determinant
+    found[2], found[3] = variance * yy / determinant, variance * xx / determinant
+    found[4], found[5] = -variance * xy / determinant, ab / np.sqrt(aa * bb)
+    return True
 
 
 @compiled
