@@ -14,7 +14,8 @@ import pyproj
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.source import Grid, open_dataset, open_pixels
 
@@ -26,11 +27,20 @@ _STEPS = 32
 _DECIMALS = 7
 
 
+@reads("make this ortho again")
 def grid_of(path: str | PathLike[str]) -> Grid:
-    """Return the grid of an orthoimage."""
+    """Return the grid of an orthoimage.
+
+    Raises
+    ------
+    InputError
+        If it is none: a raster without a CRS, or one that is not north up.
+    """
     dataset = open_dataset(path)
-    left, dx, _, top, _, dy = dataset.GetGeoTransform()
-    crs = pyproj.CRS.from_wkt(dataset.GetProjection())
+    left, dx, skew, top, other, dy = dataset.GetGeoTransform()
+    if skew or other:
+        raise InputError("this raster is turned against the axes of its CRS", field="geotransform")
+    crs = parse_crs(dataset.GetProjection())
     return Grid(crs, left, top, dx, -dy, dataset.RasterXSize, dataset.RasterYSize)
 
 
