@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ortho_pipeline.cli.command import Command, Megabytes
 from ortho_pipeline.cli.flags import as_typed
 from ortho_pipeline.cli.options import json_option
+from ortho_pipeline.cli.parsing import Command, Megabytes
 from ortho_pipeline.cli.printing import print_json, progress
 from ortho_pipeline.errors import counted
 

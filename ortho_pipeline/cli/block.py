@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import click
 
-from ortho_pipeline.cli.command import Command
 from ortho_pipeline.cli.options import adjustment_options, block_options, folder_option, json_option, sensor_options
+from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_result, print_warnings
 from ortho_pipeline.options import BlockOptions, SceneOptions
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import click
 
-from ortho_pipeline.cli.command import Megabytes, OneOrTwo
 from ortho_pipeline.cli.flags import FLAGS, with_flags
+from ortho_pipeline.cli.parsing import Megabytes, OneOrTwo
 from ortho_pipeline.options import (
     BlockOptions,
     Option,

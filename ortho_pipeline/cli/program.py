@@ -16,7 +16,6 @@ import click
 
 from ortho_pipeline.cli.batch import run
 from ortho_pipeline.cli.block import adjust, intersect
-from ortho_pipeline.cli.command import Group
 from ortho_pipeline.cli.options import (
     click_options,
     dem_datum_options,
@@ -29,6 +28,7 @@ from ortho_pipeline.cli.options import (
     scene_options,
     surface_options,
 )
+from ortho_pipeline.cli.parsing import Group
 from ortho_pipeline.cli.printing import (
     print_comparison,
     print_fit,

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ortho_pipeline.cli.command import Command, Group
 from ortho_pipeline.cli.options import folder_option, json_option
+from ortho_pipeline.cli.parsing import Command, Group
 from ortho_pipeline.cli.printing import print_result, progress
 
 if TYPE_CHECKING:

@@ -177,7 +177,7 @@ class Vertical:
         if Path(plain).suffix.lower() in _GRID_SUFFIXES:
             path = Path(plain)
             found = cls(str(path.resolve()) if path.is_file() else plain)
-            _vertical_transformer(found.name)
+            vertical_transformer(found.name)
             return found
         raise DatumError(f"{plain!r} is not a height datum", field="vertical", remedy=f"give {VERTICAL_FORMS}")
 
@@ -216,7 +216,7 @@ class Vertical:
         lon, lat = np.broadcast_arrays(np.asarray(lon, dtype=float), np.asarray(lat, dtype=float))
         if self.is_ellipsoid:
             return np.where(np.isfinite(lon) & np.isfinite(lat), 0.0, np.nan)
-        transformer = _vertical_transformer(self.name)
+        transformer = vertical_transformer(self.name)
         try:
             shift = np.array(transformer.transform(lon, lat, np.zeros(lon.shape))[2], dtype=float)
         except ProjError as error:
@@ -255,7 +255,7 @@ def _compound(name: str) -> str:
 
 
 @functools.lru_cache(maxsize=32)
-def _vertical_transformer(name: str) -> Transformer:
+def vertical_transformer(name: str) -> Transformer:
     """Return the transformation of heights from a datum to the ellipsoid (pyproj keeps one per thread inside)."""
     try:
         if name.startswith("EPSG:"):

@@ -9,7 +9,7 @@ from typing import Any
 import pyproj
 
 from ortho_pipeline.errors import DatumError
-from ortho_pipeline.geodesy.crs import VERTICAL_NAMES, _vertical_transformer, add_system_grids
+from ortho_pipeline.geodesy.crs import VERTICAL_NAMES, add_system_grids, vertical_transformer
 
 
 def proj_info() -> dict[str, Any]:
@@ -31,7 +31,7 @@ def grids() -> list[dict[str, Any]]:
             continue
         row: dict[str, Any] = {"datum": name, "crs": code, "found": True, "grid": None, "path": None}
         try:
-            definition = _vertical_transformer(code).definition
+            definition = vertical_transformer(code).definition
             found = re.search(r"grids=(\S+)", definition)
             row["grid"] = found.group(1) if found else None
         except DatumError as error:

@@ -10,8 +10,8 @@ import tracemalloc
 from dataclasses import replace
 
 import numpy as np
-import pyproj
 import pytest
+from measured import points_of
 
 from ortho_pipeline.errors import DegeneratePoints, InputError
 from ortho_pipeline.estimation.fit import fit
@@ -26,7 +26,6 @@ from ortho_pipeline.models.pushbroom.metadata import mounting_of_angles, pushbro
 from ortho_pipeline.models.pushbroom.rotations import angles_of, rotations
 from ortho_pipeline.models.pushbroom.splines import Spline, SplineForm
 from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables, rotations_of_angles, rotations_of_quaternions
-from ortho_pipeline.points import Points
 from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.testing import check_sensor_model
 
@@ -104,20 +103,6 @@ def sample(camera: SensorModel, count: int, seed: int = 0, noise: float = 0.0) -
     image = random.uniform(0, 1, (count, 2)) * size
     ground = camera.image_to_ground(image, random.uniform(*HEIGHTS, count))
     return image + random.normal(0, noise, image.shape), ground
-
-
-def points_of(image: Array, ground: Array, sigma: float = 0.5) -> Points:
-    count = len(image)
-    return Points(
-        ids=tuple(f"p{k}" for k in range(count)),
-        image=image,
-        ground=ground,
-        roles=np.array(["control"] * count),
-        sigma_image=np.full(count, sigma),
-        sigma_ground=np.zeros((count, 3)),
-        crs=pyproj.CRS(4326),
-        source="points.csv",
-    )
 
 
 # -- the map ---------------------------------------------------------------------------------------------------------

@@ -9,8 +9,8 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
-import pyproj
 import pytest
+from measured import points_of
 from ortho_rpc.dimap import has_dimap_pushbroom, read_dimap_pushbroom
 from osgeo import gdal
 
@@ -24,7 +24,6 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.models.pushbroom.splines import SplineForm
 from ortho_pipeline.plugins import open_scene
-from ortho_pipeline.points import Points
 from ortho_pipeline.testing import check_sensor_model
 
 SCENE = "P1BP--2018122638935449CP"
@@ -90,22 +89,8 @@ def test_perturbed_and_readjusted_from_nine_points(dimap: Path) -> None:
     check = generator.uniform(0, 1, (300, 2)) * size
     place = model.image_to_ground(check, generator.uniform(*model.heights, 300))
     assert np.abs(wrong.ground_to_image(place) - check).max() > 20
-    found = fit(wrong, _points(at + generator.normal(0, 0.2, (9, 2)), ground, 0.2), robust=False)
+    found = fit(wrong, points_of(at + generator.normal(0, 0.2, (9, 2)), ground, 0.2), robust=False)
     assert np.sqrt(((found.model.ground_to_image(place) - check) ** 2).mean()) < 0.4
-
-
-def _points(image: Array, ground: Array, sigma: float) -> Points:
-    count = len(image)
-    return Points(
-        ids=tuple(f"p{k}" for k in range(count)),
-        image=image,
-        ground=ground,
-        roles=np.array(["control"] * count),
-        sigma_image=np.full(count, sigma),
-        sigma_ground=np.zeros((count, 3)),
-        crs=pyproj.CRS(4326),
-        source="grid",
-    )
 
 
 def _look_angles(rpc: RPC, size: Array) -> tuple[float, float]:
@@ -156,7 +141,7 @@ def test_fitted_to_a_real_rpc(real: Path, name: str) -> None:
     assert np.abs(start.ground_to_image(ground) - image).max() < 100
     # The vendor's line is straight in angles, not in their tangents: one pixel at its ends.
     model = start.freed("path", "attitude", "focal_length", "dx_2", "dx_3")
-    found = fit(model, _points(image, ground, 1e-3), robust=False)
+    found = fit(model, points_of(image, ground, 1e-3), robust=False)
     check, place = lattice(14, 4)
     assert np.abs(found.model.ground_to_image(place) - check).max() < 0.01
 
