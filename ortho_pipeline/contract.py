@@ -1,4 +1,4 @@
-"""What a scene and its models have to be: the cheap part of the contract, which the host asks of every scene it opens.
+"""Requirements on a scene and its models: the cheap part of the contract, asked of every scene that is opened.
 
 A fault is a text that says what was returned and what is wanted. The host makes a `PluginError` of the first one, in
 milliseconds and before a warp of hours; `ortho_pipeline.testing` makes it an `AssertionError`, and asks more.

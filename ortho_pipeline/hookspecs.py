@@ -148,7 +148,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Sensor:
-    """What a plugin offers: how to recognise and to open one kind of product.
+    """The offer of a plugin: how to recognise and to open one kind of product.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Simulated:
-    """What a simulation wrote: its files by name, and what to try with them (text for the terminal)."""
+    """The outcome of a simulation: its files by name, and what to try with them (text for the terminal)."""
 
     files: Mapping[str, Path]
     text: str
@@ -192,7 +192,7 @@ class Simulated:
 
 @dataclass(frozen=True)
 class Reproduced:
-    """What an experiment found: a document of JSON values, its text for the terminal, and its page (HTML) if wanted."""
+    """The outcome of an experiment: a document of JSON values, its text for the terminal, and its page of HTML."""
 
     document: Mapping[str, Any]
     text: str

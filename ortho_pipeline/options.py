@@ -1,4 +1,4 @@
-"""What a user can ask for, grouped as the pipeline takes it.
+"""Options of a user, grouped as the pipeline takes them.
 
 Each option is stated here, once: its field and default, and in an `Option` what the command line and the pipeline file
 make their own options from. Messages name an option as ``group.field`` between backticks, with a value after an equals
@@ -55,7 +55,7 @@ def numbers_of(text: str) -> list[float]:
 
 @dataclass(frozen=True)
 class Option:
-    """What users read of a field, and what they may give.
+    """The flag and help of a field, and the values that it may have.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ class SceneOptions:
 
     @property
     def access(self) -> dict[str, Any]:
-        """What may be opened, as `raster.open_dataset` takes it."""
+        """Permissions to open files, as `raster.open_dataset` takes them."""
         return {"allow_network": self.allow_network, "roots": tuple(self.roots)}
 
     @property
@@ -211,7 +211,7 @@ class PointOptions:
     select: Annotated[
         str | None,
         Option(
-            "--select", "Points that control: N well spread, N of one region, these, or N by lot; all others check.",
+            "--select", "Points that control: N well spread, N of one region, these, or N at random; all others check.",
             "even:N|cluster:N|ids:A,B|random:N:SEED",
         ),
     ] = None  # fmt: skip
@@ -347,7 +347,7 @@ class SurfaceOptions:
 @_documented
 @dataclass(frozen=True)
 class OutputOptions:
-    """What the ortho looks like and how it is computed.
+    """Form of the ortho, and how it is computed.
 
     `memory` is in bytes.
     """

@@ -74,7 +74,7 @@ class Job:
 
     @property
     def configuration(self) -> dict[str, Any]:
-        """What was asked for, as JSON values, without the budget of the machine."""
+        """The request as JSON values, without the budget of the machine."""
         options = {name: dataclasses.asdict(getattr(self, name)) for name in ("scene", "points", "surface", "ortho")}
         for budget in ("memory", "threads"):
             del options["ortho"][budget]

@@ -1,4 +1,4 @@
-"""What a run knows of each scene: a record per scene, and locks.
+"""Records of a run, one per scene, and their locks.
 
 A record says from which content (checksums of inputs, configuration, versions) which outputs were made. It says "done"
 only after all of them are written, and no longer once work begins again, whatever kills the process in between.
@@ -69,7 +69,7 @@ class FileState:
 
 @dataclass(frozen=True)
 class Record:
-    """What was made of a scene, from what.
+    """Inputs and outputs of a scene.
 
     Parameters
     ----------

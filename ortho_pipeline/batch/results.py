@@ -1,4 +1,4 @@
-"""What a run made: the outcome of each scene and of the whole."""
+"""The outcome of a run: of each scene and of the whole."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SCHEMA_VERSION = 1
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a scene.
+    """The outcome of a scene.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class BatchResult:
-    """What became of all scenes."""
+    """The outcome of all scenes."""
 
     scenes: tuple[Outcome, ...]
     files: Mapping[str, Path]

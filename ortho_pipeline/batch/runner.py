@@ -381,7 +381,7 @@ class _Mosaic:
             for state in (record.outputs if record else ())
             if state.role == "ortho"
         )
-        order = {ortho.name: ortho.lean for ortho in self.orthos}
+        order = {ortho.name: ortho.relief_displacement for ortho in self.orthos}
         self.key = key_of(self.inputs, {**self.settings.model_dump(), "order": list(order.items())}, versions())
 
     def make(self, crew: Executor | Processes) -> dict[str, Any]:
@@ -393,13 +393,13 @@ class _Mosaic:
                 if isinstance(document, dict):
                     return {**document, "status": "unchanged"}
         self.record.unlink(missing_ok=True)
-        layout = mosaic.lay_out(self.orthos, self.settings.order)
+        placed = mosaic.lay_out(self.orthos, self.settings.order)
         with together(self.output, "mosaic"):
             if self.settings.format == "VRT":
-                mosaic.write_vrt(layout, self.path)
+                mosaic.write_vrt(placed, self.path)
             else:
-                mosaic.write_cog(layout, self.path)
-            document = {"file": str(self.path), **mosaic.summary(layout, self._seams(layout, crew))}
+                mosaic.write_cog(placed, self.path)
+            document = {"file": str(self.path), **mosaic.summary(placed, self._seams(placed, crew))}
             write_json(self.report, document)
             if record is not None:
                 retire({self.output / one.path for one in record.outputs} - {self.path, self.report})
@@ -408,10 +408,10 @@ class _Mosaic:
         Record("mosaic", self.key, "done", self.inputs, made).write(self.record)
         return {**document, "status": "done"}
 
-    def _seams(self, layout: mosaic.Layout, crew: Executor | Processes) -> list[dict[str, Any]]:
+    def _seams(self, placed: mosaic.Mosaic, crew: Executor | Processes) -> list[dict[str, Any]]:
         if not self.settings.seams:
             return []
-        pairs = mosaic.overlaps(layout)
+        pairs = mosaic.overlaps(placed)
         # New processes for a few seams take longer than these.
         crew = Sequential() if isinstance(crew, Processes) and len(pairs) < _MANY_SEAMS else crew
         found = {id(pair): future.result() for pair, future in completed(crew, mosaic.measure_seam, pairs)}

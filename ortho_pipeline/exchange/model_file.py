@@ -24,7 +24,7 @@ _REMEDY = "give a <stem>_model.json as it was written, or write it again"
 
 @dataclass(frozen=True)
 class SavedModel:
-    """What a model file holds.
+    """The contents of a model file.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class SavedModel:
 
     @property
     def adjusted(self) -> Mapping[str, Any] | None:
-        """What the model was adjusted by, of a scene or in a block; None where it is as delivered."""
+        """The adjustment of the model, of a scene or in a block; None where it is as delivered."""
         found = self.provenance.get("adjustment")
         if not isinstance(found, dict) or not (found.get("gauge") or found.get("points")):
             return None

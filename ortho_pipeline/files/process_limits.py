@@ -1,4 +1,4 @@
-"""What the system lets this process have: address space and threads.
+"""Limits that the system sets to this process: address space and threads.
 
 Libraries do badly without: a thread of Python's that fails before its first line, and a pool of GDAL's that gets fewer
 threads than it asked for, are waited for without end; PROJ and GDAL end the process. So what a job needs is asked for
@@ -28,7 +28,7 @@ _PATIENCE = 10.0
 
 @dataclass(frozen=True)
 class Resources:
-    """What a long job may take, and whom it tells how far it is.
+    """Budget of a long job, and whom it tells how far it is.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What the heights of a DEM are measured above, and in which unit: what it declares against what the user says."""
+"""Datum and unit of the heights of a DEM: what it declares against what the user says."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from ortho_pipeline.geodesy.crs import Vertical
 
 @dataclass(frozen=True)
 class DeclaredVertical:
-    """What a CRS says about heights.
+    """The heights that a CRS declares.
 
     Parameters
     ----------

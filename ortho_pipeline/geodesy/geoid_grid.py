@@ -1,4 +1,4 @@
-"""What is looked at in a geoid grid before PROJ opens it, and in the undulations that it gives."""
+"""Check a geoid grid before PROJ opens it, and the undulations that it gives."""
 
 from __future__ import annotations
 

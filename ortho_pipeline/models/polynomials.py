@@ -15,8 +15,8 @@ from ortho_pipeline.models.families import Family, exponents, family_of
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
-    """Where coefficients of a family stand in a table of the rows col, row (numerators), col, row (denominators)."""
+class TermTable:
+    """Terms of a family, and the places of its coefficients in a table: numerators of col, row, then denominators."""
 
     family: Family
     powers: NDArray[np.int64]  # (T, 3), of all terms that occur
@@ -32,7 +32,8 @@ class Layout:
 
 
 @lru_cache(maxsize=64)
-def layout_of(name: str) -> Layout:
+def term_table(name: str) -> TermTable:
+    """Return the terms of a family and the places of its coefficients."""
     family = family_of(name)
     terms = list(dict.fromkeys(("1", *family.col, *family.row, *family.den)))
     rows = {"col": [0], "row": [1], "den": [2, 3], "col_den": [2], "row_den": [3]}
@@ -40,11 +41,11 @@ def layout_of(name: str) -> Layout:
     for parameter in family.param_names:
         part, _, term = parameter.rpartition("_")
         places.append((np.array(rows[part]), terms.index(term)))
-    return Layout(family, np.array([exponents(term) for term in terms]), tuple(places))
+    return TermTable(family, np.array([exponents(term) for term in terms]), tuple(places))
 
 
 def _powers(name: str, normalised: Array) -> tuple[NDArray[np.int64], list[list[Array]]]:
-    table = layout_of(name).powers
+    table = term_table(name).powers
     found = []
     for axis in range(3):
         powers = [np.ones(len(normalised))]

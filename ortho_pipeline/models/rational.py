@@ -34,7 +34,7 @@ from ortho_pipeline.models.base import (
     as_image,
 )
 from ortho_pipeline.models.families import exponents, family_of, points_needed
-from ortho_pipeline.models.polynomials import layout_of, term_partials, terms_of
+from ortho_pipeline.models.polynomials import term_partials, term_table, terms_of
 from ortho_pipeline.models.rpc_box import RPC_TERMS, check_numbers, sound_heights
 
 #: From this many points on the compiled kernels are used: loading them takes longer than few points do.
@@ -306,9 +306,9 @@ class Rational(SensorModel):
     removed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        layout = layout_of(self.family)
+        terms = term_table(self.family)
         shapes = {
-            "coefficients": (layout.family.parameters,), "ground_offset": (3,), "ground_scale": (3,),
+            "coefficients": (terms.family.parameters,), "ground_offset": (3,), "ground_scale": (3,),
             "image_offset": (2,), "image_scale": (2,), "box": (2, 3),
         }  # fmt: skip
         for name, shape in shapes.items():
@@ -322,11 +322,11 @@ class Rational(SensorModel):
         if not (self.box[0] < self.box[1]).all():
             raise InputError("the lowest is not below the highest", field="box")
         object.__setattr__(self, "removed", tuple(self.removed))
-        unknown = set(self.removed) - set(layout.family.param_names)
-        gone = [layout.family.param_names.index(name) for name in self.removed if name not in unknown]
+        unknown = set(self.removed) - set(terms.family.param_names)
+        gone = [terms.family.param_names.index(name) for name in self.removed if name not in unknown]
         if unknown or self.coefficients[gone].any():
             raise InputError("what is removed is a coefficient of the family, and zero", field="removed")
-        object.__setattr__(self, "_table", layout.table(self.coefficients))
+        object.__setattr__(self, "_table", terms.table(self.coefficients))
 
     @property
     def crs(self) -> str:
@@ -344,7 +344,7 @@ class Rational(SensorModel):
 
     @property
     def param_names(self) -> tuple[str, ...]:
-        names = layout_of(self.family).family.param_names
+        names = term_table(self.family).family.param_names
         return tuple(name for name in names if name not in self.removed) if self.removed else names
 
     @property
@@ -442,7 +442,7 @@ class Rational(SensorModel):
         factors = np.concatenate([1.0 / sums[2:], -sums[:2] / sums[2:] ** 2]) * np.tile(self.image_scale, 2)[:, None]
         free = self._free
         partials = np.zeros((terms.shape[1], 2, len(free)))
-        places = layout_of(self.family).places
+        places = term_table(self.family).places
         for k, index in enumerate(free):
             rows, term = places[index]
             for row in rows:

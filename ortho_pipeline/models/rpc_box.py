@@ -1,4 +1,4 @@
-r"""What an RPC does all over its own box: no pole, no fold, pixels of a size that there is.
+r"""Prove that an RPC is sound all over its own box: no pole, no fold, pixels of a size that there is.
 
 A polynomial over a box is bounded by its control values (coefficients in Bernstein's basis): they enclose it, those at
 the corners are values of it, and halving the box brings them closer quadratically. So a denominator is bounded, and not

@@ -15,7 +15,7 @@ from ortho_pipeline.points.rows import (
     CSV_ERRORS,
     CSV_IMAGE,
     OF_IMAGE,
-    Layout,
+    Columns,
     Line,
     Row,
     Table,
@@ -94,7 +94,7 @@ def is_header(text: str) -> bool:
     return len(names & {"id", "image", "col", "row", "x", "y", "h"}) >= 3
 
 
-def read_csv(path: str | os.PathLike[str], text: str, layout: Layout = OF_IMAGE) -> Table:
+def read_csv(path: str | os.PathLike[str], text: str, expected: Columns = OF_IMAGE) -> Table:
     """Read a table with a header: ``id,col,row,x,y,h[,role][,sigma_image][,sigma_xy][,sigma_h][,image]`` or their like.
 
     Further columns are those of `CSV_ERRORS`.
@@ -115,10 +115,10 @@ def read_csv(path: str | os.PathLike[str], text: str, layout: Layout = OF_IMAGE)
         if line.text.startswith("#"):
             continue
         if header is None:
-            header = _header(path, line, layout)
+            header = _header(path, line, expected)
             table.of_ground = header.of_ground
             continue
-        row = _row(path, line, header, layout, marks)
+        row = _row(path, line, header, expected, marks)
         if row is not None:
             table.rows.append(row)
     return table
@@ -142,14 +142,14 @@ def _ours(name: str) -> str:
     return own if own in ("id", "col", "row", "x", "y", "h", "role") else _ALIASES.get(_plain(name), own)
 
 
-def _header(path: str | os.PathLike[str], line: Line, layout: Layout) -> Header:
+def _header(path: str | os.PathLike[str], line: Line, expected: Columns) -> Header:
     delimiter = _delimiter(line.text)
     names = cells_of(path, line, delimiter)
     ours = _our_names(names)
     place: dict[str, int] = {}
 
     def refuse(message: str) -> InputError:
-        own = f"name them {','.join(layout.columns)}; {_UNDERSTOOD}"
+        own = f"name them {','.join(expected.names)}; {_UNDERSTOOD}"
         digits = all(re.fullmatch(r"[+-]?[\d.,]+", name) for name in names[1:])
         remedy = f"put a header above the numbers: {own}" if digits else own
         found = ", ".join(name or "(no name)" for name in names)
@@ -159,12 +159,12 @@ def _header(path: str | os.PathLike[str], line: Line, layout: Layout) -> Header:
     for index, name in enumerate(ours):
         if name in CSV_IGNORED or (not name and index in (0, len(names) - 1)):
             continue
-        if name not in (*layout.columns, "status"):
+        if name not in (*expected.names, "status"):
             raise refuse(f"the column {short(names[index])} is not known")
         if name in place:
             raise refuse(f"the columns {short(names[place[name]])} and {short(names[index])} both mean {name}")
         place[name] = index
-    missing = [name for name in layout.needed if name not in place]
+    missing = [name for name in expected.needed if name not in place]
     if missing:
         raise refuse(f"no column {', '.join(missing)}")
     return Header(names, place, delimiter)
@@ -191,7 +191,7 @@ class _Cells:
     where: str
     cells: Sequence[str]
     header: Header
-    layout: Layout
+    expected: Columns
     marks: set[str]
 
     def text(self, name: str) -> str:
@@ -208,7 +208,7 @@ class _Cells:
         return _decimal(cell, self.header, self.marks, self.path, self.column(name)) if cell else cell
 
     def value(self, name: str) -> float:
-        if not self.text(name) and name not in self.layout.needed:
+        if not self.text(name) and name not in self.expected.needed:
             return math.nan
         return number(self.plain(name), self.path, self.column(name))
 
@@ -219,7 +219,7 @@ class _Cells:
 
 
 def _row(
-    path: str | os.PathLike[str], line: Line, header: Header, layout: Layout, marks: set[str]
+    path: str | os.PathLike[str], line: Line, header: Header, expected: Columns, marks: set[str]
 ) -> Row | None:  # fmt: skip
     """Return the point of a line, None where it is inactive; `marks` are the decimal marks of the file until here."""
     cells, where = cells_of(path, line, header.delimiter), f"line {line.number}"
@@ -233,11 +233,11 @@ def _row(
         )  # fmt: skip
     if not header.names[-1] and cells[-1]:
         raise InputError(f"{short(cells[-1])} stands under no column name", file=path, field=where)
-    of = _Cells(path, where, cells, header, layout, marks)
+    of = _Cells(path, where, cells, header, expected, marks)
     for name, what in (("id", "an id"), (CSV_IMAGE, "an image")):
-        if (name in layout.needed or (name == "id" and "id" in header.place)) and not of.text(name):
+        if (name in expected.needed or (name == "id" and "id" in header.place)) and not of.text(name):
             raise InputError(f"a point without {what}", file=path, field=of.column(name))
-    role = role_of(of.text("role"), path, of.column("role")) if of.text("role") else layout.role
+    role = role_of(of.text("role"), path, of.column("role")) if of.text("role") else expected.role
     if of.text("status"):
         found = _STATUS.get(of.text("status").lower(), of.text("status").lower())
         if found == "i":

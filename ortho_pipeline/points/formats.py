@@ -12,7 +12,7 @@ from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.points.delimited import is_header, read_csv
 from ortho_pipeline.points.geojson import read_geojson
 from ortho_pipeline.points.link_lists import LINK_TABLE, odm_crs, read_asp, read_envi, read_links, read_odm, read_qgis
-from ortho_pipeline.points.rows import OF_BLOCK, OWN_IMAGE, Layout, Piece, Row, Table, load_text, short
+from ortho_pipeline.points.rows import OF_BLOCK, OWN_IMAGE, Columns, Placement, Row, Table, load_text, short
 
 _FORMATS = (
     "CSV/TSV (id,col,row,x,y,h,...), GeoJSON with 'ji', QGIS .points, ODM gcp_list.txt, ENVI .pts, ASP .gcp, "
@@ -23,7 +23,7 @@ _FORMATS = (
 def read_table(
     path: str | os.PathLike[str],
     image_name: str | None = None,
-    pieces: Mapping[str, Piece] | None = None,
+    pieces: Mapping[str, Placement] | None = None,
 ) -> Table:
     """Read a point file; its format is known by its content, then by its suffix.
 
@@ -47,7 +47,7 @@ def read_table(
     return _of_image(path, table, image_name, pieces or {})
 
 
-def read_block_table(path: str | os.PathLike[str], layout: Layout = OF_BLOCK) -> Table:
+def read_block_table(path: str | os.PathLike[str], expected: Columns = OF_BLOCK) -> Table:
     """Read the rays of a block, or ground alone (`OF_GROUND`, `OF_HEIGHTS`): CSV, GeoJSON; rays as ODM or ASP too.
 
     Raises
@@ -58,8 +58,8 @@ def read_block_table(path: str | os.PathLike[str], layout: Layout = OF_BLOCK) ->
     text = load_text(path)
     reader = _reader(path, text)
     if reader is read_csv or reader is read_geojson:
-        table = _read(reader, path, text, layout)
-    elif (reader is read_odm or reader is read_asp) and layout is OF_BLOCK:
+        table = _read(reader, path, text, expected)
+    elif (reader is read_odm or reader is read_asp) and expected is OF_BLOCK:
         table = _read(reader, path, text)
     else:
         raise InputError(
@@ -83,10 +83,10 @@ _WANTED: dict[Callable[..., Table], str] = {
 }
 
 
-def _read(reader: Callable[..., Table], path: str | os.PathLike[str], text: str, *layout: Layout) -> Table:
+def _read(reader: Callable[..., Table], path: str | os.PathLike[str], text: str, *expected: Columns) -> Table:
     """Read a file; an error without a remedy gets that of the format."""
     with completed(path, remedy=_WANTED[reader]):
-        return reader(path, text, *layout)
+        return reader(path, text, *expected)
 
 
 def _reader(path: str | os.PathLike[str], text: str) -> Callable[[str | os.PathLike[str], str], Table]:
@@ -117,7 +117,9 @@ def _reader(path: str | os.PathLike[str], text: str) -> Callable[[str | os.PathL
     )  # fmt: skip
 
 
-def _of_image(path: str | os.PathLike[str], table: Table, image_name: str | None, pieces: Mapping[str, Piece]) -> Table:
+def _of_image(
+    path: str | os.PathLike[str], table: Table, image_name: str | None, pieces: Mapping[str, Placement]
+) -> Table:
     named = {row.image_name for row in table.rows if row.image_name}
     if image_name is None and len({Path(name).stem.lower() for name in named}) > 1:
         some = ", ".join(sorted(map(str, named))[:5])

@@ -18,7 +18,7 @@ from ortho_pipeline.points.rows import (
     CSV_ERRORS,
     OF_BLOCK,
     OF_IMAGE,
-    Layout,
+    Columns,
     Point,
     Row,
     Table,
@@ -29,7 +29,7 @@ from ortho_pipeline.points.rows import (
 )
 
 
-def read_geojson(path: str | os.PathLike[str], text: str, layout: Layout = OF_IMAGE) -> Table:
+def read_geojson(path: str | os.PathLike[str], text: str, expected: Columns = OF_IMAGE) -> Table:
     """Read points with a property ``ji`` = [column, row] from the *centre* of the first pixel; lon, lat, height.
 
     Further properties: ``id``, ``role``, ``sigma_image``, ``sigma_xy``, ``sigma_h``, ``filename`` (the image), and
@@ -42,7 +42,7 @@ def read_geojson(path: str | os.PathLike[str], text: str, layout: Layout = OF_IM
         raise InputError("this is not a GeoJSON FeatureCollection", file=path, field="features")
     table = Table("GeoJSON", crs=_geojson_crs(path, document), assumed_vertical="ellipsoid")
     for count, feature in enumerate(features):
-        table.rows += _feature(path, f"features[{count}]", feature, layout)
+        table.rows += _feature(path, f"features[{count}]", feature, expected)
     return table
 
 
@@ -59,11 +59,11 @@ def _geojson_crs(path: str | os.PathLike[str], document: dict[str, Any]) -> str:
     return "EPSG:4979"
 
 
-def _feature(path: str | os.PathLike[str], where: str, feature: Any, layout: Layout) -> list[Row]:
+def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: Columns) -> list[Row]:
     """Return a row for each image that the point of a feature was measured in."""
     properties = feature.get("properties") if isinstance(feature, dict) else None
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
-    tie = geometry is None and layout is OF_BLOCK
+    tie = geometry is None and expected is OF_BLOCK
     if not isinstance(properties, dict) or not (
         tie or (isinstance(geometry, dict) and geometry.get("type") == "Point")
     ):
@@ -77,7 +77,7 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, layout: Lay
     name = properties.get("id", feature.get("id"))
     if name is not None and not isinstance(name, str | int):
         raise InputError(f"{short(name)} is not an id", file=path, field=f"{where}.properties.id")
-    role = properties.get("role") or layout.role
+    role = properties.get("role") or expected.role
     sigma_image = sigma("sigma_image", False)
     covariance, group = read_image_errors(
         [properties.get(one) for one in CSV_ERRORS], path, [f"{where}.properties.{one}" for one in CSV_ERRORS],
@@ -95,9 +95,9 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, layout: Lay
         covariance=covariance,
         group=group,
     )
-    if "col" not in layout.needed:
+    if "col" not in expected.needed:
         return [row]
-    return [replace(row, image=at, image_name=image) for image, at in _measured(path, where, properties, layout)]
+    return [replace(row, image=at, image_name=image) for image, at in _measured(path, where, properties, expected)]
 
 
 def _place(path: str | os.PathLike[str], where: str, geometry: dict[str, Any]) -> tuple[float, float, float]:
@@ -109,15 +109,15 @@ def _place(path: str | os.PathLike[str], where: str, geometry: dict[str, Any]) -
 
 
 def _measured(
-    path: str | os.PathLike[str], where: str, properties: dict[str, Any], layout: Layout
+    path: str | os.PathLike[str], where: str, properties: dict[str, Any], expected: Columns
 ) -> Iterator[tuple[str | None, tuple[float, float]]]:
     """Yield image and column, row from the corner of the first pixel, for each image that a point was measured in."""
     ji, file_name = properties.get("ji"), properties.get("filename")
     field = f"{where}.properties.ji"
     pairs = [(file_name if isinstance(file_name, str) else None, ji)]
-    if isinstance(ji, dict) and layout is OF_BLOCK:
+    if isinstance(ji, dict) and expected is OF_BLOCK:
         pairs = list(ji.items())
-    elif layout is OF_BLOCK and not isinstance(file_name, str):
+    elif expected is OF_BLOCK and not isinstance(file_name, str):
         raise InputError(
             "it is not said in which image this point was measured", file=path, field=field,
             remedy="give 'ji' as {image: [column, row]}, or 'filename' beside [column, row]",

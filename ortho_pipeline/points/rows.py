@@ -32,25 +32,25 @@ CSV_IMAGE = "image"
 CSV_ERRORS = ("var_col", "var_row", "cov_col_row", "group")
 
 
-class Layout(NamedTuple):
+class Columns(NamedTuple):
     """Columns that a CSV may have, those that every line fills, and the role of lines that give none."""
 
-    columns: tuple[str, ...]
+    names: tuple[str, ...]
     needed: tuple[str, ...]
     role: str
 
 
 #: Points of one image; rays of a block, whose ground may be known; ground whose heights count; ground alone.
-OF_IMAGE = Layout((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[1:5], "control")
-OF_BLOCK = Layout(("id", CSV_IMAGE, *CSV_COLUMNS[1:], *CSV_ERRORS), ("id", CSV_IMAGE, "col", "row"), "")
-OF_HEIGHTS = Layout((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[3:6], "check")
-OF_GROUND = Layout(("id", *CSV_COLUMNS[3:7], *CSV_COLUMNS[8:]), ("id", "x", "y"), "")
+OF_IMAGE = Columns((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[1:5], "control")
+OF_BLOCK = Columns(("id", CSV_IMAGE, *CSV_COLUMNS[1:], *CSV_ERRORS), ("id", CSV_IMAGE, "col", "row"), "")
+OF_HEIGHTS = Columns((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[3:6], "check")
+OF_GROUND = Columns(("id", *CSV_COLUMNS[3:7], *CSV_COLUMNS[8:]), ("id", "x", "y"), "")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 #: Where another image lies in this one: column and row of its first corner, and the width of one of its pixels.
-Piece = tuple[float, float, float]
-OWN_IMAGE: Piece = (0.0, 0.0, 1.0)
+Placement = tuple[float, float, float]
+OWN_IMAGE: Placement = (0.0, 0.0, 1.0)
 
 
 class Point(NamedTuple):
@@ -85,7 +85,7 @@ class Row:
     sigma_xy: float | None = None
     sigma_h: float | None = None
     image_name: str | None = None
-    piece: Piece = OWN_IMAGE
+    piece: Placement = OWN_IMAGE
     covariance: tuple[float, float, float] | None = None
     group: int | None = None
 

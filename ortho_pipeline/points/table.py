@@ -45,7 +45,7 @@ from ortho_pipeline.points.rows import (
     CSV_COLUMNS,
     CSV_ERRORS,
     ROLES,
-    Piece,
+    Placement,
     Point,
     Row,
     Table,
@@ -223,7 +223,7 @@ def read_points(
     vertical: str | Vertical | None = None,
     pixel_origin: str = "corner",
     image_name: str | None = None,
-    pieces: Mapping[str, Piece] | None = None,
+    pieces: Mapping[str, Placement] | None = None,
 ) -> Points:
     """Read points of any known format (docs/formats.md).
 

@@ -53,7 +53,7 @@ _OUTSIDE = (
 
 def open_seen(
     path: AnyPath, roots: Sequence[AnyPath], drivers: Sequence[str], siblings: bool
-) -> tuple[gdal.Dataset, Block]:
+) -> tuple[gdal.Dataset, DecodedUnit]:
     """Open a raster for reading if all files that it leads to lie in its own folder or in `roots`.
 
     Parameters
@@ -67,7 +67,7 @@ def open_seen(
 
     Returns
     -------
-    gdal.Dataset, Block
+    gdal.Dataset, DecodedUnit
         The raster, and the largest block of it and of all that it leads to.
 
     Raises
@@ -93,8 +93,8 @@ def _without_fetching_drivers() -> None:
 
 
 @dataclass(frozen=True)
-class Block:
-    """What GDAL decodes at once to give one pixel: its `size` in bytes, and the `path` of the file that it is in."""
+class DecodedUnit:
+    """The unit that GDAL decodes at once to give one pixel: its `size` in bytes, and the `path` of its file."""
 
     size: int
     path: str
@@ -112,7 +112,7 @@ class _Gate:
             folders = [here, here.resolve()] if here.is_dir() else [here.parent, here.resolve().parent]
             self._roots = [folder.resolve() for folder in (*folders, *map(Path, roots))]
         self._seen: set[str] = set()
-        self.block = Block(0, os.fspath(path))
+        self.block = DecodedUnit(0, os.fspath(path))
         self._folders: dict[str, list[str]] = {}
 
     def open(self, path: AnyPath, drivers: Sequence[str], siblings: bool = True) -> gdal.Dataset:
@@ -282,7 +282,7 @@ class _Gate:
             if str(file) == str(path):
                 continue
             self._must_be_inside(file, path, kind, name)
-        self.block = max(self.block, Block(_decoded_at_once(dataset), str(path)), key=lambda block: block.size)
+        self.block = max(self.block, DecodedUnit(_decoded_at_once(dataset), str(path)), key=lambda block: block.size)
 
 
 def _decoded_at_once(dataset: gdal.Dataset) -> int:

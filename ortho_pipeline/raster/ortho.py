@@ -23,7 +23,7 @@ from ortho_pipeline.raster.source import Grid, RasterSource, holds, pixel_type
 
 @dataclass(frozen=True)
 class Profile:
-    """What an output raster takes over from its source."""
+    """Properties that an output raster takes over from its source."""
 
     count: int
     dtype: np.dtype[Any]

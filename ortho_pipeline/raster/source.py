@@ -27,7 +27,7 @@ from ortho_pipeline.files.locations import VsiPath, archive_of, in_local_archive
 from ortho_pipeline.files.process_limits import require_memory
 from ortho_pipeline.options import PIXEL_TYPES
 from ortho_pipeline.raster.block_cache import keep_blocks
-from ortho_pipeline.raster.gate import DRIVERS, Block, open_seen
+from ortho_pipeline.raster.gate import DRIVERS, DecodedUnit, open_seen
 
 gdal.UseExceptions()
 log = logging.getLogger(__name__)
@@ -108,7 +108,7 @@ def open_pixels(
 @reads(_WHOLE)
 def _opened(
     path: str | os.PathLike[str], allow_network: bool, roots: Sequence[str | os.PathLike[str]], siblings: bool
-) -> tuple[gdal.Dataset, Block]:
+) -> tuple[gdal.Dataset, DecodedUnit]:
     require_memory()
     place = located(path, allow_network=allow_network)
     name, drivers = os.fspath(place), list(DRIVERS)

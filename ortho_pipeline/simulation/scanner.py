@@ -293,7 +293,7 @@ def meet_terrain(camera: LineScanner, terrain: Terrain, image: ArrayLike) -> Arr
         level = _climb(ground, direction)
         with np.errstate(divide="ignore", invalid="ignore"):
             rate = (above - before) / step
-            # Near the end, and across a knick, the secant is noise; the ray over level ground always leads on.
+            # Near the end, and across a slope break, the secant is noise; the ray over level ground always leads on.
             rate = np.where((rate < 0.4 * level) & (rate > 2.5 * level), rate, level)
     ground[~(np.abs(above) <= 1e-6)] = np.nan
     return ground

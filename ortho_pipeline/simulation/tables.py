@@ -1,4 +1,4 @@
-"""What the reproductions of all papers share: the paper's numbers, ours beside them, and what that proves.
+"""Tables that the reproductions of all papers share: the paper's numbers, ours beside them, and what that proves.
 
 An experiment is a sequence of `Number`, one for each number of the paper's tables (and, with `paper` None, for what the
 paper did not have), a sequence of `Knob`, one for each setting that somebody chose, and an array of what came out in
@@ -60,7 +60,7 @@ class Number:
 
     @property
     def key(self) -> str:
-        """What the patterns of `Knob.rows` are compared with."""
+        """Text that the patterns of `Knob.rows` are compared with."""
         return f"{self.table}|{self.label}|{self.quantity}"
 
 

@@ -307,8 +307,8 @@ def _cells(xy: Array, size: float, salt: int) -> tuple[Array, Array]:
     number = np.zeros(len(xy))
     for di in (-1, 0, 1):
         for dj in (-1, 0, 1):
-            jitter = np.stack([_hash(i + di, j + dj, salt), _hash(i + di, j + dj, salt + 1)], axis=1)
-            site = (np.stack([i + di, j + dj], axis=1) + 0.15 + 0.7 * jitter) * size
+            offset = np.stack([_hash(i + di, j + dj, salt), _hash(i + di, j + dj, salt + 1)], axis=1)
+            site = (np.stack([i + di, j + dj], axis=1) + 0.15 + 0.7 * offset) * size
             square = ((xy - site) ** 2).sum(axis=1)
             nearer = square < best
             runner = ~nearer & (square < second)

@@ -1,4 +1,4 @@
-"""What everyone asks of the ground, be it a DEM or flat: heights, and the windows of samples that a warp reads."""
+"""The interface of the ground, be it a DEM or flat: heights, and the windows of samples that a warp reads."""
 
 from __future__ import annotations
 

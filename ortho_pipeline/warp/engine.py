@@ -31,7 +31,7 @@ from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp import kernels
 from ortho_pipeline.warp.block_kernel import DemWindow, Target, warp_block
 from ortho_pipeline.warp.gdal_engine import warp_with_gdal
-from ortho_pipeline.warp.lattice import BLOCK, Block, Lattices, Terrain, block_cells
+from ortho_pipeline.warp.lattice import BLOCK, Lattices, OutputBlock, Terrain, block_cells
 
 #: Side of a tile, the piece of work of a thread.
 TILE = 4 * BLOCK
@@ -51,7 +51,7 @@ _ARRAYS_BYTES = 100
 
 @dataclass(frozen=True)
 class WarpResult:
-    """What `rectify` did.
+    """The outcome of `rectify`.
 
     `max_error_px` is a bound on the difference (source pixels) between the geometry used and the exact model at every
     output pixel; `finest_spacing` the smallest lattice spacing that a block needed, 1 where every pixel was projected;
@@ -290,7 +290,7 @@ class _Job:
         pixels = np.full((self.source.count, height, width), self.resampling.fill, dtype=self.source.dtype)
         tile = _Tile(top, left, pixels, np.zeros(pixels.shape, dtype=bool))
         blocks = [
-            Block(row, column)
+            OutputBlock(row, column)
             for row in range(top // BLOCK, -(-(top + height) // BLOCK))
             for column in range(left // BLOCK, -(-(left + width) // BLOCK))
         ]
@@ -310,7 +310,7 @@ class _Job:
 
     # -- pixels ------------------------------------------------------------------------------------------------------
 
-    def _warp(self, blocks: list[Block], dem: DemWindow, area: tuple[int, int, int, int], tile: _Tile) -> None:
+    def _warp(self, blocks: list[OutputBlock], dem: DemWindow, area: tuple[int, int, int, int], tile: _Tile) -> None:
         windows = np.array([block.window for block in blocks])
         left, top = windows[:, :2].min(axis=0)
         right, bottom = windows[:, 2:].max(axis=0)
@@ -325,7 +325,7 @@ class _Job:
         for block in blocks:
             self._warp_block(block, window, dem, tile.target(block, area))
 
-    def _warp_cells(self, block: Block, dem: DemWindow, area: tuple[int, int, int, int], tile: _Tile) -> None:
+    def _warp_cells(self, block: OutputBlock, dem: DemWindow, area: tuple[int, int, int, int], tile: _Tile) -> None:
         """Make a block whose window of the source is too large for the memory, one cell of its lattice at a time."""
         for cell, nodes in block_cells(block.spacing):
             window = self.lattices.source_window(block, *nodes)
@@ -333,7 +333,7 @@ class _Job:
             if window is not None and within:
                 self._warp_block(block, _window(self.source, *window), dem, tile.target(block, cell))
 
-    def _warp_block(self, block: Block, window: kernels.SourceWindow, dem: DemWindow, target: Target) -> None:
+    def _warp_block(self, block: OutputBlock, window: kernels.SourceWindow, dem: DemWindow, target: Target) -> None:
         resampling = self.resampling._replace(reach=block.reach, box=block.box)
         while target.pixels.size and warp_block(window, block.lattice, dem, resampling, target):
             window = _wider(self.source, window)
@@ -348,7 +348,7 @@ class _Tile:
     pixels: NDArray[Any]
     valid: NDArray[np.bool_]
 
-    def target(self, block: Block, area: tuple[int, int, int, int]) -> Target:
+    def target(self, block: OutputBlock, area: tuple[int, int, int, int]) -> Target:
         """Return the place of a part of a block (see `Terrain.groups`); the last blocks of a grid reach beyond it."""
         top, left = block.row * BLOCK - self.top, block.column * BLOCK - self.left
         _, height, width = self.pixels.shape

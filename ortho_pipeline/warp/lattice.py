@@ -63,8 +63,8 @@ _MARGIN = 4
 
 
 @dataclass(eq=False)
-class Block:
-    """One block: where it is, its terrain, its lattice."""
+class OutputBlock:
+    """One block of the output: where it is, its terrain, its lattice."""
 
     row: int
     column: int
@@ -149,7 +149,7 @@ def _levels(count: int) -> Array:
     return -np.cos(np.pi * np.arange(count) / (count - 1))
 
 
-def _scatter(blocks: list[Block], area: Array) -> Array:
+def _scatter(blocks: list[OutputBlock], area: Array) -> Array:
     """Return `VERIFIED` points of each block ``(blocks, n, 3)``: column and row offsets, normalised height.
 
     They lie in `area` ``(blocks, 4)``, first row, last row, first column, last column (offsets in pixels). A
@@ -197,18 +197,18 @@ class Lattices:
         self._lock = threading.Lock()
         self.worst, self.finest, self.refined = 0.0, REFINEMENTS[0][0], 0
 
-    def build(self, blocks: list[Block], terrain: Terrain) -> list[Block]:
+    def build(self, blocks: list[OutputBlock], terrain: Terrain) -> list[OutputBlock]:
         """Give each block that has terrain its lattice; return those that see the source."""
         uv = self._nodes_dem(blocks, REFINEMENTS[0][0])
         with_terrain = terrain.ranges(blocks, uv)
         return self._lattices([blocks[k] for k in with_terrain], uv[with_terrain], terrain)
 
-    def _nodes_dem(self, blocks: list[Block], spacing: int) -> Array:
+    def _nodes_dem(self, blocks: list[OutputBlock], spacing: int) -> Array:
         columns, rows = self._offsets(blocks, *_positions(spacing))
         return self._exact.dem(columns, rows)
 
     @staticmethod
-    def _offsets(blocks: list[Block], columns: Array, rows: Array) -> tuple[Array, Array]:
+    def _offsets(blocks: list[OutputBlock], columns: Array, rows: Array) -> tuple[Array, Array]:
         """Return output positions of pixel centres, ``(blocks, ...)``, at offsets from each block's first pixel."""
         shape = (-1,) + (1,) * columns.ndim
         corner_columns = np.array([block.column for block in blocks], dtype=float).reshape(shape) * BLOCK
@@ -217,7 +217,7 @@ class Lattices:
 
     # -- lattices ----------------------------------------------------------------------------------------------------
 
-    def _lattices(self, blocks: list[Block], uv: Array, terrain: Terrain) -> list[Block]:
+    def _lattices(self, blocks: list[OutputBlock], uv: Array, terrain: Terrain) -> list[OutputBlock]:
         """Give each block its lattice; return those that see the source."""
         if not blocks:
             return []
@@ -236,7 +236,7 @@ class Lattices:
                 self.refined += block.spacing != REFINEMENTS[0][0]
         return [block for block in blocks if block.window is not None]
 
-    def _evaluate(self, blocks: list[Block], spacing: int, levels: int, uv: Array) -> Array:
+    def _evaluate(self, blocks: list[OutputBlock], spacing: int, levels: int, uv: Array) -> Array:
         """Set the lattices of `blocks` from exact model evaluations; return a bound on the error of each ``(blocks,)``.
 
         Infinite for a block into which the scene may come between nodes that the model does not project.
@@ -253,14 +253,14 @@ class Lattices:
             self._set(block, spacing, coefficients[k], image[k], uv[k])
         return self._bounds(blocks, image, coefficients, uv)
 
-    def _project(self, block: Block, terrain: Terrain) -> None:
+    def _project(self, block: OutputBlock, terrain: Terrain) -> None:
         """Give a block the exact image points of all its pixels, each at its own height."""
         columns, rows = self._offsets([block], *_positions(1))
         heights = terrain.heights(block, self._exact.dem(columns, rows)[0])
         image = self._exact.image(columns, rows, heights[None, :, :, None])[0]
         self._set(block, 1, image, image, np.full((*heights.shape, 2), 0.5))
 
-    def _set(self, block: Block, spacing: int, coefficients: Array, image: Array, uv: Array) -> None:
+    def _set(self, block: OutputBlock, spacing: int, coefficients: Array, image: Array, uv: Array) -> None:
         block.spacing, block.nodes, block.dem_nodes, block.image = spacing, coefficients, uv, image
         block.reach = self._reach
         if self._averages:
@@ -268,7 +268,7 @@ class Lattices:
             block.reach += math.ceil(max(block.box) / 2)
         block.window = self.source_window(block)
 
-    def _bounds(self, blocks: list[Block], image: Array, coefficients: Array, uv: Array) -> Array:
+    def _bounds(self, blocks: list[OutputBlock], image: Array, coefficients: Array, uv: Array) -> Array:
         """Return a bound on the error (source px) of each block's lattice where it may show some of the image."""
         count, spacing = image.shape[1] - 1, blocks[0].spacing
         unknown = np.array([block.window is not None or self._in_domain(block) for block in blocks])
@@ -288,7 +288,7 @@ class Lattices:
         return error
 
     def source_window(
-        self, block: Block, rows: slice = slice(None), columns: slice = slice(None)
+        self, block: OutputBlock, rows: slice = slice(None), columns: slice = slice(None)
     ) -> tuple[int, int, int, int] | None:
         """Return the window of the source (left, top, right, bottom) under some nodes of a block; None if empty."""
         assert block.image is not None
@@ -301,7 +301,7 @@ class Lattices:
         high = np.clip(np.ceil(points.max(axis=0)) + pad, 0, size).astype(int)
         return None if (high <= low).any() else (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
 
-    def _in_domain(self, block: Block) -> bool:
+    def _in_domain(self, block: OutputBlock) -> bool:
         left, top, right, bottom = self._domain
         column, row = block.column * BLOCK, block.row * BLOCK
         return left < column + BLOCK and right > column and top < row + BLOCK and bottom > row
@@ -314,7 +314,7 @@ class Terrain:
         self._surface, self._cubic, self._window_bytes = surface, cubic, window_bytes
         self._whole: DemWindow | None = None
 
-    def ranges(self, blocks: list[Block], uv: Array) -> list[int]:
+    def ranges(self, blocks: list[OutputBlock], uv: Array) -> list[int]:
         """Set the height range of each block from its lattice in the DEM; return the indices of those with heights."""
         windows = [self._window(nodes) for nodes in uv]
         present = [k for k, window in enumerate(windows) if window is not None]
@@ -326,7 +326,9 @@ class Terrain:
             self._whole = self._read(whole)
         return [k for k in present if self._range(blocks[k], windows[k])]
 
-    def groups(self, blocks: list[Block]) -> Iterator[tuple[list[Block], DemWindow, tuple[int, int, int, int]]]:
+    def groups(
+        self, blocks: list[OutputBlock]
+    ) -> Iterator[tuple[list[OutputBlock], DemWindow, tuple[int, int, int, int]]]:
         """Yield blocks with the heights that they share and the part of the block.
 
         The part (first row, last row + 1, first column, last column + 1) is the whole block, or a cell of its lattice
@@ -348,7 +350,7 @@ class Terrain:
                 if window is not None:
                     yield [block], self._read(window), cell
 
-    def heights(self, block: Block, uv: Array) -> Array:
+    def heights(self, block: OutputBlock, uv: Array) -> Array:
         """Return the heights ``(BLOCK + 1, BLOCK + 1)`` at DEM points of all pixels of a block; NaN in voids."""
         found = np.full(uv.shape[:2], np.nan)
         parts: Any = [((), slice(None))] if self._whole is not None or self._fits(block.terrain) else block_cells(1)
@@ -370,7 +372,7 @@ class Terrain:
         heights = self._surface.window(left, top, right - left, bottom - top)
         return DemWindow(heights, left, top, self._cubic)
 
-    def _range(self, block: Block, window: Any) -> bool:
+    def _range(self, block: OutputBlock, window: Any) -> bool:
         left, top, right, bottom = block.terrain = window
         if self._whole is None:
             try:
@@ -399,7 +401,7 @@ def block_cells(spacing: int) -> Iterator[tuple[tuple[int, int, int, int], tuple
             yield (row, row + step, column, column + step), (rows, columns)
 
 
-def _box(block: Block) -> tuple[float, float]:
+def _box(block: OutputBlock) -> tuple[float, float]:
     """Return how many columns and rows of the source one output pixel covers in the mean over a block, at least 1."""
     level = block.lattice.image[:, :, 0]
     across = np.abs(np.diff(level, axis=1)) / block.spacing

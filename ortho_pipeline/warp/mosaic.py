@@ -41,11 +41,11 @@ _MARGIN = 18
 
 @dataclass(frozen=True)
 class Ortho:
-    """An orthoimage of a mosaic; `lean` is the tangent of its incidence, None where that is not known."""
+    """An orthoimage of a mosaic; `relief_displacement` is that of a metre of height (m), None where it is not known."""
 
     name: str
     path: Path
-    lean: float | None = None
+    relief_displacement: float | None = None
 
 
 @dataclass(frozen=True)
@@ -59,14 +59,14 @@ class Layer:
 
 
 @dataclass(frozen=True)
-class Layout:
-    """The grid of a mosaic and its layers, the topmost first."""
+class Mosaic:
+    """Orthos placed on one grid: layers, the topmost first."""
 
     grid: Grid
     layers: tuple[Layer, ...]
 
 
-def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Layout:
+def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
     """Return where orthos lie on their common grid.
 
     Parameters
@@ -82,7 +82,9 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Layout:
     if not orthos:
         raise InputError("a mosaic needs an ortho", field="mosaic")
     if order == "best-view":
-        orthos = sorted(orthos, key=lambda ortho: math.inf if ortho.lean is None else ortho.lean)
+        orthos = sorted(
+            orthos, key=lambda ortho: math.inf if ortho.relief_displacement is None else ortho.relief_displacement
+        )
     grids = [grid_of(ortho.path) for ortho in orthos]
     first = grids[0]
     for ortho, grid in zip(orthos, grids, strict=True):
@@ -97,7 +99,7 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Layout:
         Layer(ortho, grid, round((grid.left - left) / first.dx), round((top - grid.top) / first.dy))
         for ortho, grid in zip(orthos, grids, strict=True)
     ]
-    return Layout(whole, tuple(layers))
+    return Mosaic(whole, tuple(layers))
 
 
 def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
@@ -130,7 +132,7 @@ def _check_bands(orthos: Sequence[Ortho]) -> None:
 # -- writing ---------------------------------------------------------------------------------------------------------
 
 
-def write_vrt(layout: Layout, path: Path) -> None:
+def write_vrt(placed: Mosaic, path: Path) -> None:
     """Write the mosaic as a VRT that refers to the orthos by relative paths; they have to lie below its folder.
 
     Raises
@@ -138,24 +140,24 @@ def write_vrt(layout: Layout, path: Path) -> None:
     InputError
         If GDAL leaves an ortho out.
     """
-    names = [str(layer.ortho.path) for layer in reversed(layout.layers)]
+    names = [str(layer.ortho.path) for layer in reversed(placed.layers)]
     with raster_output(path) as temporary:
         made = gdal.BuildVRT(
-            str(temporary), names, outputBounds=layout.grid.extent, xRes=layout.grid.dx, yRes=layout.grid.dy,
+            str(temporary), names, outputBounds=placed.grid.extent, xRes=placed.grid.dx, yRes=placed.grid.dy,
             resolution="user",
         )  # fmt: skip
         with written(made) as dataset:
             size = dataset.RasterXSize, dataset.RasterYSize
             listed = {Path(name).resolve() for name in dataset.GetFileList()}
-        missing = [layer.ortho.name for layer in layout.layers if layer.ortho.path.resolve() not in listed]
-        if missing or size != (layout.grid.width, layout.grid.height):
+        missing = [layer.ortho.name for layer in placed.layers if layer.ortho.path.resolve() not in listed]
+        if missing or size != (placed.grid.width, placed.grid.height):
             raise InputError(f"GDAL leaves out {', '.join(missing) or 'pixels'}", file=path, remedy="make a COG of it")
 
 
-def write_cog(layout: Layout, path: Path, *, memory: int = 512_000_000, threads: int = 1) -> None:
+def write_cog(placed: Mosaic, path: Path, *, memory: int = 512_000_000, threads: int = 1) -> None:
     """Write the mosaic as a COG, window by window."""
-    sources = [RasterSource(layer.ortho.path, memory=memory) for layer in layout.layers]
-    profile, grid = Profile.of(sources[0]), layout.grid
+    sources = [RasterSource(layer.ortho.path, memory=memory) for layer in placed.layers]
+    profile, grid = Profile.of(sources[0]), placed.grid
     limit_cache(memory, 1, max(source.block for source in sources))
     fill = profile.dtype.type(0 if profile.nodata is None else profile.nodata)
     with RasterWriter(path, grid, profile, threads=threads) as writer:
@@ -164,7 +166,7 @@ def write_cog(layout: Layout, path: Path, *, memory: int = 512_000_000, threads:
                 size = min(_WINDOW, grid.width - left), min(_WINDOW, grid.height - top)
                 pixels = np.full((profile.count, size[1], size[0]), fill, dtype=profile.dtype)
                 valid = np.zeros(pixels.shape, dtype=bool)
-                for layer, source in zip(layout.layers, sources, strict=True):
+                for layer, source in zip(placed.layers, sources, strict=True):
                     _put_below(layer, source, left, top, pixels, valid)
                 writer.write(left, top, pixels, np.all(valid, axis=0))
 
@@ -212,15 +214,15 @@ class Overlap:
     pixels: float
 
 
-def overlaps(layout: Layout) -> list[Overlap]:
+def overlaps(placed: Mosaic) -> list[Overlap]:
     """Return all pairs of layers that overlap, in the order of the layers."""
-    outlines = [valid_outline(layer.ortho.path) for layer in layout.layers]
+    outlines = [valid_outline(layer.ortho.path) for layer in placed.layers]
     tree = shapely.STRtree(outlines)
     found = []
     for i, j in sorted({(int(a), int(b)) for a, b in tree.query(outlines, predicate="intersects").T if a < b}):
-        area = shapely.intersection(outlines[i], outlines[j]).area / (layout.grid.dx * layout.grid.dy)
+        area = shapely.intersection(outlines[i], outlines[j]).area / (placed.grid.dx * placed.grid.dy)
         if area >= 1:
-            found.append(Overlap(layout.layers[i], layout.layers[j], area))
+            found.append(Overlap(placed.layers[i], placed.layers[j], area))
     return found
 
 
@@ -310,17 +312,17 @@ def _windows(box: tuple[int, int, int, int]) -> Iterator[tuple[int, int, int, in
             yield left, top, width, height
 
 
-def summary(layout: Layout, seams: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def summary(placed: Mosaic, seams: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return what there is to say of a mosaic as JSON values."""
     measured = [seam for seam in seams if seam["patches"]]
     lengths = [math.hypot(*seam["median_px"]) for seam in measured]
     worst = max(zip(lengths, measured, strict=True), key=lambda pair: pair[0], default=None)
     return {
-        "crs": crs_text(layout.grid.crs),
-        "extent": [float(value) for value in layout.grid.extent],
-        "resolution": [layout.grid.dx, layout.grid.dy],
-        "size": [layout.grid.width, layout.grid.height],
-        "on_top_first": [layer.ortho.name for layer in layout.layers],
+        "crs": crs_text(placed.grid.crs),
+        "extent": [float(value) for value in placed.grid.extent],
+        "resolution": [placed.grid.dx, placed.grid.dy],
+        "size": [placed.grid.width, placed.grid.height],
+        "on_top_first": [layer.ortho.name for layer in placed.layers],
         "seams": [dict(seam) for seam in seams],
         "seams_measured": len(measured),
         "median_seam_px": float(np.median(lengths)) if lengths else None,

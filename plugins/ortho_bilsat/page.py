@@ -1,4 +1,4 @@
-"""What the page of `ortho reproduce bilsat` says: figure 2, and why some rows differ."""
+"""Page of `ortho reproduce bilsat`: figure 2, and why some rows differ."""
 
 from __future__ import annotations
 

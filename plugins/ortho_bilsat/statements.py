@@ -1,4 +1,4 @@
-"""What the BILSAT-1 paper says in sections 4 and 5, and whether the medians of `bilsat.reproduce` say the same."""
+"""Statements of the BILSAT-1 paper, sections 4 and 5, and whether the medians of `bilsat.reproduce` agree."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ HEIGHTS = (-500.0, 9000.0)
 
 @dataclass(frozen=True)
 class Survey:
-    """What an imaging survey says; metres, radians, ECEF (WGS84).
+    """An imaging survey; metres, radians, ECEF (WGS84).
 
     `attitude` is roll, pitch, yaw from the orbital frame (along, right, down) or None.
     """

@@ -222,7 +222,7 @@ def render(
 
 @dataclass(frozen=True)
 class SurveyTruth:
-    """What an imaging survey says of a snapshot, errors included; ECEF metres and metres per second."""
+    """The imaging survey of a snapshot, errors included; ECEF metres and metres per second."""
 
     position: tuple[float, float, float]
     velocity: tuple[float, float, float]

@@ -246,7 +246,7 @@ def settings_text(realisations: int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """What somebody who adjusts a stereo pair has: measured points, RPCs and metadata. The truth is not in it."""
+    """A stereo pair as it is adjusted: measured points, RPCs and metadata. The truth is not in it."""
 
     tables: Mapping[str, Points]
     rpcs: Mapping[str, RPC]

@@ -34,7 +34,7 @@ _TIMES = ("%d-%b-%Y %H:%M:%S.%f", "%d-%b-%Y %H:%M:%S", "%d-%b-%Y:%H:%M:%S.%f", "
 
 @dataclass(frozen=True)
 class Metadata:
-    """What a `_MET.TXT` says.
+    """The statements of a `_MET.TXT`.
 
     Attributes
     ----------

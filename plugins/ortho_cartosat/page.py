@@ -1,4 +1,4 @@
-"""What the page of `ortho reproduce cartosat` says: error vectors, and why some rows differ."""
+"""Page of `ortho reproduce cartosat`: error vectors, and why some rows differ."""
 
 from __future__ import annotations
 

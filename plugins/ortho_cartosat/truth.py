@@ -58,7 +58,7 @@ CELLS = 1.2
 
 @dataclass(frozen=True)
 class Bias:
-    """What the vendor's RPC is off by over the points, predicted minus true, in pixels; slopes are pixels per pixel."""
+    """Error of the vendor's RPC over the points, predicted minus true, in pixels; slopes are pixels per pixel."""
 
     col: float
     row: float
@@ -307,7 +307,7 @@ def biased(camera: Scanner, bias: Bias) -> Scanner:
     """Return the camera as the vendor believes it to be: attitude and its rates off, so that `bias` comes out.
 
     The five numbers of a bias are matched by five errors of the attitude over the field of the points, at low heights.
-    Of jitter nobody knows.
+    Of pitch jitter nobody knows.
     """
     spots = np.array([(u, v) for u in (-1.0, 0.0, 1.0) for v in (-1.0, 0.0, 1.0)])
     image = (np.array(FIELD_MIDDLE) + spots * FIELD_HALF) * camera.size
@@ -355,7 +355,7 @@ class StereoPair:
     def make(
         cls, *, size: int = SIZE, points: int = POINTS, seed: int = 1, jitter: float = 0.0, hills: Hills | None = None
     ) -> Self:
-        """Make a pair; the places of the points and the phases of the jitter come from `seed`.
+        """Make a pair; the places of the points and the phases of the pitch jitter come from `seed`.
 
         Parameters
         ----------
@@ -378,7 +378,7 @@ class StereoPair:
                 (jitter * PITCH / FOCAL_LENGTH / np.sqrt(2.0), float(frequency), float(phase))
                 for frequency, phase in zip((1.7, 2.9), random.uniform(0, 2 * np.pi, 2), strict=True)
             )
-            # Without jitter it is the same camera every time, and what the vendor believes has been found before.
+            # Without pitch jitter it is the same camera every time, and what the vendor believes has been found before.
             cameras[view] = replace(camera, attitude=replace(camera.attitude, jitter=swings)) if jitter else camera
         ground = cameras["fore"].meet(_spread(round(CELLS * points), random) * size, hills)
         lowest = np.sort(np.argsort(ground[:, 2])[:points])

@@ -158,7 +158,7 @@ class Component:
 
 @dataclass(frozen=True)
 class Delivery:
-    """What the metadata file of an order says.
+    """The statements of the metadata file of an order.
 
     `crs` is None where the projection is another than UTM on WGS84, `projection` what the file calls it. `product`
     is what the whole product has in common, where it does not belong to one component.

@@ -50,7 +50,7 @@ class ImageFile:
 
     @property
     def grid(self) -> str:
-        """What images with the same pixels have in common: separate colours; files of several may be sharpened."""
+        """Kind of pixels that images of an order share: separate colours; files of several may be sharpened."""
         return "colour" if self.band in SEPARATE else self.band
 
     def others(self) -> Iterator[ImageFile]:

@@ -1,4 +1,4 @@
-"""What the page of `ortho reproduce ikonos` says: figure 4, and where the settings come from."""
+"""Page of `ortho reproduce ikonos`: figure 4, and where the settings come from."""
 
 from __future__ import annotations
 

@@ -305,7 +305,7 @@ class GeoScene:
         ground = self.on_map([[self.columns / 2, self.rows / 2]])
         point = geocentric(ground)
         _, origin = self.scan.passes(point, self.vendor_attitude)
-        east, north, up = _horizon(*ground[0, :2])
+        east, north, up = _enu_axes(*ground[0, :2])
         ray = (origin - point)[0]
         azimuth = np.degrees(np.arctan2(ray @ east, ray @ north)) % 360
         return float(azimuth), float(np.degrees(np.arctan2(ray @ up, np.hypot(ray @ east, ray @ north))))
@@ -319,7 +319,7 @@ class GeoScene:
     @property
     def scan_azimuth_deg(self) -> float:
         """Direction of the scan over the ground, degrees from true north."""
-        east, north, _ = _horizon(LON, LAT)
+        east, north, _ = _enu_axes(LON, LAT)
         return float(np.degrees(np.arctan2(self.scan.direction @ east, self.scan.direction @ north)) % 360)
 
     @property
@@ -351,7 +351,7 @@ class GeoScene:
 
 @dataclass(frozen=True, eq=False)
 class VendorModel(SensorModel):
-    """What the vendor knows of a scene, for fitting the RPC that is delivered."""
+    """A scene as its vendor knows it, for fitting the RPC that is delivered."""
 
     kind: ClassVar[str] = "ikonos-vendor"
 
@@ -389,7 +389,7 @@ def to_map() -> pyproj.Transformer:
     return pyproj.Transformer.from_crs("EPSG:4326", MAP_CRS, always_xy=True)
 
 
-def _horizon(lon: float, lat: float) -> tuple[Array, Array, Array]:
+def _enu_axes(lon: float, lat: float) -> tuple[Array, Array, Array]:
     """Return the unit vectors (3,) to the east, the north and upwards at a place in degrees."""
     lon, lat = np.radians(lon), np.radians(lat)
     east = np.array([-np.sin(lon), np.cos(lon), 0.0])

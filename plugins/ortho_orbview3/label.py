@@ -83,7 +83,7 @@ class Group:
         return self._number(key, self.text(key))
 
     def whole(self, key: str) -> int:
-        """Return a positive whole number below a milliard.
+        """Return a positive whole number below a billion.
 
         Raises
         ------

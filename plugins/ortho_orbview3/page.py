@@ -1,4 +1,4 @@
-"""What the page of `ortho reproduce orbview3` says: figures 4 to 7, and why some rows differ."""
+"""Page of `ortho reproduce orbview3`: figures 4 to 7, and why some rows differ."""
 
 from __future__ import annotations
 

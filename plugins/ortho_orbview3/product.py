@@ -42,7 +42,7 @@ DIFFERENT, CONTRADICTORY = 1e-3, 1.0
 
 @dataclass(frozen=True, eq=False)
 class Product:
-    """What a label says.
+    """The statements of a label.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What the OrbView-3 paper says, and whether what came out of `orbview3.reproduce` says the same."""
+"""Statements of the OrbView-3 paper, and whether the outcome of `orbview3.reproduce` agrees."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PAPER_REMOVED = {"471890": {"col_per_col", "col_per_row"}, "443940": {"col_per_r
 
 @dataclass
 class Findings:
-    """What came out beside the numbers of the tables, over all realisations."""
+    """Outcome beside the numbers of the tables, over all realisations."""
 
     numbers: dict[str, list[float]] = field(default_factory=dict)
     pruned: dict[str, Counter[str]] = field(default_factory=dict)

@@ -345,7 +345,7 @@ def to_map() -> pyproj.Transformer:
 
 @dataclass(frozen=True, eq=False)
 class Believed(SensorModel):
-    """What a vendor believes of a camera, as a model of the host, so that an RPC can be fitted to it."""
+    """A camera as its vendor believes it, as a model of the host, so that an RPC can be fitted to it."""
 
     kind: ClassVar[str] = "simulated-scanner"
 

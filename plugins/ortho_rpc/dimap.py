@@ -151,7 +151,7 @@ def tile_of(file: DimapFile, image: str | None) -> tuple[int, int, int, int] | N
 
 @dataclass(frozen=True)
 class _Scan:
-    """What either version says of a scene; times are seconds of the day.
+    """A scene as either version describes it; times are seconds of the day.
 
     Parameters
     ----------

@@ -54,7 +54,7 @@ def cut(
     with RasterWriter(path, grid, profile, driver=options.get("driver", "COG")) as writer:
         filled = np.where(valid, values, 0 if nodata is None else nodata).astype(dtype)
         writer.write(0, 0, filled[None], valid)
-    return Ortho(name, path, options.get("lean"))
+    return Ortho(name, path, options.get("relief_displacement"))
 
 
 def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -68,19 +68,19 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     [{}, {"validity": "nodata", "nodata": 7.0}, {"dtype": "float32", "validity": "nodata", "nodata": math.nan}],
 )
 def test_vrt_and_cog_are_the_same_pixels(tmp_path, landscape, options):
-    a = cut(tmp_path, "a", landscape, 40, 30, 300, 260, lean=0.4, **options)
-    b = cut(tmp_path, "b [x]", landscape + 3000, 200, 130, 300, 260, lean=0.1, **options)
-    c = cut(tmp_path, "c", landscape + 6000, 250, 20, 200, 200, lean=None, **options)
+    a = cut(tmp_path, "a", landscape, 40, 30, 300, 260, relief_displacement=0.4, **options)
+    b = cut(tmp_path, "b [x]", landscape + 3000, 200, 130, 300, 260, relief_displacement=0.1, **options)
+    c = cut(tmp_path, "c", landscape + 6000, 250, 20, 200, 200, relief_displacement=None, **options)
     expected = np.zeros((360, 460))
     for order, on_top in (("best-view", "ba?"), ("first-on-top", "abc")):
-        layout = lay_out([a, b, c], order)
-        assert "".join(layer.ortho.name[0] for layer in layout.layers).startswith(on_top[:2])
-        assert (layout.grid.width, layout.grid.height) == (460, 370)
-        assert layout.grid.extent == (500080, 4e6 - 780, 501000, 4e6 - 40)
-        write_vrt(layout, tmp_path / "m.vrt")
-        write_cog(layout, tmp_path / "m.tif")
+        placed = lay_out([a, b, c], order)
+        assert "".join(layer.ortho.name[0] for layer in placed.layers).startswith(on_top[:2])
+        assert (placed.grid.width, placed.grid.height) == (460, 370)
+        assert placed.grid.extent == (500080, 4e6 - 780, 501000, 4e6 - 40)
+        write_vrt(placed, tmp_path / "m.vrt")
+        write_cog(placed, tmp_path / "m.tif")
         expected, known = np.zeros((370, 460)), np.zeros((370, 460), dtype=bool)
-        for layer in reversed(layout.layers):
+        for layer in reversed(placed.layers):
             values, valid = read(layer.ortho.path)
             place = slice(layer.top, layer.top + values.shape[0]), slice(layer.left, layer.left + values.shape[1])
             expected[place] = np.where(valid, values, expected[place])
@@ -96,10 +96,10 @@ def test_vrt_and_cog_are_the_same_pixels(tmp_path, landscape, options):
 
 def test_a_mosaic_larger_than_its_windows(tmp_path, landscape, monkeypatch):
     orthos = [cut(tmp_path, f"s{i}", landscape + 100 * i, 90 * i, 70 * i, 250, 230) for i in range(4)]
-    layout = lay_out(orthos, "first-on-top")
-    write_cog(layout, tmp_path / "one.tif")
+    placed = lay_out(orthos, "first-on-top")
+    write_cog(placed, tmp_path / "one.tif")
     monkeypatch.setattr(mosaic, "_WINDOW", 97)
-    write_cog(layout, tmp_path / "many.tif")
+    write_cog(placed, tmp_path / "many.tif")
     for one, many in zip(read(tmp_path / "one.tif"), read(tmp_path / "many.tif"), strict=True):
         np.testing.assert_array_equal(one, many)
 
@@ -145,11 +145,11 @@ def test_seams_without_detail_or_room(tmp_path, landscape):
     b = cut(tmp_path, "b", flat, 150, 0, 300, 300)
     c = cut(tmp_path, "c", landscape, 290, 0, 300, 300, corner=-1)
     d = cut(tmp_path, "d", landscape, 0, 400, 100, 100)
-    layout = lay_out([a, b, c, d], "first-on-top")
-    found = [measure_seam(pair) for pair in overlaps(layout)]
+    placed = lay_out([a, b, c, d], "first-on-top")
+    found = [measure_seam(pair) for pair in overlaps(placed)]
     assert [(seam["first"], seam["second"]) for seam in found] == [("a", "b"), ("a", "c"), ("b", "c")]
     assert all(seam["patches"] == 0 and seam["median_px"] is None for seam in found)
-    summary = mosaic.summary(layout, found)
+    summary = mosaic.summary(placed, found)
     assert (summary["seams_measured"], summary["worst_seam"], summary["median_seam_px"]) == (0, None, None)
     json.dumps(summary, allow_nan=False)
 

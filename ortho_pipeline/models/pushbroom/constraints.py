@@ -1,4 +1,4 @@
-r"""What is known of a satellite's path and attitude beyond image measurements, as pseudo-observations.
+r"""Prior knowledge of a satellite's path and attitude, as pseudo-observations.
 
 - `Observations`: tables of the vendor (positions, angles, or their rates), each value with its sigma.
 - `OrbitShape`: the soft constraints of an almost circular orbit about the Earth's centre. At times :math:`t_k`:
