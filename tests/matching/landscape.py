@@ -181,8 +181,9 @@ def _country(random: np.random.Generator) -> tuple[NDArray[np.uint8], Texture]:
 
 
 def _woods(random: np.random.Generator) -> Texture:
-    fine, coarse = fractal(random, SIZE, 0.6)
-    return (0.35 + 0.13 * fine + 0.06 * fractal(random, SIZE, 1.4)[0]).astype(np.float32) + 0.02 * coarse
+    # Crowns, stands and clearings: a bit finer than the amplitudes of most landscapes, which fall with the frequency.
+    fine, coarse = fractal(random, SIZE, 0.9)[0], fractal(random, SIZE, 1.4)[0]
+    return (0.4 + 0.12 * fine + 0.08 * coarse).astype(np.float32)
 
 
 def _with_roofs(random: np.random.Generator, tone: Texture, count: int) -> Texture:

@@ -1,0 +1,169 @@
+"""Matching over grounds of known truth: how exact, how often, how honest, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trials
+from osgeo import gdal
+from scenes import Case, Setting, View, write_raster
+from trials import Outcome, good_texture, grounds, matches, refusals, run, tried
+
+from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.surface.base import Surface
+
+#: What the default run has: grounds that are there without real images.
+PLAIN = Setting(side=500, seed=3, error=12.0)
+
+
+def told(rows):
+    """Return the rows as text, for a test that fails."""
+    return "\n".join(trials.line(row) for row in rows)
+
+
+def outcome(tmp_path, **changes) -> Outcome:
+    return tried(Case(replace(PLAIN, **changes), tmp_path).write())
+
+
+def rms(rows) -> float:
+    return math.sqrt(float(np.mean([row["rms"] ** 2 for row in rows])))
+
+
+# -- exact -------------------------------------------------------------------------------------------------------------
+
+
+def test_matches_over_good_texture_are_within_015_px_of_the_truth():
+    rows = run(good_texture(2, ("country",)))
+    assert all(row["succeeded"] for row in rows), told(rows)
+    assert rms(rows) < 0.15, told(rows)
+
+
+@pytest.mark.slow
+def test_matches_over_all_good_textures_are_within_015_px_of_the_truth():
+    rows = run(good_texture(20))
+    assert all(row["succeeded"] for row in rows), told(rows)
+    assert rms(rows) < 0.15, told(rows)
+
+
+@pytest.mark.parametrize("change", [
+    {"pushbroom": False, "heading_deg": 100.0},
+    {"reference_crs": "EPSG:3857"},
+    {"scene": View(dtype="uint8"), "reference": View(bands="aba")},
+    {"scene": View(holes=0.15), "reference": View(holes=0.1)},
+    {"reference": View(season=1)},
+    {"error": 90.0, "kind": "affine", "margin": 110.0},
+], ids="+".join)  # fmt: skip
+def test_what_scene_and_reference_are_like_does_not_matter(tmp_path, change):
+    found = outcome(tmp_path, **change)
+    assert found.succeeded, found
+    assert found.off < 0.3, found
+
+
+def test_stripes_of_a_detector_do_not_attract_matches(tmp_path):
+    found = outcome(tmp_path, scene=View(stripes=0.1), heading_deg=180.0)
+    assert found.refused or found.off < 0.3, found
+
+
+def test_matches_do_not_depend_on_threads(tmp_path):
+    case = Case(PLAIN, tmp_path).write()
+    surface = Surface.open(case.dem_file, "ellipsoid")
+    one, two = (
+        matches(case.scene_file, case.model, surface, [case.reference_file], search=30.0, points=100, threads=count)
+        for count in (1, 2)
+    )
+    assert one.ids == two.ids
+    np.testing.assert_array_equal(one.image, two.image)
+    np.testing.assert_array_equal(one.ground, two.ground)
+    np.testing.assert_array_equal(one.sigma_image, two.sigma_image)
+
+
+# -- often, and honest -------------------------------------------------------------------------------------------------
+
+
+def test_ten_scenes_of_all_kinds_are_matched_or_refused_never_wrong():
+    """A tenth of what `benchmarks/match.py --truth` runs, without real grounds: one failure of ten is allowed."""
+    rows = run(trials.drawn(20 * k, ("country",)) for k in range(10))
+    assert not any(row["wrong"] for row in rows), told(rows)
+    assert sum(row["succeeded"] for row in rows) >= 9, told(rows)
+
+
+@pytest.mark.slow
+def test_200_scenes_of_all_kinds():
+    rows = run(trials.scenes(200))
+    assert not any(row["wrong"] for row in rows), told(rows)
+    assert np.mean([row["succeeded"] for row in rows]) >= 0.95, told(rows)
+
+
+def test_sigmas_of_the_parameters_are_not_far_from_true():
+    rows = run(trials.coverage(6)[:6:2])
+    assert not any(row["refused"] for row in rows), told(rows)
+    # The root mean square of six numbers of sigma 1 is within this in 999 of 1000 cases.
+    assert trials.spread(rows) < 1.95, told(rows)
+
+
+@pytest.mark.slow
+def test_sigmas_of_the_parameters_are_true():
+    rows = run(trials.coverage(200))
+    assert 0.85 <= trials.spread(rows) <= 1.15, told(rows)
+
+
+# -- refused -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("what", ["place", "chessboard", "water", "beyond", "roofs"])
+def test_what_cannot_be_matched_is_refused(what):
+    rows = refusals(what, 1)
+    assert all(row["refused"] for row in rows), told(rows)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["place", "chessboard", "water", "beyond", "roofs"])
+def test_what_cannot_be_matched_is_refused_20_times_of_20(what):
+    rows = refusals(what, 20)
+    assert all(row["refused"] for row in rows), told(rows)
+
+
+def test_a_reference_without_a_crs_is_refused(tmp_path):
+    case = Case(PLAIN, tmp_path).write()
+    dataset = gdal.Open(str(case.reference_file))
+    bare = tmp_path / "bare.tif"
+    write_raster(bare, [dataset.ReadAsArray() / 3000.0], "uint16", place=dataset.GetGeoTransform())
+    found = tried(case, [bare])
+    assert "coordinate system" in found.refused
+    assert "bare.tif" in found.refused
+
+
+def test_a_reference_of_far_away_is_refused(tmp_path):
+    case = Case(PLAIN, tmp_path).write()
+    dataset = gdal.Open(str(case.reference_file), gdal.GA_Update)
+    left, step, *rest = dataset.GetGeoTransform()
+    dataset.SetGeoTransform((left + 5000.0, step, *rest))
+    dataset = None
+    assert "nothing" in tried(case).refused
+
+
+def test_the_scene_itself_is_no_reference(tmp_path):
+    case = Case(PLAIN, tmp_path).write()
+    assert tried(case, [case.scene_file]).refused
+    # With the georeference that a viewer may have given it.
+    dataset = gdal.Open(str(case.scene_file))
+    place, _, _ = case.reference_grid()
+    copy = tmp_path / "copy.tif"
+    write_raster(copy, [dataset.ReadAsArray() / 3000.0], "uint16", place=place, crs="EPSG:32735")
+    found = tried(case, [copy])
+    assert found.refused, found
+
+
+def test_a_scene_of_one_ground_says_so_in_words(tmp_path):
+    case = Case(replace(PLAIN, ground="water"), tmp_path).write()
+    surface = Surface.open(case.dem_file, "ellipsoid")
+    with pytest.raises(OrthoError) as caught:
+        matches(case.scene_file, case.model, surface, [case.reference_file], search=30.0)
+    assert str(caught.value.remedy)
+
+
+def test_grounds_are_there():
+    assert set(grounds()) >= {"country", "woods", "town"}
