@@ -109,9 +109,10 @@ def measured(folder: Path, side: int, points: int) -> dict[str, float]:
     setting = Setting(side=side, fine=1.0, error=8.0, relief=5.0, margin=40.0, seed=side)
     Large(setting, folder / str(side)).write()
     code = MATCH.format(tests=sys.path[0])
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(folder / str(side)), str(points)], check=True, capture_output=True, text=True
-    )
+    command = [sys.executable, "-c", code, str(folder / str(side)), str(points)]
+    done = subprocess.run(command, check=False, stdout=subprocess.PIPE, text=True)
+    if done.returncode:
+        raise SystemExit(f"no matches of {points} points in {side}²: see above")
     return json.loads(done.stdout)
 
 
