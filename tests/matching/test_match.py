@@ -84,8 +84,11 @@ def test_matches_do_not_depend_on_threads(tmp_path):
 
 
 def test_ten_scenes_of_all_kinds_are_matched_or_refused_never_wrong():
-    """A tenth of what `benchmarks/match.py --truth` runs, without real grounds: one failure of ten is allowed."""
-    rows = run(trials.drawn(20 * k, ("country",)) for k in range(10))
+    """Ten of what `benchmarks/match.py --truth` runs, smaller and without real grounds: one failure is allowed."""
+    drawn = [trials.drawn(20 * k, ("country",)) for k in range(10)]
+    rows = run(
+        replace(one, side=one.side * 3 // 5, error=min(one.error, 60.0), margin=min(one.margin, 90.0)) for one in drawn
+    )
     assert not any(row["wrong"] for row in rows), told(rows)
     assert sum(row["succeeded"] for row in rows) >= 9, told(rows)
 
