@@ -36,6 +36,7 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import BlockOptions, PointOptions, SceneOptions, SurfaceOptions, numbers_of
 from ortho_pipeline.points import assign_roles
 from ortho_pipeline.report import block as block_report
+from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
 
 
@@ -94,12 +95,12 @@ def adjust(
             notes.append(Notice("no-rpc", f"no RPC is written ({error.message})").in_image(label))
             del files[f"{label} rpc"]
     record = _record(images, points, scenes, starts, command)
-    document = block_report.build_document(
+    made = block_report.build_report(
         fit=fit, starts=starts, exported=exported, provenance=record, warnings=[*_warnings(fit, starts), *notes]
     )
     with together(folder, "block"):
-        _write(files, document, fit, starts, exported, record)
-    return Result(files, {"report": document}, block_report.summary_text(document))
+        _write(files, made, fit, starts, exported, record)
+    return Result(files, {"report": json_value(made)}, block_report.summary_text(made))
 
 
 def intersect(
@@ -307,7 +308,7 @@ def _check_rms(fit: BlockFit) -> list[Mapping[str, Any] | None]:
 
 def _write(
     files: Mapping[str, Path],
-    document: Mapping[str, Any],
+    made: BlockReport,
     fit: BlockFit,
     starts: Mapping[str, Start],
     exported: Mapping[str, rpc.RpcExport],
@@ -318,7 +319,7 @@ def _write(
     write_text(files["points-csv"], _csv(rows))
     for label, start in starts.items():
         scene = start.scene
-        adjustment = {"gauge": fit.gauge, "sigma0": fit.sigma0, **document["adjustment"]["images"][label]}
+        adjustment = {"gauge": fit.gauge, "sigma0": fit.sigma0, **json_value(made.adjustment.images[label])}
         saved = SavedModel(
             _plain(fit.models[label]), scene.sensor, start.source, (scene.width, scene.height),
             {**record, "adjustment": adjustment},
@@ -326,8 +327,8 @@ def _write(
         write_model_file(saved, files[f"{label} model"])
         if label in exported:
             rpc.write_rpc_txt(exported[label].rpc, files[f"{label} rpc"])
-    write_json(files["report"], document, ascii_only=False)
-    write_text(files["html"], block_report.page(document))
+    write_json(files["report"], json_value(made), ascii_only=False)
+    write_text(files["html"], block_report.page(made))
 
 
 def _ground_rows(

@@ -112,11 +112,11 @@ def compare(
     adjusted = Adjusted(opened, best.fit)
     hashed = inputs.hashed(inputs.files_read(image, scene, points, surface, opened))
     record = inputs.provenance(opened, points, heights, hashed, command, {"scene": scene, "surface": surface})
-    document = report.build_report(
+    made = report.build_report(
         scene=opened, fit=best.fit, surface=heights, comparison=result.to_json(), near=points.near,
         provenance=record, warnings=adjusted.warnings(heights),
     )  # fmt: skip
-    write_report(document, best.fit, files)
+    write_report(made, best.fit, files)
     return replace(result, files=files)
 
 

@@ -19,6 +19,7 @@ from ortho_pipeline.exchange import export as formats_of_models
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import retire, sha256, states
+from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
@@ -100,18 +101,18 @@ def rectify(
         record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
     whole = raster.open_dataset(image, **scene.access)
     _write_models(model, exported, opened, whole, files, {**record, "adjustment": adjusted.record()})
-    document = report.build_report(
+    made = report.build_report(
         scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
         warp=warped, near=points.near, provenance=record,
         warnings=[*adjusted.warnings(heights), *found.notes(), *placed.sparse(warped.valid_pixels), *complaints,
                   *warped.notes(output.memory)],
     )  # fmt: skip
-    write_report(document, adjusted.fit, files)
+    write_report(made, adjusted.fit, files)
     if acquired is not None:
-        stac_items.write_item(files["stac"], document, files, acquired, name or stem)
+        stac_items.write_item(files["stac"], made, files, acquired, name or stem)
     inputs.refuse_changed(begun)
     retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
-    return Result(files, {"report": document}, report.summary_text(document))
+    return Result(files, {"report": json_value(made)}, report.summary_text(made))
 
 
 def check(

@@ -20,6 +20,7 @@ from ortho_pipeline.files import staged, together, write_text
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.map_scale import map_scale
+from ortho_pipeline.report.records import SceneReport
 
 SCHEMA_VERSION = 1
 #: How the names of a scene's outputs end, after its stem.
@@ -124,12 +125,12 @@ def outputs_together(command: Callable[_P, _R]) -> Callable[_P, _R]:
     return wrapper
 
 
-def write_report(document: Mapping[str, Any], fit: Fit, files: dict[str, Path]) -> None:
+def write_report(made: SceneReport, fit: Fit, files: dict[str, Path]) -> None:
     """Write report and residuals; without points there are no residuals, and they are taken out of `files`."""
     if len(fit.points):
         write_text(files["residuals"], json.dumps(report.residuals_geojson(fit), allow_nan=False))
-        write_text(files["style"], report.residuals_style(document))
+        write_text(files["style"], report.residuals_style(made))
     else:
         del files["residuals"], files["style"]
-    report.write_report_json(document, files["report"])
-    report.write_report_html(document, files["html"], ortho=staged(files["ortho"]) if "ortho" in files else None)
+    report.write_report_json(made, files["report"])
+    report.write_report_html(made, files["html"], ortho=staged(files["ortho"]) if "ortho" in files else None)

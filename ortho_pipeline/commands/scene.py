@@ -94,9 +94,9 @@ def write_plots(report_file: str | os.PathLike[str], folder: str | os.PathLike[s
         If it is no report, or PNG is asked for and matplotlib is not installed.
     """
     with completed(report_file, remedy="give a <stem>_report.json as it was written, or make it again"):
-        document = report.read_report_json(report_file)
+        made = report.read_report(report_file)
         stem = Path(report_file).stem
-        files = report.write_plots(document, Path(folder), stem, kind)
+        files = report.write_plots(made, Path(folder), stem, kind)
     return Result(
         files, {}, f"{counted(len(files), 'plot')} of {Path(report_file).name.removesuffix(ENDINGS['report'])}"
     )

@@ -7,7 +7,7 @@ lists all codes.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NoReturn
 
@@ -78,8 +78,8 @@ def to_document(notices: Iterable[Notice]) -> dict[str, Any]:
     return {"warnings": [str(one) for one in found], "notices": [one.to_json() for one in found]}
 
 
-def texts_but(document: Mapping[str, Any], *codes: str) -> list[str]:
-    """Return the warnings of a document, without those of the codes."""
-    if "notices" not in document:
-        return list(document["warnings"])
-    return [one["text"] for one in document["notices"] if one["code"] not in codes]
+def texts_but(warnings: Sequence[str], notices: Sequence[Mapping[str, Any]], *codes: str) -> list[str]:
+    """Return the warnings of a document, without those of the codes; documents of earlier versions have no notices."""
+    if not notices:
+        return list(warnings)
+    return [one["text"] for one in notices if one["code"] not in codes]

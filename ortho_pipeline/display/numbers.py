@@ -50,8 +50,10 @@ def signed(value: float | None) -> str:
     return "0.00" if text[1:] == "0.00" else text.replace("-", "−")
 
 
-def short(value: float, sign: str = "") -> str:
+def short(value: float | None, sign: str = "") -> str:
     """Return three significant digits."""
+    if value is None:
+        return "–"
     return f"{value:{sign}.3g}".replace("-", "−") if value else "0"
 
 

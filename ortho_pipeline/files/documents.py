@@ -1,14 +1,21 @@
-"""JSON documents: what becomes of numbers, arrays, paths and records in them. No number in one is NaN or infinite."""
+"""JSON documents: what becomes of numbers, arrays, paths and records in them, and records made of documents again.
+
+A record is a frozen dataclass (`record`) whose fields are the members of a JSON object. `json_value` writes it,
+`record_of` reads it, `schema_of` publishes what it holds. No number in a document is NaN or infinite.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import os
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar, dataclass_transform
 
 import numpy as np
+
+_T = TypeVar("_T")
 
 
 def json_value(value: Any) -> Any:
@@ -36,3 +43,68 @@ def json_position(values: Any) -> list[float] | None:
     """Return a place, or a vector ``(N,)``, as numbers; null as a whole where any of them is not finite."""
     found: list[float] = np.asarray(values, dtype=np.float64).tolist()
     return found if all(map(math.isfinite, found)) else None
+
+
+# -- records ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def record(kind: type[_T]) -> type[_T]:
+    """Make a class a record: a frozen dataclass with named fields, which refuses members that it does not know.
+
+    A field with a default may be missing in documents of earlier versions, and is in all that are written.
+    """
+    kind.__pydantic_config__ = {  # type: ignore[attr-defined]
+        "extra": "forbid", "allow_inf_nan": False, "json_schema_serialization_defaults_required": True,
+    }  # fmt: skip
+    return dataclasses.dataclass(frozen=True, kw_only=True)(kind)
+
+
+class Shape:
+    """Say more of a field's values in the schema than their type does: ``Annotated[int, Shape(minimum=0)]``."""
+
+    def __init__(self, **members: Any) -> None:
+        self.members = members
+
+    def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
+        return {**handler(core), **self.members}
+
+
+def record_of(kind: type[_T], document: Any) -> _T:
+    """Return a document as the record that it was written from.
+
+    Raises
+    ------
+    ValueError
+        If a member is missing, too much, or of a wrong type; the text names the first one.
+    """
+    import pydantic
+
+    try:
+        found: _T = _adapter(kind).validate_python(document)  # type: ignore[arg-type]
+    except pydantic.ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise ValueError(f"{'.'.join(map(str, first['loc']))[:200]}: {first['msg'][:200]}") from error
+    return found
+
+
+def schema_of(kind: type, title: str) -> dict[str, Any]:
+    """Return the JSON Schema of the documents that are written from a record."""
+    from pydantic.json_schema import GenerateJsonSchema
+
+    class WithoutTitles(GenerateJsonSchema):
+        """Leave out the titles of members, which only repeat their names."""
+
+        def field_title_should_be_set(self, schema: Any) -> bool:
+            return False
+
+    found = _adapter(kind).json_schema(mode="serialization", schema_generator=WithoutTitles)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **found, "title": title}
+
+
+@functools.cache
+def _adapter(kind: Any) -> Any:
+    """Return pydantic's reader of a record, which takes a while to make."""
+    import pydantic
+
+    return pydantic.TypeAdapter(kind)

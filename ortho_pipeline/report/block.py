@@ -1,4 +1,4 @@
-"""The report of a block: one document of images, rays and points, as JSON, as a page, and in words."""
+"""The report of a block: one record of images, rays and points, as JSON, as a page, and in words."""
 
 from __future__ import annotations
 
@@ -11,204 +11,190 @@ import numpy as np
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, to_document
-from ortho_pipeline.display.numbers import fixed, flat, metres, px
+from ortho_pipeline.display.numbers import flat, metres, px
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import counted
-from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS
+from ortho_pipeline.files.documents import json_value, record_of
+from ortho_pipeline.points.rows import ROLES
+from ortho_pipeline.report.block_records import (
+    BlockAdjustment,
+    BlockHeadline,
+    BlockImage,
+    BlockPoint,
+    BlockProvenance,
+    BlockReport,
+    VariancesRecord,
+    merged,
+)  # fmt: skip
+from ortho_pipeline.report.records import Rmse, RpcRecord, is_known
+from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, FEW
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.start import Start
     from ortho_pipeline.exchange.rpc_fit import RpcExport
 
-DOCUMENT, SCHEMA_VERSION = "ortho-pipeline block report", 1
 #: Images whose residuals are drawn, rays that are drawn of each, points that are listed on the page.
 _DRAWN_IMAGES, _DRAWN_RAYS, _LISTED = 6, 400, 400
 #: A frame's side, the longest arrow in it, and the margin in which arrows of points at its edge end.
 _SIDE, _ARROW, _MARGIN = 420.0, 44.0, 48.0
 
 
-def build_document(
+def build_report(
     *,
     fit: BlockFit,
     starts: Mapping[str, Start],
     exported: Mapping[str, RpcExport],
     provenance: Mapping[str, Any],
     warnings: Sequence[Notice],
-) -> dict[str, Any]:
-    """Return everything that the report says, as JSON values (docs/formats/block-points.md)."""
+) -> BlockReport:
+    """Collect everything that the report says (docs/formats/block-points.md)."""
     images = {}
     for label, start in starts.items():
         found = exported.get(label)
-        images[label] = {
-            "path": str(start.scene.path),
-            "size": [start.scene.width, start.scene.height],
-            "sensor": start.scene.sensor,
-            "model": start.name,
-            "model_source": start.source,
-            "facts": {str(key): str(value) for key, value in start.scene.facts.items()},
-            "rpc": None if found is None else {"exact": found.exact, "max_error_px": found.max_error_px},
-        }
-    document = {
-        "document": DOCUMENT,
-        "schema_version": SCHEMA_VERSION,
-        "images": images,
-        "adjustment": fit.to_json(),
-        "provenance": dict(provenance),
-        **to_document(warnings),
-    }
-    document["headline"] = headline(document)
-    return document
+        images[label] = BlockImage(
+            path=str(start.scene.path),
+            size=(start.scene.width, start.scene.height),
+            sensor=start.scene.sensor,
+            model=start.name,
+            model_source=start.source,
+            facts={str(key): str(value) for key, value in start.scene.facts.items()},
+            rpc=None if found is None else RpcRecord(exact=found.exact, max_error_px=found.max_error_px),
+        )
+    adjustment, noted = record_of(BlockAdjustment, json_value(fit.to_json())), to_document(warnings)
+    return BlockReport(
+        images=images,
+        adjustment=adjustment,
+        provenance=record_of(BlockProvenance, json_value(provenance)),
+        warnings=tuple(noted["warnings"]),
+        notices=tuple(noted["notices"]),
+        headline=headline(adjustment),
+    )
 
 
 # -- words -----------------------------------------------------------------------------------------------------------
 
 
-def headline(document: Mapping[str, Any]) -> dict[str, Any]:
+def headline(adjustment: BlockAdjustment) -> BlockHeadline:
     """Say how accurate the block is from the best evidence that there is: check points, else the fit of control."""
-    adjustment = document["adjustment"]
-    check, control = adjustment["object_rms"]["check"], adjustment["object_rms"]["control"]
-    notes = [f"{adjustment['gauge'][0].upper()}{adjustment['gauge'][1:]}."]
-    if check:
-        if check["n"] < ENOUGH_CHECK_POINTS:
-            notes.append(
-                f"Fewer than {ENOUGH_CHECK_POINTS} check points: an indication, not a claim of accuracy (ASPRS 2023)."
-            )
-        what = f"RMSE in plan and height at {counted(check['n'], 'check point')} whose ground took no part"
-        return {"figure": metres(check["plan"]), "height": metres(check["h"]), "what": what, "notes": notes}
+    notes = [f"{adjustment.gauge[0].upper()}{adjustment.gauge[1:]}."]
+
+    def said(figure: str, what: str, height: str | None = None) -> BlockHeadline:
+        return BlockHeadline(figure=figure, height=height, what=what, notes=tuple(notes))
+
+    if known := adjustment.object_rms.check:
+        if known.n < ENOUGH_CHECK_POINTS:
+            notes.append(FEW)
+        what = f"RMSE in plan and height at {counted(known.n, 'check point')} whose ground took no part"
+        return said(metres(known.plan), what, metres(known.h))
     # The ground of control is held by its sigma: how well it fits is to be seen in the images.
-    seen = {
-        role: merged([image["rms"]["back_projected"][role] for image in adjustment["images"].values()])
-        for role in ("check", "control")
-    }
-    if check := seen["check"]:
-        what = f"RMSE of {counted(check['n'], 'measurement')} of check points, whose ground took no part, in the images"
-        return {"figure": px(check["total"]), "height": None, "what": what, "notes": notes}
-    if control and seen["control"]:
+    seen = [image.rms.back_projected for image in adjustment.images.values()]
+    if check := merged(*(one.check for one in seen)):
+        what = f"RMSE of {counted(check.n, 'measurement')} of check points, whose ground took no part, in the images"
+        return said(px(check.total), what)
+    control = merged(*(one.control for one in seen))
+    if adjustment.object_rms.control and control:
         notes.append("No check points were kept apart.")
-        if not adjustment["redundancy"]:
-            what = "nothing is left over to test the fit with"
-            return {"figure": "Not tested", "height": None, "what": what, "notes": notes}
-        what = (
-            f"RMSE of {counted(seen['control']['n'], 'measurement')} of control points in the images: the fit, "
-            "not a test"
-        )
-        return {"figure": px(seen["control"]["total"]), "height": None, "what": what, "notes": notes}
-    sizes = [math.hypot(*ray["residual"]) for ray in adjustment["rays"] if ray["used"] and None not in ray["residual"]]
+        if not adjustment.redundancy:
+            return said("Not tested", "nothing is left over to test the fit with")
+        what = f"RMSE of {counted(control.n, 'measurement')} of control points in the images: the fit, not a test"
+        return said(px(control.total), what)
+    sizes = [math.hypot(*ray.residual) for ray in adjustment.rays if ray.used and is_known(ray.residual)]
     figure = px(float(np.median(sizes))) if sizes else "Not tested"
-    what = f"median residual of {counted(len(sizes), 'ray')}: how well the images agree, not how right they are"
-    return {"figure": figure, "height": None, "what": what, "notes": notes}
-
-
-def summary_text(document: Mapping[str, Any]) -> str:
-    """Return the report as a screenful of text."""
-    adjustment, head = document["adjustment"], document["headline"]
-    wide = max([5, *map(len, document["images"])])
-    lines = [f"{'image':<{wide}}  {'rays':>6}  {'residuals col, row (px)':>24}  {'at check points (px)':>21}  model"]
-    for label, image in document["images"].items():
-        found = adjustment["images"][label]
-        ties = merged([found["rms"]["residuals"][role] for role in ("control", "check", "tie")])
-        pairs = f"  {_pair(ties):>24}  {_pair(found['rms']['back_projected']['check']):>21}"
-        lines.append(f"{label:<{wide}}  {found['rays']:>6}{pairs}  {image['model']} of {image['model_source']}")
-    for role in ("control", "check"):
-        rms = adjustment["object_rms"][role]
-        if rms:
-            low, high = rms["min"], rms["max"]
-            axes = zip("ENh", (rms["x"], rms["y"], rms["h"]), low, high, strict=True)
-            text = ", ".join(f"{axis} {value:.3f} ({a:+.2f} to {b:+.2f})" for axis, value, a, b in axes)
-            lines.append(f"{counted(rms['n'], f'{role} point')}: RMSE {text} m")
-    sigma0 = "unknown" if adjustment["sigma0"] is None else f"{adjustment['sigma0']:.3g}"
-    lines += variance_lines(adjustment["variances"])
-    lines.append(
-        f"Redundancy {adjustment['redundancy']}, sigma0 {sigma0}, {counted(len(adjustment['rejected']), 'gross error')}"
+    return said(
+        figure, f"median residual of {counted(len(sizes), 'ray')}: how well the images agree, not how right they are"
     )
-    height = f", height {head['height']}" if head["height"] else ""
-    lines += [f"{head['figure']}{height}: {head['what']}", *head["notes"]]
-    return "\n".join([*lines, *(f"Warning: {text}" for text in document["warnings"])])
 
 
-def variance_lines(variances: Mapping[str, Any]) -> list[str]:
+def summary_text(report: BlockReport) -> str:
+    """Return the report as a screenful of text."""
+    adjustment, head = report.adjustment, report.headline
+    wide = max([5, *map(len, report.images)])
+    lines = [f"{'image':<{wide}}  {'rays':>6}  {'residuals col, row (px)':>24}  {'at check points (px)':>21}  model"]
+    for label, image in report.images.items():
+        found = adjustment.images[label]
+        pairs = f"  {_pair(found.rms.residuals.all):>24}  {_pair(found.rms.back_projected.check):>21}"
+        lines.append(f"{label:<{wide}}  {found.rays:>6}{pairs}  {image.model} of {image.model_source}")
+    for role, rms in (("control", adjustment.object_rms.control), ("check", adjustment.object_rms.check)):
+        if rms:
+            axes = zip("ENh", (rms.x, rms.y, rms.h), rms.min, rms.max, strict=True)
+            text = ", ".join(f"{axis} {value:.3f} ({a:+.2f} to {b:+.2f})" for axis, value, a, b in axes)
+            lines.append(f"{counted(rms.n, f'{role} point')}: RMSE {text} m")
+    sigma0 = "unknown" if adjustment.sigma0 is None else f"{adjustment.sigma0:.3g}"
+    lines += variance_lines(adjustment.variances)
+    lines.append(
+        f"Redundancy {adjustment.redundancy}, sigma0 {sigma0}, {counted(len(adjustment.rejected), 'gross error')}"
+    )
+    height = f", height {head.height}" if head.height else ""
+    lines += [f"{head.figure}{height}: {head.what}", *head.notes]
+    return "\n".join([*lines, *(f"Warning: {text}" for text in report.warnings)])
+
+
+def variance_lines(variances: VariancesRecord) -> list[str]:
     """Say what was found of ground that states no sigma."""
-    ground = variances["unstated_ground"]
-    number = max(part["points"] for part in ground.values())
+    ground = variances.unstated_ground
+    number = max(ground.xy.points, ground.h.points)
     if not number:
         return []
     who = counted(number, "control point")
-    if not variances["separable"]:
+    if not variances.separable:
         return [f"Ground of {who} states no sigma; its errors count as errors of measurement"]
     found = [
-        f"{part['sigma']:.2g} m in {what} (redundancy {part['redundancy']:.1f})"
-        for what, part in (("plan", ground["xy"]), ("height", ground["h"]))
-        if part["sigma"] is not None
+        f"{part.sigma:.2g} m in {what} (redundancy {part.redundancy:.1f})"
+        for what, part in (("plan", ground.xy), ("height", ground.h))
+        if part.sigma is not None
     ]
     return [f"Ground of {who} states no sigma; estimated: {', '.join(found)}"]
 
 
-def merged(parts: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:
-    """Return the root mean squares of several groups together."""
-    groups = [part for part in parts if part]
-    number = sum(part["n"] for part in groups)
-    if not number:
-        return None
-    col, row = (sum(part["n"] * part[axis] ** 2 for part in groups) / number for axis in ("col", "row"))
-    return {"col": math.sqrt(col), "row": math.sqrt(row), "total": math.sqrt(col + row), "n": number}
-
-
-def _pair(rms: Mapping[str, Any] | None) -> str:
-    return "-" if rms is None else f"{rms['col']:.3f}  {rms['row']:.3f}"
+def _pair(rms: Rmse | None) -> str:
+    return "-" if rms is None else f"{rms.col:.3f}  {rms.row:.3f}"
 
 
 # -- page ------------------------------------------------------------------------------------------------------------
 
 
-def page(document: Mapping[str, Any]) -> str:
+def page(report: BlockReport) -> str:
     """Return the report as one page that needs no other file and no network."""
-    adjustment = document["adjustment"]
-    drawn = list(document["images"])[:_DRAWN_IMAGES]
-    figures = {label: drawing.svg() for label in drawn if (drawing := plot_rays(document, label)) is not None}
-    plan = plot_ground(document)
-    residuals = {
-        label: merged([found["rms"]["residuals"][role] for role in ("control", "check", "tie")])
-        for label, found in adjustment["images"].items()
-    }
+    adjustment = report.adjustment
+    drawn = list(report.images)[:_DRAWN_IMAGES]
+    figures = {label: drawing.svg() for label in drawn if (drawing := plot_rays(report, label)) is not None}
+    plan = plot_ground(report)
+    provenance = {key: value for key, value in json_value(report.provenance).items() if key != "inputs"}
     return render(
         "report/block.html.j2",
-        document=document,
+        report=report,
         adjustment=adjustment,
-        head=document["headline"],
-        ground_sigmas=variance_lines(adjustment["variances"]),
-        warnings=document["warnings"],
-        residuals=residuals,
-        roles={role: sum(p["role"] == role for p in adjustment["points"]) for role in ("control", "check", "tie")},
-        points=sorted(adjustment["points"], key=lambda p: ("control", "check", "tie").index(p["role"]))[:_LISTED],
+        head=report.headline,
+        ground_sigmas=variance_lines(adjustment.variances),
+        roles={role: sum(point.role == role for point in adjustment.points) for role in ROLES},
+        points=sorted(adjustment.points, key=lambda point: ROLES.index(point.role))[:_LISTED],
         figures=figures,
         plan=None if plan is None else plan.svg(),
         plot_style=style_sheet(),
-        provenance=list(flat({k: v for k, v in document["provenance"].items() if k != "inputs"})),
-        inputs=document["provenance"].get("inputs") or [],
-        fixed=fixed,
+        provenance=list(flat(provenance)),
     )
 
 
-def plot_rays(document: Mapping[str, Any], label: str) -> Drawing | None:
+def plot_rays(report: BlockReport, label: str) -> Drawing | None:
     """Draw reprojection residuals of an image over its frame: those of known ground, of ties those of the adjusted."""
-    roles = {point["id"]: point["role"] for point in document["adjustment"]["points"]}
+    roles = {point.id: point.role for point in report.adjustment.points}
     shown = []
-    for ray in document["adjustment"]["rays"]:
-        if ray["image"] == label:
-            role = roles[ray["id"]]
-            vector = ray["residual"] if role == "tie" else ray["back_projected"]
-            if None not in vector:
-                shown.append((ray["measured"], vector, role if ray["used"] else "out", f"{ray['id']} ({role})"))
+    for ray in report.adjustment.rays:
+        if ray.image == label:
+            role = roles[ray.id]
+            vector = ray.residual if role == "tie" else ray.back_projected
+            if is_known(vector) and is_known(ray.measured):
+                shown.append((ray.measured, vector, role if ray.used else "out", f"{ray.id} ({role})"))
     title = f"Residuals of {counted(len(shown), 'ray')} over the frame of {label}"
-    return _vectors(title, shown[:: max(1, len(shown) // _DRAWN_RAYS)], document["images"][label]["size"], "px")
+    return _vectors(title, shown[:: max(1, len(shown) // _DRAWN_RAYS)], report.images[label].size, "px")
 
 
-def plot_ground(document: Mapping[str, Any]) -> Drawing | None:
+def plot_ground(report: BlockReport) -> Drawing | None:
     """Draw known minus adjusted ground in plan, north up, at the points in degrees made even for their latitude."""
-    known = [p for p in document["adjustment"]["points"] if None not in (*p["residual"], *p["ground"])]
+    known = [point for point in report.adjustment.points if None not in (*point.residual, *point.ground)]
     if len(known) < 2:
         return None
-    places = np.array([p["ground"][:2] for p in known])
+    places, residuals = np.array([point.ground[:2] for point in known]), [point.residual for point in known]
     places[:, 0] = np.unwrap(places[:, 0], period=360.0) * math.cos(math.radians(float(places[:, 1].mean())))
     places[:, 1] *= -1.0
     low = places.min(axis=0)
@@ -216,15 +202,15 @@ def plot_ground(document: Mapping[str, Any]) -> Drawing | None:
     at = (places - low + 0.04 * size) / (1.08 * size) * 1000.0
     extent = at.max(axis=0) + 40.0
     shown = [
-        (at[k].tolist(), [p["residual"][0], -p["residual"][1]], p["role"] if _takes_part(p) else "out",
-         f"{p['id']} ({p['role']}): E {p['residual'][0]:+.2f}, N {p['residual'][1]:+.2f}, h {p['residual'][2]:+.2f} m")
-        for k, p in enumerate(known)
+        (place.tolist(), [east, -north], point.role if _takes_part(point) else "out",
+         f"{point.id} ({point.role}): E {east:+.2f}, N {north:+.2f}, h {up:+.2f} m")
+        for place, (east, north, up), point in zip(at, np.array(residuals).tolist(), known, strict=True)
     ]  # fmt: skip
     return _vectors("Known minus adjusted ground in plan", shown, extent.tolist(), "m")
 
 
-def _takes_part(point: Mapping[str, Any]) -> bool:
-    return bool(point["role"] != "control" or point["used_ground"])
+def _takes_part(point: BlockPoint) -> bool:
+    return point.role != "control" or point.used_ground
 
 
 def _vectors(

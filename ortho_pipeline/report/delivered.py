@@ -8,65 +8,60 @@ from typing import Any
 
 from ortho_pipeline.display.numbers import px
 from ortho_pipeline.errors import counted
+from ortho_pipeline.files.documents import record_of
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
+from ortho_pipeline.report.block_records import AdjustedImage
+from ortho_pipeline.report.records import Adjustment, Headline
 from ortho_pipeline.report.wording import headline
 
-_UNTESTED = {"figure": "Not tested", "metres": None, "what": "there were no ground control points"}
 
-
-def accuracy_before(scene: Scene) -> dict[str, Any]:
-    """Return the headline of a scene that no point was measured in, as `report_text.headline` returns it.
+def accuracy_before(scene: Scene) -> Headline:
+    """Return the headline of a scene that no point was measured in, as `wording.headline` returns it.
 
     That of an adjusted model is what its file says of the adjustment.
     """
     if scene.adjusted is not None:
         try:
-            return _of_block(scene) if "gauge" in scene.adjusted else _of_scene(scene)
-        except (KeyError, TypeError, ValueError, AttributeError):
+            return (_of_block if "gauge" in scene.adjusted else _of_scene)(scene, scene.adjusted)
+        except (KeyError, TypeError, ValueError):
             text = "The model was adjusted before; its file does not say how well in a way that is understood here."
-            return {**_UNTESTED, "notes": [text]}
+            return _untested(text)
     notes = "The model is used as it was delivered."
     if isinstance(scene.model, RPC):
         notes += " Vendors' RPCs are commonly off by 5 to 25 m."
-    return {**_UNTESTED, "notes": [notes]}
+    return _untested(notes)
 
 
-def _of_scene(scene: Scene) -> dict[str, Any]:
-    adjustment: Mapping[str, Any] = {"outlying": (), "rmse_of_agreeing_checks": None, **(scene.adjusted or {})}
-    found = headline({"adjustment": adjustment, "rmse_m": dict.fromkeys(("control", "check", "loo"))})
-    control = sum(1 for point in adjustment["points"] if point["used"])
-    name = f"{adjustment['model']}, {counted(control, 'control point')}"
-    return {
-        **found,
-        "what": f"{found['what']}, when the model was adjusted ({name})",
-        "notes": _notes(scene, found["notes"]),
-    }
+def _untested(*notes: str, what: str = "there were no ground control points") -> Headline:
+    return Headline(figure="Not tested", metres=None, what=what, notes=notes)
 
 
-def _of_block(scene: Scene) -> dict[str, Any]:
-    adjusted: Mapping[str, Any] = scene.adjusted or {}
-    gauge = str(adjusted["gauge"])
-    notes = _notes(
-        scene,
-        [
-            f"The block: {gauge}, sigma0 {float(adjusted['sigma0']):.3g}."
-            if adjusted["sigma0"]
-            else f"The block: {gauge}."
-        ],
-    )
-    seen, residuals = adjusted["rms"]["back_projected"], adjusted["rms"]["residuals"]
+def _of_scene(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
+    adjustment = record_of(Adjustment, adjusted)
+    found = headline(adjustment, None)
+    name = f"{adjustment.model}, {counted(sum(point.used for point in adjustment.points), 'control point')}"
+    return Headline(
+        figure=found.figure, metres=found.metres,
+        what=f"{found.what}, when the model was adjusted ({name})", notes=(*found.notes, _source(scene)),
+    )  # fmt: skip
+
+
+def _of_block(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
+    image = record_of(AdjustedImage, {name: one for name, one in adjusted.items() if name not in ("gauge", "sigma0")})
+    sigma0 = f", sigma0 {float(adjusted['sigma0']):.3g}" if adjusted["sigma0"] else ""
+    notes = (f"The block: {adjusted['gauge']}{sigma0}.", _source(scene))
     kinds = (
-        (seen["check"], "of check points, whose ground took no part,"),
-        (seen["control"], "of control points (the fit, not a test)"),
-        (residuals["tie"], "of tie points (how well the images agree, not how right they are)"),
+        (image.rms.back_projected.check, "of check points, whose ground took no part,"),
+        (image.rms.back_projected.control, "of control points (the fit, not a test)"),
+        (image.rms.residuals.tie, "of tie points (how well the images agree, not how right they are)"),
     )
     for found, what in kinds:
         if found:
-            said = f"RMSE of {counted(found['n'], 'measurement')} {what} in this image, when it was adjusted in a block"
-            return {"figure": px(found["total"]), "metres": None, "what": said, "notes": notes}
-    return {**_UNTESTED, "what": "the model was adjusted in a block without points in this image", "notes": notes}
+            said = f"RMSE of {counted(found.n, 'measurement')} {what} in this image, when it was adjusted in a block"
+            return Headline(figure=px(found.total), metres=None, what=said, notes=notes)
+    return _untested(*notes, what="the model was adjusted in a block without points in this image")
 
 
-def _notes(scene: Scene, notes: list[str]) -> list[str]:
-    return [*notes, f"That is what {Path(scene.model_source).name} says; no point was measured here to test it."]
+def _source(scene: Scene) -> str:
+    return f"That is what {Path(scene.model_source).name} says; no point was measured here to test it."

@@ -1,6 +1,6 @@
-"""The accuracy report: one dict, shown as JSON, as a page, as plots, as GeoJSON and as text for the terminal.
+"""The accuracy report: one record, shown as JSON, as a page, as plots, as GeoJSON and as text for the terminal.
 
-`build_report` collects everything; the other functions only show what is in its dict. A residual is measured minus
+`build_report` collects everything; the other functions only show what is in its record. A residual is measured minus
 predicted, in pixels. In metres it is where the ortho shows a point minus where the point belongs, east and north, on
 the assumption that the DEM is right there.
 """
@@ -27,14 +27,35 @@ from ortho_pipeline.estimation.fit import Fit, root_mean_square
 from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rmse_metres, viewing
 from ortho_pipeline.estimation.spatial_correlation import analyse_fit
 from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
-from ortho_pipeline.files.documents import json_position, json_value
+from ortho_pipeline.files.documents import json_position, json_value, record_of
 from ortho_pipeline.geodesy.crs import Vertical, crs_text, ground_transform
 from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.delivered import accuracy_before
 from ortho_pipeline.report.map_scale import map_scale
-from ortho_pipeline.report.plots import analysed_role, kind_of, plots
+from ortho_pipeline.report.plots import plots
+from ortho_pipeline.report.records import (
+    Adjustment,
+    ComparisonRecord,
+    ControlHull,
+    Covariances,
+    Dem,
+    FlatGround,
+    MapScaleRecord,
+    OrthoRecord,
+    PointHeights,
+    Provenance,
+    RmseOfView,
+    RmsesOfView,
+    RmsesOnGround,
+    RpcRecord,
+    SceneRecord,
+    SceneReport,
+    WarpRecord,
+    is_known,
+)  # fmt: skip
 from ortho_pipeline.report.wording import headline, summary_text
+from ortho_pipeline.surface.flat import FlatSurface
 
 if TYPE_CHECKING:
     import pyproj
@@ -47,17 +68,17 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-SCHEMA_VERSION = 1
-DOCUMENT = "ortho-pipeline report"
 #: Median of control height minus DEM height from which a difference of datums is suspected, metres.
 _SUSPICIOUS_HEIGHT = 5.0
 _MAX_BYTES = 50_000_000
+_REMEDY = "give a <stem>_report.json"
 
 __all__ = [
     "build_report",
     "headline",
     "plots",
     "preview_png",
+    "read_report",
     "read_report_json",
     "residuals_geojson",
     "residuals_style",
@@ -83,8 +104,8 @@ def build_report(
     near: float | None = None,
     provenance: Mapping[str, Any] | None = None,
     warnings: Iterable[Notice] = (),
-) -> dict[str, Any]:
-    """Collect scene, adjustment, heights, ortho and provenance as plain data that JSON holds (no NaN).
+) -> SceneReport:
+    """Collect scene, adjustment, heights, ortho and provenance as what people and programs read.
 
     Parameters
     ----------
@@ -94,77 +115,101 @@ def build_report(
         Share (0 to 1) of the scene for which the DEM has a height.
     comparison : mapping, optional
         The document of ``ortho compare``.
+    provenance : mapping, optional
+        From `commands.inputs.provenance`.
     near : float, optional
         Distance (m) below which points are neighbours; as `covariance.analyse` chooses it without one.
     warnings : iterable of Notice
         What the reader ought to know; a suspicious difference between control and DEM heights is added to them.
     """
     seen = viewing(fit.model, scene.width, scene.height)
-    heights = None if surface is None else _heights_of_points(fit, surface, seen)
-    noted = to_document([*warnings, *([heights["warning"]] if heights and heights["warning"] else [])])
-    adjustment = fit.to_json() | noted
+    heights, doubts = (None, []) if surface is None else _heights_of_points(fit, surface, seen)
+    noted = to_document([*warnings, *doubts])
+    adjustment, rmse_m = _adjustment(fit, noted), record_of(RmsesOnGround, rmse_metres(fit))
+    hull = control_hull(fit.points.image[fit.used], (scene.width, scene.height))
+    return SceneReport(
+        scene=_scene(scene, seen),
+        adjustment=adjustment,
+        rmse_m=rmse_m,
+        view_rmse=_view_rmse(fit),
+        covariance=_covariances(fit, near),
+        map_scale=_map_scale(fit, seen),
+        control_hull=None if hull is None else record_of(ControlHull, hull),
+        comparison=None if comparison is None else record_of(ComparisonRecord, json_value(comparison)),
+        heights=heights,
+        surface=None if surface is None else _surface(surface, coverage),
+        rpc=None if exported is None else RpcRecord(exact=exported.exact, max_error_px=exported.max_error_px),
+        ortho=None if grid is None else _ortho(grid, warp),
+        warp=None if warp is None else _warped(warp),
+        provenance=record_of(Provenance, json_value(provenance or {})),
+        warnings=tuple(noted["warnings"]),
+        notices=tuple(noted["notices"]),
+        headline=headline(adjustment, rmse_m, accuracy_before(scene), adjusted=scene.adjusted is not None),
+    )
+
+
+def _scene(scene: Scene, seen: Mapping[str, Any]) -> SceneRecord:
+    known = {
+        "name": Path(scene.path).name,
+        "size": (scene.width, scene.height),
+        "sensor": scene.sensor,
+        "model_source": scene.model_source,
+        "facts": json_value(scene.facts),
+    }
+    return record_of(SceneRecord, {**known, **seen})
+
+
+def _adjustment(fit: Fit, noted: Mapping[str, Any]) -> Adjustment:
+    """Return the adjustment with all that there is to warn of, and its points as they are on the ground."""
+    document = json_value(fit.to_json()) | noted
     shifts, views = in_metres(fit, fit.residuals), along_view(fit)
-    for i, point in enumerate(adjustment["points"]):
+    for i, point in enumerate(document["points"]):
         point["raw_residual"] = json_position(fit.raw_residuals[i])
         point["residual_m"] = json_position(shifts[i])
         point["view_residual"] = json_position(views[i])
         point["height_m"] = json_value(fit.points.ground[i, 2])
-    report = {
-        "document": DOCUMENT,
-        "schema_version": SCHEMA_VERSION,
-        "scene": {
-            "name": Path(scene.path).name,
-            "size": [scene.width, scene.height],
-            "sensor": scene.sensor,
-            "model_source": scene.model_source,
-            "facts": {str(key): json_value(value) for key, value in scene.facts.items()},
-            **seen,
-        },
-        "adjustment": adjustment,
-        "rmse_m": rmse_metres(fit),
-        "view_rmse": _view_rmse(fit, views),
-        "covariance": {role: found and found.to_json() for role, found in analyse_fit(fit, near=near).items()},
-        "map_scale": _map_scale(fit, seen),
-        "control_hull": control_hull(fit.points.image[fit.used], (scene.width, scene.height)),
-        "comparison": None if comparison is None else json_value(comparison),
-        "heights": heights,
-        "surface": None if surface is None else {"coverage": coverage, **json_value(surface.provenance)},
-        "rpc": None if exported is None else {"exact": exported.exact, "max_error_px": exported.max_error_px},
-        "ortho": None if grid is None else _ortho(grid, warp),
-        "warp": None if warp is None else _warped(warp),
-        "provenance": json_value(provenance or {}),
-        **noted,
-    }
-    report["headline"] = headline(report, accuracy_before(scene), adjusted=scene.adjusted is not None)
-    return report
+    return record_of(Adjustment, document)
 
 
-def _map_scale(fit: Fit, seen: Mapping[str, Any]) -> dict[str, Any] | None:
+def _covariances(fit: Fit, near: float | None) -> Covariances:
+    found = analyse_fit(fit, near=near)
+    return record_of(Covariances, {role: one and one.to_json() for role, one in found.items()})
+
+
+def _map_scale(fit: Fit, seen: Mapping[str, Any]) -> MapScaleRecord | None:
     pixels = seen["ground_pixel_m"]
     found = map_scale(fit, max(pixels) if pixels else None)
-    return None if found is None else found.to_json()
+    return None if found is None else record_of(MapScaleRecord, found.to_json())
 
 
-def _view_rmse(fit: Fit, views: Array) -> dict[str, Any]:
+def _view_rmse(fit: Fit) -> RmsesOfView:
     """Return root mean squares (px) along and across the direction of view, over control (used) and check points."""
-    found: dict[str, Any] = {}
-    for name, mask in (("control", fit.used), ("check", fit.points.check)):
+    views = along_view(fit)
+
+    def over(mask: NDArray[np.bool_]) -> RmseOfView | None:
         rows = views[mask]
         rmse = root_mean_square(rows[np.isfinite(rows).all(axis=1)])
-        found[name] = rmse and {"along": rmse["col"], "across": rmse["row"], "n": rmse["n"]}
-    return found
+        return None if rmse is None else RmseOfView(along=rmse["col"], across=rmse["row"], n=int(rmse["n"]))
+
+    return RmsesOfView(control=over(fit.used), check=over(fit.points.check))
 
 
-def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> dict[str, Any] | None:
+def _surface(surface: Surface, coverage: float | None) -> FlatGround | Dem:
+    if isinstance(surface, FlatSurface):
+        return FlatGround(coverage=coverage, constant_height=surface.height)
+    return record_of(Dem, {"coverage": coverage, **json_value(surface.provenance)})
+
+
+def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> tuple[PointHeights | None, list[Notice]]:
     """Compare the heights of the points with the DEM's: a difference of datums shows here and nowhere else."""
     points = fit.points
     difference = surface.above(points.ground, points.crs)
     difference = difference[np.isfinite(difference)]
     if not len(difference):
-        return None
+        return None, []
     median = float(np.median(difference))
     spread = float(1.4826 * np.median(np.abs(difference - median)))
-    warning = None
+    doubts = []
     if len(difference) >= 3 and abs(median) > max(_SUSPICIOUS_HEIGHT, 3 * spread):
         lean = seen["lean_m_per_m"]
         moved = "" if lean is None else f"; that moves the ortho by {metres(abs(median) * lean)}"
@@ -173,8 +218,9 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> d
             f"the points lie {metres(abs(median))} {side} the DEM (median; spread {metres(spread)}): their heights "
             f"probably have another datum than the DEM's{_undulation_there(points.ground, points.crs)}{moved}"
         )
-        warning = Notice("heights-disagree", text, median_m=median, spread_m=spread)
-    return {"median_m": median, "spread_m": spread, "n": len(difference), "warning": warning}
+        doubts = [Notice("heights-disagree", text, median_m=median, spread_m=spread)]
+    warning = str(doubts[0]) if doubts else None
+    return PointHeights(median_m=median, spread_m=spread, n=len(difference), warning=warning), doubts
 
 
 def _undulation_there(ground: Array, crs: pyproj.CRS) -> str:
@@ -186,22 +232,23 @@ def _undulation_there(ground: Array, crs: pyproj.CRS) -> str:
     return f" (the geoid is {undulation:+.1f} m from the ellipsoid there)"
 
 
-def _ortho(grid: Grid, warp: WarpResult | None) -> dict[str, Any]:
+def _ortho(grid: Grid, warp: WarpResult | None) -> OrthoRecord:
     unit = grid.crs.axis_info[0].unit_name
-    return {
-        "crs": crs_text(grid.crs),
-        "crs_name": grid.crs.name,
-        "unit": {"metre": "m", "degree": "°"}.get(unit, unit),
-        "extent": [float(value) for value in grid.extent],
-        "resolution": [float(grid.dx), float(grid.dy)],
-        "size": [grid.width, grid.height],
-        "valid_share": None if warp is None else warp.valid_pixels / max(warp.pixels, 1),
-    }
+    left, bottom, right, top = (float(value) for value in grid.extent)
+    return OrthoRecord(
+        crs=crs_text(grid.crs),
+        crs_name=grid.crs.name,
+        unit={"metre": "m", "degree": "°"}.get(unit, unit),
+        extent=(left, bottom, right, top),
+        resolution=(float(grid.dx), float(grid.dy)),
+        size=(grid.width, grid.height),
+        valid_share=None if warp is None else warp.valid_pixels / max(warp.pixels, 1),
+    )
 
 
-def _warped(warp: WarpResult) -> dict[str, Any]:
+def _warped(warp: WarpResult) -> WarpRecord:
     """Return what the warp did without how long it took: the same inputs make the same report, byte by byte."""
-    return {name: value for name, value in asdict(warp).items() if name != "seconds"}
+    return record_of(WarpRecord, {name: value for name, value in asdict(warp).items() if name != "seconds"})
 
 
 def residuals_geojson(fit: Fit) -> dict[str, Any]:
@@ -237,20 +284,16 @@ def residuals_geojson(fit: Fit) -> dict[str, Any]:
     return {"type": "FeatureCollection", "features": features}
 
 
-def residuals_style(report: Mapping[str, Any]) -> str:
+def residuals_style(report: SceneReport) -> str:
     """Return a QGIS style (QML) for the residuals: marks by role, and arrows that are exaggerated in length.
 
     QGIS takes it by itself, as it has the name of the GeoJSON file with the ending ``.qml``.
     """
     # Points that were left out have no arrow: a gross error would shrink those of all others to dots.
-    lengths = [
-        math.hypot(*point["residual_m"])
-        for point in report["adjustment"]["points"]
-        if point["residual_m"] and kind_of(point) != "out"
-    ]
-    ground = report["scene"]["ground_pixel_m"]
-    extent = max(report["scene"]["size"]) * (max(ground) if ground else 1.0)
-    longest = max(lengths, default=0.0)
+    shifts = [point.residual_m for point in report.adjustment.points if point.kind != "out"]
+    longest = max((math.hypot(*shift) for shift in shifts if is_known(shift)), default=0.0)
+    ground = report.scene.ground_pixel_m
+    extent = max(report.scene.size) * (max(ground) if ground else 1.0)
     # The longest arrow spans about a twelfth of the scene.
     exaggeration = round_down(extent / 12 / longest) if longest > 0 else 1.0
     return render("report/residuals.qml.j2", exaggeration=exaggeration)
@@ -259,42 +302,56 @@ def residuals_style(report: Mapping[str, Any]) -> str:
 # -- showing ---------------------------------------------------------------------------------------------------------
 
 
-def write_report_json(report: Mapping[str, Any], path: str | PathLike[str]) -> None:
+def write_report_json(report: SceneReport, path: str | PathLike[str]) -> None:
     """Write the report as JSON, whole or not at all."""
-    write_json(path, report, ascii_only=False)
+    write_json(path, json_value(report), ascii_only=False)
 
 
 def read_report_json(path: str | PathLike[str]) -> dict[str, Any]:
+    """Read the document of a report of this version, whatever else it holds.
+
+    Raises
+    ------
+    InputError
+        If the file is not a report of this version.
+    """
+    document = read_json(path, _MAX_BYTES, _REMEDY)
+    if not isinstance(document, dict) or document.get("document") != SceneReport.document:
+        raise InputError("this is not a report of ortho-pipeline", file=path, remedy=_REMEDY)
+    if document.get("schema_version") != SceneReport.schema_version:
+        raise InputError(
+            f"schema version {document.get('schema_version')!r} is not known here (this version reads "
+            f"{SceneReport.schema_version})", file=path, field="schema_version", remedy="make the report again",
+        )  # fmt: skip
+    return document
+
+
+def read_report(path: str | PathLike[str]) -> SceneReport:
     """Read a report again.
 
     Raises
     ------
     InputError
-        If the file is no report of this version.
+        If the file is not a report of this version, or does not hold what docs/report.schema.json says.
     """
-    document = read_json(path, _MAX_BYTES, "give a <stem>_report.json")
-    if not isinstance(document, dict) or document.get("document") != DOCUMENT:
-        raise InputError("this is no report of ortho-pipeline", file=path, remedy="give a <stem>_report.json")
-    if document.get("schema_version") != SCHEMA_VERSION:
-        raise InputError(
-            f"schema version {document.get('schema_version')!r} is not known here (this version reads "
-            f"{SCHEMA_VERSION})", file=path, field="schema_version", remedy="make the report again",
-        )  # fmt: skip
-    return document
+    try:
+        return record_of(SceneReport, read_report_json(path))
+    except ValueError as error:
+        raise InputError(f"the report is damaged: {error}", file=path, remedy="make the report again") from error
 
 
-def write_plots(report: Mapping[str, Any], folder: Path, stem: str, kind: str = "svg") -> dict[str, Path]:
+def write_plots(report: SceneReport, folder: Path, stem: str, kind: str = "svg") -> dict[str, Path]:
     """Write each plot as a picture of its own: ``<stem>_<plot>.svg`` or ``.png``.
 
     Raises
     ------
     InputError
-        If PNG is asked for and matplotlib is not installed, or the report does not hold what its schema says.
+        If PNG is asked for and matplotlib is not installed, or the numbers of the report cannot be drawn.
     """
     try:
         drawings = plots(report)
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        # What a report holds is the business of report.schema.json; here it is used as it was written.
+    except (LookupError, ValueError, ArithmeticError) as error:
+        # Its members have their types, but numbers that contradict each other are nobody's.
         raise InputError(
             f"the report is damaged ({type(error).__name__}: {str(error)[:120]})", field="plots",
             remedy="make the report again",
@@ -311,7 +368,7 @@ def write_plots(report: Mapping[str, Any], folder: Path, stem: str, kind: str = 
 
 
 def write_report_html(
-    report: Mapping[str, Any], path: str | PathLike[str], *, ortho: str | PathLike[str] | bytes | None = None
+    report: SceneReport, path: str | PathLike[str], *, ortho: str | PathLike[str] | bytes | None = None
 ) -> None:
     """Write the report as one page that needs no other file and no network.
 
@@ -321,26 +378,28 @@ def write_report_html(
         The orthoimage, of which a preview is made, or the PNG of a preview.
     """
     png = ortho if isinstance(ortho, bytes) or ortho is None else preview_png(ortho)
+    adjustment = report.adjustment
     page = render(
         "report/report.html.j2",
         report=report,
-        adjustment=report["adjustment"],
-        head=report["headline"],
+        adjustment=adjustment,
+        head=report.headline,
         # The headline's notes have said these already.
-        warnings=texts_but(report, "no-redundancy", "few-check-points"),
-        rejected={entry["id"]: entry["reason"] for entry in report["adjustment"]["rejected"]},
-        outlying={entry["id"]: entry["reason"] for entry in report["adjustment"]["outlying"]},
-        has_loo=any(point["loo_residual"] for point in report["adjustment"]["points"]),
-        provenance=list(flat({**report["scene"]["facts"], **_brief(report["provenance"])})),
-        inputs=report["provenance"].get("inputs") or [],
+        warnings=texts_but(report.warnings, report.notices, "no-redundancy", "few-check-points"),
+        rejected={one.id: one.reason for one in adjustment.rejected},
+        outlying={one.id: one.reason for one in adjustment.outlying},
+        has_loo=any(point.loo_residual for point in adjustment.points),
+        provenance=list(flat({**report.scene.facts, **_brief(report.provenance)})),
+        inputs=report.provenance.inputs,
         plots={name: drawing.svg() for name, drawing in plots(report).items()},
-        plotted_role=analysed_role(report),
+        plotted_role=report.covariance.drawn_role,
         plot_style=style_sheet(),
         preview=base64.b64encode(png).decode() if png else None,
     )
     write_text(path, page)
 
 
-def _brief(provenance: Mapping[str, Any]) -> dict[str, Any]:
+def _brief(provenance: Provenance) -> dict[str, Any]:
     """Return the provenance without what the page shows in tables of its own."""
-    return {key: value for key, value in provenance.items() if key not in ("inputs", "surface", "model_source")}
+    shown = ("inputs", "surface", "model_source")
+    return {key: value for key, value in json_value(provenance).items() if key not in shown}

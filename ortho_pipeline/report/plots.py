@@ -1,16 +1,18 @@
-"""The plots of the report, each drawn from the report's own document."""
+"""The plots of the report, each drawn from the report itself."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, number, round_down
 from ortho_pipeline.errors import counted
+from ortho_pipeline.report.records import ComparedModel, Covariance, Pair, Point, SceneReport, is_known
 
 #: Drawing area of the plot of vectors in CSS pixels, and the space around it.
 _PLOT_WIDTH, _PLOT_HEIGHT, _PAD = 452.0, 460.0, 19.0
@@ -21,12 +23,10 @@ _MAX_LABELS = 60
 #: With more parameters than this, a matrix of correlations cannot be read.
 _MAX_PARAMETERS = 80
 
-Point = Mapping[str, Any]
 
-
-def plots(report: Mapping[str, Any]) -> dict[str, Drawing]:
+def plots(report: SceneReport) -> dict[str, Drawing]:
     """Return every plot for which the report has data, by name."""
-    makers: dict[str, Callable[[Mapping[str, Any]], Drawing | None]] = {
+    makers: dict[str, Callable[[SceneReport], Drawing | None]] = {
         "residuals": plot_residuals,
         "directions": plot_directions,
         "heights": plot_heights,
@@ -39,21 +39,31 @@ def plots(report: Mapping[str, Any]) -> dict[str, Drawing]:
     return {name: drawing for name, drawing in made.items() if drawing is not None}
 
 
-def kind_of(point: Point) -> str:
-    """Return what a point is drawn as: control, check or out."""
-    if point["role"] == "control" and not point["used"]:
-        return "out"
-    return "check" if point["role"] == "check" else "control"
+class Shown(NamedTuple):
+    """A point that is drawn: where it was measured in the image and its residual, pixels, and what it is drawn as."""
+
+    point: Point
+    image: Pair
+    residual: Pair
+
+    @property
+    def kind(self) -> str:
+        """What it is drawn as: control, check or out."""
+        return self.point.kind
 
 
-def _shown(report: Mapping[str, Any]) -> list[Point]:
-    return [p for p in report["adjustment"]["points"] if p["residual"] and p["image"] and p["role"] != "tie"]
+def _shown(report: SceneReport) -> list[Shown]:
+    return [
+        Shown(point, point.image, point.residual)
+        for point in report.adjustment.points
+        if is_known(point.image) and is_known(point.residual) and point.role != "tie"
+    ]
 
 
 # -- vectors ---------------------------------------------------------------------------------------------------------
 
 
-def plot_residuals(report: Mapping[str, Any]) -> Drawing | None:
+def plot_residuals(report: SceneReport) -> Drawing | None:
     """Draw the residual vectors over the frame of the image, with the hull of the control points.
 
     Used control points are dots, check points squares, points that were left out crosses without an arrow. Points
@@ -62,27 +72,27 @@ def plot_residuals(report: Mapping[str, Any]) -> Drawing | None:
     points = _shown(report)
     if not points:
         return None
-    width, height = report["scene"]["size"]
-    image = np.array([point["image"] for point in points])
+    width, height = report.scene.size
+    image = np.array([point.image for point in points])
     low, high = np.minimum(image.min(axis=0), 0.0), np.maximum(image.max(axis=0), (width, height))
     scale = min(_PLOT_WIDTH / (high[0] - low[0]), _PLOT_HEIGHT / (high[1] - low[1]))
     wide, tall = (high - low) * scale + 2 * _PAD
     wide = max(float(wide), 340.0)
     shift = np.array([(wide - (high[0] - low[0]) * scale) / 2, _PAD]) - low * scale
-    lengths = [math.hypot(*point["residual"]) for point in points if kind_of(point) != "out"]
+    lengths = [math.hypot(*point.residual) for point in points if point.kind != "out"]
     longest = max(lengths, default=0.0)
     arrow = _LONGEST * min(_PLOT_WIDTH, max(tall - 2 * _PAD, wide / 2)) / longest if longest > 0 else 0.0
     label = f"Residual vectors of {counted(len(points), 'point')} over the frame of the image"
     drawing = Drawing(wide, float(tall) + 36, label, "residuals")
     x0, y0 = shift
-    hull = report.get("control_hull") or {}
-    if hull.get("outline"):
-        drawing.path("hull", [tuple(np.array(corner) * scale + shift) for corner in hull["outline"]], closed=True)
+    if report.control_hull and report.control_hull.outline:
+        corners = [tuple(np.array(corner) * scale + shift) for corner in report.control_hull.outline]
+        drawing.path("hull", corners, closed=True)
     drawing.rect("frame", x0, y0, width * scale, height * scale)
     drawing.text(x0, y0 - 8, "0, 0", quiet=True)
     drawing.text(x0 + width * scale, y0 + height * scale + 15, f"{width}, {height}", quiet=True, anchor="end")
     for point in points:
-        _draw_point(drawing, point, np.array(point["image"]) * scale + shift, arrow, len(points) <= _MAX_LABELS)
+        _draw_point(drawing, point, np.array(point.image) * scale + shift, arrow, len(points) <= _MAX_LABELS)
     _legend(drawing, points, float(tall) + 20)
     if longest > 0:
         size = round_down(longest)
@@ -92,10 +102,10 @@ def plot_residuals(report: Mapping[str, Any]) -> Drawing | None:
     return drawing
 
 
-def _draw_point(drawing: Drawing, point: Point, at: Any, arrow: float, label: bool) -> None:
+def _draw_point(drawing: Drawing, point: Shown, at: Any, arrow: float, label: bool) -> None:
     x, y = (float(value) for value in at)
-    dx, dy = (value * arrow for value in point["residual"])
-    kind = kind_of(point)
+    dx, dy = (value * arrow for value in point.residual)
+    kind = point.kind
     with drawing.titled(_title(point)):
         if kind != "out":
             drawing.arrow(kind, x, y, dx, dy)
@@ -106,23 +116,23 @@ def _draw_point(drawing: Drawing, point: Point, at: Any, arrow: float, label: bo
             if x + side * 6 > drawing.width:
                 side, anchor = -9, "end"
             down = 4 if abs(dx) > abs(dy) else (-5 if dy > 0 else 12)
-            drawing.text(x + side, y + down, str(point["id"]), anchor=anchor, quiet=kind == "out")
+            drawing.text(x + side, y + down, point.point.id, anchor=anchor, quiet=kind == "out")
 
 
-def _title(point: Point) -> str:
-    column, row = point["residual"]
-    lines = [f"{point['id']} ({point['role']}{', left out' if kind_of(point) == 'out' else ''})"]
+def _title(shown: Shown) -> str:
+    point, (column, row) = shown.point, shown.residual
+    lines = [f"{point.id} ({point.role}{', left out' if point.kind == 'out' else ''})"]
     lines.append(f"residual {column:+.3f}, {row:+.3f} px")
-    if point.get("residual_m") and None not in point["residual_m"]:
-        lines.append("on the ground {:+.2f}, {:+.2f} m".format(*point["residual_m"]))
-    if point.get("loo_residual") and None not in point["loo_residual"]:
-        lines.append("left out {:+.3f}, {:+.3f} px".format(*point["loo_residual"]))
+    if is_known(point.residual_m):
+        lines.append("on the ground {:+.2f}, {:+.2f} m".format(*point.residual_m))
+    if is_known(point.loo_residual):
+        lines.append("left out {:+.3f}, {:+.3f} px".format(*point.loo_residual))
     return "\n".join(lines)
 
 
-def _legend(drawing: Drawing, points: Sequence[Point], y: float) -> None:
+def _legend(drawing: Drawing, points: Sequence[Shown], y: float) -> None:
     names = {"control": "control", "check": "check", "out": "left out"}
-    present = {kind_of(point) for point in points}
+    present = {point.kind for point in points}
     x = _PAD + 4.0
     for kind, name in names.items():
         if kind in present:
@@ -134,55 +144,68 @@ def _legend(drawing: Drawing, points: Sequence[Point], y: float) -> None:
 # -- scatter ---------------------------------------------------------------------------------------------------------
 
 
-def plot_directions(report: Mapping[str, Any]) -> Drawing | None:
+def plot_directions(report: SceneReport) -> Drawing | None:
     """Draw residuals along the direction of view against those across it, on equal axes."""
-    points = [p for p in _shown(report) if p.get("view_residual")]
-    kept = [p for p in points if kind_of(p) != "out"]
+    points = [(one, one.point.view_residual) for one in _shown(report)]
+    seen = [(one, vector) for one, vector in points if is_known(vector)]
+    kept = [max(abs(along), abs(across)) for one, (along, across) in seen if one.kind != "out"]
     if not kept:
         return None
-    reach = 1.12 * max(max(abs(value) for value in p["view_residual"]) for p in kept) or 1.0
-    inside = [p for p in points if max(abs(value) for value in p["view_residual"]) <= reach]
+    reach = 1.12 * max(kept) or 1.0
+    inside = [(one, vector) for one, vector in seen if max(abs(vector[0]), abs(vector[1])) <= reach]
     drawing = Drawing(420, 420, "Residuals along and across the direction of view", "directions")
     axes = Axes(drawing, (52.0, 14.0, 354.0, 316.0), (-reach, reach), (-reach, reach))
     axes.draw("along the direction of view, px", "across, px")
-    for point in inside:
-        with drawing.titled(_title(point)):
-            drawing.mark(kind_of(point), *axes.at(*point["view_residual"]))
-    _legend(drawing, inside, 406)
+    for one, vector in inside:
+        with drawing.titled(_title(one)):
+            drawing.mark(one.kind, *axes.at(*vector))
+    _legend(drawing, [one for one, _ in inside], 406)
     return drawing
 
 
-def plot_heights(report: Mapping[str, Any]) -> Drawing | None:
+def plot_heights(report: SceneReport) -> Drawing | None:
     """Draw residuals along the direction of view (in rows, for a view straight down) against height."""
-    points = [p for p in _shown(report) if p.get("height_m") is not None]
-    kept = [p for p in points if kind_of(p) != "out"]
-    heights = [p["height_m"] for p in kept]
+    points = [one for one in _shown(report) if one.point.height_m is not None]
+    viewed = all(is_known(one.point.view_residual) for one in points if one.kind != "out")
+    found = [(one, one.point.height_m or 0.0, _upward(one, viewed)) for one in points]
+    kept = [(height, value) for one, height, value in found if one.kind != "out" and value is not None]
+    heights = [height for height, _ in kept]
     if len(kept) < 3 or max(heights) - min(heights) < 1.0:
         return None
-    viewed = all(p.get("view_residual") for p in kept)
-    value = (lambda p: p["view_residual"][0]) if viewed else (lambda p: p["residual"][1])
-    reach = 1.12 * max(abs(value(p)) for p in kept) or 1.0
+    reach = 1.12 * max(abs(value) for _, value in kept) or 1.0
     margin = 0.06 * (max(heights) - min(heights))
     low, high = min(heights) - margin, max(heights) + margin
-    inside = [p for p in points if (kind_of(p) != "out" or (abs(value(p)) <= reach and low <= p["height_m"] <= high))]
+    # Points that were left out only where they do not squeeze the others.
+    inside = [
+        (one, height, value)
+        for one, height, value in found
+        if value is not None and (one.kind != "out" or (abs(value) <= reach and low <= height <= high))
+    ]
     drawing = Drawing(420, 420, "Residuals against the height of the points", "heights")
     axes = Axes(drawing, (52.0, 14.0, 354.0, 316.0), (low, high), (-reach, reach))
     axes.draw("height above the ellipsoid, m", "along the view, px" if viewed else "row, px")
-    for point in inside:
-        with drawing.titled(f"{_title(point)}\nheight {point['height_m']:.1f} m"):
-            drawing.mark(kind_of(point), *axes.at(point["height_m"], value(point)))
-    _legend(drawing, inside, 406)
+    for one, height, value in inside:
+        with drawing.titled(f"{_title(one)}\nheight {height:.1f} m"):
+            drawing.mark(one.kind, *axes.at(height, value))
+    _legend(drawing, [one for one, _, _ in inside], 406)
     return drawing
+
+
+def _upward(one: Shown, viewed: bool) -> float | None:
+    """Return the residual in which an error of height shows: along the direction of view, or in rows without one."""
+    if not viewed:
+        return one.residual[1]
+    return one.point.view_residual[0] if one.point.view_residual else None
 
 
 # -- correlations ----------------------------------------------------------------------------------------------------
 
 
-def plot_correlation(report: Mapping[str, Any]) -> Drawing | None:
+def plot_correlation(report: SceneReport) -> Drawing | None:
     """Draw the correlations of the parameters as a matrix of cells, the stronger the darker."""
-    adjustment = report["adjustment"]
-    names = list(adjustment["parameters"])
-    matrix = (adjustment.get("statistics") or {}).get("correlation") or []
+    adjustment = report.adjustment
+    names = list(adjustment.parameters)
+    matrix = adjustment.statistics.correlation if adjustment.statistics else ()
     if not 2 <= len(names) <= _MAX_PARAMETERS or len(matrix) != len(names):
         return None
     room = 10 + 6.6 * max(map(len, names))
@@ -216,29 +239,20 @@ def plot_correlation(report: Mapping[str, Any]) -> Drawing | None:
 # -- distances -------------------------------------------------------------------------------------------------------
 
 
-def analysed_role(report: Mapping[str, Any]) -> str | None:
-    """Return which points' covariance analysis is drawn: check points where they could be tested, else control."""
-    found = report.get("covariance") or {}
-    for role in ("check", "control"):
-        if found.get(role) and found[role]["p_joint"] is not None and len(found[role]["classes"]) > 1:
-            return role
-    return None
-
-
-def plot_neighbours(report: Mapping[str, Any]) -> Drawing | None:
+def plot_neighbours(report: SceneReport) -> Drawing | None:
     """Draw the correlation of residuals against the distance of points, with what chance does to each class."""
-    role = analysed_role(report)
-    if role is None:
+    role = report.covariance.drawn_role
+    found = None if role is None else report.covariance.of(role)
+    if role is None or found is None:
         return None
-    found = report["covariance"][role]
-    classes = found["classes"]
-    reach = max(abs(value) for one in classes for value in (*one["correlation"], 2 / math.sqrt(one["pairs"])))
+    classes = found.classes
+    reach = max(abs(value) for one in classes for value in (*one.correlation, 2 / math.sqrt(one.pairs)))
     reach = max(1.08 * reach, 0.3)
     drawing, axes = _distance_axes(found, (-reach, reach), "correlation of residuals", "neighbours")
     # Products of independent residuals are uncorrelated among pairs: two standard deviations of their mean.
     for one in classes:
-        chance = min(2 / math.sqrt(one["pairs"]), reach)
-        (left, top), (right, low) = axes.at(one["from_m"], chance), axes.at(one["to_m"], -chance)
+        chance = min(2 / math.sqrt(one.pairs), reach)
+        (left, top), (right, low) = axes.at(one.from_m, chance), axes.at(one.to_m, -chance)
         drawing.rect("chance", left, top, right - left, low - top)
     _series(axes, found, "correlation", role)
     drawing.rect("chance", 236, 396, 14, 12)
@@ -246,22 +260,22 @@ def plot_neighbours(report: Mapping[str, Any]) -> Drawing | None:
     return drawing
 
 
-def plot_relative(report: Mapping[str, Any]) -> Drawing | None:
+def plot_relative(report: SceneReport) -> Drawing | None:
     """Draw the relative standard deviation against the distance of points, and the fitted covariance function."""
-    role = analysed_role(report)
-    if role is None:
+    role = report.covariance.drawn_role
+    found = None if role is None else report.covariance.of(role)
+    if role is None or found is None:
         return None
-    found = report["covariance"][role]
-    high = 1.12 * max(max(one["relative"]) for one in found["classes"]) or 1.0
-    drawing, axes = _distance_axes(found, (0.0, high), f"relative standard deviation, {found['unit']}", "relative")
-    fitted = found["verdict"] == "systematic"
+    high = 1.12 * max(max(one.relative) for one in found.classes) or 1.0
+    drawing, axes = _distance_axes(found, (0.0, high), f"relative standard deviation, {found.unit}", "relative")
+    fitted = found.verdict == "systematic"
     if fitted:
         at = np.linspace(0.0, axes.x[1], 60)
-        for function, p in zip(found["functions"], found["p"], strict=True):
+        for function, p in zip(found.functions, found.p or (1.0, 1.0), strict=True):
             if function is None or p >= 0.05:
                 continue
-            shared = function["systematic"] ** 2 * -np.expm1(-at / function["range_m"])
-            curve = [axes.at(x, y) for x, y in zip(at, np.sqrt(function["noise"] ** 2 + shared), strict=True)]
+            shared = function.systematic**2 * -np.expm1(-at / function.range_m)
+            curve = [axes.at(x, y) for x, y in zip(at, np.sqrt(function.noise**2 + shared), strict=True)]
             for start, end in itertools.pairwise(curve):
                 drawing.line("axis", *start, *end)
     _series(axes, found, "relative", role)
@@ -271,29 +285,28 @@ def plot_relative(report: Mapping[str, Any]) -> Drawing | None:
     return drawing
 
 
-def _distance_axes(found: Mapping[str, Any], y: tuple[float, float], y_name: str, name: str) -> tuple[Drawing, Axes]:
+def _distance_axes(found: Covariance, y: tuple[float, float], y_name: str, name: str) -> tuple[Drawing, Axes]:
     """Return a drawing with axes for values of classes of distance."""
     drawing = Drawing(420, 420, f"{y_name} against the distance of points", name)
-    axes = Axes(drawing, (52.0, 14.0, 354.0, 316.0), (0.0, found["classes"][-1]["to_m"]), y)
+    axes = Axes(drawing, (52.0, 14.0, 354.0, 316.0), (0.0, found.classes[-1].to_m), y)
     axes.draw("distance of points, m", y_name)
     return drawing, axes
 
 
-def _series(axes: Axes, found: Mapping[str, Any], key: str, role: str) -> None:
+def _series(axes: Axes, found: Covariance, key: Literal["correlation", "relative"], role: str) -> None:
     """Draw the values of all classes, one line per axis of the ground: x filled and solid, y hollow and dashed."""
     looks = {
         "control": (("control", "control"), ("control-dash", "loo")),
         "check": (("check-line", "check-head"), ("check-dash", "check")),
     }  # fmt: skip
-    drawing = axes.drawing
+    drawing, values = axes.drawing, operator.attrgetter(key)
     for k, (line, mark) in enumerate(looks[role]):
-        at = [axes.at(one["distance_m"], one[key][k]) for one in found["classes"]]
+        at = [axes.at(one.distance_m, values(one)[k]) for one in found.classes]
         for start, end in itertools.pairwise(at):
             drawing.line(line, *start, *end)
-        for (x, y), one in zip(at, found["classes"], strict=True):
+        for (x, y), one in zip(at, found.classes, strict=True):
             title = (
-                f"{'xy'[k]}: {one[key][k]:.2f}, {one['from_m']:.0f} to {one['to_m']:.0f} m, "
-                f"{counted(one['pairs'], 'pair')}"
+                f"{'xy'[k]}: {values(one)[k]:.2f}, {one.from_m:.0f} to {one.to_m:.0f} m, {counted(one.pairs, 'pair')}"
             )
             with drawing.titled(title):
                 drawing.circle(mark, x, y, 3.4)
@@ -306,16 +319,17 @@ def _series(axes: Axes, found: Mapping[str, Any], key: str, role: str) -> None:
 # -- comparison ------------------------------------------------------------------------------------------------------
 
 
-def plot_comparison(report: Mapping[str, Any]) -> Drawing | None:
+def plot_comparison(report: SceneReport) -> Drawing | None:
     """Draw the RMSE of every compared model on a logarithmic axis: the fit, left out in turn, check points."""
-    rows = [row for row in (report.get("comparison") or {}).get("rows", []) if not row["error"]]
-    kinds = {"control": "control", "loo": "loo", "check": "check"}
-    values = [row["rmse"][key]["total"] for row in rows for key in kinds if row["rmse"][key]]
-    values = [value for value in values if value > 1e-6]
+    compared = report.comparison
+    if compared is None:
+        return None
+    rows = [(row, _totals(row)) for row in compared.rows if not row.error]
+    values = [value for _, totals in rows for value in totals.values() if value > 1e-6]
     if not rows or not values:
         return None
     low, high = min(values) / 1.25, max(values) * 1.25
-    room = 14 + 6.6 * max(len(row["model"]) for row in rows)
+    room = 14 + 6.6 * max(len(row.model) for row, _ in rows)
     wide, step = 700.0, 24.0
     tall = step * len(rows)
     drawing = Drawing(wide, tall + 70, "RMSE of the compared models", "comparison")
@@ -327,18 +341,18 @@ def plot_comparison(report: Mapping[str, Any]) -> Drawing | None:
     for value in _log_ticks(low, high):
         drawing.line("grid", across(value), 6, across(value), tall + 6)
         drawing.text(across(value), tall + 22, f"{value:g}", anchor="middle", quiet=True)
-    chosen = report["comparison"]["recommendation"]["model"]
-    for k, row in enumerate(rows):
+    chosen = compared.recommendation.model
+    for k, (row, totals) in enumerate(rows):
         y = 6 + step * (k + 0.5)
-        if row["model"] == chosen:
+        if row.model == chosen:
             drawing.rect("chosen", 0, y - step / 2, wide, step)
-        drawing.text(room - 10, y + 4, row["model"], anchor="end")
-        said = [f"{key} {row['rmse'][key]['total']:.3g} px" for key in kinds if row["rmse"][key]]
-        with drawing.titled(f"{row['model']}, {counted(row['parameters'], 'parameter')}\n" + "\n".join(said)):
-            found = {key: across(row["rmse"][key]["total"]) for key in kinds if row["rmse"][key]}
+        drawing.text(room - 10, y + 4, row.model, anchor="end")
+        said = [f"{kind} {value:.3g} px" for kind, value in totals.items()]
+        with drawing.titled(f"{row.model}, {counted(row.parameters, 'parameter')}\n" + "\n".join(said)):
+            found = {kind: across(value) for kind, value in totals.items()}
             drawing.line("axis", min(found.values()), y, max(found.values()), y)
-            for key, x in found.items():
-                drawing.mark(kinds[key], x, y)
+            for kind, x in found.items():
+                drawing.mark(kind, x, y)
     x = room
     for kind, name in (("control", "control (the fit)"), ("loo", "each left out in turn"), ("check", "check")):
         drawing.mark(kind, x, tall + 48)
@@ -346,6 +360,12 @@ def plot_comparison(report: Mapping[str, Any]) -> Drawing | None:
         x += 34 + 6.4 * len(name)
     drawing.text(wide - 20, tall + 52, "RMSE, px", anchor="end", quiet=True)
     return drawing
+
+
+def _totals(row: ComparedModel) -> dict[str, float]:
+    """Return the RMSE (px) of a model by what it is drawn as."""
+    kinds = (("control", row.rmse.control), ("loo", row.rmse.loo), ("check", row.rmse.check))
+    return {kind: rmse.total for kind, rmse in kinds if rmse is not None}
 
 
 def _log_ticks(low: float, high: float) -> list[float]:

@@ -21,6 +21,7 @@ from ortho_pipeline.files import sha256, staged, whole_or_nothing, write_json
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.raster.valid_area import grid_of, to_geojson, valid_outline
+from ortho_pipeline.report.records import SceneReport, View
 
 if TYPE_CHECKING:
     from ortho_pipeline.raster.source import Grid
@@ -83,7 +84,7 @@ def acquisition_time(facts: Mapping[str, Any], given: str | None = None) -> date
 
 
 def write_item(
-    path: Path, report: Mapping[str, Any], files: Mapping[str, Path], acquired: datetime, name: str
+    path: Path, report: SceneReport, files: Mapping[str, Path], acquired: datetime, name: str
 ) -> None:  # fmt: skip
     """Write the STAC item of an ortho, and its pictures.
 
@@ -91,7 +92,7 @@ def write_item(
     ----------
     path : Path
         Beside the ortho, to which it refers by relative links.
-    report : mapping
+    report : SceneReport
         The accuracy report of the ortho.
     files : mapping of str to Path
         Outputs by what they are; ``ortho`` has to be there, ``thumbnail`` and ``overview`` are made of it (PNG,
@@ -111,12 +112,12 @@ def write_item(
     if outline.is_empty:
         raise InputError("no pixel of the ortho is valid: it has no place", file=files["ortho"])
     geometry, box = to_geojson(outline, grid.crs)
-    properties = {**_projection(grid, outline), **_view(report["scene"]), **_accuracy(report)}
+    properties = {**_projection(grid, outline), **_view(report.scene.view), **_accuracy(report)}
     prefixes = {"file", "raster", *(name.partition(":")[0] for name in properties)}
-    facts = report["scene"]["facts"]
+    facts = report.scene.facts
     if isinstance(facts.get("satellite"), str):
         properties["platform"] = facts["satellite"].lower()
-    pixel = report["scene"]["ground_pixel_m"]
+    pixel = report.scene.ground_pixel_m
     if pixel is not None:
         properties["gsd"] = round(float(np.mean(pixel)), 4)
     item = pystac.Item(
@@ -151,14 +152,14 @@ def _href(path: Path, folder: Path) -> str:
     return f"./{path.relative_to(folder).as_posix()}"
 
 
-def _ortho_asset(path: Path, report: Mapping[str, Any], folder: Path) -> Any:
+def _ortho_asset(path: Path, report: SceneReport, folder: Path) -> Any:
     import pystac
 
     content = staged(path)
     source = RasterSource(content)
     band: dict[str, Any] = {"data_type": source.dtype.name, "sampling": "area"}
-    if report["ortho"]["unit"] == "m":
-        band["spatial_resolution"] = float(np.mean(report["ortho"]["resolution"]))
+    if report.ortho is not None and report.ortho.unit == "m":
+        band["spatial_resolution"] = float(np.mean(report.ortho.resolution))
     bands = []
     for nodata in source.nodata:
         value = {} if nodata is None else {"nodata": "nan" if math.isnan(nodata) else nodata}
@@ -189,28 +190,26 @@ def _projection(grid: Grid, outline: Any) -> dict[str, Any]:
     }
 
 
-def _view(scene: Mapping[str, Any]) -> dict[str, Any]:
+def _view(view: View | None) -> dict[str, Any]:
     """Return incidence and azimuth at the scene: as the extension has it, from the point below the sensor onwards."""
-    view = scene.get("view")
     if view is None:
         return {}
-    angles: dict[str, Any] = {"view:incidence_angle": round(view["incidence_deg"], 4)}
-    if view["sensor_azimuth_deg"] is not None:
-        angles["view:azimuth"] = round((view["sensor_azimuth_deg"] + 180) % 360, 4)
+    angles: dict[str, Any] = {"view:incidence_angle": round(view.incidence_deg, 4)}
+    if view.sensor_azimuth_deg is not None:
+        angles["view:azimuth"] = round((view.sensor_azimuth_deg + 180) % 360, 4)
     return angles
 
 
-def _accuracy(report: Mapping[str, Any]) -> dict[str, Any]:
+def _accuracy(report: SceneReport) -> dict[str, Any]:
     """Return what points that took no part say: a radial RMSE in metres, bias and spread of check points."""
     found: dict[str, Any] = {}
-    for role, what in (("check", "check points"), ("loo", "leave-one-out residuals")):
-        rmse = report["rmse_m"].get(role)
+    for rmse, what in ((report.rmse_m.check, "check points"), (report.rmse_m.loo, "leave-one-out residuals")):
         if rmse:
-            found = {"accuracy:geometric_rmse": round(rmse["total"], 4), "ortho:accuracy_from": what,
-                     "ortho:accuracy_points": rmse["n"]}  # fmt: skip
+            found = {"accuracy:geometric_rmse": round(rmse.total, 4), "ortho:accuracy_from": what,
+                     "ortho:accuracy_points": rmse.n}  # fmt: skip
             break
-    shifts = np.array([point["residual_m"] for point in report["adjustment"]["points"]
-                       if point["role"] == "check" and point["residual_m"]])  # fmt: skip
+    points = report.adjustment.points
+    shifts = np.array([point.residual_m for point in points if point.role == "check" and point.residual_m])
     if len(shifts) > 1:
         for axis, values in zip("xy", shifts.T, strict=True):
             found[f"accuracy:geometric_{axis}_bias"] = round(float(values.mean()), 4)

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable
+from pathlib import Path
 
 from ortho_pipeline.display.notices import Notice, texts_but
-from ortho_pipeline.display.numbers import metres, px, short, signed, size_text
+from ortho_pipeline.display.numbers import metres, px, share, short, signed, size_text
 from ortho_pipeline.errors import counted
-from ortho_pipeline.surface.base import provenance_text
+from ortho_pipeline.report.records import (
+    Adjustment,
+    Bias,
+    Dem,
+    FlatGround,
+    Headline,
+    Parameter,
+    Rmse,
+    RmseOnGround,
+    RmsesOnGround,
+    SceneReport,
+)  # fmt: skip
 
 #: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
 ENOUGH_CHECK_POINTS = 30
+FEW = f"Fewer than {ENOUGH_CHECK_POINTS} check points: an indication, not a claim of accuracy (ASPRS 2023)."
 
 
 def few_check_points(count: int) -> Notice:
@@ -26,124 +38,125 @@ def few_check_points(count: int) -> Notice:
 
 
 def headline(
-    report: Mapping[str, Any], before: Mapping[str, Any] | None = None, *, adjusted: bool = False
-) -> dict[str, Any]:
+    adjustment: Adjustment, rmse_m: RmsesOnGround | None, before: Headline | None = None, *, adjusted: bool = False
+) -> Headline:
     """Say how accurate the result is, in words, from the best evidence that there is.
 
     Parameters
     ----------
-    before : mapping, optional
-        The headline where there are no points (`delivered.accuracy_before`).
+    rmse_m : RmsesOnGround, optional
+        The accuracy on the ground, where it is known.
+    before : Headline, optional
+        What is said where there are no points (`delivered.accuracy_before`).
     adjusted : bool
         Whether the model was adjusted before.
-
-    Returns
-    -------
-    dict
-        `figure` (``"0.21 px"`` or a word), `metres` (text or None), `what` (a phrase that follows the figure),
-        `notes` (sentences that qualify it).
     """
-    adjustment = report["adjustment"]
-    rmse, redundancy, parameters = adjustment["rmse"], adjustment["redundancy"], len(adjustment["parameters"])
-    control, check, loo = rmse["control"], rmse["check"], rmse["loo"]
-    if not adjustment["points"]:
-        untested: dict[str, Any] = {
-            "figure": "Not tested",
-            "metres": None,
-            "what": "there were no ground control points",
-            "notes": [],
-        }
-        return dict(before or untested)
+    if not adjustment.points:
+        return before or Headline(
+            figure="Not tested", metres=None, what="there were no ground control points", notes=()
+        )
+    rmse, ground = adjustment.rmse, rmse_m or RmsesOnGround(control=None, check=None, loo=None)
+    notes = [*_fit_notes(adjustment), *_outlying_notes(adjustment)]
+    if check := rmse.check:
+        what = f"RMSE at {counted(check.n, 'check point')} that took no part in the adjustment"
+        if check.n < ENOUGH_CHECK_POINTS:
+            notes.append(FEW)
+        return _headline(check, ground.check, what, notes)
+    if rmse.control and not adjustment.parameters:
+        points = counted(rmse.control.n, "point")
+        what = (
+            f"RMSE at {points} of the model as it was adjusted before: a test only if to others"
+            if adjusted
+            else f"RMSE at {points} of the model as delivered, none of which it was adjusted to"
+        )
+        return _headline(rmse.control, ground.control, what, notes)
+    notes.append("No check points were kept apart.")
+    if rmse.loo and adjustment.redundancy:
+        what = f"RMSE when each of {counted(rmse.loo.n, 'control point')} is left out in turn"
+        return _headline(rmse.loo, ground.loo, what, notes)
+    what = "nothing is left over to test the fit with"
+    return Headline(figure="Not tested", metres=None, what=what, notes=tuple(notes))
+
+
+def _headline(rmse: Rmse, ground: RmseOnGround | None, what: str, notes: Iterable[str]) -> Headline:
+    on_ground = None if ground is None else metres(ground.total)
+    return Headline(figure=px(rmse.total), metres=on_ground, what=what, notes=tuple(notes))
+
+
+def _fit_notes(adjustment: Adjustment) -> list[str]:
+    """Say what was left out, and how well the control points are fitted."""
     notes = []
-    if lost := len(adjustment["rejected"]):
+    if lost := len(adjustment.rejected):
         notes.append(
             f"{counted(lost, 'control point')} left out and not counted: good points that are left out are a sign of a "
             "model that does not suit the scene."
         )
+    control, parameters = adjustment.rmse.control, len(adjustment.parameters)
     if control and parameters:
-        fitted = f"{px(control['total'])} RMSE at {counted(control['n'], 'control point')}"
+        points = counted(control.n, "control point")
         notes.append(
-            f"The fit: {fitted}, redundancy {redundancy}."
-            if redundancy
-            else f"No redundancy: {counted(control['n'], 'control point')} for "
-            f"{counted(parameters, 'parameter')} fit exactly, "
+            f"The fit: {px(control.total)} RMSE at {points}, redundancy {adjustment.redundancy}."
+            if adjustment.redundancy
+            else f"No redundancy: {points} for {counted(parameters, 'parameter')} fit exactly, "
             "which says nothing about accuracy."
         )
-    notes += _outlying_notes(adjustment)
-    if check:
-        what = f"RMSE at {counted(check['n'], 'check point')} that took no part in the adjustment"
-        if check["n"] < ENOUGH_CHECK_POINTS:
-            notes.append(
-                f"Fewer than {ENOUGH_CHECK_POINTS} check points: an indication, not a claim of accuracy (ASPRS 2023)."
-            )
-        return {**_figure(check, report["rmse_m"]["check"]), "what": what, "notes": notes}
-    if control and not parameters:
-        what = (
-            f"RMSE at {counted(control['n'], 'point')} of the model as it was adjusted before: a test only if to others"
-            if adjusted
-            else f"RMSE at {counted(control['n'], 'point')} of the model as delivered, none of which it was adjusted to"
-        )
-        return {**_figure(control, report["rmse_m"]["control"]), "what": what, "notes": notes}
-    notes.append("No check points were kept apart.")
-    if loo and redundancy:
-        what = f"RMSE when each of {counted(loo['n'], 'control point')} is left out in turn"
-        return {**_figure(loo, report["rmse_m"]["loo"]), "what": what, "notes": notes}
-    return {"figure": "Not tested", "metres": None, "what": "nothing is left over to test the fit with", "notes": notes}
+    return notes
 
 
-def _outlying_notes(adjustment: Mapping[str, Any]) -> list[str]:
+def _outlying_notes(adjustment: Adjustment) -> list[str]:
     """Say which check points contradict the others, and what the figure would be without them."""
-    names = [one["id"] for one in adjustment["outlying"] if one["role"] == "check"]
+    names = [one.id for one in adjustment.outlying if one.role == "check"]
     if not names:
         return []
     said = f"Probably wrong, but counted: check point{'s' if len(names) > 1 else ''} {', '.join(names)}"
-    rest = adjustment["rmse_of_agreeing_checks"]
-    return [f"{said}; without {px(rest['total'])} at {counted(rest['n'], 'check point')}." if rest else f"{said}."]
+    rest = adjustment.rmse_of_agreeing_checks
+    return [f"{said}; without {px(rest.total)} at {counted(rest.n, 'check point')}." if rest else f"{said}."]
 
 
-def _figure(rmse: Mapping[str, Any], rmse_m: Mapping[str, Any] | None) -> dict[str, Any]:
-    return {"figure": px(rmse["total"]), "metres": metres(rmse_m["total"]) if rmse_m else None}
-
-
-def summary_text(report: Mapping[str, Any]) -> str:
+def summary_text(report: SceneReport) -> str:
     """Return the report as a screenful of text, without colours."""
-    adjustment, scene, head = report["adjustment"], report["scene"], report["headline"]
-    rows = [("scene", f"{scene['name']}, {size_text(scene['size'])} px, {scene['sensor']} ({scene['model_source']})")]
-    if raw := adjustment["raw_bias"]:
-        rows.append(("raw bias", f"{_bias(raw)} (measured minus delivered model, {counted(raw['n'], 'point')})"))
-    if adjustment["parameters"]:
-        values = [f"{name} {_parameter(entry)}" for name, entry in adjustment["parameters"].items()]
-        rows.append(("model", f"{adjustment['model']}: {', '.join(values)}"))
+    adjustment, scene, head = report.adjustment, report.scene, report.headline
+    rows = [("scene", f"{scene.name}, {size_text(scene.size)} px, {scene.sensor} ({scene.model_source})")]
+    if raw := adjustment.raw_bias:
+        rows.append(("raw bias", f"{_bias(raw)} (measured minus delivered model, {counted(raw.n, 'point')})"))
+    if adjustment.parameters:
+        values = [f"{name} {_parameter(entry)}" for name, entry in adjustment.parameters.items()]
+        rows.append(("model", f"{adjustment.model}: {', '.join(values)}"))
     else:
-        rows.append(("model", adjustment["model"]))
-    ground = f" ({head['metres']})" if head["metres"] else ""
-    rows.append(("accuracy", f"{head['figure']}{ground}: {head['what']}"))
-    rows += [("", note) for note in head["notes"]]
-    if scale := report.get("map_scale"):
-        rows.append(("map scale", scale["statement"]))
-    for role, found in (report.get("covariance") or {}).items():
-        if found and found["verdict"] == "systematic":
-            rows.append(("pattern", f"{role} points: {found['statement']}"))
-    rows += [("left out", f"{entry['id']}: {entry['reason']}") for entry in adjustment["rejected"]]
-    if surface := report["surface"]:
-        rows.append(("heights", provenance_text(surface)))
-    if ortho := report["ortho"]:
-        steps = " x ".join(short(step) for step in ortho["resolution"])
-        rows.append(("ortho", f"{size_text(ortho['size'])} px of {steps} {ortho['unit']}, {ortho['crs']}"))
-    if warp := report["warp"]:
-        by = f" (GDAL's {name} transformer)" if (name := warp.get("transformer")) else ""
-        rows.append(("warp", f"{px(warp['max_error_px'])} at worst from the exact model{by}"))
+        rows.append(("model", adjustment.model))
+    ground = f" ({head.metres})" if head.metres else ""
+    rows.append(("accuracy", f"{head.figure}{ground}: {head.what}"))
+    rows += [("", note) for note in head.notes]
+    if report.map_scale:
+        rows.append(("map scale", report.map_scale.statement))
+    for role, found in (("control", report.covariance.control), ("check", report.covariance.check)):
+        if found and found.verdict == "systematic":
+            rows.append(("pattern", f"{role} points: {found.statement}"))
+    rows += [("left out", f"{one.id}: {one.reason}") for one in adjustment.rejected]
+    if report.surface:
+        rows.append(("heights", _surface_text(report.surface)))
+    if ortho := report.ortho:
+        steps = " x ".join(short(step) for step in ortho.resolution)
+        rows.append(("ortho", f"{size_text(ortho.size)} px of {steps} {ortho.unit}, {ortho.crs}"))
+    if warp := report.warp:
+        by = f" (GDAL's {warp.transformer} transformer)" if warp.transformer else ""
+        rows.append(("warp", f"{px(warp.max_error_px)} at worst from the exact model{by}"))
     # The headline and the rows above have said these already.
-    rows += [("warning", text) for text in texts_but(report, "left-out", "no-redundancy", "few-check-points")]
+    said = ("left-out", "no-redundancy", "few-check-points")
+    rows += [("warning", text) for text in texts_but(report.warnings, report.notices, *said)]
     return "\n".join(f"{key:<10}{value}" for key, value in rows)
 
 
-def _bias(raw: Mapping[str, Any]) -> str:
-    return f"column {signed(raw['col'])} px, row {signed(raw['row'])} px"
+def _bias(raw: Bias) -> str:
+    return f"column {signed(raw.col)} px, row {signed(raw.row)} px"
 
 
-def _parameter(entry: Mapping[str, Any]) -> str:
-    return f"{short(entry['value'], '+')} ±{short(entry['sigma'])}"
+def _parameter(entry: Parameter) -> str:
+    return f"{short(entry.value, '+')} ±{short(entry.sigma)}"
 
 
-# -- numbers as people read them -------------------------------------------------------------------------------------
+def _surface_text(surface: FlatGround | Dem) -> str:
+    if isinstance(surface, FlatGround):
+        return f"flat ground at {metres(surface.constant_height)} above the ellipsoid"
+    covered = "" if surface.coverage is None else f", covers {share(surface.coverage)} of the scene"
+    return f"{Path(surface.path).name}, heights above {surface.vertical_label}{covered}"

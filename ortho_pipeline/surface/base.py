@@ -5,15 +5,13 @@ from __future__ import annotations
 import abc
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_pipeline.display.numbers import metres, share
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.options import number_of
@@ -237,11 +235,3 @@ def positions(xy: ArrayLike) -> Array:
     if found.ndim != 2 or found.shape[1] < 2:
         raise InputError(f"positions have the shape (N, 2), not {found.shape}")
     return found[:, :2]
-
-
-def provenance_text(provenance: Mapping[str, Any]) -> str:
-    """Say what a surface was, from its provenance and its ``coverage`` of a scene as a report holds them."""
-    if provenance.get("constant_height") is not None:
-        return f"flat ground at {metres(provenance['constant_height'])} above the ellipsoid"
-    covered = "" if provenance["coverage"] is None else f", covers {share(provenance['coverage'])} of the scene"
-    return f"{Path(str(provenance.get('path', ''))).name}, heights above {provenance.get('vertical_label')}{covered}"

@@ -28,6 +28,7 @@ from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.exchange.model_file import read_model_file, save_model
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpb
+from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.options import PointOptions, SceneOptions
@@ -234,7 +235,7 @@ def _model(path: Path) -> Any:
 
 def _report_seed(folder: Path) -> bytes:
     fitted = commands.fit(seeds.SAMPLE / "scene.tif", PointOptions(gcps=seeds.SAMPLE / "gcps.geojson", check="every:4"))
-    return json.dumps(report.build_report(scene=fitted.scene, fit=fitted.fit)).encode()
+    return json.dumps(json_value(report.build_report(scene=fitted.scene, fit=fitted.fit))).encode()
 
 
 def _report(path: Path) -> Any:

@@ -73,8 +73,9 @@ def test_texts_of_sensors_get_a_code_and_their_notices_keep_theirs():
 
 
 def test_a_document_without_codes_shows_all_its_texts():
-    assert texts_but({"warnings": ["a", "b"]}, "left-out") == ["a", "b"]
-    assert texts_but(to_document([Notice("left-out", "a"), Notice("no-rpc", "left out")]), "left-out") == ["left out"]
+    assert texts_but(["a", "b"], [], "left-out") == ["a", "b"]
+    found = to_document([Notice("left-out", "a"), Notice("no-rpc", "left out")])
+    assert texts_but(found["warnings"], found["notices"], "left-out") == ["left out"]
 
 
 # -- all codes -------------------------------------------------------------------------------------------------------
@@ -104,7 +105,7 @@ def test_the_page_lists_the_codes_that_there_are():
 
 
 def test_codes_that_are_compared_exist():
-    compared = [arg.value for _, call in calls("texts_but") for arg in call.args[1:] if isinstance(arg, ast.Constant)]
+    compared = [arg.value for _, call in calls("texts_but") for arg in call.args[2:] if isinstance(arg, ast.Constant)]
     assert compared
     assert set(compared) <= set(listed())
 

@@ -16,11 +16,13 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.estimation.spatial_correlation import CovarianceAnalysis, analyse, analyse_fit
+from ortho_pipeline.files.documents import json_value, record_of
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.report import document as report
+from ortho_pipeline.report.records import SceneReport
 from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
 from ortho_pipeline.simulation.terrain import Terrain
 
@@ -284,7 +286,7 @@ def test_report_holds_the_analysis_and_draws_it(tmp_path):
     provenance = {"command": None, "inputs": [], "software": {}}
     made = report.build_report(scene=scene, fit=result, provenance=provenance)
     schema = json.loads((Path(__file__).parent.parent.parent / "docs" / "report.schema.json").read_text())
-    jsonschema.validate(made, schema, cls=jsonschema.Draft202012Validator)
+    jsonschema.validate(json_value(made), schema, cls=jsonschema.Draft202012Validator)
     # The check points were tested: their analysis is drawn, and the words are on page and terminal.
     assert {"neighbours", "relative"} <= set(report.plots(made))
     report.write_report_html(made, tmp_path / "r.html")
@@ -301,11 +303,14 @@ def test_report_of_few_points_says_so_and_draws_nothing():
     result = adjusted(wave=0.0, control=5, check=3)
     scene = Scene("simulated", "scene.tif", 1000, 1000, {"camera": result.model}, "from a seed")
     made = report.build_report(scene=scene, fit=result)
-    assert made["covariance"]["control"]["verdict"] == "too few points"
+    control = made.covariance.control
+    assert control is not None
+    assert control.verdict == "too few points"
     assert not {"neighbours", "relative"} & set(report.plots(made))
     # Reports that were written before this section was there are still shown.
-    del made["covariance"], made["scene"]["view"]
-    assert "residuals" in report.plots(made)
+    earlier = json_value(made)
+    del earlier["covariance"], earlier["scene"]["view"], earlier["notices"]
+    assert "residuals" in report.plots(record_of(SceneReport, earlier))
 
 
 # -- the size of a pixel by direction of view ------------------------------------------------------------------------

@@ -77,9 +77,9 @@ def test_a_model_of_a_block_says_so(sample, tmp_path):
 
 
 def test_only_rpcs_come_from_vendors(tiny):
-    assert "Vendors' RPCs" in accuracy_before(open_scene(tiny.image))["notes"][0]
+    assert "Vendors' RPCs" in accuracy_before(open_scene(tiny.image)).notes[0]
     camera = FrameCamera(Interior(6, 4, 0.01, 1e-3, 1e-3), np.array([0, 0, 500.0, 0, 0, 0]), origin=(33.0, 39.0, 0.0))
-    (note,) = accuracy_before(Scene("frame", "a.tif", 6, 4, {"frame": camera}, "poses.csv"))["notes"]
+    (note,) = accuracy_before(Scene("frame", "a.tif", 6, 4, {"frame": camera}, "poses.csv")).notes
     assert note == "The model is used as it was delivered."
 
 
@@ -103,6 +103,6 @@ def test_a_damaged_record_is_not_understood_and_no_error(tiny, tmp_path, adjustm
     scene = open_scene(tiny.image, SceneOptions(model=tmp_path / "m.json"))
     assert dict(scene.adjusted or {}) == adjustment
     head = accuracy_before(scene)
-    assert head["figure"] == "Not tested"
-    assert "adjusted before" in head["notes"][0]
-    assert accuracy_before(dataclasses.replace(scene, adjusted=None))["notes"][0].startswith("The model is used as")
+    assert head.figure == "Not tested"
+    assert "adjusted before" in head.notes[0]
+    assert accuracy_before(dataclasses.replace(scene, adjusted=None)).notes[0].startswith("The model is used as")

@@ -19,10 +19,12 @@ from osgeo import gdal
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import Fit, fit
+from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.points import Points
 from ortho_pipeline.report import document as report
+from ortho_pipeline.report.records import SceneReport
 from ortho_pipeline.report.wording import few_check_points
 from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
 from ortho_pipeline.simulation.terrain import Terrain
@@ -65,7 +67,7 @@ def no_points() -> Points:
     return points().select(np.zeros(18, dtype=bool))
 
 
-def document(result: Fit, **more: Any) -> dict[str, Any]:
+def document(result: Fit, **more: Any) -> SceneReport:
     model = result.model
     scene = Scene("simulated", "folder/scene.tif", 1000, 1000, {"camera": model}, "from a seed", {"sun": float("nan")})
     return report.build_report(scene=scene, fit=result, **more)
@@ -94,11 +96,13 @@ class FakeSurface:
 
 def test_report_is_json_without_nan(tmp_path):
     made = document(
-        adjusted(points()), warnings=[Notice("from-sensor", "look here")], provenance={"image": {"path": "scene.tif"}}
+        adjusted(points()),
+        warnings=[Notice("from-sensor", "look here")],
+        provenance={"image": {"path": "scene.tif", "size": [1000, 1000]}},
     )
     report.write_report_json(made, tmp_path / "r.json")
     again = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"), parse_constant=pytest.fail)
-    assert again == made
+    assert again == json_value(made)
     assert again["schema_version"] == 1
     assert again["scene"]["facts"] == {"sun": None}
     assert again["warnings"] == ["look here"]
@@ -106,17 +110,17 @@ def test_report_is_json_without_nan(tmp_path):
 
 
 def test_raw_bias_is_measured_minus_delivered():
-    raw = document(adjusted(points()))["adjustment"]["raw_bias"]
-    assert (raw["col"], raw["row"]) == pytest.approx(BIAS, abs=0.2)
+    raw = document(adjusted(points())).adjustment.raw_bias
+    assert (raw.col, raw.row) == pytest.approx(BIAS, abs=0.2)
 
 
 def test_metres_are_pixels_times_their_size():
     made = document(adjusted(points()))
-    assert made["scene"]["ground_pixel_m"] == pytest.approx([2.5, 2.5], rel=0.02)
+    assert made.scene.ground_pixel_m == pytest.approx([2.5, 2.5], rel=0.02)
     for which in ("control", "check", "loo"):
-        pixels, metres = made["adjustment"]["rmse"][which], made["rmse_m"][which]
-        assert metres["n"] == pixels["n"]
-        assert metres["total"] == pytest.approx(2.5 * pixels["total"], rel=0.1)
+        pixels, metres = getattr(made.adjustment.rmse, which), getattr(made.rmse_m, which)
+        assert metres.n == pixels.n
+        assert metres.total == pytest.approx(2.5 * pixels.total, rel=0.1)
 
 
 def test_metres_say_where_the_ortho_shows_the_point():
@@ -128,17 +132,17 @@ def test_metres_say_where_the_ortho_shows_the_point():
     result = adjusted(dataclasses.replace(measured, image=image))
     shown = CAMERA.image_to_ground(image[index : index + 1] - BIAS, measured.ground[index, 2])
     east, north = (TERRAIN.xy(*shown.T[:2]) - TERRAIN.xy(*measured.ground[index : index + 1, :2].T))[0]
-    said = document(result)["adjustment"]["points"][index]["residual_m"]
+    said = document(result).adjustment.points[index].residual_m
     # The map is turned against north by the convergence of meridians, 0.2 degrees there.
     assert said == pytest.approx((east, north), abs=0.02)
 
 
 def test_relief_displacement_is_that_of_the_camera():
-    scene = document(adjusted(points()))["scene"]
+    scene = document(adjusted(points())).scene
     low, high = (TERRAIN.xy(*CAMERA.image_to_ground([[500.0, 500.0]], h).T[:2])[0] for h in (1100.0, 1000.0))
     east, north = (high - low) / 100
-    assert scene["lean_m_per_m"] == pytest.approx(np.hypot(east, north), rel=0.01)
-    assert scene["lean_azimuth_deg"] == pytest.approx(np.degrees(np.arctan2(east, north)) % 360, abs=1.0)
+    assert scene.lean_m_per_m == pytest.approx(np.hypot(east, north), rel=0.01)
+    assert scene.lean_azimuth_deg == pytest.approx(np.degrees(np.arctan2(east, north)) % 360, abs=1.0)
 
 
 def test_residuals_geojson_is_flat_and_in_lon_lat():
@@ -163,49 +167,49 @@ def test_residuals_geojson_is_flat_and_in_lon_lat():
 
 
 def test_headline_prefers_check_points():
-    head = document(adjusted(points()))["headline"]
-    assert re.fullmatch(r"0\.\d\d px", head["figure"])
-    assert head["metres"].endswith(" m")
-    assert "6 check points" in head["what"]
-    assert any("30 check points" in note for note in head["notes"])
+    head = document(adjusted(points())).headline
+    assert re.fullmatch(r"0\.\d\d px", head.figure)
+    assert head.metres.endswith(" m")
+    assert "6 check points" in head.what
+    assert any("30 check points" in note for note in head.notes)
 
 
 def test_headline_with_enough_check_points_makes_no_excuse():
-    head = document(adjusted(points(control=10, check=30)))["headline"]
-    assert not any("ewer than" in note for note in head["notes"])
+    head = document(adjusted(points(control=10, check=30))).headline
+    assert not any("ewer than" in note for note in head.notes)
 
 
 def test_headline_without_check_points_leaves_one_out():
     made = document(adjusted(points(check=0)))
-    assert "left out in turn" in made["headline"]["what"]
-    assert made["headline"]["figure"] == f"{made['adjustment']['rmse']['loo']['total']:.2f} px"
+    assert "left out in turn" in made.headline.what
+    assert made.headline.figure == f"{made.adjustment.rmse.loo.total:.2f} px"
 
 
 def test_headline_without_redundancy_gives_no_figure():
-    head = document(adjusted(points(control=1, check=0)))["headline"]
-    assert head["figure"] == "Not tested"
-    assert any(note.startswith("No redundancy") for note in head["notes"])
+    head = document(adjusted(points(control=1, check=0))).headline
+    assert head.figure == "Not tested"
+    assert any(note.startswith("No redundancy") for note in head.notes)
 
 
 def test_headline_without_points_says_so():
     made = document(as_delivered(no_points()))
-    assert made["headline"]["figure"] == "Not tested"
-    assert "no ground control" in made["headline"]["what"]
+    assert made.headline.figure == "Not tested"
+    assert "no ground control" in made.headline.what
     assert "Not tested" in report.summary_text(made)
     assert report.plots(made) == {}
 
 
 def test_headline_of_a_model_as_delivered():
-    head = document(as_delivered(points(check=0)))["headline"]
-    assert float(head["figure"].removesuffix(" px")) == pytest.approx(np.hypot(*BIAS), abs=0.2)
-    assert "as delivered" in head["what"]
+    head = document(as_delivered(points(check=0))).headline
+    assert float(head.figure.removesuffix(" px")) == pytest.approx(np.hypot(*BIAS), abs=0.2)
+    assert "as delivered" in head.what
 
 
 @pytest.mark.parametrize(("offset", "warned"), [(33.6, True), (0.0, False), (-33.6, True)])
 def test_other_height_datum_of_the_points_is_seen(offset, warned):
     made = document(adjusted(points()), surface=FakeSurface(offset), coverage=1.0)
-    assert made["heights"]["median_m"] == pytest.approx(-offset, abs=0.2)
-    found = [text for text in made["warnings"] if "datum" in text]
+    assert made.heights.median_m == pytest.approx(-offset, abs=0.2)
+    found = [text for text in made.warnings if "datum" in text]
     assert bool(found) is warned
     if warned:
         assert ("below" if offset > 0 else "above") in found[0]
@@ -273,7 +277,10 @@ def page(tmp_path) -> str:
         adjusted(dataclasses.replace(measured, image=image)),
         surface=FakeSurface(0.0),
         coverage=1.0,
-        provenance={"image": {"path": HOSTILE, "sha256": "ab" * 32}, "empty": None},
+        provenance={
+            "command": HOSTILE,
+            "inputs": [{"role": "image", "path": HOSTILE, "bytes": 1, "sha256": "ab" * 32}],
+        },
         warnings=[Notice("left-out", f"{HOSTILE} was left out")],
     )
     png = report.preview_png(_raster(tmp_path / "ortho.tif"))
@@ -334,7 +341,7 @@ def test_page_without_optional_parts(tmp_path):
     assert "<img" not in page
 
 
-def drawn_residuals(made: dict[str, Any]) -> str:
+def drawn_residuals(made: SceneReport) -> str:
     return report.plots(made)["residuals"].svg()
 
 
@@ -373,14 +380,16 @@ def test_plot_keeps_points_outside_of_the_image_in_view():
 
 def test_plot_of_a_perfect_point_has_no_arrow():
     made = document(adjusted(points(control=1, check=0)))
-    made["adjustment"]["points"][0]["residual"] = [0.0, 0.0]
-    assert "<line" not in drawn_residuals(made)
+    exact = dataclasses.replace(made.adjustment.points[0], residual=(0.0, 0.0))
+    adjustment = dataclasses.replace(made.adjustment, points=(exact,))
+    assert "<line" not in drawn_residuals(dataclasses.replace(made, adjustment=adjustment))
 
 
 def test_plots_of_a_whole_report_as_svg_and_png(tmp_path):
     made = document(adjusted(points(), "affine"))
     report.write_report_json(made, tmp_path / "scene_report.json")
-    again = report.read_report_json(tmp_path / "scene_report.json")
+    again = report.read_report(tmp_path / "scene_report.json")
+    assert again == made
     for kind in ("svg", "png"):
         files = report.write_plots(again, tmp_path / "plots", "scene_report", kind)
         assert set(files) == {"residuals", "directions", "heights", "correlation", "neighbours", "relative"}
@@ -396,13 +405,36 @@ def test_a_report_that_is_none_is_refused(tmp_path):
     for text in ("[]", "{", '{"document": "ortho-pipeline report", "schema_version": 99}'):
         (tmp_path / "r.json").write_text(text)
         with pytest.raises(InputError):
-            report.read_report_json(tmp_path / "r.json")
+            report.read_report(tmp_path / "r.json")
     with pytest.raises(InputError, match="cannot be read"):
-        report.read_report_json(tmp_path / "absent.json")
+        report.read_report(tmp_path / "absent.json")
+
+
+@pytest.mark.parametrize(
+    ("section", "name", "value", "said"),
+    [
+        ("scene", "size", None, "scene.size"),
+        ("scene", "size", "large", "scene.size"),
+        ("headline", "surplus", 1, "headline.surplus"),
+        ("rmse_m", "check", {"x": 1.0}, "rmse_m.check.y"),
+    ],
+)
+def test_a_damaged_report_is_refused_by_the_name_of_the_member(tmp_path, section, name, value, said):
+    damaged = json_value(document(adjusted(points())))
+    damaged[section] |= {name: value}
+    (tmp_path / "r.json").write_text(json.dumps(damaged))
+    with pytest.raises(InputError, match=f"damaged: {said}"):
+        report.read_report(tmp_path / "r.json")
+
+
+def test_a_point_that_does_not_project_is_not_drawn():
+    """A residual of nulls was taken for one."""
     made = document(adjusted(points()))
-    del made["scene"]["size"]
-    with pytest.raises(InputError, match="damaged"):
-        report.write_plots(made, tmp_path, "r")
+    lost = dataclasses.replace(made.adjustment.points[0], residual=(None, None), view_residual=None)
+    adjustment = dataclasses.replace(made.adjustment, points=(lost, *made.adjustment.points[1:]))
+    drawn = report.plots(dataclasses.replace(made, adjustment=adjustment))
+    assert lost.id not in drawn["residuals"].svg()
+    assert {"directions", "heights"} <= set(drawn)
 
 
 def test_a_wrong_height_shows_along_the_view_and_not_across():
@@ -411,11 +443,11 @@ def test_a_wrong_height_shows_along_the_view_and_not_across():
     ground = measured.ground.copy()
     ground[index, 2] += 20.0
     made = document(adjusted(dataclasses.replace(measured, ground=ground)))
-    along, across = made["adjustment"]["points"][index]["view_residual"]
+    along, across = made.adjustment.points[index].view_residual
     # 20 m of height at tan(20 degrees), in pixels of 2.5 m; the point is believed too high, so it is measured short.
     assert along == pytest.approx(-20 * 0.41 / 2.5, rel=0.05)
     assert across == pytest.approx(0.0, abs=0.1)
-    assert made["view_rmse"]["check"]["along"] > 5 * made["view_rmse"]["check"]["across"]
+    assert made.view_rmse.check.along > 5 * made.view_rmse.check.across
 
 
 def test_hull_of_the_control_points_is_a_share_of_the_image():
@@ -423,10 +455,10 @@ def test_hull_of_the_control_points_is_a_share_of_the_image():
     corners = np.array([[0.0, 0.0], [1000.0, 0.0], [1000.0, 500.0], [0.0, 500.0]])
     ground = CAMERA.image_to_ground(corners, 1000.0)
     moved = dataclasses.replace(measured, image=corners, ground=ground)
-    hull = document(adjusted(moved, "none"))["control_hull"]
-    assert hull["share"] == pytest.approx(0.5)
-    assert hull["n"] == len(hull["outline"]) == 4
-    assert document(adjusted(points(control=2, check=0)))["control_hull"] is None
+    hull = document(adjusted(moved, "none")).control_hull
+    assert hull.share == pytest.approx(0.5)
+    assert hull.n == len(hull.outline) == 4
+    assert document(adjusted(points(control=2, check=0))).control_hull is None
 
 
 def test_style_of_the_residuals_is_qgis_xml():
@@ -446,9 +478,9 @@ def test_arrows_of_the_style_are_scaled_by_points_that_have_one():
     image = measured.image.copy()
     image[index] += (60.0, 0.0)
     wrong = document(adjusted(dataclasses.replace(measured, image=image)))
-    assert [one["id"] for one in wrong["adjustment"]["rejected"]] == [measured.ids[index]]
+    assert [one.id for one in wrong.adjustment.rejected] == [measured.ids[index]]
 
-    def scale(made: dict[str, Any]) -> float:
+    def scale(made: SceneReport) -> float:
         root = ElementTree.fromstring(report.residuals_style(made).split("\n", 1)[1])
         return {float(prop.get("v") or 0) for prop in root.iter("prop") if prop.get("k") == "scale"}.pop()
 
@@ -463,13 +495,13 @@ def test_a_wrong_check_point_is_said_everywhere_and_counts(tmp_path):
     result = adjusted(dataclasses.replace(measured, image=image))
     name = measured.ids[index]
     made = document(result)
-    good = document(adjusted(measured))["adjustment"]["rmse"]["check"]
-    (one,) = made["adjustment"]["outlying"]
-    assert (one["id"], one["role"]) == (name, "check")
-    assert made["adjustment"]["rmse"]["check"]["n"] == 6
-    assert made["adjustment"]["rmse"]["check"]["total"] > 2.5
-    assert made["adjustment"]["rmse_of_agreeing_checks"]["total"] == pytest.approx(good["total"], rel=0.3)
-    note = next(text for text in made["headline"]["notes"] if name in text)
+    good = document(adjusted(measured)).adjustment.rmse.check
+    (one,) = made.adjustment.outlying
+    assert (one.id, one.role) == (name, "check")
+    assert made.adjustment.rmse.check.n == 6
+    assert made.adjustment.rmse.check.total > 2.5
+    assert made.adjustment.rmse_of_agreeing_checks.total == pytest.approx(good.total, rel=0.3)
+    note = next(text for text in made.headline.notes if name in text)
     assert "at 5 check points" in note
     assert note in report.summary_text(made)
     report.write_report_html(made, tmp_path / "r.html")

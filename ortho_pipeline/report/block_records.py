@@ -1,0 +1,240 @@
+"""What the report of a block says, as records: its JSON, its page and docs/block_report.schema.json follow them.
+
+Numbers that do not exist are None. Residuals in images are measured minus predicted, in pixels (column, row); those on
+the ground known minus adjusted, in metres east, north, up.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+from ortho_pipeline.files.documents import record
+from ortho_pipeline.report.records import (
+    Count,
+    InputFile,
+    NoticeDocument,
+    Parameter,
+    Residual,
+    Rmse,
+    Role,
+    RpcRecord,
+    Size,
+)  # fmt: skip
+
+Triple = tuple[float, float, float]
+#: Of a point of which it may be unknown.
+OnGround = tuple[float | None, float | None, float | None]
+
+
+@record
+class BlockImage:
+    """An image of the block, and the model that was adjusted."""
+
+    path: str
+    size: Size
+    sensor: str
+    model: str
+    model_source: str
+    facts: dict[str, str]
+    rpc: RpcRecord | None
+
+
+@record
+class RmseByRole:
+    """Over the points of each role in one image."""
+
+    control: Rmse | None
+    check: Rmse | None
+    tie: Rmse | None
+
+    @property
+    def all(self) -> Rmse | None:
+        """Over the points of all roles."""
+        return merged(self.control, self.check, self.tie)
+
+
+@record
+class ImageRms:
+    """At the adjusted ground, at the known ground, and at the known ground with the models as they were."""
+
+    residuals: RmseByRole
+    back_projected: RmseByRole
+    raw_residuals: RmseByRole
+
+
+@record
+class AdjustedImage:
+    """What was adjusted of an image, and how well its rays fit."""
+
+    parameters: dict[str, Parameter]
+    rays: Count
+    rms: ImageRms
+
+
+@record
+class ObjectRms:
+    """Root mean squares on the ground, in plan and height, and the least and greatest residual."""
+
+    x: float
+    y: float
+    h: float
+    plan: float
+    n: Count
+    min: Triple
+    max: Triple
+
+
+@record
+class ObjectRmsByRole:
+    """Of control points, whose ground was used, and of check points, whose ground was not."""
+
+    control: ObjectRms | None
+    check: ObjectRms | None
+
+
+@record
+class ImageVariance:
+    """The factor of the stated sigmas of measurements, and their part of the redundancy."""
+
+    factor: float
+    redundancy: float
+
+
+@record
+class GroundVariance:
+    """The sigma of ground that states none, of how many points, and its part of the redundancy."""
+
+    sigma: float | None
+    points: Count
+    redundancy: float
+
+
+@record
+class UnstatedGround:
+    """In plan (each axis) and in height."""
+
+    xy: GroundVariance
+    h: GroundVariance
+
+
+@record
+class VariancesRecord:
+    """Standard deviations of the observations, as stated or found; separable is whether they can be told apart."""
+
+    image: ImageVariance
+    unstated_ground: UnstatedGround
+    separable: bool
+
+
+@record
+class BlockPoint:
+    """A point: its adjusted longitude, latitude and height, its sigma in metres, and known minus adjusted ground."""
+
+    id: str
+    role: Role
+    used_ground: bool
+    ground: OnGround
+    sigma: OnGround
+    residual: OnGround
+
+
+@record
+class Ray:
+    """A point in an image: its residual at the adjusted ground, and at the known ground."""
+
+    id: str
+    image: str
+    used: bool
+    measured: Residual
+    residual: Residual
+    back_projected: Residual
+
+
+@record
+class GrossError:
+    """A measurement, the ground of a control point, or a whole point that was left out."""
+
+    point: str
+    what: Literal["ray", "ground", "point"]
+    image: str | None
+    reason: str
+
+
+@record
+class ContradictedPoint:
+    """A known point that the block contradicts, and that was left as it is."""
+
+    point: str
+    role: Literal["control", "check"]
+    what: Literal["plan", "height", "ground"]
+    metres: float
+    sigmas: float
+
+
+@record
+class BlockAdjustment:
+    """What was adjusted, what defines the datum (gauge), and what came out."""
+
+    gauge: str
+    sigma0: float | None
+    redundancy: int
+    degrees_of_freedom: float
+    condition: float | None
+    iterations: Count
+    variances: VariancesRecord
+    images: dict[str, AdjustedImage]
+    object_rms: ObjectRmsByRole
+    points: tuple[BlockPoint, ...]
+    rays: tuple[Ray, ...]
+    rejected: tuple[GrossError, ...]
+    outlying: tuple[ContradictedPoint, ...]
+    warnings: tuple[str, ...]
+    notices: tuple[NoticeDocument, ...]
+
+
+@record
+class BlockProvenance:
+    """What is needed to make the same result again."""
+
+    command: str | None
+    inputs: tuple[InputFile, ...]
+    options: dict[str, dict[str, Any]]
+    software: dict[str, str]
+
+
+@record
+class BlockHeadline:
+    """How accurate the block is, in words: a figure, that of heights, a phrase that follows, and reservations."""
+
+    figure: str
+    height: str | None
+    what: str
+    notes: tuple[str, ...]
+
+
+@record
+class BlockReport:
+    """The content of block_report.json. Numbers that do not exist are null."""
+
+    document: Literal["ortho-pipeline block report"] = "ortho-pipeline block report"
+    schema_version: Literal[1] = 1
+    images: dict[str, BlockImage]
+    adjustment: BlockAdjustment
+    provenance: BlockProvenance
+    warnings: tuple[str, ...]
+    notices: tuple[NoticeDocument, ...]
+    headline: BlockHeadline
+
+
+def merged(*parts: Rmse | None) -> Rmse | None:
+    """Return the root mean squares of several groups together; None where there is no point."""
+    groups = [part for part in parts if part]
+    number = sum(part.n for part in groups)
+    if not number:
+        return None
+    col, row = (
+        sum(part.n * square**2 for part, square in zip(groups, squares, strict=True)) / number
+        for squares in ([part.col for part in groups], [part.row for part in groups])
+    )
+    return Rmse(col=math.sqrt(col), row=math.sqrt(row), total=math.sqrt(col + row), n=number)

@@ -1,0 +1,551 @@
+"""What the report of a scene says, as records: its JSON, its page, its plots and docs/report.schema.json follow them.
+
+Numbers that do not exist are None. A residual is measured minus predicted, in pixels (column, row).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, TypeGuard
+
+from ortho_pipeline.files.documents import Shape, record
+
+Count = Annotated[int, Shape(minimum=0)]
+Size = tuple[Annotated[int, Shape(minimum=1)], Annotated[int, Shape(minimum=1)]]
+Pair = tuple[float, float]
+#: Of a point for which it may be unknown.
+Residual = tuple[float | None, float | None]
+Role = Literal["control", "check", "tie"]
+#: A warning with its code and what it is about (docs/notices.md).
+NoticeDocument = Annotated[
+    dict[str, Any],
+    Shape(
+        properties={"code": {"type": "string", "pattern": "^[a-z0-9]+(-[a-z0-9]+)*$"}, "text": {"type": "string"}},
+        required=["code", "text"],
+    ),
+]
+
+
+# -- where it comes from ---------------------------------------------------------------------------------------------
+
+
+@record
+class InputFile:
+    """A file that was read."""
+
+    role: str
+    path: str
+    bytes: Count
+    sha256: Annotated[str, Shape(pattern="^[0-9a-f]{64}$")]
+
+
+@record
+class ImageFile:
+    """The image that was opened."""
+
+    path: str
+    size: Size
+
+
+@record
+class Provenance:
+    """What is needed to make the same result again."""
+
+    command: str | None = None
+    inputs: tuple[InputFile, ...] = ()
+    image: ImageFile | None = None
+    sensor: str | None = None
+    model_source: str | None = None
+    points: dict[str, Any] | None = None
+    surface: dict[str, Any] | None = None
+    options: dict[str, dict[str, Any]] | None = None
+    software: dict[str, str] | None = None
+
+
+@record
+class PixelOnGround:
+    """What a pixel covers on level ground, metres along and across the direction of view."""
+
+    along_view: float
+    across_view: float
+
+
+@record
+class View:
+    """How the middle of the image is seen; the azimuth is from the ground to the sensor, null straight down."""
+
+    incidence_deg: float
+    sensor_azimuth_deg: float | None
+    pixel_m: PixelOnGround
+
+
+@record
+class SceneRecord:
+    """The scene; geometry is that of its middle, by the adjusted model."""
+
+    name: str
+    size: Size
+    sensor: str
+    model_source: str
+    facts: dict[str, Any]
+    ground_pixel_m: Pair | None
+    lean_m_per_m: float | None
+    lean_azimuth_deg: float | None
+    view: View | None = None
+
+
+# -- adjustment ------------------------------------------------------------------------------------------------------
+
+
+@record
+class Rmse:
+    """Root mean square in pixels."""
+
+    col: float
+    row: float
+    total: float
+    n: Count
+
+
+@record
+class RmseOnGround:
+    """Root mean square in metres on the ground."""
+
+    x: float
+    y: float
+    total: float
+    n: Count
+
+
+@record
+class RmseOfView:
+    """Root mean square in pixels along and across the direction of view."""
+
+    along: float
+    across: float
+    n: Count
+
+
+@record
+class Rmses:
+    """Over control points (the fit), check points, and control points left out in turn."""
+
+    control: Rmse | None
+    check: Rmse | None
+    loo: Rmse | None
+
+
+@record
+class RmsesOnGround:
+    """Over control points (the fit), check points, and control points left out in turn."""
+
+    control: RmseOnGround | None
+    check: RmseOnGround | None
+    loo: RmseOnGround | None
+
+
+@record
+class RmsesOfView:
+    """Over control points (the fit) and check points."""
+
+    control: RmseOfView | None
+    check: RmseOfView | None
+
+
+@record
+class Bias:
+    """Mean and scatter of measured minus predicted of the model as delivered, over the used points."""
+
+    col: float
+    row: float
+    std_col: float
+    std_row: float
+    n: Count
+
+
+@record
+class Parameter:
+    """An adjusted parameter."""
+
+    value: float
+    sigma: float | None
+
+
+@record
+class Statistics:
+    """How far the points justify each parameter; ridge is the regularisation, condition that of the design."""
+
+    correlation: tuple[tuple[float | None, ...], ...]
+    total_correlation: dict[str, float | None]
+    t: dict[str, float | None]
+    p: dict[str, float | None]
+    significance: float
+    not_justified: tuple[str, ...]
+    degrees_of_freedom: float | None
+    effective_parameters: float | None
+    ridge: float | None
+    condition: float | None
+    corner_ratio: float | None = None
+
+
+@record
+class SharedErrors:
+    """Errors that neighbouring points share: their standard deviations per axis, and the range in which they fall."""
+
+    points: Count
+    groups: Count
+    effective_points: float
+    noise: Pair | None
+    shared: Pair | None
+    range_px: Pair | None
+
+
+@record
+class GroupedStatistics(Statistics):
+    """Tests of the parameters where points have groups."""
+
+    shared_errors: SharedErrors
+
+
+@record
+class Point:
+    """A point in the image: `residual_m` is where the ortho shows it minus where it belongs, metres along x and y.
+
+    `view_residual` is along and across the direction of view, `raw_residual` of the model as delivered.
+    """
+
+    id: str
+    role: Role
+    used: bool
+    image: Residual | None
+    predicted: Residual | None
+    residual: Residual | None
+    loo_residual: Residual | None
+    raw_residual: Residual | None = None
+    residual_m: Residual | None = None
+    view_residual: Residual | None = None
+    height_m: float | None = None
+
+    @property
+    def kind(self) -> Literal["control", "check", "out"]:
+        """What it is drawn as."""
+        if self.role == "control" and not self.used:
+            return "out"
+        return "check" if self.role == "check" else "control"
+
+
+@record
+class LeftOut:
+    """A point that was left out as a gross error."""
+
+    id: str
+    reason: str
+
+
+@record
+class OutlyingPoint:
+    """A point that contradicts the others and still counts."""
+
+    id: str
+    role: Literal["control", "check"]
+    distance: float
+    expected: float
+    chance: float
+    leverage: float
+    reason: str
+
+
+@record
+class Adjustment:
+    """What was adjusted to the points, and how well it fits them."""
+
+    model: str
+    parameters: dict[str, Parameter]
+    points: tuple[Point, ...]
+    rmse: Rmses
+    raw_bias: Bias | None
+    redundancy: int
+    sigma0: float | None
+    rejected: tuple[LeftOut, ...]
+    outlying: tuple[OutlyingPoint, ...] = ()
+    rmse_of_agreeing_checks: Rmse | None = None
+    warnings: tuple[str, ...] = ()
+    notices: tuple[NoticeDocument, ...] = ()
+    statistics: Statistics | GroupedStatistics | None = None
+
+
+# -- accuracy --------------------------------------------------------------------------------------------------------
+
+
+@record
+class DistanceClass:
+    """Pairs of points whose distance is in a range, metres."""
+
+    from_m: float
+    to_m: float
+    distance_m: float
+    pairs: Annotated[int, Shape(minimum=1)]
+    correlation: Pair
+    relative: Pair
+
+
+@record
+class CovarianceFunction:
+    """Standard deviations of noise and of what neighbours share, and the distance at which 1/e of that is left."""
+
+    noise: float
+    systematic: float
+    range_m: float
+
+
+@record
+class Covariance:
+    """Covariance analysis of residuals on the ground, per axis (x, y); docs/accuracy.md says what each number is."""
+
+    unit: str
+    n: Count
+    near_m: float | None
+    pairs_near: Count
+    mean: Pair
+    mean_p: Pair | None
+    absolute: Pair
+    relative: Pair | None
+    correlation: Pair | None
+    classes: tuple[DistanceClass, ...]
+    functions: tuple[CovarianceFunction | None, CovarianceFunction | None]
+    moran: Pair | None
+    p: Pair | None
+    p_joint: float | None
+    critical: float | None
+    verdict: Literal["systematic", "none found", "too few points"]
+    statement: str
+
+
+@record
+class Covariances:
+    """Of control and of check points, never of both together."""
+
+    control: Covariance | None = None
+    check: Covariance | None = None
+
+    @property
+    def drawn_role(self) -> Literal["control", "check"] | None:
+        """Which points' analysis is drawn: check points where they could be tested, else control."""
+        roles: tuple[Literal["check", "control"], ...] = ("check", "control")
+        for role in roles:
+            found = self.of(role)
+            if found is not None and found.p_joint is not None and len(found.classes) > 1:
+                return role
+        return None
+
+    def of(self, role: Literal["control", "check"]) -> Covariance | None:
+        """Return the analysis of the points of a role."""
+        return self.check if role == "check" else self.control
+
+
+@record
+class MapScaleRecord:
+    """What maps the accuracy is good for; docs/accuracy.md says what each number is."""
+
+    evidence: Literal["check", "delivered", "loo"]
+    n: Annotated[int, Shape(minimum=1)]
+    rmse: float
+    ce90: float
+    pixel: float | None
+    paper_scale: int | None
+    limited_by: Literal["pixel", "accuracy"] | None
+    class_cm: int
+    survey: float
+    claim: bool
+    nmas_scale: int | None
+    statement: str
+
+
+@record
+class ControlHull:
+    """Convex hull of the used control points, and its share of the image; no outline of points in a line."""
+
+    share: Annotated[float, Shape(minimum=0)]
+    n: Count
+    outline: tuple[Pair, ...]
+
+
+@record
+class Headline:
+    """How accurate the result is, in words: a figure, the same in metres, a phrase that follows, and reservations."""
+
+    figure: str
+    metres: str | None
+    what: str
+    notes: tuple[str, ...]
+
+
+# -- compared models -------------------------------------------------------------------------------------------------
+
+
+@record
+class ComparedModel:
+    """A model that was fitted, or why it could not be."""
+
+    model: str
+    parameters: Count
+    minimum_points: Count
+    dimensions: Literal[2, 3]
+    error: str | None
+    rmse: Rmses
+    rmse_m: RmsesOnGround
+    condition: float | None
+    redundancy: int | None
+    sigma0: float | None
+    fitted_as: str | None
+    ridge: float | None
+    effective_parameters: float | None
+    warnings: tuple[str, ...]
+    notices: tuple[NoticeDocument, ...] = ()
+
+
+@record
+class PointCounts:
+    """How many points there were."""
+
+    control: Count
+    check: Count
+
+
+@record
+class Recommendation:
+    """The model to take, null where nothing can be said, and what speaks for it."""
+
+    model: str | None
+    criterion: Literal["check", "leave-one-out", "none"]
+    reason: str
+
+
+@record
+class ComparisonRecord:
+    """What ortho compare found."""
+
+    schema_version: Count
+    image: str
+    sensor: str
+    model_crs: str | None
+    points: PointCounts
+    rows: tuple[ComparedModel, ...]
+    left_out: tuple[LeftOut, ...]
+    recommendation: Recommendation
+    warnings: tuple[str, ...]
+    notices: tuple[NoticeDocument, ...] = ()
+    files: dict[str, str]
+
+
+# -- heights and the ortho -------------------------------------------------------------------------------------------
+
+
+@record
+class PointHeights:
+    """Heights of the points minus those of the DEM."""
+
+    median_m: float
+    spread_m: float
+    n: Count
+    warning: str | None
+
+
+@record
+class FlatGround:
+    """Flat ground, metres above the ellipsoid."""
+
+    coverage: float | None
+    constant_height: float
+
+    @property
+    def is_flat(self) -> bool:
+        """True."""
+        return True
+
+
+@record
+class Dem:
+    """The DEM, and how its heights were understood."""
+
+    coverage: float | None
+    path: str
+    crs: str | None = None
+    declared_vertical: str | None = None
+    declared_by: Literal["code", "name"] | None = None
+    option: str | None = None
+    override: bool = False
+    vertical: str | None = None
+    vertical_label: str | None = None
+    metres_per_unit: float | None = None
+    fill: str | float | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def is_flat(self) -> bool:
+        """False."""
+        return False
+
+
+@record
+class RpcRecord:
+    """The adjusted model as RPC: exactly, or fitted to it."""
+
+    exact: bool
+    max_error_px: float
+
+
+@record
+class OrthoRecord:
+    """The grid of the ortho; extent is left, bottom, right, top."""
+
+    crs: str
+    crs_name: str
+    unit: str
+    extent: tuple[float, float, float, float]
+    resolution: Pair
+    size: Size
+    valid_share: float | None
+
+
+@record
+class WarpRecord:
+    """How exact the pixels are, in pixels of the image; the transformer is GDAL's where its warper made them."""
+
+    max_error_px: float
+    tolerance_px: float
+    finest_spacing: int | None = None
+    refined_blocks: int | None = None
+    blocks: int | None = None
+    pixels: Count
+    valid_pixels: Count
+    transformer: str | None = None
+
+
+@record
+class SceneReport:
+    """The content of <stem>_report.json. Numbers that do not exist are null."""
+
+    document: Literal["ortho-pipeline report"] = "ortho-pipeline report"
+    schema_version: Literal[1] = 1
+    scene: SceneRecord
+    adjustment: Adjustment
+    rmse_m: RmsesOnGround
+    view_rmse: RmsesOfView
+    covariance: Covariances = Covariances()
+    map_scale: MapScaleRecord | None = None
+    control_hull: ControlHull | None = None
+    comparison: ComparisonRecord | None
+    heights: PointHeights | None
+    surface: FlatGround | Dem | None
+    rpc: RpcRecord | None
+    ortho: OrthoRecord | None
+    warp: WarpRecord | None
+    provenance: Provenance
+    warnings: tuple[str, ...]
+    notices: tuple[NoticeDocument, ...] = ()
+    headline: Headline
+
+
+def is_known(values: Residual | None) -> TypeGuard[Pair]:
+    """Whether a vector is known, in both axes."""
+    return values is not None and None not in values
