@@ -1,4 +1,4 @@
-"""The guts of each command: paths in, paths out.
+"""The work behind each command: paths in, paths out.
 
 Imports everything below; parses no command line and prints nothing.
 """

@@ -1,4 +1,4 @@
-"""The guts of `ortho register`: single bands brought onto one of them, in one image that opens as the same product."""
+"""`ortho register`: single bands brought onto one of them, in one image that opens as the same product."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The guts of `ortho adjust` and `ortho intersect`: images and points in, models, ground points and a report out."""
+"""`ortho adjust` and `ortho intersect`: images and points in, models, ground points and a report out."""
 
 from __future__ import annotations
 

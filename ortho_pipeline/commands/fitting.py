@@ -16,7 +16,7 @@ from ortho_pipeline.commands.scene_fit import (
     heights_where_wanted,
     on_surface,
     open_adjustable,
-)  # fmt: skip
+)
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped

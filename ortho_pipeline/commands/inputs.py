@@ -1,4 +1,4 @@
-"""What a command reads: the scene, the surface, the points; which paths it may write; and the record of all that."""
+"""Inputs of a command: the scene, the surface, the points; the paths it may write; and the record of all that."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ _SPARSE = 0.05
 
 
 class Placement(NamedTuple):
-    """Where an ortho lies and what it is made from: the adjusted model, its footprint on the surface, the grid."""
+    """The place of an ortho and all that it is made from: adjusted model, footprint on the surface, and grid."""
 
     adjusted: Adjusted
     model: SensorModel

@@ -1,4 +1,4 @@
-"""What commands return: documents for ``--json``, files, and what people see of them in a notebook."""
+"""Results of commands: documents for ``--json``, files, and their looks in a notebook."""
 
 from __future__ import annotations
 

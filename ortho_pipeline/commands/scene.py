@@ -1,4 +1,4 @@
-"""What a scene, an image, a DEM and the installation tell: `ortho info`, `edge`, `dem-check`, `report`, `doctor`."""
+"""Facts about a scene, an image, a DEM and the installation: `ortho info`, `edge`, `dem-check`, `report`, `doctor`."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def write_plots(report_file: str | os.PathLike[str], folder: str | os.PathLike[s
     Raises
     ------
     InputError
-        If it is no report, or PNG is asked for and matplotlib is not installed.
+        If it is not a report, or PNG is asked for and matplotlib is not installed.
     """
     with completed(report_file, remedy="give a <stem>_report.json as it was written, or make it again"):
         made = report.read_report(report_file)

@@ -1,4 +1,4 @@
-"""The guts of ``ortho simulate`` and ``ortho reproduce``: what plugins offer in the hook ``ortho_studies``."""
+"""`ortho simulate` and `ortho reproduce`: studies that plugins offer in the hook ``ortho_studies``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How results look in a notebook: plain HTML that takes the notebook's own colours."""
+"""Results in a notebook: plain HTML that takes the notebook's own colours."""
 
 from __future__ import annotations
 

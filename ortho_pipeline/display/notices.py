@@ -1,4 +1,4 @@
-"""Notices: what people ought to know before they trust a result, each with a code that programs compare.
+"""Notices to read before a result is trusted, each with a code that programs compare.
 
 A module that treats some notices in a way of its own compares their codes, never their sentences. docs/notices.md
 lists all codes.

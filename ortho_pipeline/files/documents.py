@@ -60,6 +60,14 @@ def record(kind: type[_T]) -> type[_T]:
     return dataclasses.dataclass(frozen=True, kw_only=True)(kind)
 
 
+class DocumentError(ValueError):
+    """A document that is not the one of a record: `place` is the first member that is wrong, `fault` how."""
+
+    def __init__(self, place: str, fault: str) -> None:
+        super().__init__(f"{place}: {fault}")
+        self.place, self.fault = place, fault
+
+
 class Shape:
     """Say more of a field's values in the schema than their type does: ``Annotated[int, Shape(minimum=0)]``."""
 
@@ -75,8 +83,8 @@ def record_of(kind: type[_T], document: Any) -> _T:
 
     Raises
     ------
-    ValueError
-        If a member is missing, too much, or of a wrong type; the text names the first one.
+    DocumentError
+        If a member is missing, too much, or of a wrong type.
     """
     import pydantic
 
@@ -84,7 +92,7 @@ def record_of(kind: type[_T], document: Any) -> _T:
         found: _T = _adapter(kind).validate_python(document)  # type: ignore[arg-type]
     except pydantic.ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
-        raise ValueError(f"{'.'.join(map(str, first['loc']))[:200]}: {first['msg'][:200]}") from error
+        raise DocumentError(".".join(map(str, first["loc"]))[:200], first["msg"][:200]) from error
     return found
 
 

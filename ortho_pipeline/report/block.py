@@ -25,7 +25,7 @@ from ortho_pipeline.report.block_records import (
     BlockReport,
     VariancesRecord,
     merged,
-)  # fmt: skip
+)
 from ortho_pipeline.report.records import Rmse, RpcRecord, is_known
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, FEW
 

@@ -1,4 +1,4 @@
-"""What the report of a block says, as records: its JSON, its page and docs/block_report.schema.json follow them.
+"""The report of a block as records: its JSON, its page and docs/block_report.schema.json follow them.
 
 Numbers that do not exist are None. Residuals in images are measured minus predicted, in pixels (column, row); those on
 the ground known minus adjusted, in metres east, north, up.
@@ -20,7 +20,7 @@ from ortho_pipeline.report.records import (
     Role,
     RpcRecord,
     Size,
-)  # fmt: skip
+)
 
 Triple = tuple[float, float, float]
 #: Of a point of which it may be unknown.
@@ -65,7 +65,7 @@ class ImageRms:
 
 @record
 class AdjustedImage:
-    """What was adjusted of an image, and how well its rays fit."""
+    """The adjusted parameters of an image, and how well its rays fit."""
 
     parameters: dict[str, Parameter]
     rays: Count
@@ -174,7 +174,7 @@ class ContradictedPoint:
 
 @record
 class BlockAdjustment:
-    """What was adjusted, what defines the datum (gauge), and what came out."""
+    """The adjustment of all images and points together; gauge names what defines the datum."""
 
     gauge: str
     sigma0: float | None
@@ -195,7 +195,7 @@ class BlockAdjustment:
 
 @record
 class BlockProvenance:
-    """What is needed to make the same result again."""
+    """Files, options and versions with which the same result can be made again."""
 
     command: str | None
     inputs: tuple[InputFile, ...]
@@ -205,7 +205,7 @@ class BlockProvenance:
 
 @record
 class BlockHeadline:
-    """How accurate the block is, in words: a figure, that of heights, a phrase that follows, and reservations."""
+    """The accuracy in words: a figure, that of heights, a phrase that follows, and reservations."""
 
     figure: str
     height: str | None

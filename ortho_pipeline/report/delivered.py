@@ -1,4 +1,4 @@
-"""What is known of how accurate a model is before any point is seen: delivered, or adjusted before."""
+"""The accuracy of a model that no point was measured for: as delivered, or as its file says that it was adjusted."""
 
 from __future__ import annotations
 

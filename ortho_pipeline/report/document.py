@@ -27,7 +27,7 @@ from ortho_pipeline.estimation.fit import Fit, root_mean_square
 from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rmse_metres, viewing
 from ortho_pipeline.estimation.spatial_correlation import analyse_fit
 from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
-from ortho_pipeline.files.documents import json_position, json_value, record_of
+from ortho_pipeline.files.documents import DocumentError, json_position, json_value, record_of
 from ortho_pipeline.geodesy.crs import Vertical, crs_text, ground_transform
 from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
@@ -53,7 +53,7 @@ from ortho_pipeline.report.records import (
     SceneReport,
     WarpRecord,
     is_known,
-)  # fmt: skip
+)
 from ortho_pipeline.report.wording import headline, summary_text
 from ortho_pipeline.surface.flat import FlatSurface
 
@@ -211,8 +211,8 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
     spread = float(1.4826 * np.median(np.abs(difference - median)))
     doubts = []
     if len(difference) >= 3 and abs(median) > max(_SUSPICIOUS_HEIGHT, 3 * spread):
-        lean = seen["lean_m_per_m"]
-        moved = "" if lean is None else f"; that moves the ortho by {metres(abs(median) * lean)}"
+        displacement = seen["lean_m_per_m"]
+        moved = "" if displacement is None else f"; that moves the ortho by {metres(abs(median) * displacement)}"
         side = "above" if median > 0 else "below"
         text = (
             f"the points lie {metres(abs(median))} {side} the DEM (median; spread {metres(spread)}): their heights "
@@ -334,10 +334,13 @@ def read_report(path: str | PathLike[str]) -> SceneReport:
     InputError
         If the file is not a report of this version, or does not hold what docs/report.schema.json says.
     """
+    document = read_report_json(path)
     try:
-        return record_of(SceneReport, read_report_json(path))
-    except ValueError as error:
-        raise InputError(f"the report is damaged: {error}", file=path, remedy="make the report again") from error
+        return record_of(SceneReport, document)
+    except DocumentError as error:
+        raise InputError(
+            f"the report is damaged: {error.fault}", file=path, field=error.place, remedy="make the report again"
+        ) from error
 
 
 def write_plots(report: SceneReport, folder: Path, stem: str, kind: str = "svg") -> dict[str, Path]:

@@ -1,4 +1,4 @@
-"""What maps the accuracy is good for: a rule of the OrbView-3 paper, ASPRS 2023, and NMAS.
+"""Map scales that the accuracy suffices for: by a rule of the OrbView-3 paper, ASPRS 2023, and NMAS.
 
 All three take the errors on the ground (where the ortho shows a point minus where it belongs, on the assumption that
 the DEM is right there) of points that took no part in the adjustment. Points that contradict the others count.
@@ -84,7 +84,7 @@ class MapScale:
 
 
 def map_scale(fit: Fit, pixel: float | None) -> MapScale | None:
-    """Return what maps a fit is good for; None where nothing tests it.
+    """Return the map scales that a fit suffices for; None where nothing tests it.
 
     Parameters
     ----------

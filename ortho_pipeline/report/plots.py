@@ -48,7 +48,7 @@ class Shown(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """What it is drawn as: control, check or out."""
+        """The mark that it is drawn with: control, check or out."""
         return self.point.kind
 
 

@@ -1,4 +1,4 @@
-"""What the report of a scene says, as records: its JSON, its page, its plots and docs/report.schema.json follow them.
+"""The report of a scene as records: its JSON, its page, its plots and docs/report.schema.json follow them.
 
 Numbers that do not exist are None. A residual is measured minus predicted, in pixels (column, row).
 """
@@ -48,7 +48,7 @@ class ImageFile:
 
 @record
 class Provenance:
-    """What is needed to make the same result again."""
+    """Files, options and versions with which the same result can be made again."""
 
     command: str | None = None
     inputs: tuple[InputFile, ...] = ()
@@ -63,7 +63,7 @@ class Provenance:
 
 @record
 class PixelOnGround:
-    """What a pixel covers on level ground, metres along and across the direction of view."""
+    """Size of a pixel on level ground, metres along and across the direction of view."""
 
     along_view: float
     across_view: float
@@ -71,7 +71,7 @@ class PixelOnGround:
 
 @record
 class View:
-    """How the middle of the image is seen; the azimuth is from the ground to the sensor, null straight down."""
+    """Direction of view in the middle of the image; azimuth from the ground to the sensor, null straight down."""
 
     incidence_deg: float
     sensor_azimuth_deg: float | None
@@ -172,7 +172,7 @@ class Parameter:
 
 @record
 class Statistics:
-    """How far the points justify each parameter; ridge is the regularisation, condition that of the design."""
+    """Tests of the parameters; ridge is the regularisation, condition that of the design."""
 
     correlation: tuple[tuple[float | None, ...], ...]
     total_correlation: dict[str, float | None]
@@ -227,7 +227,7 @@ class Point:
 
     @property
     def kind(self) -> Literal["control", "check", "out"]:
-        """What it is drawn as."""
+        """The mark that it is drawn with."""
         if self.role == "control" and not self.used:
             return "out"
         return "check" if self.role == "check" else "control"
@@ -256,7 +256,7 @@ class OutlyingPoint:
 
 @record
 class Adjustment:
-    """What was adjusted to the points, and how well it fits them."""
+    """The model that was adjusted to the points, and how well it fits them."""
 
     model: str
     parameters: dict[str, Parameter]
@@ -329,7 +329,7 @@ class Covariances:
 
     @property
     def drawn_role(self) -> Literal["control", "check"] | None:
-        """Which points' analysis is drawn: check points where they could be tested, else control."""
+        """The points whose analysis is drawn: check points where they could be tested, else control."""
         roles: tuple[Literal["check", "control"], ...] = ("check", "control")
         for role in roles:
             found = self.of(role)
@@ -344,7 +344,7 @@ class Covariances:
 
 @record
 class MapScaleRecord:
-    """What maps the accuracy is good for; docs/accuracy.md says what each number is."""
+    """The largest map scales that the accuracy suffices for; docs/accuracy.md says what each number is."""
 
     evidence: Literal["check", "delivered", "loo"]
     n: Annotated[int, Shape(minimum=1)]
@@ -371,7 +371,7 @@ class ControlHull:
 
 @record
 class Headline:
-    """How accurate the result is, in words: a figure, the same in metres, a phrase that follows, and reservations."""
+    """The accuracy in words: a figure, the same in metres, a phrase that follows, and reservations."""
 
     figure: str
     metres: str | None
@@ -405,7 +405,7 @@ class ComparedModel:
 
 @record
 class PointCounts:
-    """How many points there were."""
+    """Numbers of points."""
 
     control: Count
     check: Count
@@ -422,7 +422,7 @@ class Recommendation:
 
 @record
 class ComparisonRecord:
-    """What ortho compare found."""
+    """Models that ortho compare fitted to the same points, and its recommendation."""
 
     schema_version: Count
     image: str
@@ -509,7 +509,7 @@ class OrthoRecord:
 
 @record
 class WarpRecord:
-    """How exact the pixels are, in pixels of the image; the transformer is GDAL's where its warper made them."""
+    """The exactness of the warp, in pixels of the image; the transformer is GDAL's where its warper made the ortho."""
 
     max_error_px: float
     tolerance_px: float
@@ -547,5 +547,5 @@ class SceneReport:
 
 
 def is_known(values: Residual | None) -> TypeGuard[Pair]:
-    """Whether a vector is known, in both axes."""
+    """Tell whether a vector is known, in both axes."""
     return values is not None and None not in values

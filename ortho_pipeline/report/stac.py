@@ -1,7 +1,7 @@
 """A STAC item for an orthoimage: where and when it is, how it was seen, how accurate it is, and a checksum.
 
 Extensions: projection 2.0, raster 1.1, view 1.0, file 2.1, accuracy 1.0 beta 1 (its only published version). Accuracy
-comes from check points, or from leave-one-out residuals; that of control points is no accuracy, and is left out.
+comes from check points, or from leave-one-out residuals; control points only tell of the fit, and are left out.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def acquisition_time(facts: Mapping[str, Any], given: str | None = None) -> date
     Raises
     ------
     InputError
-        If there is none, or it is no time: STAC has no item without one.
+        If there is none, or it is not a time: STAC has no item without one.
     """
     text = given if given is not None else facts.get("acquired")
     if not text:
@@ -77,7 +77,7 @@ def acquisition_time(facts: Mapping[str, Any], given: str | None = None) -> date
     except (ValueError, OverflowError) as error:
         # Overflow: the last hours of the last year, in a zone in which they are the next year in UTC.
         raise InputError(
-            f"{str(text)[:40]!r} is no time of acquisition",
+            f"{str(text)[:40]!r} is not a time of acquisition",
             field="output.acquired",
             remedy="for example 2005-08-03T08:12:31Z",
         ) from error

@@ -19,7 +19,7 @@ from ortho_pipeline.report.records import (
     RmseOnGround,
     RmsesOnGround,
     SceneReport,
-)  # fmt: skip
+)
 
 #: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
 ENOUGH_CHECK_POINTS = 30

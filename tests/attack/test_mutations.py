@@ -175,5 +175,5 @@ def test_a_name_longer_than_a_file_system_takes(tmp_path: Path, field: str) -> N
 
 
 def test_the_end_of_time_is_no_time_of_acquisition() -> None:
-    with pytest.raises(InputError, match="no time of acquisition"):
+    with pytest.raises(InputError, match="not a time of acquisition"):
         acquisition_time({}, "9999-12-31T23:59:59-14:00")

@@ -1,4 +1,4 @@
-"""The commands' guts: whole jobs, and the traps in which programs of this kind go wrong silently."""
+"""Whole jobs of the commands, and the traps in which programs of this kind go wrong silently."""
 
 from __future__ import annotations
 
