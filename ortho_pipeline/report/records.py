@@ -189,7 +189,7 @@ class Statistics:
 
 @record
 class SharedErrors:
-    """Errors that neighbouring points share: their standard deviations per axis, and the range in which they fall."""
+    """Errors that neighbouring points share, in units of stated sigmas; docs/accuracy.md says what each number is."""
 
     points: Count
     groups: Count

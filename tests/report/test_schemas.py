@@ -77,6 +77,17 @@ def test_real_reports_hold_what_their_schema_says(reports, of):
     assert json_value(record_of(SCHEMAS[name][0], document)) == document
 
 
+def test_errors_that_points_share_are_in_the_schema(reports):
+    name, document = copy.deepcopy(reports["scene with points"])
+    shared = {"points": 4, "groups": 2, "effective_points": 3.1, "noise": None, "shared": [0.5, 0.25], "range_px": None}
+    document["adjustment"]["statistics"]["shared_errors"] = shared
+    validator = jsonschema.Draft202012Validator(json.loads((DOCS / name).read_text()))
+    assert validator.is_valid(document)
+    assert json_value(record_of(SceneReport, document)) == document
+    shared["surplus"] = 1
+    assert not validator.is_valid(document)
+
+
 #: Objects whose members have names of their own: facts, options, parameters, files.
 OPEN = {
     "facts", "files", "images", "notices", "options", "p", "parameters", "points", "software", "surface", "t",
