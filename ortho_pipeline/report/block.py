@@ -16,6 +16,7 @@ from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import counted
 from ortho_pipeline.files.documents import json_value, record_of
 from ortho_pipeline.points.rows import ROLES
+from ortho_pipeline.report.adjustment_records import Rmse, is_known
 from ortho_pipeline.report.block_records import (
     BlockAdjustment,
     BlockHeadline,
@@ -26,7 +27,7 @@ from ortho_pipeline.report.block_records import (
     VariancesRecord,
     merged,
 )
-from ortho_pipeline.report.records import Rmse, RpcRecord, is_known
+from ortho_pipeline.report.records import RpcRecord
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, FEW
 
 if TYPE_CHECKING:

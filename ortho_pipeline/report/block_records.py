@@ -10,17 +10,8 @@ import math
 from typing import Any, Literal
 
 from ortho_pipeline.files.documents import record
-from ortho_pipeline.report.records import (
-    Count,
-    InputFile,
-    NoticeDocument,
-    Parameter,
-    Residual,
-    Rmse,
-    Role,
-    RpcRecord,
-    Size,
-)
+from ortho_pipeline.report.adjustment_records import Count, NoticeDocument, Parameter, Residual, Rmse, Role
+from ortho_pipeline.report.records import InputFile, RpcRecord, Size
 
 Triple = tuple[float, float, float]
 #: Of a point of which it may be unknown.

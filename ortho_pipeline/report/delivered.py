@@ -11,8 +11,9 @@ from ortho_pipeline.errors import counted
 from ortho_pipeline.files.documents import record_of
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
+from ortho_pipeline.report.adjustment_records import Adjustment
 from ortho_pipeline.report.block_records import AdjustedImage
-from ortho_pipeline.report.records import Adjustment, Headline
+from ortho_pipeline.report.records import Headline
 from ortho_pipeline.report.wording import headline
 
 

@@ -31,11 +31,11 @@ from ortho_pipeline.files.documents import DocumentError, json_position, json_va
 from ortho_pipeline.geodesy.crs import Vertical, crs_text, ground_transform
 from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
+from ortho_pipeline.report.adjustment_records import Adjustment, RmseOfView, RmsesOfView, RmsesOnGround, is_known
 from ortho_pipeline.report.delivered import accuracy_before
 from ortho_pipeline.report.map_scale import map_scale
 from ortho_pipeline.report.plots import plots
 from ortho_pipeline.report.records import (
-    Adjustment,
     ComparisonRecord,
     ControlHull,
     Covariances,
@@ -45,14 +45,10 @@ from ortho_pipeline.report.records import (
     OrthoRecord,
     PointHeights,
     Provenance,
-    RmseOfView,
-    RmsesOfView,
-    RmsesOnGround,
     RpcRecord,
     SceneRecord,
     SceneReport,
     WarpRecord,
-    is_known,
 )
 from ortho_pipeline.report.wording import headline, summary_text
 from ortho_pipeline.surface.flat import FlatSurface

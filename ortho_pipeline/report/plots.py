@@ -12,7 +12,8 @@ import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, number, round_down
 from ortho_pipeline.errors import counted
-from ortho_pipeline.report.records import ComparedModel, Covariance, Pair, Point, SceneReport, is_known
+from ortho_pipeline.report.adjustment_records import Pair, Point, is_known
+from ortho_pipeline.report.records import ComparedModel, Covariance, SceneReport
 
 #: Drawing area of the plot of vectors in CSS pixels, and the space around it.
 _PLOT_WIDTH, _PLOT_HEIGHT, _PAD = 452.0, 460.0, 19.0

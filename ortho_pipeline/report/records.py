@@ -5,24 +5,21 @@ Numbers that do not exist are None. A residual is measured minus predicted, in p
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeGuard
+from typing import Annotated, Any, Literal
 
 from ortho_pipeline.files.documents import Shape, record
+from ortho_pipeline.report.adjustment_records import (
+    Adjustment,
+    Count,
+    LeftOut,
+    NoticeDocument,
+    Pair,
+    Rmses,
+    RmsesOfView,
+    RmsesOnGround,
+)
 
-Count = Annotated[int, Shape(minimum=0)]
 Size = tuple[Annotated[int, Shape(minimum=1)], Annotated[int, Shape(minimum=1)]]
-Pair = tuple[float, float]
-#: Of a point for which it may be unknown.
-Residual = tuple[float | None, float | None]
-Role = Literal["control", "check", "tie"]
-#: A warning with its code and what it is about (docs/notices.md).
-NoticeDocument = Annotated[
-    dict[str, Any],
-    Shape(
-        properties={"code": {"type": "string", "pattern": "^[a-z0-9]+(-[a-z0-9]+)*$"}, "text": {"type": "string"}},
-        required=["code", "text"],
-    ),
-]
 
 
 # -- where it comes from ---------------------------------------------------------------------------------------------
@@ -91,186 +88,6 @@ class SceneRecord:
     lean_m_per_m: float | None
     lean_azimuth_deg: float | None
     view: View | None = None
-
-
-# -- adjustment ------------------------------------------------------------------------------------------------------
-
-
-@record
-class Rmse:
-    """Root mean square in pixels."""
-
-    col: float
-    row: float
-    total: float
-    n: Count
-
-
-@record
-class RmseOnGround:
-    """Root mean square in metres on the ground."""
-
-    x: float
-    y: float
-    total: float
-    n: Count
-
-
-@record
-class RmseOfView:
-    """Root mean square in pixels along and across the direction of view."""
-
-    along: float
-    across: float
-    n: Count
-
-
-@record
-class Rmses:
-    """Over control points (the fit), check points, and control points left out in turn."""
-
-    control: Rmse | None
-    check: Rmse | None
-    loo: Rmse | None
-
-
-@record
-class RmsesOnGround:
-    """Over control points (the fit), check points, and control points left out in turn."""
-
-    control: RmseOnGround | None
-    check: RmseOnGround | None
-    loo: RmseOnGround | None
-
-
-@record
-class RmsesOfView:
-    """Over control points (the fit) and check points."""
-
-    control: RmseOfView | None
-    check: RmseOfView | None
-
-
-@record
-class Bias:
-    """Mean and scatter of measured minus predicted of the model as delivered, over the used points."""
-
-    col: float
-    row: float
-    std_col: float
-    std_row: float
-    n: Count
-
-
-@record
-class Parameter:
-    """An adjusted parameter."""
-
-    value: float
-    sigma: float | None
-
-
-@record
-class Statistics:
-    """Tests of the parameters; ridge is the regularisation, condition that of the design."""
-
-    correlation: tuple[tuple[float | None, ...], ...]
-    total_correlation: dict[str, float | None]
-    t: dict[str, float | None]
-    p: dict[str, float | None]
-    significance: float
-    not_justified: tuple[str, ...]
-    degrees_of_freedom: float | None
-    effective_parameters: float | None
-    ridge: float | None
-    condition: float | None
-    corner_ratio: float | None = None
-
-
-@record
-class SharedErrors:
-    """Errors that neighbouring points share, in units of stated sigmas; docs/accuracy.md says what each number is."""
-
-    points: Count
-    groups: Count
-    effective_points: float
-    noise: Pair | None
-    shared: Pair | None
-    range_px: Pair | None
-
-
-@record
-class GroupedStatistics(Statistics):
-    """Tests of the parameters where points have groups."""
-
-    shared_errors: SharedErrors
-
-
-@record
-class Point:
-    """A point in the image: `residual_m` is where the ortho shows it minus where it belongs, metres along x and y.
-
-    `view_residual` is along and across the direction of view, `raw_residual` of the model as delivered.
-    """
-
-    id: str
-    role: Role
-    used: bool
-    image: Residual | None
-    predicted: Residual | None
-    residual: Residual | None
-    loo_residual: Residual | None
-    raw_residual: Residual | None = None
-    residual_m: Residual | None = None
-    view_residual: Residual | None = None
-    height_m: float | None = None
-
-    @property
-    def kind(self) -> Literal["control", "check", "out"]:
-        """The mark that it is drawn with."""
-        if self.role == "control" and not self.used:
-            return "out"
-        return "check" if self.role == "check" else "control"
-
-
-@record
-class LeftOut:
-    """A point that was left out as a gross error."""
-
-    id: str
-    reason: str
-
-
-@record
-class OutlyingPoint:
-    """A point that contradicts the others and still counts."""
-
-    id: str
-    role: Literal["control", "check"]
-    distance: float
-    expected: float
-    chance: float
-    leverage: float
-    reason: str
-
-
-@record
-class Adjustment:
-    """The model that was adjusted to the points, and how well it fits them."""
-
-    model: str
-    parameters: dict[str, Parameter]
-    points: tuple[Point, ...]
-    rmse: Rmses
-    raw_bias: Bias | None
-    redundancy: int
-    sigma0: float | None
-    rejected: tuple[LeftOut, ...]
-    outlying: tuple[OutlyingPoint, ...] = ()
-    rmse_of_agreeing_checks: Rmse | None = None
-    warnings: tuple[str, ...] = ()
-    notices: tuple[NoticeDocument, ...] = ()
-    statistics: Statistics | GroupedStatistics | None = None
 
 
 # -- accuracy --------------------------------------------------------------------------------------------------------
@@ -544,8 +361,3 @@ class SceneReport:
     warnings: tuple[str, ...]
     notices: tuple[NoticeDocument, ...] = ()
     headline: Headline
-
-
-def is_known(values: Residual | None) -> TypeGuard[Pair]:
-    """Tell whether a vector is known, in both axes."""
-    return values is not None and None not in values

@@ -8,18 +8,8 @@ from pathlib import Path
 from ortho_pipeline.display.notices import Notice, texts_but
 from ortho_pipeline.display.numbers import metres, px, share, short, signed, size_text
 from ortho_pipeline.errors import counted
-from ortho_pipeline.report.records import (
-    Adjustment,
-    Bias,
-    Dem,
-    FlatGround,
-    Headline,
-    Parameter,
-    Rmse,
-    RmseOnGround,
-    RmsesOnGround,
-    SceneReport,
-)
+from ortho_pipeline.report.adjustment_records import Adjustment, Bias, Parameter, Rmse, RmseOnGround, RmsesOnGround
+from ortho_pipeline.report.records import Dem, FlatGround, Headline, SceneReport
 
 #: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
 ENOUGH_CHECK_POINTS = 30
