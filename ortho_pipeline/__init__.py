@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.block.points import BlockPoints as BlockPoints
     from ortho_pipeline.block.points import read_block_points as read_block_points
     from ortho_pipeline.commands import rectify as rectify
+    from ortho_pipeline.commands.control.matching import match_scene as match_scene
     from ortho_pipeline.display.notices import Notice as Notice
     from ortho_pipeline.errors import OrthoError as OrthoError
     from ortho_pipeline.estimation.comparison import compare as compare
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.models import RPC as RPC
     from ortho_pipeline.models import ImageCorrection as ImageCorrection
     from ortho_pipeline.models import SensorModel as SensorModel
+    from ortho_pipeline.options import MatchOptions as MatchOptions
     from ortho_pipeline.options import OutputOptions as OutputOptions
     from ortho_pipeline.options import PointOptions as PointOptions
     from ortho_pipeline.options import SceneOptions as SceneOptions
@@ -61,6 +63,7 @@ _HOMES = {
     "Fit": "estimation.fit",
     "Grid": "raster.source",
     "ImageCorrection": "models",
+    "MatchOptions": "options",
     "Notice": "display.notices",
     "OrthoError": "errors",
     "OutputOptions": "options",
@@ -84,6 +87,7 @@ _HOMES = {
     "hookimpl": "hookspecs",
     "intersect": "block.intersection",
     "load_model": "exchange.model_file",
+    "match_scene": "commands.control.matching",
     "open_scene": "plugins",
     "read_block_points": "block.points",
     "read_points": "points",

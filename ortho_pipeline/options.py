@@ -29,7 +29,7 @@ CORRECTIONS = ("none", "shift", "shift-drift", "affine", "model")
 #: How the value of an option is written, where choices or a field that is true or false do not say it.
 Kind = Literal[
     "text", "file", "number", "integer", "pair", "box", "one or two", "number or word", "number or nan", "bytes",
-    "integers", "folders", "keys",
+    "integers", "files", "folders", "keys",
 ]  # fmt: skip
 PathLike = str | os.PathLike[str]
 
@@ -430,7 +430,53 @@ class OutputOptions:
     ] = None
 
 
+@_documented
+@dataclass(frozen=True)
+class MatchOptions:
+    """Control points without hands: the scene is matched with reference orthoimages."""
+
+    reference: Annotated[
+        Sequence[PathLike],
+        Option(
+            "--reference", "Orthoimages to take control points from by matching; where several show a place, the "
+            "first.", "ORTHO[,...]", kind="files",
+        ),
+    ] = ()  # fmt: skip
+    search: Annotated[
+        float | None,
+        Option(
+            "--search", "How far the image's model may be off on the ground.", "M", kind="number", above=0,
+            unset="three times the accuracy that the scene states, else 100",
+        ),
+    ] = None  # fmt: skip
+    points: Annotated[
+        int, Option("--match-points", "About how many matches are wanted.", "N", kind="integer", above=0)
+    ] = 500
+    dem_sigma: Annotated[
+        float | None,
+        Option(
+            "--dem-sigma", "Standard deviation of the heights of the DEM.", "M", kind="number", above=0,
+            unset="what the residuals tell",
+        ),
+    ] = None  # fmt: skip
+    reference_sigma: Annotated[
+        float | None,
+        Option(
+            "--reference-sigma", "Standard deviation of the reference's own places, in each axis.", "M",
+            kind="number", above=0,
+        ),
+    ] = None  # fmt: skip
+    gcps_as: Annotated[
+        str,
+        Option(
+            "--gcps-as", "What `points.gcps` are beside matches: a test that takes no part, or control too.",
+            choices=("check", "control"),
+        ),
+    ] = "check"  # fmt: skip
+
+
 #: The groups, by the name that they have in messages, in the pipeline file and as arguments of the commands.
 GROUPS: Mapping[str, type] = {
-    "scene": SceneOptions, "points": PointOptions, "surface": SurfaceOptions, "output": OutputOptions,
+    "scene": SceneOptions, "points": PointOptions, "surface": SurfaceOptions, "match": MatchOptions,
+    "output": OutputOptions,
 }  # fmt: skip

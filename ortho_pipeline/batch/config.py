@@ -1,7 +1,7 @@
 """The file of `ortho run`: what it may hold, and how it is read.
 
-The groups ``scene``, ``points``, ``surface`` and ``output`` are made from `options`, field by field; the budget of the
-machine (memory, threads, workers) is not a part of the file, because no result depends on it.
+The groups ``scene``, ``points``, ``surface``, ``match`` and ``output`` are made from `options`, field by field; the
+budget of the machine (memory, threads, workers) is not a part of the file, because no result depends on it.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.options import (
+    MatchOptions,
     Option,
     OutputOptions,
     PointOptions,
@@ -63,6 +64,8 @@ def _type(option: Option) -> Any:
         "file": str,
         "number": number,
         "integers": Annotated[list[whole], Field(min_length=1)],
+        "integer": whole,
+        "files": str | list[str],
         "pair": Annotated[list[number], Field(min_length=2, max_length=2)],
         "box": Annotated[list[number], Field(min_length=4, max_length=4)],
         "one or two": number | Annotated[list[number], Field(min_length=2, max_length=2)],
@@ -80,7 +83,7 @@ def _settings(name: str, group: type) -> Any:
         option = known[one.name]
         if not option.in_file:
             continue
-        default = {} if option.kind == "keys" else one.default
+        default: Any = {"keys": {}, "files": []}.get(option.kind, one.default)
         kind: Any = bool if isinstance(default, bool) else _type(option)
         described = Field(default=default, description=_described(option) or None)
         found[one.name] = (kind | None if default is None else kind, described)
@@ -97,6 +100,7 @@ def _described(option: Option) -> str:
 SceneSettings = _settings("SceneSettings", SceneOptions)
 PointSettings = _settings("PointSettings", PointOptions)
 SurfaceSettings = _settings("SurfaceSettings", SurfaceOptions)
+MatchSettings = _settings("MatchSettings", MatchOptions)
 OutputSettings = _settings("OutputSettings", OutputOptions)
 
 
@@ -106,6 +110,7 @@ class Settings(_Strict):
     scene: SceneSettings = SceneSettings()  # type: ignore[valid-type]
     points: PointSettings = PointSettings()  # type: ignore[valid-type]
     surface: SurfaceSettings = SurfaceSettings()  # type: ignore[valid-type]
+    match: MatchSettings = MatchSettings()  # type: ignore[valid-type]
     output: OutputSettings = OutputSettings()  # type: ignore[valid-type]
 
 
@@ -343,7 +348,7 @@ def _allowed(place: Place) -> str:
             continue
         model = {
             "scenes": Entry, "defaults": Settings, "mosaic": MosaicSettings, "scene": SceneSettings,
-            "points": PointSettings, "surface": SurfaceSettings, "output": OutputSettings,
+            "points": PointSettings, "surface": SurfaceSettings, "match": MatchSettings, "output": OutputSettings,
         }.get(str(part), model)  # fmt: skip
     names = list(model.model_fields)
     close = difflib.get_close_matches(str(place[-1]), names, 1)

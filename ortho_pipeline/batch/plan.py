@@ -21,7 +21,7 @@ from ortho_pipeline import plugins
 from ortho_pipeline.batch.config import Config, Entry, MosaicSettings, Settings, merged, read_config
 from ortho_pipeline.commands.inputs import OWN_POINTS
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster import source as raster
 
 #: Folder of records and locks within the output folder.
@@ -53,6 +53,7 @@ class Job:
     scene: SceneOptions = SceneOptions()
     points: PointOptions = PointOptions()
     surface: SurfaceOptions = SurfaceOptions()
+    match: MatchOptions = MatchOptions()
     ortho: OutputOptions = OutputOptions()
     versions: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     run: str = ""
@@ -78,6 +79,8 @@ class Job:
         options = {name: dataclasses.asdict(getattr(self, name)) for name in ("scene", "points", "surface", "ortho")}
         for budget in ("memory", "threads"):
             del options["ortho"][budget]
+        if self.match.reference:
+            options["match"] = dataclasses.asdict(self.match)
         return {"name": self.name, "image": str(self.image), **options}
 
 
@@ -209,7 +212,8 @@ class _Planner:
         return Job(
             name=self._checked_name(name, image, where), image=image, output=self.output,
             scene=self._scene(settings, image, where), points=self._points(settings, image, where),
-            surface=self._surface(settings, image, where), ortho=self._ortho(settings), versions=versions(),
+            surface=self._surface(settings, image, where), match=self._match(settings, image, where),
+            ortho=self._ortho(settings), versions=versions(),
         )  # fmt: skip
 
     def _scene(self, settings: Settings, image: Path, where: str) -> SceneOptions:
@@ -240,6 +244,12 @@ class _Planner:
         if values["vertical"] is not None:
             values["vertical"] = self._perhaps_file(values["vertical"], image, f"{where}.surface.vertical")
         return SurfaceOptions(**values)
+
+    def _match(self, settings: Settings, image: Path, where: str) -> MatchOptions:
+        values: dict[str, Any] = dict(settings.match)
+        field = f"{where}.match.reference"
+        values["reference"] = tuple(self._file(name, image, field) for name in _listed(values["reference"]))
+        return MatchOptions(**values)
 
     def _ortho(self, settings: Settings) -> OutputOptions:
         values: dict[str, Any] = dict(settings.output)

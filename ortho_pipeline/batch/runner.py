@@ -78,8 +78,8 @@ def _make_locked(job: Job, verify: bool, begin: float) -> Outcome:
         if record is not None:
             Record(job.name, "", "started", outputs=before).write(job.record)
         result = commands.rectify(
-            job.image, job.folder, scene=job.scene, points=job.points, surface=job.surface, output=job.ortho,
-            name=job.name, digest=_digests,
+            job.image, job.folder, scene=job.scene, points=job.points, surface=job.surface, match=job.match,
+            output=job.ortho, name=job.name, digest=_digests,
         )  # fmt: skip
         report = result.document["report"]
         read = _as_read(job, report)
@@ -118,7 +118,7 @@ def _still_good(record: Record | None, job: Job, listing: str, verify: bool) -> 
     if not verify:
         _digests.learn(record.inputs)
     known = {one.path: one.role for one in record.inputs if os.path.isfile(one.path)}
-    found = inputs.hashed(inputs.files_read(job.image, job.scene, job.points, job.surface), _digests)
+    found = inputs.hashed(inputs.files_read(job.image, job.scene, job.points, job.surface, job.match), _digests)
     read = _states(job, {**{one["path"]: one["role"] for one in found}, **known})
     if record.key != key_of(read, job.configuration, job.versions) or not record.intact(job.folder, verify):
         return None
@@ -144,7 +144,8 @@ def _as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
 
 def _folders(job: Job) -> list[str | os.PathLike[str]]:
     """Return the files in whose folders a new name could change the scene."""
-    return [path for path in (job.image, inputs.point_file(job.points), job.surface.dem, *job.scene.files.values())
+    return [path for path in (job.image, inputs.point_file(job.points), job.surface.dem, *job.match.reference,
+                          *job.scene.files.values())
             if path is not None and os.path.isabs(path)]  # fmt: skip
 
 
@@ -279,7 +280,9 @@ def check_scenes(
     for job in planned.chosen(only, shard):
         one: dict[str, Any] = {"name": job.name, "image": str(job.image)}
         try:
-            one |= commands.check(job.image, scene=job.scene, points=job.points, surface=job.surface, output=job.ortho)
+            one |= commands.check(
+                job.image, scene=job.scene, points=job.points, surface=job.surface, match=job.match, output=job.ortho
+            )  # fmt: skip
         except OrthoError as error:
             one["error"] = error_document(error)
         checked.append(one)

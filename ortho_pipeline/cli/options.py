@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, fields
 from typing import Any
@@ -14,6 +15,7 @@ from ortho_pipeline.cli.flags import FLAGS, with_flags
 from ortho_pipeline.cli.parsing import Megabytes, OneOrTwo
 from ortho_pipeline.options import (
     BlockOptions,
+    MatchOptions,
     Option,
     OutputOptions,
     PointOptions,
@@ -81,7 +83,7 @@ def click_options(group: str, options: type, *names: str) -> Decorator:
 
 def _help(option: Option) -> str | None:
     text = option.help
-    if option.kind in ("integers", "folders", "keys"):
+    if option.kind in ("integers", "files", "folders", "keys"):
         text = f"{text.removesuffix('.')}; may be repeated."
     if option.unset:
         text = f"{text.removesuffix('.')}  [default: {option.unset}]".strip()
@@ -119,6 +121,7 @@ def _typed(option: Option) -> dict[str, Any]:
         "one or two": {"type": OneOrTwo()},
         "number or nan": {"type": _Nodata()},
         "bytes": {"type": Megabytes()},
+        "files": {"callback": _files, "multiple": True},
         "folders": {"type": click.Path(exists=True, file_okay=False), "multiple": True},
         "keys": {"callback": _keys, "multiple": True},
     }.get(option.kind, {})
@@ -132,6 +135,11 @@ def _pair(_: click.Context, __: click.Parameter, text: str | None) -> tuple[floa
     except ValueError:
         raise click.BadParameter(f"{text!r} is not COL,ROW") from None
     return column, row
+
+
+def _files(_: click.Context, __: click.Parameter, texts: Sequence[str]) -> tuple[str, ...]:
+    """Return the files that are named, several with commas between; a file whose own name has commas is one."""
+    return tuple(name for text in texts for name in ([text] if os.path.exists(text) else text.split(",")) if name)
 
 
 def _keys(_: click.Context, __: click.Parameter, texts: Sequence[str]) -> dict[str, str]:
@@ -171,6 +179,8 @@ block_options = _grouped("points", BlockOptions, "points", "gcps", "crs", "verti
 #: The rest of that group, which is taken by its decorator too.
 adjustment_options = click_options("points", BlockOptions, "correction", "ground_sigma", "model_crs", "hold")
 surface_options = _grouped("surface", SurfaceOptions)
+match_options = _grouped("match", MatchOptions)
+matching_options = _grouped("match", MatchOptions, "reference", "search", "points", "dem_sigma", "reference_sigma")
 dem_datum_options = _grouped("surface", SurfaceOptions, "vertical", "override_vertical")
 network_option = _grouped("scene", SceneOptions, "allow_network")
 output_options = _grouped("output", OutputOptions)

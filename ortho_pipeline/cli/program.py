@@ -16,12 +16,14 @@ import click
 
 from ortho_pipeline.cli.batch import run
 from ortho_pipeline.cli.block import adjust, intersect
+from ortho_pipeline.cli.matching import match
 from ortho_pipeline.cli.options import (
     click_options,
     dem_datum_options,
     folder_option,
     image_argument,
     json_option,
+    match_options,
     network_option,
     output_options,
     point_options,
@@ -42,7 +44,7 @@ from ortho_pipeline.cli.printing import (
 from ortho_pipeline.cli.signals import ended_by_signals
 from ortho_pipeline.cli.studies import reproduce, simulate
 from ortho_pipeline.errors import InputError, OrthoError, Terminated
-from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 
 FAILED, CORRECTABLE, INTERRUPTED = 1, 2, 130
 
@@ -169,6 +171,7 @@ cli.add_command(reproduce)
 cli.add_command(run)
 cli.add_command(adjust)
 cli.add_command(intersect)
+cli.add_command(match)
 
 # -- commands --------------------------------------------------------------------------------------------------------
 
@@ -236,14 +239,22 @@ def info(image: str, scene: SceneOptions, as_json: bool) -> None:
 @cli.command()
 @image_argument
 @point_options
+@match_options
 @scene_options
 @surface_options
 @json_option
-def fit(image: str, points: PointOptions, scene: SceneOptions, surface: SurfaceOptions, as_json: bool) -> None:
+def fit(
+    image: str,
+    points: PointOptions,
+    match: MatchOptions,
+    scene: SceneOptions,
+    surface: SurfaceOptions,
+    as_json: bool,
+) -> None:
     """Adjust the model of IMAGE to control points and show every residual (measured minus predicted, pixels)."""
     from ortho_pipeline import commands
 
-    result = commands.fit(image, points, scene, surface)
+    result = commands.fit(image, points, scene, surface, match)
     if as_json:
         return print_json(result.to_json())
     print_fit(result)
@@ -256,6 +267,7 @@ def fit(image: str, points: PointOptions, scene: SceneOptions, surface: SurfaceO
 @click.option("--units", type=click.Choice(["px", "m"]), default="px", show_default=True, help="Of the table.")
 @click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the report.")
 @point_options
+@match_options
 @scene_options
 @surface_options
 @json_option
@@ -265,6 +277,7 @@ def compare(
     units: str,
     folder: str | None,
     points: PointOptions,
+    match: MatchOptions,
     scene: SceneOptions,
     surface: SurfaceOptions,
     as_json: bool,
@@ -278,7 +291,7 @@ def compare(
 
     command = click.get_current_context().meta["command"]
     result = commands.compare(
-        image, points, models=models, folder=folder, scene=scene, surface=surface, command=command
+        image, points, models=models, folder=folder, scene=scene, surface=surface, match=match, command=command
     )  # fmt: skip
     if as_json:
         return print_json(result.to_json())
@@ -298,6 +311,7 @@ def compare(
     "same name are replaced without it.",
 )
 @point_options
+@match_options
 @scene_options
 @surface_options
 @output_options
@@ -307,6 +321,7 @@ def rectify(
     folder: str,
     overwrite: bool,
     points: PointOptions,
+    match: MatchOptions,
     scene: SceneOptions,
     surface: SurfaceOptions,
     output: OutputOptions,
@@ -322,6 +337,7 @@ def rectify(
             scene=scene,
             points=points,
             surface=surface,
+            match=match,
             output=output,
             progress=advance,
             overwrite=overwrite,
@@ -342,6 +358,7 @@ def rectify(
 )
 @click.option("--force", is_flag=True, help="Accept an RPC that is more than 0.1 px from the model.")
 @point_options
+@match_options
 @scene_options
 @surface_options
 @json_option
@@ -351,11 +368,12 @@ def export(
     formats: tuple[str, ...],
     force: bool,
     points: PointOptions,
+    match: MatchOptions,
     scene: SceneOptions,
     surface: SurfaceOptions,
     as_json: bool,
 ) -> None:
-    """Write the model of IMAGE for GDAL and every GIS, adjusted if --gcps are given.
+    """Write the model of IMAGE for GDAL and every GIS, adjusted if --gcps or a --reference are given.
 
     RPC as text, RPB, VRT and tag of a copy; control points (the measured ones, or else a grid) as VRT and copy; or
     geolocation arrays.
@@ -364,7 +382,9 @@ def export(
 
     chosen = [name.strip() for text in formats for name in text.split(",")]
     given: dict[str, Any] = {"formats": chosen} if chosen else {}
-    result = commands.export(image, folder, scene=scene, points=points, surface=surface, force=force, **given)
+    result = commands.export(
+        image, folder, scene=scene, points=points, surface=surface, match=match, force=force, **given
+    )  # fmt: skip
     print_result(result, as_json)
 
 

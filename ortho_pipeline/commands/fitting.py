@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.control.points import control_of, has_control, match_asked
 from ortho_pipeline.commands.inputs import has_surface, open_surface
 from ortho_pipeline.commands.results import ENDINGS, CompareResult, FitResult, outputs_together, write_report
 from ortho_pipeline.commands.scene_fit import (
@@ -22,7 +23,7 @@ from ortho_pipeline.estimation import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import ridge_of
 from ortho_pipeline.models import families
-from ortho_pipeline.options import PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.report import document as report
 
 
@@ -31,6 +32,7 @@ def fit(
     points: PointOptions,
     scene: SceneOptions = SceneOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
+    match: MatchOptions = MatchOptions(),
 ) -> FitResult:
     """Adjust the model of a scene to its control points and hold it against its check points.
 
@@ -39,10 +41,10 @@ def fit(
     InputError
         If there are no points, or a file is wrong (message names file, field and remedy).
     """
-    _require_points(points)
-    opened = open_adjustable(image, scene, points)
+    _require_points(points, match)
+    opened = open_adjustable(image, scene, points, match)
     heights = open_surface(surface, scene) if has_surface(surface) else None
-    adjusted = adjust(opened, points, scene, heights)
+    adjusted = adjust(opened, points, scene, heights, match)
     return FitResult(
         adjusted.scene, adjusted.fit, adjusted.warnings(heights), tuple(adjusted.removed_json()), points.near
     )  # fmt: skip
@@ -57,6 +59,7 @@ def compare(
     folder: str | os.PathLike[str] | None = None,
     scene: SceneOptions = SceneOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
+    match: MatchOptions = MatchOptions(),
     command: str | None = None,
 ) -> CompareResult:
     """Fit many models to the same points, and recommend one.
@@ -74,7 +77,7 @@ def compare(
     InputError
         If there are no points, a model is unknown, or a file is wrong. A model that cannot be fitted is a row.
     """
-    _require_points(points)
+    _require_points(points, match)
     if points.correction is not None or points.fit_model is not None:
         raise InputError(
             "compare takes its models from `models`", remedy="for example `models=all`",
@@ -91,7 +94,7 @@ def compare(
     heights = open_surface(surface, scene) if has_surface(surface) else None
     opened = on_surface(opened, heights)
     own = opened.model if opened.models else None
-    given = inputs.read_control(opened, points, scene)
+    given, matched = control_of(opened, points, match, scene, heights)
     if own is not None:
         refuse_swapped(own, given, opened.height)
     given = heights_where_wanted(given, heights, *names)
@@ -106,12 +109,13 @@ def compare(
         return result
     stem = Path(image).stem
     files = {name: Path(folder) / f"{stem}{ENDINGS[name]}" for name in ("residuals", "style", "report", "html")}
-    inputs.check_paths(files, image, scene, points, surface)
+    inputs.check_paths(files, image, scene, points, surface, match)
     if best.model in {family.name for family in families()}:
         opened = replace(opened, models={best.model: best.fit.model}, model_source="control points")
-    adjusted = Adjusted(opened, best.fit)
-    hashed = inputs.hashed(inputs.files_read(image, scene, points, surface, opened))
-    record = inputs.provenance(opened, points, heights, hashed, command, {"scene": scene, "surface": surface})
+    adjusted = Adjusted(opened, best.fit, matched=matched)
+    hashed = inputs.hashed(inputs.files_read(image, scene, points, surface, match, opened))
+    asked = {"scene": scene, "surface": surface, **match_asked(match)}
+    record = inputs.provenance(opened, points, heights, hashed, command, asked)
     made = report.build_report(
         scene=opened, fit=best.fit, surface=heights, comparison=result.to_json(), near=points.near,
         provenance=record, warnings=adjusted.warnings(heights),
@@ -120,8 +124,9 @@ def compare(
     return replace(result, files=files)
 
 
-def _require_points(points: PointOptions) -> None:
-    if points.gcps is None:
+def _require_points(points: PointOptions, match: MatchOptions) -> None:
+    if not has_control(points, match):
         raise InputError(
-            "there are no points to fit to", field="points.gcps", remedy="give a file of points with `points.gcps`"
-        )
+            "there are no points to fit to", field="points.gcps",
+            remedy="give a file of points with `points.gcps`, or an orthoimage to match with (`match.reference`)",
+        )  # fmt: skip

@@ -12,22 +12,20 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyproj
 
 from ortho_pipeline import plugins
-from ortho_pipeline.errors import InputError, OrthoError, counted, of_option
+from ortho_pipeline.errors import InputError, OrthoError, of_option
 from ortho_pipeline.exchange import crop
 from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.exchange.rpc import files_of
 from ortho_pipeline.files import sha256, states
 from ortho_pipeline.files.locations import archive_of, located
 from ortho_pipeline.files.process_limits import startable_threads
-from ortho_pipeline.geodesy.crs import Vertical, parse_crs
+from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, read_points
-from ortho_pipeline.points.selection import select_control
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
@@ -202,56 +200,6 @@ def has_surface(options: SurfaceOptions) -> bool:
 # -- points ----------------------------------------------------------------------------------------------------------
 
 
-def read_control(scene: Scene, options: PointOptions, opened: SceneOptions = SceneOptions()) -> Points:
-    """Read the points of the options with their roles; none where none are given.
-
-    Raises
-    ------
-    InputError
-        For a wrong file, roles that contradict each other, or an adjustment that has no points.
-    """
-    if options.gcps is None:
-        if options.correction not in (None, "none"):
-            raise InputError(
-                f"the correction {options.correction!r} needs control points",
-                field="points.gcps",
-                remedy="give a file of points",
-            )
-        return no_points()
-    points = _given_points(scene, options, opened)
-    if options.select is not None and options.check is not None:
-        raise InputError(
-            "`points.select` and `points.check` both say which points check",
-            field="points.select",
-            remedy="give one of them",
-        )
-    if options.select is not None:
-        return select_control(points, options.select)
-    return points if options.check is None else assign_roles(points, options.check)
-
-
-def _given_points(scene: Scene, options: PointOptions, opened: SceneOptions) -> Points:
-    with of_option("points.crs"):
-        crs = None if options.crs is None else parse_crs(options.crs)
-    with of_option("points.vertical"):
-        vertical = None if options.vertical is None else Vertical.parse(options.vertical)
-    path = point_file(options)
-    origin = options.pixel_origin
-    if path is None or os.fspath(path) == OWN_POINTS:
-        if origin != "corner" or (path is None and not (crs is vertical is None)):
-            raise InputError(
-                "these points say themselves what their coordinates are", field="points.pixel_origin",
-                remedy="leave `points.pixel_origin` out, and of points that are read already `points.crs` and "
-                "`points.vertical`",
-            )  # fmt: skip
-        if isinstance(options.gcps, Points):
-            return options.gcps
-        return gcps_of_dataset(raster.open_dataset(scene.path, **opened.access), crs=crs, vertical=vertical)
-    pieces = {Path(piece.path).name: (*piece.offset, piece.scale) for piece in scene.pieces}
-    name, path = Path(scene.path).name, located(path, allow_network=opened.allow_network)
-    return read_points(path, crs=crs, vertical=vertical, pixel_origin=origin, image_name=name, pieces=pieces)
-
-
 def point_options(points: PointOptions | Points) -> PointOptions:
     """Return options; points that are read already are used as they are."""
     return PointOptions(gcps=points) if isinstance(points, Points) else points
@@ -260,32 +208,6 @@ def point_options(points: PointOptions | Points) -> PointOptions:
 def point_file(options: PointOptions) -> str | os.PathLike[str] | None:
     """Return the file of points, None where there is none or they are read already."""
     return options.gcps if isinstance(options.gcps, str | os.PathLike) else None
-
-
-def no_points() -> Points:
-    """Return an empty table of points."""
-    none = np.zeros(0)
-    return Points(
-        ids=(), image=np.zeros((0, 2)), ground=np.zeros((0, 3)), roles=np.zeros(0, dtype="<U7"), sigma_image=none,
-        sigma_ground=np.zeros((0, 3)), crs=pyproj.CRS.from_epsg(4326), source="",
-    )  # fmt: skip
-
-
-def with_heights(points: Points, surface: Surface | None) -> Points:
-    """Fill heights that a file does not give from the surface."""
-    missing = ~np.isfinite(points.ground[:, 2])
-    if not missing.any():
-        return points
-    if surface is None:
-        names = ", ".join(np.array(points.ids)[missing][:5])
-        raise InputError(
-            f"{int(missing.sum())} of {counted(len(points), 'point')} without a height "
-            f"({names})", file=points.source, field="h",
-            remedy="give heights in the file, or a DEM with `surface.dem` to take them from",
-        )  # fmt: skip
-    ground = points.ground.copy()
-    ground[missing, 2] = surface.heights(ground[missing, :2], points.crs)
-    return points.with_ground(ground)
 
 
 # -- paths -----------------------------------------------------------------------------------------------------------
@@ -297,6 +219,7 @@ def check_paths(
     scene: SceneOptions,
     points: PointOptions,
     surface: SurfaceOptions,
+    match: MatchOptions = MatchOptions(),
     overwrite: bool = False,
 ) -> None:
     """Refuse to write what is read, and outputs that change the model of the source or of the ortho.
@@ -311,7 +234,7 @@ def check_paths(
     InputError
         With the path that is in the way.
     """
-    inputs = {Path(path).resolve() for path in given_files(image, scene, points, surface)}
+    inputs = {Path(path).resolve() for path in given_files(image, scene, points, surface, match)}
     removed = old_side_cars(files["ortho"]) if overwrite and "ortho" in files else []
     for path in (*files.values(), *removed):
         if path.resolve() in inputs:
@@ -340,9 +263,10 @@ def given_files(
     scene: SceneOptions = SceneOptions(),
     points: PointOptions = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
+    match: MatchOptions = MatchOptions(),
 ) -> list[str | os.PathLike[str]]:
     """Return the files that the user gave."""
-    given = (image, *scene.files.values(), point_file(points), surface.dem)
+    given = (image, *scene.files.values(), point_file(points), surface.dem, *match.reference)
     return [path for path in given if path is not None]
 
 
@@ -379,6 +303,7 @@ def files_read(
     scene: SceneOptions = SceneOptions(),
     points: PointOptions = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
+    match: MatchOptions = MatchOptions(),
     opened: Scene | None = None,
 ) -> dict[Path, str]:
     """Return every file that is read and its role, side-cars and sources of a VRT included.
@@ -406,6 +331,8 @@ def files_read(
         add("DEM", [surface.dem, *_files_of(surface.dem, scene)])
     if surface.vertical is not None:
         add("geoid", [surface.vertical])
+    for reference in match.reference:
+        add("reference", [reference, *_files_of(reference, scene)])
     return read
 
 
@@ -491,9 +418,11 @@ def provenance(
 def _as_asked(options: Any) -> dict[str, Any]:
     """Return options as JSON values, without the budget of the machine, on which no result depends."""
     given = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
-    texts = {key: str(value) if isinstance(value, Points) else value for key, value in given.items()}
-    return {
-        key: os.fspath(value) if isinstance(value, os.PathLike) else value
-        for key, value in texts.items()
-        if key not in ("memory", "threads")
-    }
+    return {key: _text_of(value) for key, value in given.items() if key not in ("memory", "threads")}
+
+
+def _text_of(value: Any) -> Any:
+    """Return points and paths as text, anything else as it is."""
+    if isinstance(value, tuple):
+        return tuple(map(_text_of, value))
+    return str(value) if isinstance(value, Points) else os.fspath(value) if isinstance(value, os.PathLike) else value

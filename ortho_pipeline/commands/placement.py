@@ -11,7 +11,7 @@ from ortho_pipeline.errors import completed, of_option
 from ortho_pipeline.geodesy.crs import crs_text, map_crs
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
-from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.footprint import Footprint, choose_grid, lay, scene_pixels
@@ -63,16 +63,23 @@ class Placement(NamedTuple):
 
 
 def place_scene(
-    opened: Scene, points: PointOptions, scene: SceneOptions, surface: Surface, output: OutputOptions
+    opened: Scene,
+    points: PointOptions,
+    scene: SceneOptions,
+    surface: Surface,
+    output: OutputOptions,
+    match: MatchOptions = MatchOptions(),
 ) -> Placement:
-    """Adjust a scene to its points, lay it on the surface and choose the grid of its ortho; no pixel is read.
+    """Adjust a scene to its points, lay it on the surface and choose the grid of its ortho.
+
+    No pixel is read, but those that are matched with a reference.
 
     Raises
     ------
     InputError
         For wrong points, a DEM that does not cover the scene, a grid that is none.
     """
-    adjusted = adjust(opened, points, scene, surface)
+    adjusted = adjust(opened, points, scene, surface, match, output.threads)
     model, size = adjusted.model, (opened.width, opened.height)
     with completed(adjusted.scene.model_source, of="model"):
         found = lay(model, surface, *size)

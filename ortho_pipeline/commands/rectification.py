@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.control.points import match_asked
 from ortho_pipeline.commands.inputs import has_surface, open_surface
 from ortho_pipeline.commands.placement import place_scene, source_of
 from ortho_pipeline.commands.results import ENDINGS, OF_STAC, Result, outputs_together, write_report
@@ -23,7 +24,7 @@ from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
-from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.raster.block_cache import limit_cache
@@ -48,6 +49,7 @@ def rectify(
     scene: SceneOptions = SceneOptions(),
     points: PointOptions | Points = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
+    match: MatchOptions = MatchOptions(),
     output: OutputOptions = OutputOptions(),
     progress: Callable[[float], None] | None = None,
     command: str | None = None,
@@ -80,24 +82,24 @@ def rectify(
         kind: Path(folder) / f"{stem}{ending}" for kind, ending in ENDINGS.items() if kind not in OF_STAC or output.stac
     }
     points = inputs.point_options(points)
-    inputs.check_paths(files, image, scene, points, surface, overwrite)
+    inputs.check_paths(files, image, scene, points, surface, match, overwrite)
     inputs.require_heights(surface)
-    begun = states(inputs.given_files(image, scene, points, surface))
+    begun = states(inputs.given_files(image, scene, points, surface, match))
     # Before the DEM is read: left alone, GDAL keeps blocks in a share of the machine's memory.
     limit_cache(output.memory, 1)
-    opened = open_adjustable(image, scene, points)
+    opened = open_adjustable(image, scene, points, match)
     heights = open_surface(surface, scene, output.memory)
     acquired = _acquired(opened.facts, output)
-    read = inputs.files_read(image, scene, points, surface, opened)
+    read = inputs.files_read(image, scene, points, surface, match, opened)
     begun = states(read) | begun
     with inputs.hashed_beside(read, digest) as hashing:
-        placed = place_scene(opened, points, scene, heights, output)
+        placed = place_scene(opened, points, scene, heights, output, match)
         adjusted, model, heights, found, grid = placed
         opened = adjusted.scene
         exported, complaints = _as_rpc(model)
         source = source_of(opened, image, scene, output)
         warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
-        asked = {"scene": scene, "surface": surface, "output": output}
+        asked = {"scene": scene, "surface": surface, "output": output, **match_asked(match)}
         record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
     whole = raster.open_dataset(image, **scene.access)
     _write_models(model, exported, opened, whole, files, {**record, "adjustment": adjusted.record()})
@@ -121,6 +123,7 @@ def check(
     scene: SceneOptions = SceneOptions(),
     points: PointOptions = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
+    match: MatchOptions = MatchOptions(),
     output: OutputOptions = OutputOptions(),
 ) -> dict[str, Any]:
     """Do all that `rectify` does before the first pixel: what it would say then, it says now.
@@ -136,9 +139,9 @@ def check(
         As `rectify`.
     """
     inputs.require_heights(surface)
-    opened = open_adjustable(image, scene, points)
+    opened = open_adjustable(image, scene, points, match)
     _acquired(opened.facts, output)
-    placed = place_scene(opened, points, scene, open_surface(surface, scene, output.memory), output)
+    placed = place_scene(opened, points, scene, open_surface(surface, scene, output.memory), output, match)
     Profile.of(source_of(placed.scene, image, scene, output), output.dtype, output.nodata)
     return placed.to_json()
 
@@ -152,6 +155,7 @@ def export(
     scene: SceneOptions = SceneOptions(),
     points: PointOptions = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
+    match: MatchOptions = MatchOptions(),
     force: bool = False,
 ) -> Result:
     """Write the model of a scene, adjusted if there are points, in formats that GDAL and every GIS read.
@@ -176,10 +180,10 @@ def export(
     formats = formats_of_models.check_formats(formats)
     stem = Path(image).stem
     files = {name: Path(folder) / f"{stem}{formats_of_models.ENDINGS[name]}" for name in formats}
-    inputs.check_paths(files, image, scene, points, surface)
-    opened = open_adjustable(image, scene, points)
+    inputs.check_paths(files, image, scene, points, surface, match)
+    opened = open_adjustable(image, scene, points, match)
     heights = open_surface(surface, scene) if has_surface(surface) else None
-    adjusted = adjust(opened, points, scene, heights)
+    adjusted = adjust(opened, points, scene, heights, match)
     dataset = raster.open_dataset(image, **scene.access)
     size = opened.width, opened.height
     adjustment = adjusted.fit

@@ -11,14 +11,18 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.control.matching import Matched
+from ortho_pipeline.commands.control.points import control_of, has_control, with_heights
 from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import CoverageError, InputError, ModelError, counted
+from ortho_pipeline.estimation import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import OWN, Removed, fit_family, fit_own, prune, restricted, ridge_of
 from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
-from ortho_pipeline.options import PointOptions, SceneOptions
+from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions
 from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.points.control_hull import uncovered
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
@@ -42,11 +46,17 @@ class Adjusted:
     fit : Fit
     removed : tuple of Removed
         Parameters that ``--prune`` took out.
+    matched : Matched, optional
+        The matching that points came from.
+    notes : tuple of Notice
+        What was chosen for the user.
     """
 
     scene: Scene
     fit: Fit
     removed: tuple[Removed, ...] = ()
+    matched: Matched | None = None
+    notes: tuple[Notice, ...] = ()
 
     @property
     def model(self) -> SensorModel:
@@ -73,6 +83,9 @@ class Adjusted:
         found += adjusted.warnings
         if surface is not None:
             found += surface.provenance.get("warnings", [])
+        if self.matched is not None:
+            found += self.matched.notices
+        found += [*self._relative(), *self.notes]
         found += self._doubtful()
         found += marks_warning(points.select(adjusted.used & points.control))
         inside = ((points.image >= 0) & (points.image <= (scene.width, scene.height))).all(axis=1)
@@ -94,6 +107,19 @@ class Adjusted:
             text = f"parameters that the points do not justify were removed: {names}"
             found.append(Notice("parameters-removed", text, parameters=[one.name for one in self.removed]))
         return tuple(dict.fromkeys(found))
+
+    def _relative(self) -> list[Notice]:
+        """Return a notice if all control is matched: nothing then says where the reference itself lies."""
+        points = self.fit.points
+        if not self.fit.used.any() or not (points.groups[self.fit.used] >= 0).all():
+            return []
+        sigma = None if self.matched is None else self.matched.options.reference_sigma
+        floor = f"its own {metres(sigma)} per axis are the floor" if sigma else "how accurate that is was not stated"
+        text = (
+            f"all control was matched: accuracy is relative to the reference, and {floor}; an error that scene and "
+            "reference have in common is not seen"
+        )
+        return [Notice("relative-to-reference", text, reference_sigma_m=sigma)]
 
     def _doubtful(self) -> list[Notice]:
         """Return a notice for each point that was left out, and for each that contradicts the others and was not."""
@@ -124,7 +150,9 @@ class Adjusted:
         return [Notice("model-elsewhere", text, image_sizes=sizes)]
 
 
-def open_adjustable(image: Any, scene: SceneOptions, points: PointOptions) -> Scene:
+def open_adjustable(
+    image: Any, scene: SceneOptions, points: PointOptions, match: MatchOptions = MatchOptions()
+) -> Scene:
     """Open the scene; only where a model family is fitted may it be without a model of its own.
 
     Raises
@@ -151,7 +179,7 @@ def open_adjustable(image: Any, scene: SceneOptions, points: PointOptions) -> Sc
             field="points.fit_model",
             remedy=f"leave out one of `points.fit_model` and `{other}`",
         )  # fmt: skip
-    if points.gcps is None:
+    if not has_control(points, match):
         raise InputError(
             "a model is fitted to points", field="points.gcps", remedy="give a file of points with `points.gcps`"
         )
@@ -177,10 +205,17 @@ def on_surface(scene: Scene, surface: Surface | None) -> Scene:
     return dataclasses.replace(scene, models=models)
 
 
-def adjust(scene: Scene, options: PointOptions, opened: SceneOptions, surface: Surface | None) -> Adjusted:
+def adjust(
+    scene: Scene,
+    options: PointOptions,
+    opened: SceneOptions,
+    surface: Surface | None,
+    match: MatchOptions = MatchOptions(),
+    threads: int | None = None,
+) -> Adjusted:
     """Adjust the model of a scene, or fit the family of the options to the points alone.
 
-    Without points nothing is adjusted, and the model is as it was delivered.
+    Without points nothing is adjusted, and the model is as it was delivered. `threads` match, if a reference is given.
 
     Raises
     ------
@@ -188,18 +223,40 @@ def adjust(scene: Scene, options: PointOptions, opened: SceneOptions, surface: S
         If points are missing or wrong, or do not determine the model.
     """
     scene = on_surface(scene, surface)
-    points = inputs.read_control(scene, options, opened)
+    points, matched = control_of(scene, options, match, opened, surface, threads)
+    notes: tuple[Notice, ...] = ()
+    if matched is not None and options.correction is options.fit_model is opened.model is None:
+        correction, note = by_matches(scene, with_heights(points, surface))
+        options, notes = dataclasses.replace(options, correction=correction), (note,)
     done = _from_points(scene, options, points, surface) if options.fit_model else _corrected(
         scene, options, opened, points, surface
     )  # fmt: skip
-    done = dataclasses.replace(done, fit=dataclasses.replace(done.fit, significance=options.significance))
+    adjusted = dataclasses.replace(done.fit, significance=options.significance)
+    done = dataclasses.replace(done, fit=adjusted, matched=matched, notes=notes)
     if not options.prune:
         return done
     pruned = prune(done.fit)
     if options.fit_model:
         scene = dataclasses.replace(done.scene, models={options.fit_model: pruned.fit.model})
-        return Adjusted(scene, pruned.fit, tuple(pruned.removed))
-    return Adjusted(done.scene, pruned.fit, tuple(pruned.removed))
+        done = dataclasses.replace(done, scene=scene)
+    return dataclasses.replace(done, fit=pruned.fit, removed=tuple(pruned.removed))
+
+
+def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:
+    """Return the correction that many matches justify, as `ortho compare` recommends it, and what people read of it.
+
+    Of shift, shift-drift, affine, and the model's own parameters where it has some, the one with the fewest parameters
+    whose error at points that took no part is within 5 % of the smallest.
+    """
+    own = shared_model(scene)
+    kinds = [name for name in comparing.CORRECTIONS if name != "none"] + ([OWN] if own.param_names else [])
+    names = {comparing.own_name(own, kind): kind for kind in kinds}
+    compared = comparing.compare(
+        points, tuple(names), own=own, priors=scene.priors, size=(scene.width, scene.height)
+    )  # fmt: skip
+    chosen = "shift" if compared.recommended is None else names[compared.recommended]
+    text = f"the correction was chosen by the matches (`points.correction` chooses another): {compared.reason}"
+    return chosen, Notice("correction-by-matches", text, correction=chosen)
 
 
 def params_of(options: PointOptions) -> tuple[str, ...] | None:
@@ -215,7 +272,7 @@ def _corrected(
     if options.correction != OWN:
         # What adjusts its own parameters may start anywhere.
         refuse_swapped(shared_model(scene), points, scene.height)
-    points = inputs.with_heights(points, surface)
+    points = with_heights(points, surface)
     correction = options.correction
     if correction is None:
         correction = "shift" if points.control.any() and opened.model is None else "none"
@@ -274,7 +331,7 @@ def heights_where_wanted(points: Points, surface: Surface | None, *names: str) -
     flat = {family.name for family in families() if family.dimensions == 2}
     if surface is None and set(names) <= flat:
         return points
-    return inputs.with_heights(points, surface)
+    return with_heights(points, surface)
 
 
 def heights_around(points: Points, surface: Surface | None) -> tuple[float, float] | None:

@@ -52,6 +52,8 @@ def candidates(
         if place is not None:
             found.append((*place[0], number, place[1]))
     table = np.array(found, dtype=float).reshape(-1, 4)
+    # Cells may choose the same place on the side that they share.
+    table = table[np.sort(np.unique(table[:, :2], axis=0, return_index=True)[1])]
     return table[:, :2].astype(int), table[:, 2].astype(int), table[:, 3]
 
 

@@ -1,0 +1,35 @@
+"""The command `ortho match`: control points of a scene from reference orthoimages."""
+
+from __future__ import annotations
+
+import click
+
+from ortho_pipeline.cli.options import image_argument, json_option, matching_options, scene_options, surface_options
+from ortho_pipeline.cli.parsing import Command
+from ortho_pipeline.cli.printing import print_result, print_warnings
+from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
+
+
+@click.command(cls=Command)
+@image_argument
+@matching_options
+@surface_options
+@click.option(
+    "--output", "-o", type=click.Path(dir_okay=False), required=True, metavar="FILE", help="Points: .geojson or .csv."
+)
+@scene_options
+@json_option
+def match(
+    image: str, match: MatchOptions, surface: SurfaceOptions, output: str, scene: SceneOptions, as_json: bool
+) -> None:
+    """Find control points of IMAGE by matching it with orthoimages of the same place.
+
+    Every fifth cell of the image is kept apart to check. The points carry covariances, which 'ortho fit', 'rectify',
+    'compare' and 'export' take with --gcps; these commands also match by themselves, with --reference.
+    """
+    from ortho_pipeline.commands.control import command
+
+    result = command.match(image, output, match, scene=scene, surface=surface)
+    print_result(result, as_json)
+    if not as_json:
+        print_warnings(result.document["warnings"])

@@ -1,0 +1,329 @@
+"""Matching as a command does it: the scene and its references opened, how far to search, and what is said of it all."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.display.numbers import metres, px
+from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.models import RPC
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.options import MatchOptions, SceneOptions
+from ortho_pipeline.raster.intensity import Intensity
+from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.surface.base import Surface
+
+if TYPE_CHECKING:
+    # What matches takes a while to load, and few commands match.
+    from ortho_pipeline.imaging.matching import Matches, Reference
+
+#: How far a model may be off (m) of which nothing is known, and at most this part of the scene's shorter side.
+DEFAULT_SEARCH, _PART = 100.0, 0.25
+#: Many times the sigma that a scene states are searched, and never less than so many pixels.
+_SIGMAS, _LEAST = 3.0, 8.0
+#: Median correlation of chips from which the reference is probably made of the scene itself.
+_SAME = 0.995
+#: Fields per side of the image in which matches are counted.
+_FIELDS = 10
+
+
+@dataclass(frozen=True)
+class Search:
+    """How far the model of a scene may be off, and who says so.
+
+    Parameters
+    ----------
+    distance : float
+        Metres on the ground.
+    source : str
+    known : bool
+        Whether the user or the scene says so.
+    """
+
+    distance: float
+    source: str
+    known: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """What a scene and its references have in common.
+
+    Parameters
+    ----------
+    matches : Matches
+        With the chips; `matches.points` are the points.
+    references : tuple of path
+    options : MatchOptions
+    search : Search
+    size : (int, int)
+        Columns and rows of the scene.
+    pixel : float
+        Size (m) of a pixel on the ground.
+    notices : tuple of Notice
+    """
+
+    matches: Matches
+    references: tuple[str, ...]
+    options: MatchOptions
+    search: Search
+    size: tuple[int, int]
+    pixel: float
+    notices: tuple[Notice, ...] = ()
+
+    @property
+    def kept(self) -> np.ndarray:
+        """Which matches are points ``(n,)``."""
+        return np.asarray(self.matches.reason == "")
+
+    @property
+    def shift(self) -> Array:
+        """How far (px) the delivered model is off: measured minus predicted, the median over the matches ``(2,)``."""
+        shift: Array = -np.median(self.matches.offset[self.kept], axis=0)
+        return shift
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the section ``matching`` of documents (docs/formats.md)."""
+        from ortho_pipeline.imaging.matching import REASONS
+
+        matches, kept, points = self.matches, self.kept, self.matches.points
+        reasons = {name: int((matches.reason == name).sum()) for name in REASONS}
+        parts = matches.components
+        found = {
+            "references": list(self.references),
+            "reference_sigma_m": self.options.reference_sigma,
+            "dem_sigma_m": self.options.dem_sigma,
+            "search_m": self.search.distance,
+            "search_from": self.search.source,
+            "pixel_m": self.pixel,
+            "tried": len(kept),
+            "kept": int(kept.sum()),
+            "control": int(points.control.sum()),
+            "check": int(points.check.sum()),
+            "reasons": {name: count for name, count in reasons.items() if count},
+            "levels": [
+                {"factor": one.factor, "radius": one.radius, "chips": one.chips, "agreeing": one.agreeing,
+                 "shift_px": [-one.shift[0], -one.shift[1]]}
+                for one in matches.levels
+            ],
+            "shift_px": self.shift,
+            "shift_m": float(np.hypot(*self.shift)) * self.pixel,
+            "components": {"matching": parts.matching, "height_m": parts.height, "other_px": parts.other},
+            "sigma_px": float(np.median(points.sigma_image)),
+            "correlation": median_correlation(matches),
+            "coverage": self._coverage(),
+        }  # fmt: skip
+        document: dict[str, Any] = json_value(found)
+        return document
+
+    def _coverage(self) -> dict[str, Any]:
+        """Return how many matches were tried and kept in each field of the image, rows of columns."""
+        counts = {}
+        for name, mask in (("tried", np.ones(len(self.kept), dtype=bool)), ("kept", self.kept)):
+            part = np.clip(self.matches.image[mask] / self.size * _FIELDS, 0, _FIELDS - 1).astype(int)
+            number = np.bincount(part[:, 1] * _FIELDS + part[:, 0], minlength=_FIELDS**2)
+            counts[name] = number.reshape(_FIELDS, _FIELDS)
+        share = float((counts["kept"] > 0).mean())
+        return {"share": share, **{name: number.tolist() for name, number in counts.items()}}
+
+    def summary(self) -> list[tuple[str, str]]:
+        """Return what people read of it, as rows of a name and a text."""
+        from ortho_pipeline.imaging.matching import REASONS
+
+        said = self.to_json()
+        column, row = said["shift_px"]
+        reasons = ", ".join(f"{count} {REASONS[name]}" for name, count in said["reasons"].items())
+        levels = "; ".join(
+            f"{one['agreeing']} of {counted(one['chips'], 'chip')} of 1/{one['factor']} resolution agree"
+            for one in said["levels"]
+        )
+        parts = said["components"]
+        sigma = self.options.reference_sigma
+        return [
+            ("reference", ", ".join(Path(one).name for one in self.references)
+             + (f", +-{metres(sigma)} per axis" if sigma else ", its own accuracy is not stated")),
+            ("matches", f"{said['kept']} of {said['tried']} tried{': ' + reasons if reasons else ''}"),
+            ("", f"{said['control']} control, {said['check']} check (every fifth cell), in "
+             f"{said['coverage']['share']:.0%} of {_FIELDS} x {_FIELDS} fields of the image"),
+            ("search", f"{metres(self.search.distance)} ({self.search.source}); {levels}"),
+            ("model off", f"column {column:+.2f} px, row {row:+.2f} px (measured minus delivered model), "
+             f"{metres(said['shift_m'])}"),
+            ("accuracy", f"{px(said['sigma_px'])} in the middle of the matches, relative to the reference: matching "
+             f"{parts['matching']:.3g} times what it says itself, heights {parts['height_m']:.3g} m, other "
+             f"{parts['other_px']:.3g} px"),
+        ]  # fmt: skip
+
+
+def match_scene(
+    scene: Scene,
+    options: MatchOptions,
+    surface: Surface | None,
+    opened: SceneOptions = SceneOptions(),
+    threads: int | None = None,
+) -> Matched:
+    """Match a scene with the references of the options.
+
+    Parameters
+    ----------
+    scene : Scene
+        With models that are meant for the surface.
+    opened : SceneOptions
+        What may be opened.
+    threads : int, optional
+        As many as there are processors without; no result depends on it.
+
+    Raises
+    ------
+    InputError
+        For references that are none, a scene without model or heights, and what matching refuses.
+    """
+    from ortho_pipeline.imaging.matching import MatchSettings, View, match, open_references
+    from ortho_pipeline.imaging.matching.matcher import metres_per_pixel
+
+    if surface is None:
+        raise InputError(
+            "matching needs heights", field="surface.dem",
+            remedy="give `surface.dem=FILE`, or `surface.height=METRES` above the ellipsoid for flat ground",
+        )  # fmt: skip
+    if not scene.models:
+        raise InputError(
+            "this image has no model of its own to begin matching with", file=scene.path, field="match.reference",
+            remedy="give control points by hand with `points.gcps`",
+        )  # fmt: skip
+    with _of_references():
+        references = open_references(options.reference, **opened.access)
+    for one in references:
+        _refuse_scene(scene, one)
+    rasters = scene.rasters or (scene.path,)
+    view = View(Intensity(RasterSource(*rasters, **opened.access)), scene.model, surface)
+    pixel = metres_per_pixel(view)
+    search = search_of(scene, options, pixel)
+    settings = MatchSettings(
+        search=search.distance, points=options.points, dem_sigma=options.dem_sigma or 0.0,
+        reference_sigma=options.reference_sigma or 0.0, threads=threads or os.cpu_count() or 1,
+    )  # fmt: skip
+    with _of_references():
+        matches = match(view, references, settings)
+    paths = tuple(one.path for one in references)
+    notices = [*_default_search(search), *_made_of_scene(scene, references, matches)]
+    return Matched(matches, paths, options, search, (scene.width, scene.height), pixel, tuple(notices))
+
+
+@contextmanager
+def _of_references() -> Iterator[None]:
+    """Name the option that is refused, where that is known of the reference alone."""
+    try:
+        yield
+    except InputError as error:
+        if error.field in (None, "reference"):
+            error.field = "match.reference"
+        raise
+
+
+# -- how far to search -----------------------------------------------------------------------------------------------
+
+
+def search_of(scene: Scene, options: MatchOptions, pixel: float) -> Search:
+    """Return how far (m) the model may be off: as the user says, as the scene says, or a default.
+
+    Parameters
+    ----------
+    pixel : float
+        Size (m) of a pixel on the ground.
+    """
+    if options.search is not None:
+        return Search(options.search, "as asked for")
+    stated = _stated(scene, pixel)
+    if stated is not None:
+        sigma, source = stated
+        return Search(max(_SIGMAS * sigma, _LEAST * pixel), f"{_SIGMAS:.0f} times {metres(sigma)}, {source}")
+    part = _PART * min(scene.width, scene.height) * pixel
+    if part < DEFAULT_SEARCH:
+        return Search(part, f"a default: the scene states no accuracy; {_PART:.0%} of its side", known=False)
+    return Search(DEFAULT_SEARCH, "a default: the scene states no accuracy", known=False)
+
+
+def _stated(scene: Scene, pixel: float) -> tuple[float, str] | None:
+    """Return the standard deviation (m) of a scene's model and who states it; None where nobody does."""
+    model = scene.model
+    if isinstance(model, RPC):
+        errors = [value for value in (model.err_bias, model.err_rand) if value is not None and value > 0]
+        if errors:
+            return math.hypot(*errors), "the errors that the RPC states (ERR_BIAS, ERR_RAND)"
+    sigma = scene.facts.get("position_sigma_m")
+    if isinstance(sigma, int | float) and sigma > 0:
+        return float(sigma) * math.sqrt(2), "the accuracy of position in the metadata"
+    known = {name: prior.sigma for name, prior in scene.priors.items() if math.isfinite(prior.sigma)}
+    names = model.param_names
+    if names and set(names) <= set(known):
+        centre = model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), model.reference_height)
+        spread = model.param_partials(centre)[0] * np.array([known[name] for name in names])
+        if np.isfinite(spread).all():
+            return float(np.linalg.norm(spread)) * pixel, "what the sensor knows of its parameters"
+    return None
+
+
+def _default_search(search: Search) -> list[Notice]:
+    if search.known:
+        return []
+    text = (
+        f"the scene does not say how accurate its model is: it was looked for within {metres(search.distance)} "
+        "(`match.search`)"
+    )
+    return [Notice("search-by-default", text, search_m=search.distance)]
+
+
+# -- what a reference is not -----------------------------------------------------------------------------------------
+
+
+def _refuse_scene(scene: Scene, reference: Reference) -> None:
+    """Refuse a reference that is the scene itself, or a view of it."""
+    own = {os.path.realpath(path) for path in (scene.path, *scene.rasters)}
+    shown = {os.path.realpath(name) for name in reference.intensity.source.dataset.GetFileList() or ()}
+    if own & {os.path.realpath(reference.path), *shown}:
+        raise InputError(
+            "the reference is the scene itself: that says nothing of where it lies", file=reference.path,
+            field="match.reference", remedy="give an orthoimage that was made of other images",
+        )  # fmt: skip
+
+
+def _made_of_scene(scene: Scene, references: tuple[Reference, ...], matches: Matches) -> list[Notice]:
+    """Return a notice if the reference looks as if it were made of the scene."""
+    name, alike = Path(scene.path).name, median_correlation(matches)
+    for one in references:
+        described = one.intensity.source.dataset.GetMetadata() or {}
+        if any(name in str(text) for text in described.values()):
+            text = f"{Path(one.path).name} names {name} in its metadata: if it was made of this scene, the matches "
+            return [Notice("reference-made-of-scene", f"{text}say nothing of where it lies", correlation=alike)]
+    if alike < _SAME:
+        return []
+    text = (
+        f"scene and reference are alike to the noise (correlation {alike:.3f} in the median): if the reference was "
+        "made of this scene, the matches say nothing of where it lies"
+    )
+    return [Notice("reference-made-of-scene", text, correlation=alike)]
+
+
+def median_correlation(matches: Matches) -> float:
+    """Return the median correlation of the intensities of scene and target in the chips that were kept."""
+    kept = matches.reason == ""
+    one, other = (chips[kept].reshape(int(kept.sum()), -1).astype(float) for chips in (matches.scene, matches.target))
+    seen = np.isfinite(one) & np.isfinite(other)
+    count = np.maximum(seen.sum(axis=1), 1)[:, None]
+    one, other = (
+        np.where(seen, values - np.where(seen, values, 0.0).sum(axis=1, keepdims=True) / count, 0.0)
+        for values in (one, other)
+    )
+    length = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
+    return float(np.median((one * other).sum(axis=1) / np.where(length > 0, length, 1.0)))

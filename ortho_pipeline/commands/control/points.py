@@ -1,0 +1,184 @@
+"""Points as a command takes them: read or matched, with their roles, in a scene's own pixels, with heights."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyproj
+
+from ortho_pipeline.commands.control.matching import Matched, match_scene
+from ortho_pipeline.commands.inputs import OWN_POINTS, point_file
+from ortho_pipeline.errors import InputError, counted, of_option
+from ortho_pipeline.files.locations import located
+from ortho_pipeline.geodesy.crs import Vertical, parse_crs
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions
+from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, read_points
+from ortho_pipeline.points.selection import select_control
+from ortho_pipeline.raster import source as raster
+from ortho_pipeline.surface.base import Surface
+
+
+def control_of(
+    scene: Scene,
+    options: PointOptions,
+    match: MatchOptions,
+    opened: SceneOptions,
+    surface: Surface | None,
+    threads: int | None = None,
+) -> tuple[Points, Matched | None]:
+    """Return what a scene is adjusted to and held against: points of a file, matches with a reference, or both.
+
+    Points of a file stay themselves beside matches: they check, or control as their file says if the user wants that.
+
+    Raises
+    ------
+    InputError
+        As `read_control` and `match_scene`, and for options that contradict each other.
+    """
+    if not match.reference:
+        refuse_idle(match)
+        return read_control(scene, options, opened), None
+    chosen = next((name for name in ("select", "check") if getattr(options, name) is not None), None)
+    if chosen is not None and options.gcps is None:
+        raise InputError(
+            f"`points.{chosen}` chooses among `points.gcps`, and there are none", field=f"points.{chosen}",
+            remedy="leave it out: every fifth cell of the matches checks",
+        )  # fmt: skip
+    if chosen is not None and match.gcps_as == "check":
+        raise InputError(
+            f"`points.{chosen}` chooses among points that all check", field=f"points.{chosen}",
+            remedy="leave it out, or give `match.gcps_as=control`",
+        )  # fmt: skip
+    surveyed = None if options.gcps is None else read_control(scene, replace(options, correction=None), opened)
+    matched = match_scene(scene, match, surface, opened, threads)
+    points = matched.matches.points
+    if surveyed is None:
+        return points, matched
+    if match.gcps_as == "check":
+        surveyed = surveyed.with_roles(np.where(surveyed.control, "check", surveyed.roles))
+    return _joined(with_heights(surveyed, surface), points), matched
+
+
+def has_control(points: PointOptions, match: MatchOptions) -> bool:
+    """Tell whether there is anything to adjust to."""
+    return points.gcps is not None or bool(match.reference)
+
+
+def match_asked(match: MatchOptions) -> dict[str, MatchOptions]:
+    """Return what the record of a result holds of matching: nothing where nothing was matched."""
+    return {"match": match} if match.reference else {}
+
+
+def refuse_idle(match: MatchOptions) -> None:
+    """Refuse what is said of matching where there is no reference.
+
+    Raises
+    ------
+    InputError
+        With the option.
+    """
+    for name in ("search", "points", "dem_sigma", "reference_sigma", "gcps_as"):
+        if getattr(match, name) != getattr(MatchOptions, name):
+            raise InputError(
+                "this is said of matching, and there is no reference", field=f"match.{name}",
+                remedy="leave it out, or give `match.reference`",
+            )  # fmt: skip
+
+
+def _joined(surveyed: Points, matches: Points) -> Points:
+    """Return points of a file and matches as one table, in the CRS of the matches."""
+    surveyed = surveyed.to_crs(matches.crs)
+    prefix = ""
+    while any(prefix + name in surveyed.ids for name in matches.ids):
+        prefix += "m"
+    groups = np.where(matches.groups >= 0, matches.groups + surveyed.groups.max(initial=-1) + 1, -1)
+
+    def both(name: str) -> np.ndarray:
+        return np.concatenate([getattr(surveyed, name), getattr(matches, name)])
+
+    return Points(
+        ids=(*surveyed.ids, *(prefix + name for name in matches.ids)), image=both("image"), ground=both("ground"),
+        roles=both("roles"), sigma_image=both("sigma_image"), sigma_ground=both("sigma_ground"), crs=matches.crs,
+        source=f"{surveyed.source}, {matches.source}", covariance_image=both("covariance_image"),
+        groups=np.concatenate([surveyed.groups, groups]),
+    )  # fmt: skip
+
+
+def read_control(scene: Scene, options: PointOptions, opened: SceneOptions = SceneOptions()) -> Points:
+    """Read the points of the options with their roles; none where none are given.
+
+    Raises
+    ------
+    InputError
+        For a wrong file, roles that contradict each other, or an adjustment that has no points.
+    """
+    if options.gcps is None:
+        if options.correction not in (None, "none"):
+            raise InputError(
+                f"the correction {options.correction!r} needs control points",
+                field="points.gcps",
+                remedy="give a file of points",
+            )
+        return no_points()
+    points = _given_points(scene, options, opened)
+    if options.select is not None and options.check is not None:
+        raise InputError(
+            "`points.select` and `points.check` both say which points check",
+            field="points.select",
+            remedy="give one of them",
+        )
+    if options.select is not None:
+        return select_control(points, options.select)
+    return points if options.check is None else assign_roles(points, options.check)
+
+
+def _given_points(scene: Scene, options: PointOptions, opened: SceneOptions) -> Points:
+    with of_option("points.crs"):
+        crs = None if options.crs is None else parse_crs(options.crs)
+    with of_option("points.vertical"):
+        vertical = None if options.vertical is None else Vertical.parse(options.vertical)
+    path = point_file(options)
+    origin = options.pixel_origin
+    if path is None or os.fspath(path) == OWN_POINTS:
+        if origin != "corner" or (path is None and not (crs is vertical is None)):
+            raise InputError(
+                "these points say themselves what their coordinates are", field="points.pixel_origin",
+                remedy="leave `points.pixel_origin` out, and of points that are read already `points.crs` and "
+                "`points.vertical`",
+            )  # fmt: skip
+        if isinstance(options.gcps, Points):
+            return options.gcps
+        return gcps_of_dataset(raster.open_dataset(scene.path, **opened.access), crs=crs, vertical=vertical)
+    pieces = {Path(piece.path).name: (*piece.offset, piece.scale) for piece in scene.pieces}
+    name, path = Path(scene.path).name, located(path, allow_network=opened.allow_network)
+    return read_points(path, crs=crs, vertical=vertical, pixel_origin=origin, image_name=name, pieces=pieces)
+
+
+def no_points() -> Points:
+    """Return an empty table of points."""
+    none = np.zeros(0)
+    return Points(
+        ids=(), image=np.zeros((0, 2)), ground=np.zeros((0, 3)), roles=np.zeros(0, dtype="<U7"), sigma_image=none,
+        sigma_ground=np.zeros((0, 3)), crs=pyproj.CRS.from_epsg(4326), source="",
+    )  # fmt: skip
+
+
+def with_heights(points: Points, surface: Surface | None) -> Points:
+    """Fill heights that a file does not give from the surface."""
+    missing = ~np.isfinite(points.ground[:, 2])
+    if not missing.any():
+        return points
+    if surface is None:
+        names = ", ".join(np.array(points.ids)[missing][:5])
+        raise InputError(
+            f"{int(missing.sum())} of {counted(len(points), 'point')} without a height "
+            f"({names})", file=points.source, field="h",
+            remedy="give heights in the file, or a DEM with `surface.dem` to take them from",
+        )  # fmt: skip
+    ground = points.ground.copy()
+    ground[missing, 2] = surface.heights(ground[missing, :2], points.crs)
+    return points.with_ground(ground)
