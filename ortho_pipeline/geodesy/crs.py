@@ -27,7 +27,7 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import AreaOfInterest, Transformer, TransformerGroup
 
 from ortho_pipeline.errors import CrsError, DatumError, OrthoError
-from ortho_pipeline.geodesy.geoid_grid import header_fault, refuse_absurd
+from ortho_pipeline.geodesy.geoid_grid import header_fault, refuse_absurd, refuse_unread
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -223,6 +223,8 @@ class Vertical:
             raise _grid_error(self, str(error)) from error
         shift[~np.isfinite(shift)] = np.nan
         refuse_absurd(shift, self.name)
+        if not self.name.startswith("EPSG:"):
+            refuse_unread(transformer, lon, lat, shift, self.name)
         asked = np.isfinite(lon) & np.isfinite(lat)
         if asked.any() and not np.isfinite(shift).any() and self.name.startswith("EPSG:"):
             # PROJ picks among several operations per point, and answers inf, not an error, where none has its grid.

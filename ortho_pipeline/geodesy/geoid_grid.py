@@ -2,31 +2,46 @@
 
 from __future__ import annotations
 
+import mmap
 import struct
 from pathlib import Path
 
 import numpy as np
+from pyproj.exceptions import ProjError
+from pyproj.transformer import Transformer
 
 from ortho_pipeline.errors import DatumError, InputError
 from ortho_pipeline.files import read_bounded
 
 #: South and west end, steps in latitude and longitude, rows, columns; what follows are heights of 4 bytes each.
 _GTX = struct.Struct(">4d2i")
+#: Tags of a TIFF: width and height of a tile, rows of a strip.
+_TILES, _STRIPS = (322, 323), (278,)
+_BLOCK_SIZES = (*_TILES, *_STRIPS)
+#: Grids of a whole continent have some hundreds of directories.
+_MOST_DIRECTORIES, _MOST_ENTRIES = 10_000, 200
 #: Metres; the geoid of the Earth is between 107 m below the ellipsoid and 86 m above it.
 _LARGEST_UNDULATION = 200.0
+#: Positions without a height that are looked at.
+_TRIED = 16
 
 
 def header_fault(path: Path) -> str | None:
-    """Return what is wrong with a grid file that exists: a pipe, or a GTX header that does not fit the file.
+    """Return what is wrong with a grid file that exists: a pipe, or a GTX or TIFF header that does not fit the file.
 
-    PROJ waits for the one, and allocates what the other asks for.
+    PROJ waits for the one, allocates what a GTX asks for, and divides by what a TIFF leaves out.
     """
     try:
         header = read_bounded(path, _GTX.size - 1) if path.exists() else b""
     except InputError as error:
         return error.message
-    if not path.name.endswith("gtx") or not path.exists():
-        return None
+    if header[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            return _fault_of_tiff(data)
+    return _fault_of_gtx(header, path) if path.name.endswith("gtx") and path.exists() else None
+
+
+def _fault_of_gtx(header: bytes, path: Path) -> str | None:
     if len(header) < _GTX.size:
         return "this is shorter than a header of GTX"
     *place, rows, columns = _GTX.unpack(header)
@@ -34,6 +49,35 @@ def header_fault(path: Path) -> str | None:
         return "the header states no grid"
     if _GTX.size + 4 * rows * columns != path.stat().st_size:
         return f"the header states {rows} x {columns} heights, which is not the size of the file"
+    return None
+
+
+def _fault_of_tiff(data: mmap.mmap) -> str | None:
+    """Return what is wrong with the directories of a TIFF: each has to say in which blocks its heights lie."""
+    order = "<" if data[:2] == b"II" else ">"
+    big = data[2:4] in (b"+\0", b"\0+")
+    count, entry, offset = (struct.Struct(order + form) for form in (("Q", "HHQQ", "Q") if big else ("H", "HHII", "I")))
+    seen: set[int] = set()
+    try:
+        (at,) = offset.unpack_from(data, 8 if big else 4)
+        while at:
+            if at in seen or len(seen) >= _MOST_DIRECTORIES:
+                return "its directories have no end"
+            seen.add(at)
+            (entries,) = count.unpack_from(data, at)
+            begin, stated = at + count.size, {}
+            for k in range(min(entries, _MOST_ENTRIES)):
+                place = begin + k * entry.size
+                tag, kind, values, _ = entry.unpack_from(data, place)
+                if tag in _BLOCK_SIZES and values == 1 and kind in (3, 4):
+                    form = order + ("H" if kind == 3 else "I")
+                    (stated[tag],) = struct.unpack_from(form, data, place + entry.size - offset.size)
+            needed = _TILES if _TILES[0] in stated else _STRIPS
+            if not all(stated.get(tag) for tag in needed):
+                return "a directory does not say how large its blocks are"
+            (at,) = offset.unpack_from(data, begin + entries * entry.size)
+    except struct.error:
+        return "a directory lies beyond the end of the file"
     return None
 
 
@@ -51,4 +95,27 @@ def refuse_absurd(undulation: np.ndarray, name: str) -> None:
             f"this height datum lies {absurd[0]:.4g} m above the ellipsoid, and the Earth's geoid within 110 m of it",
             file=None if name.startswith("EPSG:") else name, field="vertical",
             remedy="give a geoid grid in metres, and check that the file is not damaged",
+        )  # fmt: skip
+
+
+def refuse_unread(transformer: Transformer, lon: np.ndarray, lat: np.ndarray, shift: np.ndarray, file: str) -> None:
+    """Refuse a grid file that PROJ cannot read at positions ``(N,)`` which lie within it.
+
+    PROJ gives no height there without a word, as if they lay outside. Asked for errors, it has one for positions
+    outside and for those without a value, and none where it could not read.
+
+    Raises
+    ------
+    DatumError
+        If it is so at one of a few positions without a height, which are tried.
+    """
+    lost = np.flatnonzero(np.isnan(shift) & np.isfinite(lon) & np.isfinite(lat))
+    for one in lost[:: max(1, len(lost) // _TRIED)]:
+        try:
+            transformer.transform(lon.flat[one], lat.flat[one], 0.0, errcheck=True)
+        except ProjError:
+            continue
+        raise DatumError(
+            f"this geoid grid cannot be read at {lon.flat[one]:.6g} {lat.flat[one]:.6g}, which lies in it", file=file,
+            field="vertical", remedy="the file is cut off or damaged: copy it again",
         )  # fmt: skip

@@ -382,5 +382,6 @@ READERS = (
     Reader("image", "tiff", "one.tif", _tiff(seeds.image), _image),
     Reader("vrt", "xml", "one.vrt", _with_image(seeds.vrt), _image),
     Reader("geoid-grid", "binary", "geoid.gtx", lambda folder: seeds.geoid_gtx(), _grid, of_files=False),
+    Reader("geoid-tiff", "tiff", "geoid.tif", _tiff(seeds.geoid_tiff), _grid, of_files=False),
 )  # fmt: skip
 BY_NAME = {reader.name: reader for reader in READERS}

@@ -126,6 +126,18 @@ def vrt(folder: Path) -> str:
     return (folder / "seed.vrt").read_text()
 
 
+def geoid_tiff(path: Path) -> Path:
+    """Write the geoid grid of `geoid_gtx` as GeoTIFF."""
+    system = osr.SpatialReference()
+    system.ImportFromEPSG(4326)
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), 8, 8, 1, gdal.GDT_Float32, ["COMPRESS=DEFLATE"])
+    dataset.SetGeoTransform((29.5, 1.0, 0.0, 40.5, 0.0, -1.0))
+    dataset.SetSpatialRef(system)
+    dataset.WriteArray(np.linspace(20.0, 40.0, 8 * 8, dtype=np.float32).reshape(8, 8)[::-1])
+    dataset = None
+    return path
+
+
 def geoid_gtx() -> bytes:
     """Return a geoid grid of 1 degree in GTX: south, west, steps, rows, columns, floats, all big-endian."""
     heights = np.linspace(20.0, 40.0, 8 * 8).astype(">f4")

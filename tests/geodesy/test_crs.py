@@ -153,6 +153,75 @@ def test_a_geoid_of_absurd_heights(tmp_path: Path, ending: str, value: float) ->
     assert refused.value.remedy
 
 
+def geoid_tiff(path: Path, *options: str) -> bytes:
+    """Write a sound GeoTIFF of 8 x 8 heights of 20 to 40 m from 33 E 30 N, and return it."""
+    grid = gdal.GetDriverByName("GTiff").Create(str(path), 8, 8, 1, gdal.GDT_Float32, list(options))
+    grid.SetProjection(pyproj.CRS.from_epsg(4326).to_wkt())
+    grid.SetGeoTransform((32.5, 1.0, 0.0, 37.5, 0.0, -1.0))
+    grid.WriteArray(np.linspace(20, 40, 64, dtype=np.float32).reshape(8, 8))
+    grid = None
+    return path.read_bytes()
+
+
+_OTHER_TAG = struct.pack("<HHI", 278, 3, 1), struct.pack("<HHI", 31901, 3, 1)
+
+
+def lying(data: bytes) -> dict[str, bytes]:
+    """Return GeoTIFFs whose directory lies, by what of it does."""
+    begin = struct.unpack_from("<I", data, 4)[0]
+    entries = {}
+    for k in range(struct.unpack_from("<H", data, begin)[0]):
+        at = begin + 2 + 12 * k
+        entries[struct.unpack_from("<H", data, at)[0]] = at
+
+    def stating(tag: int, value: int) -> bytes:
+        made = bytearray(data)
+        struct.pack_into("<HHII", made, entries[tag], tag, 4, 1, value)
+        return bytes(made)
+
+    def placed(tag: int, offset: int, value: float) -> bytes:
+        made = bytearray(data)
+        struct.pack_into("<d", made, struct.unpack_from("<I", data, entries[tag] + 8)[0] + offset, value)
+        return bytes(made)
+
+    # Of a block that is said to lie elsewhere in the file nobody can tell.
+    found = {f"tag {tag} {value}": stating(tag, value) for tag in (256, 257, 273) for value in (0, 10**5, 2**31)
+             if (tag, value) != (273, 0)}  # fmt: skip
+    found |= {f"place {tag} {offset} {value}": placed(tag, offset, value)
+              for tag, offset in ((33550, 0), (33550, 8), (33922, 24), (33922, 32))
+              for value in (np.nan, np.inf, 1e300, 1e-300)}  # fmt: skip
+    # PROJ divides by the rows of a strip, also where they are not stated, and ended the process.
+    found["no rows of a strip"], found["rows of a strip 0"] = data.replace(*_OTHER_TAG), stating(278, 0)
+    found["bits"], found["cut off"] = stating(258, 64), data[:-100]
+    return found
+
+
+def test_a_geotiff_geoid_whose_header_lies(tmp_path: Path) -> None:
+    """Refused, or the true heights; never without a word no heights, as outside of the grid."""
+    sound = geoid_tiff(tmp_path / "geoid.tif")
+    lon, lat = [34.0, 36.5, 90.0], [36.5, 31.5, 0.0]
+    true = Vertical.parse(str(tmp_path / "geoid.tif")).undulation(lon, lat)
+    assert np.isfinite(true[:2]).all()
+    # Outside of it there are no heights, and that is no damage.
+    assert np.isnan(true[2])
+    refused = 0
+    for number, (what, data) in enumerate(lying(sound).items()):
+        path = tmp_path / f"{number}.tif"
+        path.write_bytes(data)
+        try:
+            found = Vertical.parse(str(path)).undulation(lon, lat)
+        except DatumError as error:
+            refused += 1
+            named = error
+        else:
+            named = None
+            # A grid that lies elsewhere.
+            elsewhere = what.startswith("place 33922") and "1e-300" in what
+            assert elsewhere or np.array_equal(found, true, equal_nan=True), what
+        assert named is None or (named.file == str(path) and named.remedy), what
+    assert refused > 15
+
+
 @pytest.mark.parametrize("name", ["pipe.gtx", "pipe.tif"])
 def test_a_geoid_that_is_a_pipe(tmp_path: Path, name: str) -> None:
     os.mkfifo(tmp_path / name)
