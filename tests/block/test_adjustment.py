@@ -11,11 +11,14 @@ from ortho_cartosat.truth import StereoPair
 
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.equations import solver as block_solver
+from ortho_pipeline.block.equations.problem import BlockProblem, Selection, State
+from ortho_pipeline.block.equations.solver import once, solve
 from ortho_pipeline.block.equations.steps import Steps
 from ortho_pipeline.block.fit import BlockFit
-from ortho_pipeline.block.intersection import intersect
-from ortho_pipeline.block.local_frame import GroundFrame
+from ortho_pipeline.block.intersection import frame_of, intersect
+from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.block.reliability.standardised_residuals import standardise
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.estimation.problem import Prior
@@ -635,6 +638,26 @@ def test_a_mark_that_was_measured_twice_is_told(rpcs: dict[str, RPC]) -> None:
     assert "p4 and p5" in told[0]
     # A point that takes no part, or that only checks, adds no redundancy.
     assert not any("measured twice" in text for text in adjust(starts(truth), points, exclude=["p5"]).warnings)
+
+
+def test_one_step_of_a_robust_round_tests_what_it_leaves(rpcs: dict[str, RPC]) -> None:
+    """A step leads from anywhere to the minimum, nearly: rays and known ground are tested by what is left there."""
+    truth = biased(rpcs)
+    points = measured(truth, places(20), roles_of(9, 11), noise=0.3, sigma_ground=0.3, sigma_image=0.3)
+    models = tuple(starts(truth).values())
+    frame = frame_of(models, points)
+    known = np.where(points.control[:, None], points.known_in(GEODETIC), np.nan)
+    problem = BlockProblem(points, models, frame, known)
+    everything = Selection.of(np.ones(points.rays, dtype=bool), points.control)
+    start = State(models, frame.of_geodetic(points.known_in(GEODETIC)))
+    there = solve(problem, start, everything)
+    wanted = standardise(there)
+    # 3 m and 2 px away: the misfits before the step are some ten sigmas.
+    away = there.state.moved(np.full(problem.size, 2.0), np.full((len(points), 3), 3.0))
+    found = standardise(once(problem, away, everything)[0])
+    np.testing.assert_allclose(found.rays, wanted.rays, atol=1e-2)
+    np.testing.assert_allclose(found.ground, wanted.ground, atol=1e-2)
+    assert wanted.ground[points.control].max() > 0.1
 
 
 # -- rank defects ----------------------------------------------------------------------------------------------------

@@ -70,7 +70,7 @@ def standardise(solved: Solved) -> StandardisedResiduals:
             rays[used], ray_rank[used] = _standardise(hat, linear.misfits.rays[used])
         if rows.chunk.ground:
             used = rows.chunk.points
-            ground[used], ground_rank[used] = _of_ground(rows, core)
+            ground[used], ground_rank[used] = _of_ground(solved, rows, core)
     weights = linear.weights
     return StandardisedResiduals(rays / weights.ray_weights, ray_rank, ground / weights.ground_weights, ground_rank)
 
@@ -82,13 +82,14 @@ def standardise_ground(solved: Solved) -> tuple[Array, Index]:
     for rows in solved.eliminated:
         if rows.chunk.ground:
             core = np.eye(3) + rows.taken(solved.cofactors)[1]
-            ground[rows.chunk.points], rank[rows.chunk.points] = _of_ground(rows, core)
+            ground[rows.chunk.points], rank[rows.chunk.points] = _of_ground(solved, rows, core)
     return ground, rank
 
 
-def _of_ground(rows: Eliminated, core: Array) -> tuple[Array, Index]:
+def _of_ground(solved: Solved, rows: Eliminated, core: Array) -> tuple[Array, Index]:
     q = rows.q[:, -3:]
-    return _standardise(q @ core @ q.swapaxes(1, 2), rows.linear.misfits.ground[rows.chunk.points])
+    # What is left after a step, as of the rays: the rows themselves have the misfits that it was taken from.
+    return _standardise(q @ core @ q.swapaxes(1, 2), solved.linear.misfits.ground[rows.chunk.points])
 
 
 def _of_images(solved: Solved, images: Index) -> Array:
