@@ -20,9 +20,10 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import sys
 from collections.abc import Callable, Iterator
 from os import PathLike, fspath
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -122,6 +123,26 @@ def counted(number: int, what: str, plural: str | None = None) -> str:
         Where it is not formed with an s, or a verb follows: ``counted(n, "point does", "points do")``.
     """
     return f"{number} {what if number == 1 else plural or f'{what}s'}"
+
+
+def is_told_already(lost: Any) -> bool:
+    """Tell whether what a destructor cannot raise is of a dataset that GDAL's binding dropped because a copy failed.
+
+    The binding raises what stops a copy and drops what there is of it, whose destructor complains once more. All other
+    datasets that are written are closed by `raster.output`, which raises.
+    """
+    return getattr(lost.object, "__name__", "") == "delete_Dataset"
+
+
+def print_no_error_twice() -> None:
+    """Let this process print, of what destructors cannot raise, only what is not told already."""
+    before = sys.unraisablehook
+
+    def said(lost: Any) -> None:
+        if not is_told_already(lost):
+            before(lost)
+
+    sys.unraisablehook = said
 
 
 class Terminated(SystemExit):

@@ -16,7 +16,7 @@ from multiprocessing import connection
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, TypeVar
 
-from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.errors import InputError, OrthoError, print_no_error_twice
 from ortho_pipeline.files.process_limits import require_memory, startable_threads
 
 #: Jobs that are handed over before their turn, so that no worker waits for the next one.
@@ -131,6 +131,7 @@ def start_worker(threads: int) -> None:
         os.environ[name] = str(threads)
     # Ctrl-C goes to all processes of the terminal; what happens then is for the parent to decide.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    print_no_error_twice()
     require_memory()
     startable_threads(1)
     parent = multiprocessing.parent_process()

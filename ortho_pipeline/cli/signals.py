@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from ortho_pipeline.errors import Terminated
+from ortho_pipeline.errors import Terminated, is_told_already
 
 #: Seconds after which an end that was lost is asked for again.
 _AGAIN = 0.01
@@ -45,12 +45,9 @@ def _end(number: int, _: Any) -> None:
 def _ask_again(lost: Any) -> None:
     """Raise the exception of a signal a moment later once more; say what else a destructor cannot raise."""
     error = lost.exc_value
-    if getattr(lost.object, "__name__", "") == "delete_Dataset":
-        # GDAL's binding raises what stops a copy and drops what there is of it, whose destructor complains once more.
-        # All other datasets that are written are closed by `raster.output`, which raises.
-        return
     if not isinstance(error, KeyboardInterrupt | Terminated):
-        sys.__unraisablehook__(lost)
+        if not is_told_already(lost):
+            sys.__unraisablehook__(lost)
         return
 
     def end(*_: Any) -> None:
