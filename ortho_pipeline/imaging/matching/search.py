@@ -70,7 +70,9 @@ class Level:
     shift: tuple[float, float]
 
 
-def place(view: View, targets: Sequence[Target], reach: float, base: int) -> tuple[ImageCorrection, list[Level]]:
+def place(
+    view: View, targets: Sequence[Target], reach: float, base: int, window: tuple[int, int, int, int] | None = None
+) -> tuple[ImageCorrection, list[Level]]:
     """Return the model of a view with the correction under which the targets agree with it, to a few chip px.
 
     Parameters
@@ -79,20 +81,23 @@ def place(view: View, targets: Sequence[Target], reach: float, base: int) -> tup
         How far (px of the scene) the model may be off.
     base : int
         Pixels of the scene in a chip pixel at the finest level.
+    window : (left, top, right, bottom), optional
+        The part of the scene that is looked at; all of it if not given.
 
     Raises
     ------
     InputError
         If no place within reach stands out, with the reason.
     """
-    width, height = view.size
-    correction = ImageCorrection.identity(view.model, "affine", (width / 2, height / 2))
-    factor, side, radius = _coarsest(view, reach, base)
+    left, top, right, bottom = (0, 0, *view.size) if window is None else window
+    correction = ImageCorrection.identity(view.model, "affine", ((left + right) / 2, (top + bottom) / 2))
+    size = right - left, bottom - top
+    factor, side, radius = _coarsest(size, reach, base)
     levels: list[Level] = []
     first = True
     while True:
         corrected = View(view.intensity, correction, view.surface)
-        origins = _spread(view, side, factor)
+        origins = np.array([left, top]) + _spread(size, side, factor)
         shown = _correlated(corrected, targets, origins, side, factor, radius)
         if len(shown.centres) < (_FEWEST if first else 3):
             raise _no_overlap(targets, len(shown.centres))
@@ -108,7 +113,7 @@ def place(view: View, targets: Sequence[Target], reach: float, base: int) -> tup
         if factor <= base:
             return correction, levels
         factor, radius, first = max(base, factor // 2), _NEXT, False
-        side = min(_SIDE, min(width, height) // factor)
+        side = min(_SIDE, min(size) // factor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,9 +132,9 @@ class _Shown:
         return _Shown(self.centres, part, np.array([column - half, row - half], dtype=float))
 
 
-def _coarsest(view: View, reach: float, base: int) -> tuple[int, int, int]:
+def _coarsest(size: tuple[int, int], reach: float, base: int) -> tuple[int, int, int]:
     """Return factor, side and radius of the coarsest level: the largest pixels that still give several chips."""
-    smaller, larger = min(view.size), max(view.size)
+    smaller, larger = min(size), max(size)
     factor = base
     while reach / factor > _COMFORTABLE or factor == base:
         next_factor = factor * 2
@@ -141,16 +146,16 @@ def _coarsest(view: View, reach: float, base: int) -> tuple[int, int, int]:
     radius = max(_NEXT, math.ceil(reach / factor) + 2)
     if radius > _LARGEST_RADIUS:
         raise InputError(
-            f"a search over {reach:.0f} px is too wide for an image of {view.size[0]} x {view.size[1]} px",
+            f"a search over {reach:.0f} px is too wide for an image of {size[0]} x {size[1]} px",
             field="match.search", remedy="search less far, or give control points by hand",
         )  # fmt: skip
     return factor, min(side, smaller // factor), radius
 
 
-def _spread(view: View, side: int, factor: int) -> NDArray[np.int_]:
-    """Return first pixels ``(n, 2)`` of chips that are spread over the scene and do not overlap."""
+def _spread(size: tuple[int, int], side: int, factor: int) -> NDArray[np.int_]:
+    """Return first pixels ``(n, 2)`` of chips that are spread over a window and do not overlap."""
     places = []
-    for extent in view.size:
+    for extent in size:
         count = max(1, min(_PER_SIDE, extent // (side * factor)))
         cell = extent / count
         places.append([int(cell * (k + 0.5) - side * factor / 2) for k in range(count)])

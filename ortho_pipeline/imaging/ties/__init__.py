@@ -1,0 +1,6 @@
+"""Tie points between overlapping scenes, found by `imaging.matching`: pairs of scenes, and tracks through many."""
+
+from ortho_pipeline.imaging.ties.pairs import Pair, PairSummary, TieSettings
+from ortho_pipeline.imaging.ties.tracks import Ties, tie
+
+__all__ = ["Pair", "PairSummary", "TieSettings", "Ties", "tie"]

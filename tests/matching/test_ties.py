@@ -1,0 +1,140 @@
+"""Ties between simulated scenes against their truth, with a DEM that is wrong and models that err."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scenes import Case, Setting, write_raster
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.imaging import matching
+from ortho_pipeline.imaging.ties import Ties, TieSettings, tie
+from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.raster.intensity import Intensity
+from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.surface.base import Surface
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Look(Case):
+    """One of several scenes of the same ground, with an attitude, noise and a model's error of its own."""
+
+    number: int = 0
+
+    def random(self, what: int) -> np.random.Generator:
+        own = [self.number] if what in (2, 3, 10) else []
+        return np.random.default_rng([self.setting.seed, what, *own])
+
+    @property
+    def scene_file(self) -> Path:
+        return self.folder / f"scene{self.number}.tif"
+
+    def view(self, surface: Surface) -> matching.View:
+        return matching.View(Intensity(RasterSource(self.scene_file)), self.model, surface)
+
+
+def looks(folder: Path, angles: list[float], **changes: object) -> tuple[list[Look], list[matching.View]]:
+    """Return scenes off nadir by so many degrees, and how a matcher sees them."""
+    settings = {"side": 420, "relief": 6.0, "error": 6.0, "margin": 250.0, **changes}
+    found = [Look(Setting(off_nadir_deg=angle, **settings), folder, k) for k, angle in enumerate(angles)]
+    for look in found:
+        write_raster(look.scene_file, look.rendered(), "uint16", rpc=look.model)
+    found[0].write_dem()
+    surface = Surface.open(found[0].dem_file, "ellipsoid")
+    return found, [look.view(surface) for look in found]
+
+
+def apart(first: Look, second: Look, ties: Ties, pair: tuple[int, int]) -> tuple[Array, Array, Array]:
+    """Return measured minus true positions in the second scene, across and along the epipolar direction, and z."""
+    tracks = ties.of_pair(*pair)
+    one, other = (np.flatnonzero((ties.image == image) & np.isin(ties.track, tracks)) for image in pair)
+    # Rows of a scene are in the order of the tracks.
+    ground = first.ground_of(ties.measured[one])
+    off = ties.measured[other] - second.image_of(ground)
+    steps = []
+    for step in (-5.0, 5.0):
+        height = ground[:, 2] + step
+        steps.append(
+            second.camera.image_of(np.column_stack([first.camera.ground_at(ties.measured[one], height), height]))
+        )
+    along = steps[1] - steps[0]
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    sigma = np.sqrt(2 * np.einsum("ni,nij,nj->n", across, ties.covariance[other], across))
+    return (off * across).sum(axis=1), (off * along).sum(axis=1), sigma
+
+
+def rms(values: Array) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+@pytest.mark.parametrize(
+    ("angles", "dem_sigma"),
+    [
+        pytest.param([-12.0, 12.0], 3.0, marks=pytest.mark.slow),
+        pytest.param([-30.0, 30.0], 5.0, marks=pytest.mark.slow),
+        ([-30.0, 0.0, 30.0], 5.0),
+    ],
+)  # fmt: skip
+def test_ties_lie_where_the_truth_is_whatever_the_heights_of_the_dem(tmp_path, angles, dem_sigma):
+    scenes, views = looks(tmp_path, angles, dem_sigma=dem_sigma)
+    ties = tie(views, TieSettings(search=25.0, points=120, dem_sigma=dem_sigma))
+    for pair in ties.pairs:
+        across, along, sigma = apart(scenes[pair.images[0]], scenes[pair.images[1]], ties, pair.images)
+        assert len(across) >= 80
+        assert rms(across) < 0.15
+        # Along it slopes of the DEM's error displace a chip as a whole; heights are found to that.
+        assert rms(along) < 0.35
+        assert 0.7 < rms(across / sigma) < 1.4
+
+
+def test_a_track_has_each_scene_once_and_covers_the_overlap(tmp_path):
+    _, views = looks(tmp_path, [-15.0, 0.0, 15.0], dem_sigma=2.0)
+    ties = tie(views, TieSettings(search=25.0, points=100, dem_sigma=3.0))
+    both = np.stack([ties.track, ties.image], axis=1)
+    assert len(np.unique(both, axis=0)) == len(both)
+    counts = np.bincount(ties.track)
+    assert set(counts) <= {2, 3}
+    assert (counts == 3).mean() > 0.6
+    # All but the rim of the scenes, where chips do not fit, and corners that one of them does not show.
+    place = ties.measured[ties.image == 0] / views[0].size
+    cells = np.histogram2d(*place.T, bins=5, range=[[0, 1], [0, 1]])[0]
+    assert (cells > 0).mean() > 0.85
+    values = np.linalg.eigvalsh(ties.covariance)
+    assert (values > 0).all()
+    assert np.sqrt(values.max()) < 0.6
+
+
+def test_ties_of_scenes_of_different_resolution(tmp_path):
+    fine = looks(tmp_path, [-14.0], side=420, dem_sigma=2.0)
+    (coarse,) = [Look(Setting(off_nadir_deg=10.0, side=210, gsd=2.0, fine=4.0, relief=3.0, error=3.0), tmp_path, 1)]
+    write_raster(coarse.scene_file, coarse.rendered(), "uint16", rpc=coarse.model)
+    views = [*fine[1], coarse.view(fine[1][0].surface)]
+    for order in ([0, 1], [1, 0]):
+        scenes = [[*fine[0], coarse][k] for k in order]
+        ties = tie([views[k] for k in order], TieSettings(search=25.0, points=60, dem_sigma=3.0))
+        across, _, _ = apart(*scenes, ties, (0, 1))
+        assert len(across) >= 25
+        # Pixels of the coarser scene.
+        assert rms(across) / (1 if order[1] == 1 else 2) < 0.15
+
+
+def test_scenes_without_common_ground_are_refused(tmp_path):
+    _, views = looks(tmp_path, [-5.0, 5.0], side=280)
+    away = ImageCorrection(views[1].model, "shift", (0.0, 0.0), np.array([5000.0, 0, 0, 0, 0, 0]))
+    with pytest.raises(InputError, match="no two of the scenes show the same ground"):
+        tie([views[0], replace(views[1], model=away)], TieSettings(search=25.0))
+
+
+def test_scenes_of_different_places_have_no_ties(tmp_path):
+    scenes, views = looks(tmp_path, [-5.0], side=280)
+    other = Look(replace(scenes[0].setting, seed=1), tmp_path, 1)
+    write_raster(other.scene_file, other.rendered(), "uint16", rpc=other.model)
+    with pytest.raises(InputError, match=r"there are no ties: scene0.tif and scene1.tif: "):
+        tie([*views, other.view(views[0].surface)], TieSettings(search=25.0))
