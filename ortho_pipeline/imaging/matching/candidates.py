@@ -22,32 +22,39 @@ _SATURATED = 0.2
 _RIM = 2
 
 
-def cells_of(width: int, height: int, count: int) -> tuple[int, int]:
+def cells_of(width: float, height: float, count: int) -> tuple[int, int]:
     """Return columns and rows of a grid of about `count` cells that are nearly squares."""
     columns = max(1, round(math.sqrt(count * width / height)))
     return columns, max(1, round(count / columns))
 
 
 def candidates(
-    view: View, cells: tuple[int, int], size: int, factor: int, inside: NDArray[np.bool_]
+    view: View,
+    region: tuple[int, int, int, int],
+    cells: tuple[int, int],
+    size: int,
+    factor: int,
+    inside: NDArray[np.bool_],
 ) -> tuple[NDArray[np.int_], NDArray[np.int_], Array]:
     """Return first pixels ``(n, 2)`` of chips, their cells ``(n,)``, and their structure ``(n,)``, one of each cell.
 
     Parameters
     ----------
+    region : (left, top, right, bottom)
+        The part of the scene (px) that is looked at.
     cells : (int, int)
-        Columns and rows of the grid.
+        Columns and rows of the grid over it.
     size, factor : int
         A chip has `size` x `size` means of `factor` x `factor` pixels.
     inside : (rows, columns) of bool
         Cells that are looked at.
     """
-    width, height = view.size
+    width, height = region[2] - region[0], region[3] - region[1]
     found = []
     for number in np.flatnonzero(inside.ravel()).tolist():
         row, column = divmod(number, cells[0])
-        left, right = width * column / cells[0], width * (column + 1) / cells[0]
-        top, bottom = height * row / cells[1], height * (row + 1) / cells[1]
+        left, right = (region[0] + width * place / cells[0] for place in (column, column + 1))
+        top, bottom = (region[1] + height * place / cells[1] for place in (row, row + 1))
         place = _best(view, (left, top, right, bottom), size, factor)
         if place is not None:
             found.append((*place[0], number, place[1]))

@@ -23,9 +23,9 @@ from ortho_pipeline.surface.base import Surface
 
 Pixels = NDArray[np.float32]
 #: Nodes per side of a chip's lattice, tried until it is this exact (pixels of the target).
-_NODES, _EXACT = (3, 5, 9, 17), 0.01
-#: Rays meet the surface within this height (m): a hundredth of a pixel where a metre moves a third of one.
-_TOLERANCE = 0.03
+_NODES, _EXACT = (3, 5, 9, 17), 0.002
+#: Rays meet the surface within this height (m): a thousandth of a pixel where a metre moves a third of one.
+_TOLERANCE = 0.003
 #: Larger windows of a target or a DEM than this are not read for one chip: its model leads far away.
 _LARGEST = 64_000_000
 #: Chips whose lattice is held against the model.

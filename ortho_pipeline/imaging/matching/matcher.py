@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
 from ortho_pipeline.imaging.matching.chips import View, resolution_ratio, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
 from ortho_pipeline.imaging.matching.least_squares import measure
-from ortho_pipeline.imaging.matching.search import Level, agreed, best_rendered, place
+from ortho_pipeline.imaging.matching.search import Level, agreed, best_rendered, place, refuse_accident
 from ortho_pipeline.imaging.matching.targets import Target
 from ortho_pipeline.imaging.matching.weights import Components, components
 from ortho_pipeline.models import ImageCorrection
@@ -138,12 +138,17 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     shown = _shown(view, targets)
     base = _base(view, targets, shown)
     reach = max(settings.search / metres_per_pixel(view), 2.0 * base)
-    correction, levels = place(view, targets, reach, base)
-    share = len(shown) / _SAMPLES**2
-    grid = cells_of(*view.size, min(round(settings.points / share), 20 * settings.points))
-    origins, cells, _ = candidates(view, grid, SIDE, base, _cells_shown(view, targets, grid))
+    region = _region(view, shown)
+    correction, levels = place(view, targets, reach, base, region)
+    extent = region[2] - region[0], region[3] - region[1]
+    # The targets may show a part of that rectangle only.
+    share = len(shown) / _SAMPLES**2 * view.size[0] * view.size[1] / (extent[0] * extent[1])
+    grid = cells_of(*extent, round(settings.points / min(max(share, 0.05), 1.0)))
+    seen = View(view.intensity, correction, view.surface)
+    origins, cells, _ = candidates(view, region, grid, SIDE, base, _cells_shown(seen, targets, region, grid))
     tried = _Tried(view, targets, origins, cells, base, settings.threads)
     tried.search(correction)
+    tried.refuse_accident(correction, reach)
     for _ in range(_ROUNDS):
         correction = tried.agreed(correction)
         tried.measure(correction)
@@ -174,6 +179,14 @@ def _shown(view: View, targets: Sequence[Target]) -> Array:
     return image[inside]
 
 
+def _region(view: View, shown: Array) -> tuple[int, int, int, int]:
+    """Return the rectangle (left, top, right, bottom) of the scene about points ``(n, 2)`` that a target shows."""
+    half = np.array(view.size) / (2 * _SAMPLES)
+    low = np.maximum(np.floor(shown.min(axis=0) - half), 0).astype(int)
+    high = np.minimum(np.ceil(shown.max(axis=0) + half), view.size).astype(int)
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
 def _inside(view: View, targets: Sequence[Target], image: Array) -> NDArray[np.bool_]:
     """Tell which image points ``(n,)`` fall into a target."""
     ground = meet_surface(view.model, image, view.surface)
@@ -188,11 +201,14 @@ def _inside(view: View, targets: Sequence[Target], image: Array) -> NDArray[np.b
     return found
 
 
-def _cells_shown(view: View, targets: Sequence[Target], grid: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return the cells ``(rows, columns)`` whose centre a target shows."""
-    columns, rows = np.meshgrid(
-        (np.arange(grid[0]) + 0.5) / grid[0] * view.size[0], (np.arange(grid[1]) + 0.5) / grid[1] * view.size[1]
-    )
+def _cells_shown(
+    view: View, targets: Sequence[Target], region: tuple[int, int, int, int], grid: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Return the cells ``(rows, columns)`` of a region whose centre a target shows."""
+    steps = [
+        region[axis] + (np.arange(grid[axis]) + 0.5) / grid[axis] * (region[axis + 2] - region[axis]) for axis in (0, 1)
+    ]
+    columns, rows = np.meshgrid(*steps)
     return _inside(view, targets, np.column_stack([columns.ravel(), rows.ravel()])).reshape(rows.shape)
 
 
@@ -292,6 +308,16 @@ class _Tried:
         found = peaks(surfaces(orientation(there), orientation(around)))
         return np.hypot(*(found.shift + (shift - whole)).T)
 
+    def refuse_accident(self, correction: ImageCorrection, reach: float) -> None:
+        """Raise an error if as many matches could as well agree by chance, at any place of the whole search."""
+        good = np.flatnonzero(self.reason == "")
+        if len(good) < FEWEST:
+            raise self._too_few()
+        near = _NEAR * self.factor
+        _, agreeing = agreed(correction, self.centres[good], self.offset[good], self.score[good], near)
+        places = (2 * reach / self.factor + 1) ** 2
+        refuse_accident(int(agreeing.sum()), len(good), _NEAR, places, self.targets, reach)
+
     def agreed(self, correction: ImageCorrection) -> ImageCorrection:
         """Return the correction that most offsets agree on; the others are of no use any more."""
         good = np.flatnonzero(self.reason == "")
@@ -371,14 +397,13 @@ class _Tried:
         """Return all that was tried, and the points."""
         good = np.flatnonzero(self.reason == "")
         partials = self.view.model.ground_partials(self.ground[good])
-        # What neighbours share is not in the residuals: what is known of the heights is the least that they have.
-        parts = replace(self.components, height=max(self.components.height, settings.dem_sigma))
+        parts = self.components
         covariance = parts.covariance(self.covariance[good], partials[:, :, 2])
         if settings.reference_sigma > 0:
             spread = settings.reference_sigma * units_per_metre(parse_crs(self.view.model.crs), self.ground[good])
             plan = partials[:, :, :2] * spread[:, None, :2]
             covariance = covariance + plan @ plan.transpose(0, 2, 1)
-        groups, roles = held_out(self.centres[good], self.view.size, len(good))
+        groups, roles = held_out(self.centres[good])
         delivered = np.full(self.offset.shape, np.nan)
         delivered[good] = self.view.model.ground_to_image(self.ground[good]) - self.centres[good]
         crs = parse_crs(self.view.model.crs)
@@ -407,14 +432,14 @@ def _robust(design: Array, values: Array) -> Array:
     return found
 
 
-def held_out(image: Array, size: tuple[int, int], count: int) -> tuple[NDArray[np.int_], NDArray[np.str_]]:
+def held_out(image: Array) -> tuple[NDArray[np.int_], NDArray[np.str_]]:
     """Return the groups ``(n,)`` that points share errors within, and their roles: every fifth cell checks.
 
     Cells hold some ten points each, so that check points are not the neighbours of control points. Those that check
     lie a knight's move apart: five of them in any five by five.
     """
-    columns, rows = cells_of(*size, int(np.clip(count / 10, 10, 100)))
-    column = np.clip((image[:, 0] / size[0] * columns).astype(int), 0, columns - 1)
-    row = np.clip((image[:, 1] / size[1] * rows).astype(int), 0, rows - 1)
-    roles = np.where((column + 2 * row) % 5 == 2, "check", "control")
-    return row * columns + column, roles
+    low, extent = image.min(axis=0), np.maximum(np.ptp(image, axis=0), 1.0)
+    columns, rows = cells_of(float(extent[0]), float(extent[1]), int(np.clip(len(image) / 10, 10, 100)))
+    place = np.minimum(((image - low) / extent * (columns, rows)).astype(int), (columns - 1, rows - 1))
+    roles = np.where((place[:, 0] + 2 * place[:, 1]) % 5 == 2, "check", "control")
+    return place[:, 1] * columns + place[:, 0], roles

@@ -4,8 +4,8 @@ Coarse chips all over the scene are compared with wide windows of the target. A 
 everywhere, so the mean of all correlation surfaces has one peak, far above what any single chip shows. It is
 believed if
 
-- it is *unique*: over the chips, the correlation there is better than at the best other place by a paired t-test, which
-  stripes, chessboards and rows of equal roofs do not pass;
+- it is *unique*: the mean correlation is clearly higher than at the best other place, and over the chips so by a paired
+  t-test, which stripes, chessboards and rows of equal roofs do not pass;
 - it is *no accident*: at each finer level so many chips agree on a smooth correction that it would happen by chance,
   over all places searched, once in a million times (binomial test).
 
@@ -29,6 +29,8 @@ from ortho_pipeline.imaging.matching.targets import Target
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
 
+#: Left, top, right and bottom, px.
+Region = tuple[int, int, int, int]
 #: Side of a coarse chip (chip px), and the least that is worth a try.
 _SIDE, _LEAST_SIDE = 48, 24
 #: Coarse chips per side of the scene, at most; and at least so many in all.
@@ -39,10 +41,15 @@ _COMFORTABLE, _LARGEST_RADIUS = 40, 160
 _NEXT = 4
 #: The mean surface is blurred by so much (chip px): corrections are not the same everywhere.
 _SMEAR = 1.5
+#: So many places are rendered anew, if their mean correlation is this part of the highest one.
+_HYPOTHESES, _WORTH = 5, 0.4
 #: Places nearer than this (chip px) are the same peak.
 _APART = 6
 #: Chance at which the best place passes for better than the second best one, and chips for agreeing by accident.
 _UNIQUE, _ACCIDENT = 1e-3, 1e-6
+#: Part of the highest mean correlation that the second highest may have. Where a pattern repeats itself it has nearly
+#: all of it, and which one is higher is decided by how places fall between pixels.
+_CLEARLY = 0.8
 #: Chips agree within this (chip px).
 _AGREE = 1.5
 
@@ -71,7 +78,7 @@ class Level:
 
 
 def place(
-    view: View, targets: Sequence[Target], reach: float, base: int, window: tuple[int, int, int, int] | None = None
+    view: View, targets: Sequence[Target], reach: float, base: int, region: Region
 ) -> tuple[ImageCorrection, list[Level]]:
     """Return the model of a view with the correction under which the targets agree with it, to a few chip px.
 
@@ -81,60 +88,78 @@ def place(
         How far (px of the scene) the model may be off.
     base : int
         Pixels of the scene in a chip pixel at the finest level.
-    window : (left, top, right, bottom), optional
-        The part of the scene that is looked at; all of it if not given.
+    region : (left, top, right, bottom)
+        The part of the scene (px) that the targets show.
 
     Raises
     ------
     InputError
         If no place within reach stands out, with the reason.
     """
-    left, top, right, bottom = (0, 0, *view.size) if window is None else window
-    correction = ImageCorrection.identity(view.model, "affine", ((left + right) / 2, (top + bottom) / 2))
-    size = right - left, bottom - top
-    factor, side, radius = _coarsest(size, reach, base)
+    middle = (region[0] + region[2]) / 2, (region[1] + region[3]) / 2
+    correction = ImageCorrection.identity(view.model, "affine", middle)
+    factor, side, radius = _coarsest(region, reach, base)
+    hypotheses = _hypotheses(_correlated(view, targets, _spread(region, side, factor), side, factor, radius), targets)
+    step = [np.zeros(6) for _ in hypotheses]
+    for one, shift in zip(step, hypotheses, strict=True):
+        one[[0, 3]] = -shift * factor
+    # Each is rendered anew: only where a model is right does relief lie where it belongs.
+    corrections = [followed_by(correction, one) for one in step]
+    compared = [
+        _correlated(
+            View(view.intensity, one, view.surface), targets, _spread(region, side, factor), side, factor, _NEXT
+        )
+        for one in corrections
+    ]
+    best = _standing_out(compared, targets, reach)
+    correction, shown = corrections[best], compared[best]
     levels: list[Level] = []
-    first = True
     while True:
-        corrected = View(view.intensity, correction, view.surface)
-        origins = np.array([left, top]) + _spread(size, side, factor)
-        shown = _correlated(corrected, targets, origins, side, factor, radius)
-        if len(shown.centres) < (_FEWEST if first else 3):
-            raise _no_overlap(targets, len(shown.centres))
-        if first:
-            shift = _common(shown, radius, targets, reach, factor)
-            shown = shown.about(shift, min(radius, _NEXT + 2))
         found = peaks(shown.surface, 2)
-        offsets = shown.start + found.shift
-        correction, agreeing = agreed(correction, shown.centres, offsets * factor, found.score, _AGREE * factor)
-        _refuse_accident(int(agreeing.sum()), len(offsets), min(radius, _NEXT + 2), targets, reach, radius)
+        correction, agreeing = agreed(
+            correction, shown.centres, found.shift * factor, found.score, _AGREE * factor
+        )  # fmt: skip
+        # That it is the right place among all is for the many chips of the last search to say.
+        refuse_accident(int(agreeing.sum()), len(agreeing), _AGREE, 1.0, targets, reach)
         mean = correction.coefficients[[0, 3]]
-        levels.append(Level(factor, radius, len(offsets), int(agreeing.sum()), (float(mean[0]), float(mean[1]))))
+        levels.append(
+            Level(
+                factor,
+                radius if not levels else _NEXT,
+                len(agreeing),
+                int(agreeing.sum()),
+                (float(mean[0]), float(mean[1])),
+            )
+        )
         if factor <= base:
             return correction, levels
-        factor, radius, first = max(base, factor // 2), _NEXT, False
-        side = min(_SIDE, min(size) // factor)
+        factor = max(base, factor // 2)
+        side = min(_SIDE, min(_extent(region)) // factor)
+        seen = View(view.intensity, correction, view.surface)
+        shown = _correlated(seen, targets, _spread(region, side, factor), side, factor, _NEXT)
+        if len(shown.centres) < 3:
+            raise _no_overlap(targets, len(shown.centres))
 
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """Correlation surfaces ``(n, k, k)`` of chips about `centres` (px of the scene); their middle is `start`."""
+    """Correlation surfaces ``(n, k, k)`` of chips about `centres` ``(n, 2)``, px of the scene."""
 
     centres: Array
     surface: NDArray[np.float32]
-    start: Array
 
-    def about(self, shift: Array, radius: int) -> _Shown:
-        """Return the part of the surfaces around a shift (whole chip px) that is `radius` wide."""
-        half = (self.surface.shape[1] - 1) // 2
-        column, row = (int(np.clip(round(value) + half, radius, 2 * half - radius)) for value in shift)
-        part = self.surface[:, row - radius : row + radius + 1, column - radius : column + radius + 1]
-        return _Shown(self.centres, part, np.array([column - half, row - half], dtype=float))
+    def smooth(self) -> NDArray[np.float32]:
+        """Return the surfaces blurred by what the shift differs over a scene."""
+        return np.asarray(ndimage.gaussian_filter(self.surface, (0, _SMEAR, _SMEAR), mode="nearest"))
 
 
-def _coarsest(size: tuple[int, int], reach: float, base: int) -> tuple[int, int, int]:
+def _extent(region: Region) -> tuple[int, int]:
+    return region[2] - region[0], region[3] - region[1]
+
+
+def _coarsest(region: Region, reach: float, base: int) -> tuple[int, int, int]:
     """Return factor, side and radius of the coarsest level: the largest pixels that still give several chips."""
-    smaller, larger = min(size), max(size)
+    smaller, larger = sorted(_extent(region))
     factor = base
     while reach / factor > _COMFORTABLE or factor == base:
         next_factor = factor * 2
@@ -146,19 +171,19 @@ def _coarsest(size: tuple[int, int], reach: float, base: int) -> tuple[int, int,
     radius = max(_NEXT, math.ceil(reach / factor) + 2)
     if radius > _LARGEST_RADIUS:
         raise InputError(
-            f"a search over {reach:.0f} px is too wide for an image of {size[0]} x {size[1]} px",
+            f"a search over {reach:.0f} px is too wide for an image of {larger} x {smaller} px",
             field="match.search", remedy="search less far, or give control points by hand",
         )  # fmt: skip
     return factor, min(side, smaller // factor), radius
 
 
-def _spread(size: tuple[int, int], side: int, factor: int) -> NDArray[np.int_]:
-    """Return first pixels ``(n, 2)`` of chips that are spread over a window and do not overlap."""
+def _spread(region: Region, side: int, factor: int) -> NDArray[np.int_]:
+    """Return first pixels ``(n, 2)`` of chips that are spread over a region and do not overlap."""
     places = []
-    for extent in size:
+    for first, extent in zip(region, _extent(region), strict=False):
         count = max(1, min(_PER_SIDE, extent // (side * factor)))
         cell = extent / count
-        places.append([int(cell * (k + 0.5) - side * factor / 2) for k in range(count)])
+        places.append([first + int(cell * (k + 0.5) - side * factor / 2) for k in range(count)])
     columns, rows = np.meshgrid(*places)
     return np.column_stack([columns.ravel(), rows.ravel()])
 
@@ -173,7 +198,7 @@ def _correlated(
     surface = surfaces(orientation(scene), orientation(shown))
     known = (surface != 0).mean(axis=(1, 2)) > 0.2
     centres = origins + side * factor / 2
-    return _Shown(centres[known], surface[known], np.zeros(2))
+    return _Shown(centres[known], surface[known])
 
 
 def best_rendered(
@@ -193,36 +218,60 @@ def best_rendered(
     return shown
 
 
-def _common(shown: _Shown, radius: int, targets: Sequence[Target], reach: float, factor: int) -> Array:
-    """Return the shift (chip px) that stands out in the mean of all surfaces.
+def _hypotheses(shown: _Shown, targets: Sequence[Target]) -> list[Array]:
+    """Return the shifts (chip px) of the highest places of the mean of all surfaces, the highest first."""
+    if len(shown.centres) < _FEWEST:
+        raise _no_overlap(targets, len(shown.centres))
+    mean = shown.smooth().mean(axis=0)
+    radius = (mean.shape[0] - 1) // 2
+    highest = float(mean.max())
+    found: list[Array] = []
+    left = mean.copy()
+    rows, columns = np.indices(mean.shape)
+    while len(found) < _HYPOTHESES:
+        row, column = np.unravel_index(int(left.argmax()), left.shape)
+        if found and not left[row, column] > _WORTH * highest:
+            break
+        found.append(np.array([column - radius, row - radius], dtype=float))
+        left[np.maximum(np.abs(rows - row), np.abs(columns - column)) <= _APART] = -2.0
+    return found
+
+
+def _standing_out(compared: Sequence[_Shown], targets: Sequence[Target], reach: float) -> int:
+    """Return the number of the hypothesis that is clearly better than the others.
 
     Raises
     ------
     InputError
-        If none does.
+        If none is.
     """
-    smooth = ndimage.gaussian_filter(shown.surface, (0, _SMEAR, _SMEAR), mode="nearest")
-    mean = smooth.mean(axis=0)
-    row, column = np.unravel_index(int(mean.argmax()), mean.shape)
-    rows, columns = np.indices(mean.shape)
-    elsewhere = np.maximum(np.abs(rows - row), np.abs(columns - column)) > _APART
-    if not elsewhere.any():
-        return np.array([column - radius, row - radius], dtype=float)
-    second = np.unravel_index(int(np.where(elsewhere, mean, -2.0).argmax()), mean.shape)
-    difference = smooth[:, row, column] - smooth[:, second[0], second[1]]
-    chance = float(stats.ttest_1samp(difference, 0.0, alternative="greater").pvalue)
-    # So many places could have been the highest by accident.
-    places = mean.size / (2 * math.pi * (_SMEAR**2 + 1))
-    if not chance * 1.0 < _UNIQUE:
+    values: list[dict[tuple[float, ...], float]] = []
+    for shown in compared:
+        if len(shown.centres) < _FEWEST:
+            values.append({})
+            continue
+        smooth = shown.smooth()
+        row, column = np.unravel_index(int(smooth.mean(axis=0).argmax()), smooth.shape[1:])
+        values.append({tuple(c): float(v) for c, v in zip(shown.centres, smooth[:, row, column], strict=True)})
+    means = [float(np.mean(list(one.values()))) if one else -1.0 for one in values]
+    order = np.argsort(means)[::-1]
+    best = int(order[0])
+    for other in order[1:].tolist():
+        common = [place for place in values[best] if place in values[other]]
+        difference = np.array([values[best][place] - values[other][place] for place in common])
+        chance = 1.0
+        if len(difference) >= _FEWEST:
+            chance = float(stats.ttest_1samp(difference, 0.0, alternative="greater").pvalue)
+        if chance < _UNIQUE and means[other] < _CLEARLY * means[best]:
+            continue
         raise InputError(
-            f"no place within {reach:.0f} px stands out: the best of {places:.0f} is no better than another one "
-            f"(correlation {mean[row, column]:.2f} and {mean[second]:.2f} in the mean of "
-            f"{counted(len(shown.centres), 'chip')})",
+            f"no place within {reach:.0f} px stands out: the best two of {len(compared)} are too much alike "
+            f"(correlation {means[best]:.2f} and {means[other]:.2f} in the mean of {counted(len(common), 'chip')})",
             file=targets[0].path, field="match.reference",
             remedy="check that the reference shows this place, search farther (`match.search`) if the model may be "
             "off by more, or give control points by hand where the ground is uniform or repeats itself",
         )  # fmt: skip
-    return np.array([column - radius, row - radius], dtype=float)
+    return best
 
 
 def agreed(
@@ -271,13 +320,25 @@ def followed_by(correction: ImageCorrection, step: Array) -> ImageCorrection:
     return ImageCorrection(correction.model, "affine", correction.origin, coefficients)
 
 
-def _refuse_accident(
-    agreeing: int, chips: int, radius: int, targets: Sequence[Target], reach: float, first_radius: int
+def refuse_accident(
+    agreeing: int, chips: int, tolerance: float, places: float, targets: Sequence[Target], reach: float
 ) -> None:
-    """Raise an error if as many chips could as well agree by chance."""
-    share = min(1.0, math.pi * _AGREE**2 / (2 * radius + 1) ** 2)
-    chance = float(stats.binom.sf(agreeing - 1, chips, share)) * (2 * first_radius + 1) ** 2
-    if chance > _ACCIDENT:
+    """Raise an error if as many chips could as well agree by chance.
+
+    Parameters
+    ----------
+    tolerance : float
+        Chips that agree lie so near to each other (chip px), in searches `_NEXT` chip px wide.
+    places : float
+        So many other corrections could have been found instead.
+
+    Raises
+    ------
+    InputError
+        If that has a chance of more than one in a million.
+    """
+    share = min(1.0, math.pi * tolerance**2 / (2 * _NEXT + 1) ** 2)
+    if float(stats.binom.sf(agreeing - 1, chips, share)) * places > _ACCIDENT:
         raise InputError(
             f"the scene and the reference do not agree: {agreeing} of {counted(chips, 'chip')} fit together within "
             f"{reach:.0f} px of where the model puts them, which chance does as well",
