@@ -35,6 +35,7 @@ import numpy as np
 from mutate import mutant
 from osgeo import gdal
 from readers import BY_NAME, READERS, Reader, numbers
+from real_seeds import real_seeds
 
 from ortho_pipeline.errors import OrthoError
 
@@ -105,9 +106,12 @@ def limited() -> Iterator[None]:
 class Attack:
     """One reader, its valid file in a folder of its own, and its mutants by their numbers."""
 
-    def __init__(self, reader: Reader, folder: Path) -> None:
+    def __init__(self, reader: Reader, folder: Path, real: Path | None = None) -> None:
         self.reader, self.path = reader, folder / reader.file
+        # The seed puts beside it what has to lie there.
         self.data = reader.seed(folder)
+        if real is not None:
+            self.data = real.read_bytes()
         self.path.write_bytes(self.data)
         self.tally = Tally(reader.name)
 
@@ -290,6 +294,32 @@ def table(tallies: list[Tally]) -> str:
     return "\n".join(rows)
 
 
+def attack_real(names: list[str] | None, first: int, count: int) -> int:
+    """Attack the readers of which there are real files, with each of these as the seed."""
+    hush()
+    tallies = []
+    for name, path in real_seeds():
+        if names is None or name in names:
+            with scratch() as folder:
+                one = Attack(BY_NAME[name], Path(folder), path)
+                one.check_seed()
+                for number in range(first, first + count):
+                    one.judge(number)
+            one.tally.reader = f"{name}, {path.name}"
+            print(f"{one.tally.reader}: {one.tally.mutants} mutants", file=sys.stderr, flush=True)
+            tallies.append(one.tally)
+    return report(tallies)
+
+
+def report(tallies: list[Tally]) -> int:
+    """Print what became of the mutants; return 1 if anything was found."""
+    print(table(tallies))
+    for one in tallies:
+        for key, (number_of, number, text) in sorted(one.faults.items(), key=lambda item: -item[1][0]):
+            print(f"{one.reader}: {number_of} x {key.partition(':')[0]} (first: mutant {number}): {text[:300]}")
+    return 0 if all(one.sound for one in tallies) else 1
+
+
 def main(arguments: list[str]) -> int:
     """Run by hand; exit code 1 if anything was found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -301,20 +331,19 @@ def main(arguments: list[str]) -> int:
         "--keep", type=Path, help="folder for the results; what it holds is not run again (-n 0: shown)"
     )
     parser.add_argument("-j", type=int, default=2, help="processes")
+    parser.add_argument("--real", action="store_true", help="of the real files in ../shared/data, one after the other")
     chosen = parser.parse_args(arguments)
     names = chosen.reader or [reader.name for reader in READERS]
     if chosen.show is not None:
         with scratch() as folder:
             sys.stdout.buffer.write(Attack(BY_NAME[names[0]], Path(folder)).file(chosen.show))
         return 0
+    if chosen.real:
+        return attack_real(chosen.reader, chosen.first, chosen.n)
     if chosen.keep:
         chosen.keep.mkdir(parents=True, exist_ok=True)
     tallies = run_all(names, chosen.first, chosen.n, chosen.j, chosen.keep)
-    print(table(tallies))
-    for one in tallies:
-        for key, (count, number, text) in sorted(one.faults.items(), key=lambda item: -item[1][0]):
-            print(f"{one.reader}: {count} x {key.partition(':')[0]} (first: mutant {number}): {text[:300]}")
-    return 0 if all(one.sound for one in tallies) else 1
+    return report(tallies)
 
 
 if __name__ == "__main__":

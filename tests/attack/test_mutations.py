@@ -11,6 +11,7 @@ import pytest
 from fuzz import Attack, Tally
 from mutate import mutant
 from readers import BY_NAME, READERS
+from real_seeds import FILES, real_seeds
 
 from ortho_pipeline.batch import plan as batch_plan
 from ortho_pipeline.batch.records import FileState, Record
@@ -24,9 +25,9 @@ FEW, MANY = 150, 5000
 DEAR = {"cartosat-met": 25, "dimap-lists": 60, "dimap-polynomials": 60, "bilsat-survey": 60, "points-geojson": 100}
 
 
-def attacked(name: str, folder: Path, count: int, first: int = 0) -> Tally:
-    """Return what became of the mutants of a reader."""
-    one = Attack(BY_NAME[name], folder)
+def attacked(name: str, folder: Path, count: int, first: int = 0, real: Path | None = None) -> Tally:
+    """Return what became of the mutants of a reader, of its own seed or of a real file."""
+    one = Attack(BY_NAME[name], folder, real)
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         one.check_seed()
@@ -47,6 +48,17 @@ def test_damaged_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
 def test_thousands_of_damaged_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
     tally = attacked(name, tmp_path, MANY, first=FEW)
     assert tally.sound, tally.faults
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", FILES)
+def test_damaged_real_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
+    seeds = [path for reader, path in real_seeds() if reader == name]
+    assert seeds
+    for number, real in enumerate(seeds):
+        (tmp_path / str(number)).mkdir()
+        tally = attacked(name, tmp_path / str(number), 10 if name in DEAR else 30, real=real)
+        assert tally.sound, (real.name, tally.faults)
 
 
 def test_mutants_are_the_same_on_every_machine() -> None:
