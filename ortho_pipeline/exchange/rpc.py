@@ -72,8 +72,9 @@ def read_rpc(path: str | PathLike[str]) -> RPC:
 def has_rpc(dataset: gdal.Dataset) -> bool:
     """Tell whether GDAL found an RPC for this dataset, in it or beside it, readable or not."""
     try:
+        _refuse_unread_sidecar(dataset)
         return bool(dataset.GetMetadata("RPC"))
-    except RuntimeError:
+    except (RuntimeError, InputError):
         return True
 
 
@@ -90,11 +91,13 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
     Raises
     ------
     InputError
-        If there is no RPC, it is damaged, the chosen one is absent, or tag and side-car disagree.
+        If there is no RPC, it is damaged or cannot be read, the chosen one is absent, or tag and side-car disagree.
     """
     name = dataset.GetDescription()
     if choice is not None and str(choice) not in ("tag", "sidecar"):
         return read_rpc(choice), os.fspath(choice)
+    if choice != "tag":
+        _refuse_unread_sidecar(dataset)
     tag, sidecar = _own_fields(dataset), None
     fields = _fields_beside(dataset)
     beside = _sidecar_files(dataset)
@@ -129,6 +132,17 @@ def _fields_beside(dataset: gdal.Dataset) -> dict[str, str]:
         return dict(dataset.GetMetadata("RPC") or {})
     except RuntimeError:
         return {}
+
+
+def _refuse_unread_sidecar(dataset: gdal.Dataset) -> None:
+    """Refuse an RPC side-car that the disk does not give: GDAL goes on without, or with a tag."""
+    path = place(dataset.GetDescription())
+    for file in _sidecar_names(path) if isinstance(path, Path) else []:
+        if file.is_file():
+            files.read_bounded(
+                file, 1_000_000, field="scene.rpc",
+                remedy="copy it again from the delivery, or choose another RPC: `scene.rpc=tag`, `scene.rpc=FILE`",
+            )  # fmt: skip
 
 
 def _unreadable_beside(path: Path) -> list[str]:
