@@ -20,7 +20,7 @@ class Outcome:
     facts : mapping
         JSON values: sensor, model, RMSE, ortho, view.
     error : mapping, optional
-        Kind, message, file, field, remedy, and the trace of what is no `OrthoError`.
+        Kind, message, file, field, remedy, and the trace of what is not an `OrthoError`.
     """
 
     name: str

@@ -54,18 +54,20 @@ def viewing(model: SensorModel, width: int, height: int) -> dict[str, Any]:
         inverse = np.linalg.inv(plan[0])
     except np.linalg.LinAlgError:
         return nothing
-    lean = inverse @ up[0]
-    tangent = float(np.hypot(*lean))
+    displacement = inverse @ up[0]
+    tangent = float(np.hypot(*displacement))
     seen = np.hypot(*up[0]) > _NADIR
-    along = lean / tangent if seen else np.array([0.0, 1.0])
+    along = displacement / tangent if seen else np.array([0.0, 1.0])
     across = np.array([along[1], -along[0]])
     return {
         "ground_pixel_m": np.linalg.norm(inverse, axis=0).tolist(),
         "lean_m_per_m": tangent,
-        "lean_azimuth_deg": float(np.degrees(np.arctan2(lean[0], lean[1])) % 360),
+        "lean_azimuth_deg": float(np.degrees(np.arctan2(displacement[0], displacement[1])) % 360),
         "view": {
             "incidence_deg": float(np.degrees(np.arctan(tangent))),
-            "sensor_azimuth_deg": float(np.degrees(np.arctan2(-lean[0], -lean[1])) % 360) if seen else None,
+            "sensor_azimuth_deg": float(np.degrees(np.arctan2(-displacement[0], -displacement[1])) % 360)
+            if seen
+            else None,
             "pixel_m": {
                 "along_view": float(1.0 / np.linalg.norm(plan[0] @ along)),
                 "across_view": float(1.0 / np.linalg.norm(plan[0] @ across)),

@@ -1,4 +1,4 @@
-"""What is known of the errors of image measurements: covariance of a point, and groups of points that share errors.
+"""Errors of image measurements: covariance of a point, and groups of points that share errors.
 
 A covariance that is the same in all directions says no more than a standard deviation, and is that one's square.
 """

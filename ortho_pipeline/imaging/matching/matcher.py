@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +64,7 @@ REASONS = {
 
 @dataclass(frozen=True)
 class MatchSettings:
-    """What a user may choose.
+    """Choices of a user.
 
     Parameters
     ----------
@@ -397,7 +397,8 @@ class _Tried:
         """Return all that was tried, and the points."""
         good = np.flatnonzero(self.reason == "")
         partials = self.view.model.ground_partials(self.ground[good])
-        parts = self.components
+        # Of the heights' errors the residuals show what differs from place to place; a stated sigma is the least.
+        parts = replace(self.components, height=max(self.components.height, settings.dem_sigma))
         covariance = parts.covariance(self.covariance[good], partials[:, :, 2])
         if settings.reference_sigma > 0:
             spread = settings.reference_sigma * units_per_metre(parse_crs(self.view.model.crs), self.ground[good])

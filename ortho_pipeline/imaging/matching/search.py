@@ -56,7 +56,7 @@ _AGREE = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """What one level of the search found.
+    """Result of one level of the search.
 
     Parameters
     ----------

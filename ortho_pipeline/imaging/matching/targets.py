@@ -1,4 +1,4 @@
-"""What a scene is matched with: reference orthoimages, or another scene; each says where ground lies in its pixels."""
+"""Images that a scene is matched with: reference orthoimages, or another scene. Each says where ground lies in it."""
 
 from __future__ import annotations
 
