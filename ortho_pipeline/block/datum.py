@@ -53,7 +53,7 @@ def _held(problem: BlockProblem, state: State, selection: Selection, sigma: floa
     found = []
     params = state.params
     for image, used in enumerate(linear.ordering.rays_of_image):
-        partials = linear.by_params[used] * problem.points.sigma_image[used][:, None, None]
+        partials = problem.points.in_pixels(linear.by_params[used], used)
         effect = np.sqrt((partials**2).sum(axis=1).mean(axis=0)) if len(used) else []
         for column, size in zip(problem.columns.of_image(image), effect, strict=False):
             if int(column) not in known and size > 0:

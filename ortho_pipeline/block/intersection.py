@@ -243,8 +243,8 @@ def _equations(
             continue
         of = points.point[rays]
         sigma = points.sigma_image[rays]
-        misfit[rays] = (points.measured[rays] - places.project(model, of)) / sigma[:, None]
-        rows[rays] = places.ground_partials(model, of) / sigma[:, None, None]
+        misfit[rays] = points.whitened((points.measured[rays] - places.project(model, of)) / sigma[:, None], rays)
+        rows[rays] = points.whitened(places.ground_partials(model, of) / sigma[:, None, None], rays)
     return misfit, rows
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,13 @@ from ortho_pipeline.options import is_usable
 from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE, Points
 from ortho_pipeline.points.formats import read_block_table
 from ortho_pipeline.points.ground import ground_of
-from ortho_pipeline.points.image_errors import sigmas_of
+from ortho_pipeline.points.image_errors import (
+    checked_covariance,
+    covariance_of,
+    says_more,
+    sigma_of_covariance,
+    sigmas_of,
+)
 from ortho_pipeline.points.rows import OF_GROUND, ROLES, Row, Table, origin_shift
 
 #: Two statements of one point's ground are the same within this (degrees or metres): files round.
@@ -57,6 +63,9 @@ class BlockPoints:
         Standard deviation of the measurement, px.
     source : str
         Where they come from, for people.
+    shape_image : ndarray (M, 2, 2), optional
+        Covariance of the measurement over the square of `sigma_image`, which is its root mean square per axis. If not
+        given, measurements are as certain in all directions; other values of `sigma_image` change the scale alone.
     """
 
     ids: tuple[str, ...]
@@ -70,6 +79,8 @@ class BlockPoints:
     measured: Array
     sigma_image: Array
     source: str = ""
+    shape_image: Array | None = None
+    _whitening: Array | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
         count, rays = len(self.ids), len(self.point)
@@ -86,6 +97,10 @@ class BlockPoints:
         object.__setattr__(self, "images", tuple(self.images))
         self._check_values()
         self._check_identity()
+        if self.shape_image is not None:
+            directions = checked_covariance(self.shape_image, rays)
+            object.__setattr__(self, "shape_image", directions)
+            object.__setattr__(self, "_whitening", np.linalg.inv(np.linalg.cholesky(directions)))
 
     def _check_values(self) -> None:
         if not np.isin(self.roles, ROLES).all():
@@ -164,6 +179,7 @@ class BlockPoints:
             image=places[:, 1], measured=np.concatenate([table.image for table in tables.values()]),
             sigma_image=np.concatenate([table.sigma_image for table in tables.values()]),
             source=", ".join(dict.fromkeys(table.source for table in tables.values() if table.source)),
+            shape_image=shape_of(np.concatenate([table.covariance_image for table in tables.values()])),
         )  # fmt: skip
 
     @property
@@ -209,8 +225,37 @@ class BlockPoints:
         return replace(
             self, ids=tuple(self.ids[i] for i in chosen), ground=self.ground[chosen], roles=self.roles[chosen],
             sigma_ground=self.sigma_ground[chosen], point=place[self.point[rays]], image=self.image[rays],
-            measured=self.measured[rays], sigma_image=self.sigma_image[rays],
+            measured=self.measured[rays], sigma_image=self.sigma_image[rays], shape_image=self._shape_of(rays),
         )  # fmt: skip
+
+    def of_rays(self, rays: ArrayLike) -> BlockPoints:
+        """Return these points with some of their rays, a mask ``(M,)`` or indices; points without any stay."""
+        chosen = np.arange(self.rays)[np.asarray(rays)]
+        return replace(
+            self, point=self.point[chosen], image=self.image[chosen], measured=self.measured[chosen],
+            sigma_image=self.sigma_image[chosen], shape_image=self._shape_of(chosen),
+        )  # fmt: skip
+
+    def _shape_of(self, rays: NDArray[Any]) -> Array | None:
+        return None if self.shape_image is None else self.shape_image[rays]
+
+    @property
+    def covariance_image(self) -> Array:
+        """Covariances of the measurements ``(M, 2, 2)`` px²."""
+        shape = np.eye(2) if self.shape_image is None else self.shape_image
+        return np.asarray(self.sigma_image[:, None, None] ** 2 * shape)
+
+    def whitened(self, values: Array, rays: Index) -> Array:
+        """Return values of rays ``(k, 2, ...)``, over their sigma already, as independent and of sigma 1."""
+        if self._whitening is None:
+            return values
+        return np.asarray(np.einsum("kij,kj...->ki...", self._whitening[rays], values))
+
+    def in_pixels(self, values: Array, rays: Index) -> Array:
+        """Return in pixels what `whitened` returned, values of rays ``(k, 2, ...)``."""
+        if self._whitening is not None:
+            values = np.einsum("kij,kj...->ki...", np.linalg.inv(self._whitening[rays]), values)
+        return np.asarray(values * self.sigma_image[rays].reshape(-1, *[1] * (values.ndim - 1)))
 
     def in_image(self, name: str) -> Points:
         """Return the points that were measured in one image, as the table of that image."""
@@ -225,6 +270,7 @@ class BlockPoints:
             ids=tuple(self.ids[i] for i in rows), image=self.measured[rays], ground=self.ground[rows],
             roles=self.roles[rows], sigma_image=self.sigma_image[rays], sigma_ground=self.sigma_ground[rows],
             crs=self.crs, source=self.source,
+            covariance_image=self.covariance_image[rays],
         )  # fmt: skip
 
     def known_in(self, crs: str | pyproj.CRS) -> Array:
@@ -246,6 +292,16 @@ def _agree(
                 f"the {what} of the point {one!r} is another one in the image {name!r}", file=source or None,
                 field="role" if what == "role" else "x, y, h", remedy="points of one id are one point on the ground",
             )  # fmt: skip
+
+
+def shape_of(covariance: Array) -> Array | None:
+    """Return covariances ``(M, 2, 2)`` over their mean square per axis; None if none differs with the direction."""
+    more = says_more(covariance)
+    if not more.any():
+        return None
+    shape = np.tile(np.eye(2), (len(covariance), 1, 1))
+    shape[more] = covariance[more] / sigma_of_covariance(covariance[more])[:, None, None] ** 2
+    return shape
 
 
 # -- reading ---------------------------------------------------------------------------------------------------------
@@ -382,8 +438,8 @@ class _Joined:
             ids=tuple(self.index), ground=ground, roles=np.array(roles, dtype="<U7"),
             sigma_ground=np.array([[one.get("sigma_xy", 0.0)] * 2 + [one.get("sigma_h", 0.0)] for one in said]),
             crs=crs, images=images, point=point, image=image, measured=measured,
-            sigma_image=sigmas_of(rows, DEFAULT_SIGMA_IMAGE),
-            source=os.fspath(path),
+            sigma_image=(sigma := sigmas_of(rows, DEFAULT_SIGMA_IMAGE)), source=os.fspath(path),
+            shape_image=shape_of(covariance_of(rows, sigma)),
         )  # fmt: skip
 
 

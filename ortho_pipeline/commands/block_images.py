@@ -80,11 +80,10 @@ def points_of_images(
             f"no point was measured in {without[0]}; there are points of {', '.join(points.images[:5])}",
             file=points.source, field="image", remedy="use the names of the images in the points file",
         )  # fmt: skip
-    rays = np.isin(points.image, list(owner))
+    of_images = points.of_rays(np.isin(points.image, list(owner)))
     kept = replace(
-        points, images=tuple(labels), point=points.point[rays], measured=points.measured[rays],
-        image=np.array([owner[number] for number in points.image[rays].tolist()], dtype=np.int64),
-        sigma_image=points.sigma_image[rays],
+        of_images, images=tuple(labels),
+        image=np.array([owner[number] for number in of_images.image.tolist()], dtype=np.int64),
     )  # fmt: skip
     return kept.select(np.bincount(kept.point, minlength=len(kept)) > 0), strangers
 

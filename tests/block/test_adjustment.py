@@ -213,6 +213,78 @@ def test_errors_of_the_ground_weigh_as_in_the_fit_of_one_image(rpcs: dict[str, R
     assert (np.abs(found.values - alone.values) < alone.sigmas).all()
 
 
+# -- covariances of measurements -------------------------------------------------------------------------------------
+
+
+def test_covariances_that_are_the_same_in_all_directions_change_no_bit(rpcs: dict[str, RPC]) -> None:
+    truth = biased(rpcs)
+    points = measured(truth, places(30), roles_of(8, 12, 10), noise=0.3, sigma_ground=0.3, sigma_image=0.3)
+    plain = adjust(starts(truth), points)
+    found = adjust(starts(truth), replace(points, shape_image=np.tile(np.eye(2), (points.rays, 1, 1))))
+    np.testing.assert_array_equal(found.ground, plain.ground)
+    np.testing.assert_array_equal(found.covariance, plain.covariance)
+
+
+def leaning(points: BlockPoints, seed: int) -> BlockPoints:
+    """Return points whose measurements err by 2 px in one direction, another for each, and by 0.1 px across it."""
+    random = np.random.default_rng(seed)
+    angle = random.uniform(0, np.pi, points.rays)
+    axis = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    across = np.stack([-axis[:, 1], axis[:, 0]], axis=1)
+    error = axis * random.normal(0, 2.0, (points.rays, 1)) + across * random.normal(0, 0.1, (points.rays, 1))
+    covariance = 2.0**2 * axis[:, :, None] * axis[:, None] + 0.1**2 * across[:, :, None] * across[:, None]
+    sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
+    return replace(
+        points, measured=points.measured + error, sigma_image=sigma, shape_image=covariance / sigma[:, None, None] ** 2
+    )
+
+
+def test_measurements_weigh_by_their_covariances(rpcs: dict[str, RPC]) -> None:
+    """Three images see each point, in directions of their own: the good one of each counts, and sigmas say how much."""
+    truth = biased(rpcs)
+    ground = places(60)
+    apart, plain, spread = [], [], []
+    for seed in range(4):
+        exact = measured(truth, ground, roles_of(15, 0, 45), sigma_ground=0.05, seed=seed)
+        points = leaning(exact, seed)
+        found = adjust(starts(truth), points)
+        assert not found.rejected
+        assert found.sigma0 == pytest.approx(1.0, abs=0.15)
+        frame = GroundFrame.about(ground)
+        apart.append(frame.apart(ground, frame.of_geodetic(found.ground))[15:])
+        spread.append(apart[-1] / found.ground_sigmas[15:])
+        other = adjust(starts(truth), replace(points, shape_image=None), robust=False)
+        plain.append(frame.apart(ground, frame.of_geodetic(other.ground))[15:])
+    better, worse = (np.sqrt(np.nanmean(np.square(kept))) for kept in (apart, plain))
+    assert better < 0.6 * worse
+    # A point whose rays do not meet to begin with, by 2 px at a bad place, is not determined, and named.
+    assert np.isnan(spread).mean() < 0.01
+    assert np.nanstd(spread) == pytest.approx(1.0, abs=0.12)
+
+
+def test_an_intersection_weighs_by_covariances(rpcs: dict[str, RPC]) -> None:
+    ground = places(400)
+    points = leaning(measured(rpcs, ground, "tie"), 3)
+    found = intersect(rpcs, points)
+    frame = GroundFrame.about(ground)
+    errors = frame.apart(ground, frame.of_geodetic(found.ground))
+    assert np.nanstd(errors / found.sigmas) == pytest.approx(1.0, abs=0.1)
+    plain = intersect(rpcs, replace(points, shape_image=None))
+    assert np.nanstd(errors) < 0.6 * np.nanstd(frame.apart(ground, frame.of_geodetic(plain.ground)))
+
+
+def test_a_gross_error_is_found_across_its_measurement_and_said_in_pixels(rpcs: dict[str, RPC]) -> None:
+    truth = biased(rpcs)
+    points = leaning(measured(truth, places(60), roles_of(15, 0, 45), sigma_ground=0.05), 1)
+    assert points.shape_image is not None
+    ray = int(np.flatnonzero((points.point == 40) & (points.image == 1))[0])
+    across = np.linalg.eigh(points.shape_image[ray])[1][:, 0]
+    moved = points.measured.copy()
+    moved[ray] += 12.0 * across
+    found = adjust(starts(truth), replace(points, measured=moved))
+    assert [one.point for one in found.rejected] == ["p40"]
+
+
 # -- honest covariance -----------------------------------------------------------------------------------------------
 
 

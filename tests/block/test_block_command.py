@@ -94,6 +94,25 @@ def run(*args: str | Path, code: int = 0) -> str:
     return done.stdout if "--json" in args else done.output
 
 
+# -- points with covariances -----------------------------------------------------------------------------------------
+
+
+def test_rays_of_a_file_have_their_covariances(tmp_path: Path) -> None:
+    path = tmp_path / "rays.csv"
+    path.write_text(
+        "id,image,col,row,sigma_image,var_col,var_row,cov_col_row\n"
+        "a,one,10,20,,0.04,0.25,0.05\na,two,11,21,0.3,,,\nb,two,50,60,,0.09,0.09,0\n"
+    )
+    points = read_block_points(path)
+    wanted = [[[0.04, 0.05], [0.05, 0.25]], 0.09 * np.eye(2), 0.09 * np.eye(2)]
+    np.testing.assert_allclose(points.covariance_image, wanted, rtol=1e-12)
+    for part in (points.select([0]), points.of_rays([0, 1])):
+        np.testing.assert_allclose(part.covariance_image, wanted[:2], rtol=1e-12)
+    np.testing.assert_allclose(points.in_image("one").covariance_image, wanted[:1], rtol=1e-12)
+    again = BlockPoints.of({name: points.in_image(name) for name in points.images})
+    np.testing.assert_allclose(again.covariance_image, wanted, rtol=1e-12)
+
+
 # -- ortho adjust ----------------------------------------------------------------------------------------------------
 
 

@@ -42,9 +42,10 @@ class Linear:
         by_params = np.zeros((points.rays, 2, problem.columns.widest))
         for model, used in zip(state.models, ordering.rays_of_image, strict=True):
             rows, scale = points.point[used], root[used][:, None, None]
-            by_point[used] = places.ground_partials(model, rows) * scale
+            by_point[used] = points.whitened(places.ground_partials(model, rows) * scale, used)
             if count := len(model.params):
-                by_params[used, :, :count] = model.param_partials(places.in_crs(model.crs)[rows]) * scale
+                partials = model.param_partials(places.in_crs(model.crs)[rows]) * scale
+                by_params[used, :, :count] = points.whitened(partials, used)
         ground_by_point, rows = np.zeros((len(points), 3, 3)), ordering.grounded
         scale = np.sqrt(weights.ground_weights[rows])[:, None] / problem.ground_sigmas[rows]
         ground_by_point[rows] = problem.enu[rows] * scale[:, :, None]

@@ -178,7 +178,7 @@ class BlockProblem:
         rays = np.zeros((points.rays, 2))
         for model, used in zip(state.models, ordering.rays_of_image, strict=True):
             predicted = places.project(model, points.point[used])
-            rays[used] = (points.measured[used] - predicted) / points.sigma_image[used][:, None]
+            rays[used] = points.whitened((points.measured[used] - predicted) / points.sigma_image[used][:, None], used)
         rays *= np.sqrt(weights.ray_weights)[:, None]
         ground, rows = np.zeros((len(points), 3)), ordering.grounded
         apart = (self.enu[rows] @ (self.target[rows] - state.local[rows])[:, :, None])[:, :, 0]

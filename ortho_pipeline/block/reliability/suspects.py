@@ -193,9 +193,9 @@ class _Suspects:
         known = _GROUND in self.parts
         if len(culprits) != 1:
             who = "its ground and its measurements contradict each other" if known else "its rays miss each other"
-            size = float(np.abs(self._apart(k, None)[: 2 * chunk.rays.shape[1]]).max())
-            sigma = float(points.sigma_image[chunk.rays[k]].max())
-            reason = f"gross error: {who} by {size * sigma:.1f} px, and it cannot be decided which is wrong"
+            missed = self._apart(k, None)[: 2 * chunk.rays.shape[1]].reshape(-1, 2)
+            size = float(np.abs(points.in_pixels(missed, chunk.rays[k])).max())
+            reason = f"gross error: {who} by {size:.1f} px, and it cannot be decided which is wrong"
             return Rejected(name, "point", None, reason)
         culprit = culprits[0]
         apart = self._apart(k, culprit)[self.parts[culprit]]
@@ -204,7 +204,7 @@ class _Suspects:
             metres = float(np.linalg.norm((apart * sigmas)[np.isfinite(sigmas)]))
             return Rejected(name, "ground", None, f"gross error: {metres:.1f} m from where its rays meet")
         ray = chunk.rays[k, culprit]
-        size = float(np.hypot(*apart) * points.sigma_image[ray])
+        size = float(np.hypot(*points.in_pixels(apart[None], np.array([ray]))[0]))
         image = points.images[points.image[ray]]
         return Rejected(name, "ray", image, f"gross error: {size:.1f} px from where the other rays and points put it")
 

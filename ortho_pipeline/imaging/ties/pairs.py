@@ -185,8 +185,16 @@ class Pair:
         finest = base
         while sigma / finest > _BLURRED and min(high - low) / (2 * finest) >= 3 * 24:
             finest *= 2
-        correction, _ = place(view, [target], max(search, 2.0 * finest), finest, window)
-        return cls(view, target, correction, base, _HEIGHTS * sigma + 2 * finest, settings)
+        while True:
+            try:
+                correction, _ = place(view, [target], max(search, 2.0 * finest), finest, window)
+            except InputError:
+                # The heights may be better than stated, and some grounds show nothing in large pixels.
+                if finest == base:
+                    raise
+                finest = max(base, finest // 2)
+            else:
+                return cls(view, target, correction, base, _HEIGHTS * sigma + 2 * finest, settings)
 
     @property
     def shift(self) -> tuple[float, float]:
