@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import click
 
-from ortho_pipeline.cli.options import adjustment_options, block_options, folder_option, json_option, sensor_options
+from ortho_pipeline.cli.options import (
+    adjustment_options,
+    block_options,
+    folder_option,
+    images_argument,
+    json_option,
+    sensor_options,
+)
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_result, print_warnings
 from ortho_pipeline.options import BlockOptions, SceneOptions
 
-_images = click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
 _models = click.option(
     "--models", multiple=True, type=click.Path(), metavar="FILE", help="A saved *_model.json of each image."
 )
 
 
 @click.command(cls=Command)
-@_images
+@images_argument
 @folder_option
 @block_options
 @_models
@@ -44,7 +50,7 @@ def adjust(
 
 
 @click.command(cls=Command)
-@_images
+@images_argument
 @block_options
 @_models
 @click.option(

@@ -1,10 +1,19 @@
-"""The command `ortho match`: control points of a scene from reference orthoimages."""
+"""The commands `ortho match` and `ortho ties`: control points from reference orthoimages, ties between scenes."""
 
 from __future__ import annotations
 
 import click
 
-from ortho_pipeline.cli.options import image_argument, json_option, matching_options, scene_options, surface_options
+from ortho_pipeline.cli.options import (
+    image_argument,
+    images_argument,
+    json_option,
+    matching_options,
+    scene_options,
+    sensor_options,
+    surface_options,
+    tie_options,
+)
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_result, print_warnings
 from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
@@ -30,6 +39,34 @@ def match(
     from ortho_pipeline.commands.control import command
 
     result = command.match(image, output, match, scene=scene, surface=surface)
+    print_result(result, as_json)
+    if not as_json:
+        print_warnings(result.document["warnings"])
+
+
+@click.command(cls=Command)
+@images_argument
+@tie_options
+@surface_options
+@click.option("--output", "-o", type=click.Path(dir_okay=False), required=True, metavar="FILE", help="Ties: .csv.")
+@sensor_options
+@json_option
+def ties(
+    images: tuple[str, ...],
+    match: MatchOptions,
+    surface: SurfaceOptions,
+    output: str,
+    scene: SceneOptions,
+    as_json: bool,
+) -> None:
+    """Find tie points between overlapping IMAGEs: places that two of them or more show, with their covariances.
+
+    The heights bring the images into one geometry, and may be wrong: --dem-sigma says by how much. 'ortho adjust' takes
+    the ties with --points, or finds them by itself with --ties auto.
+    """
+    from ortho_pipeline.commands.control import ties as command
+
+    result = command.ties(images, output, match, scene=scene, surface=surface)
     print_result(result, as_json)
     if not as_json:
         print_warnings(result.document["warnings"])

@@ -181,11 +181,13 @@ adjustment_options = click_options("points", BlockOptions, "correction", "ground
 surface_options = _grouped("surface", SurfaceOptions)
 match_options = _grouped("match", MatchOptions)
 matching_options = _grouped("match", MatchOptions, "reference", "search", "points", "dem_sigma", "reference_sigma")
+tie_options = _grouped("match", MatchOptions, "search", "points", "dem_sigma")
 dem_datum_options = _grouped("surface", SurfaceOptions, "vertical", "override_vertical")
 network_option = _grouped("scene", SceneOptions, "allow_network")
 output_options = _grouped("output", OutputOptions)
 
 image_argument = click.argument("image", type=click.Path())
+images_argument = click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
 folder_option = click.option(
     "--output", "-o", "folder", type=click.Path(file_okay=False), required=True, metavar="DIR", help="Output folder."
 )

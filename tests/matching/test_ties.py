@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from numpy.typing import NDArray
 from scenes import Case, Setting, write_raster
 
+from ortho_pipeline.block.points import read_block_points
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.control.ties import names_of
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.imaging import matching
 from ortho_pipeline.imaging.ties import Ties, TieSettings, tie
@@ -138,3 +143,39 @@ def test_scenes_of_different_places_have_no_ties(tmp_path):
     write_raster(other.scene_file, other.rendered(), "uint16", rpc=other.model)
     with pytest.raises(InputError, match=r"there are no ties: scene0.tif and scene1.tif: "):
         tie([*views, other.view(views[0].surface)], TieSettings(search=25.0))
+
+
+def run(*args: object, code: int = 0) -> str:
+    """Run a command; return what it prints."""
+    done = CliRunner().invoke(cli, [str(arg) for arg in args])
+    assert done.exit_code == code, done.output + str(done.exception)
+    return done.output
+
+
+def test_the_command_writes_ties_that_an_adjustment_reads(tmp_path):
+    scenes, _ = looks(tmp_path, [-12.0, 12.0], side=300, dem_sigma=2.0)
+    images = [scene.scene_file for scene in scenes]
+    heights = "--dem", scenes[0].dem_file, "--dem-vertical", "ellipsoid", "--dem-sigma", 3
+    said = run("ties", *images, *heights, "--search", 25, "--match-points", 40, "-o", tmp_path / "ties.csv")
+    assert "scene0.tif - scene1.tif: " in said
+    points = read_block_points(tmp_path / "ties.csv")
+    assert len(points) > 25
+    assert points.tie.all()
+    assert points.shape_image is not None
+    assert 0.01 < np.median(points.sigma_image) < 0.3
+    run("adjust", *images, "--points", tmp_path / "ties.csv", "--correction", "shift", "-o", tmp_path / "out")
+    found = json.loads((tmp_path / "out" / "block_report.json").read_text())["adjustment"]
+    assert found["sigma0"] == pytest.approx(1.0, abs=0.35)
+    apart = [np.hypot(*ray["residual"]) for ray in found["rays"] if ray["used"]]
+    assert np.median(apart) < 0.1
+    refused = run("ties", images[0], *heights, "-o", tmp_path / "one.csv", code=2)
+    assert "two images" in refused
+    assert not (tmp_path / "one.csv").exists()
+
+
+def test_images_of_one_name_are_told_apart():
+    assert names_of(["/a/fore/BAND.tif", "/a/aft/BAND.tif", "/a/other.tif"]) == [
+        "fore/BAND.tif",
+        "aft/BAND.tif",
+        "other.tif",
+    ]

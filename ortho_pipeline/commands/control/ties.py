@@ -1,0 +1,244 @@
+"""`ortho ties`: several scenes and heights in, the tie points between them out."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyproj
+
+from ortho_pipeline.block.points import BlockPoints, shape_of
+from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.block_images import labels_of
+from ortho_pipeline.commands.control.matching import search_of
+from ortho_pipeline.commands.results import Result
+from ortho_pipeline.commands.scene_fit import on_surface
+from ortho_pipeline.display.notices import Notice, to_document
+from ortho_pipeline.display.numbers import metres, px
+from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.files import write_text
+from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.points.image_errors import sigma_of_covariance
+from ortho_pipeline.raster.intensity import Intensity
+from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.surface.base import Surface
+
+if TYPE_CHECKING:
+    # What matches takes a while to load, and few commands match.
+    from ortho_pipeline.imaging.ties import Ties
+
+#: How wrong (m) the heights of a DEM may be of which nothing is said, and those of ground that is taken to be flat.
+DEM_SIGMA, FLAT_SIGMA = 10.0, 30.0
+#: Fewer ties than this between two scenes are said.
+_FEW = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Tied:
+    """Ties between scenes, and what is said of them.
+
+    Parameters
+    ----------
+    points : BlockPoints
+        Tie points with covariances, by the labels of the images.
+    ties : Ties
+    search, dem_sigma : float
+        Metres.
+    notices : tuple of Notice
+    """
+
+    points: BlockPoints
+    ties: Ties
+    search: float
+    dem_sigma: float
+    notices: tuple[Notice, ...] = field(default=())
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the section ``ties`` of documents (docs/formats/block-points.md)."""
+        names = self.points.images
+        counts = np.bincount(np.bincount(self.points.point))
+        found: dict[str, Any] = {
+            "search_m": self.search,
+            "dem_sigma_m": self.dem_sigma,
+            "tracks": len(self.points),
+            "tracks_by_images": {str(count): int(number) for count, number in enumerate(counts) if number},
+            "sigma_px": float(np.median(self.points.sigma_image)),
+            "pairs": [
+                {
+                    "images": [names[one.images[0]], names[one.images[1]]],
+                    "ties": len(self.ties.of_pair(*one.images)),
+                    "tried": one.tried,
+                    "shift_px": [-one.shift[0], -one.shift[1]],
+                    "height_m": None if one.components is None else one.components.height,
+                    "reason": one.reason,
+                }
+                for one in self.ties.pairs
+            ],
+        }
+        document: dict[str, Any] = json_value(found)
+        return document
+
+    def summary(self) -> str:
+        """Return what people read of it."""
+        said = self.to_json()
+        tracks = ", ".join(f"{number} in {count} images" for count, number in said["tracks_by_images"].items())
+        lines = [f"{counted(said['tracks'], 'tie point')}: {tracks}; {px(said['sigma_px'])} in the median"]
+        for one in said["pairs"]:
+            pair = f"{one['images'][0]} - {one['images'][1]}"
+            if one["reason"]:
+                lines.append(f"{pair}: no ties ({one['reason']})")
+                continue
+            column, row = one["shift_px"]
+            lines.append(
+                f"{pair}: {counted(one['ties'], 'tie')} of {one['tried']} tried here; models apart by column "
+                f"{column:+.2f} px, row {row:+.2f} px; heights off by {metres(one['height_m'])}"
+            )
+        return "\n".join(lines)
+
+
+def tie_scenes(
+    scenes: Mapping[str, Scene],
+    options: MatchOptions,
+    surface: Surface,
+    opened: SceneOptions = SceneOptions(),
+    threads: int | None = None,
+) -> Tied:
+    """Find tie points between scenes, by their names.
+
+    Raises
+    ------
+    InputError
+        For a scene without a model, fewer than two scenes, and scenes that cannot be tied together.
+    """
+    from ortho_pipeline.imaging.matching import View
+    from ortho_pipeline.imaging.matching.matcher import metres_per_pixel
+    from ortho_pipeline.imaging.ties import TieSettings, tie
+
+    if len(scenes) < 2:
+        raise InputError("ties are between two images or more", field="images", remedy="give more images")
+    for scene in scenes.values():
+        if not scene.models:
+            raise InputError(
+                "this image has no model of its own to begin matching with", file=scene.path, field="images",
+                remedy="measure tie points by hand",
+            )  # fmt: skip
+    views = [
+        View(Intensity(RasterSource(*(scene.rasters or (scene.path,)), **opened.access)), scene.model, surface)
+        for scene in (on_surface(one, surface) for one in scenes.values())
+    ]
+    searches = [
+        search_of(scene, options, metres_per_pixel(view)) for scene, view in zip(scenes.values(), views, strict=True)
+    ]
+    search = max(one.distance for one in searches)
+    usual = FLAT_SIGMA if surface.provenance.get("constant_height") is not None else DEM_SIGMA
+    sigma = usual if options.dem_sigma is None else options.dem_sigma
+    found = tie(views, TieSettings(search, options.points, sigma, threads or os.cpu_count() or 1))
+    notices = [*_few(found, tuple(scenes))]
+    if options.dem_sigma is None:
+        text = f"nobody says how accurate the heights are: taken to be within {metres(sigma)} (`match.dem_sigma`)"
+        notices.append(Notice("dem-sigma-by-default", text, dem_sigma_m=sigma))
+    return Tied(_points(found, tuple(scenes)), found, search, sigma, tuple(notices))
+
+
+def _points(ties: Ties, names: tuple[str, ...]) -> BlockPoints:
+    count = int(ties.track.max()) + 1
+    digits = len(str(count))
+    return BlockPoints(
+        ids=tuple(f"tie{number + 1:0{digits}}" for number in range(count)), ground=np.full((count, 3), np.nan),
+        roles=np.full(count, "tie"), sigma_ground=np.zeros((count, 3)), crs=pyproj.CRS.from_epsg(4326), images=names,
+        point=ties.track.astype(np.int64), image=ties.image.astype(np.int64), measured=ties.measured,
+        sigma_image=sigma_of_covariance(ties.covariance), source="ties by matching",
+        shape_image=shape_of(ties.covariance),
+    )  # fmt: skip
+
+
+def _few(ties: Ties, names: tuple[str, ...]) -> list[Notice]:
+    """Return notices of pairs that were not tied, and of those with few ties."""
+    found = []
+    for one in ties.pairs:
+        pair = f"{names[one.images[0]]} and {names[one.images[1]]}"
+        number = len(ties.of_pair(*one.images))
+        if number >= _FEW:
+            continue
+        why = f" ({one.reason})" if one.reason else ""
+        text = f"{counted(number, 'tie')} between {pair}, which show the same ground{why}"
+        found.append(Notice("few-ties", text, images=[names[image] for image in one.images], count=number))
+    return found
+
+
+def ties(
+    images: Sequence[str | os.PathLike[str]],
+    output: str | os.PathLike[str],
+    match: MatchOptions = MatchOptions(),
+    *,
+    scene: SceneOptions = SceneOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+) -> Result:
+    """Find tie points between overlapping scenes and write them as points of a block.
+
+    Parameters
+    ----------
+    output : path
+        A ``.csv`` file (docs/formats/block-points.md), written whole or not at all.
+
+    Raises
+    ------
+    InputError
+        For whatever the user can correct.
+    """
+    names = names_of(images)
+    files = {"ties": Path(output)}
+    if files["ties"].suffix.lower() != ".csv":
+        raise InputError("ties are not written in this format", file=output, field="output", remedy="give a .csv file")
+    for image in images:
+        inputs.check_paths(files, image, scene, PointOptions(), surface)
+    heights = inputs.open_surface(surface, scene)
+    scenes = {name: inputs.open_scene(image, scene) for name, image in zip(names, images, strict=True)}
+    tied = tie_scenes(scenes, match, heights, scene)
+    write_text(output, _csv(tied.points))
+    notices = [notice.in_image(name) for name, one in scenes.items() for notice in one.notices]
+    return Result(files, {"ties": tied.to_json(), **to_document([*notices, *tied.notices])}, tied.summary())
+
+
+def names_of(images: Sequence[str | os.PathLike[str]]) -> list[str]:
+    """Return a name for each image as files of points have it: its file, with folders ahead where files are the same.
+
+    Raises
+    ------
+    InputError
+        If an image is given twice.
+    """
+    labels_of(images)
+    parts = [PurePath(os.path.abspath(image)).parts[1:] for image in images]
+    names = [part[-1] for part in parts]
+    for depth in range(2, max(map(len, parts), default=1) + 1):
+        stems = [str(PurePath(name).with_suffix("")).lower() for name in names]
+        names = [
+            "/".join(part[-depth:]) if stems.count(stem) > 1 else name
+            for part, name, stem in zip(parts, names, stems, strict=True)
+        ]
+    return names
+
+
+def _csv(points: BlockPoints) -> str:
+    """Return tie points as a table that --points reads."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(("id", "image", "col", "row", "role", "var_col", "var_row", "cov_col_row"))
+    for point, image, place, covariance in zip(
+        points.point.tolist(), points.image.tolist(), points.measured.tolist(), points.covariance_image.tolist(),
+        strict=True,
+    ):  # fmt: skip
+        (column, both), (_, row) = covariance
+        writer.writerow(
+            [points.ids[point], points.images[image], *map(repr, place), "tie", *map(repr, (column, row, both))]
+        )
+    return out.getvalue()
