@@ -326,10 +326,15 @@ class _Run:
 
     def _without_unchanged(self, jobs: Sequence[Job]) -> Iterator[Job]:
         """Yield the jobs that dates and sizes alone do not show to be done."""
+        # A run that was killed just after it wrote a record leaves the lock of that.
+        left = any(name.endswith(".part") for name in os.listdir(self.planned.output / STATE))
         listings: dict[Path, list[str]] = {}
         for job in jobs:
             record = None if self.verify else Record.read(job.record)
             if record is not None and _untouched(record, job, listings):
+                if left:
+                    with contextlib.suppress(OrthoError):
+                        clear_up(job.record)
                 self._note(Outcome(job.name, "unchanged", files=_paths(record, job), facts=record.facts), len(jobs))
             else:
                 yield job

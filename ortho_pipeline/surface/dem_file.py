@@ -16,7 +16,7 @@ from osgeo import gdal
 from pyproj.exceptions import CRSError
 
 from ortho_pipeline.errors import CrsError, InputError
-from ortho_pipeline.geodesy.crs import ground_transform, horizontal
+from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.raster.source import first_line, open_pixels
 from ortho_pipeline.surface.base import Array
 
@@ -182,7 +182,7 @@ class DemFile:
     def _crs(self, wkt: str) -> tuple[pyproj.CRS, pyproj.CRS]:
         """Return the CRS and its horizontal part."""
         try:
-            crs = pyproj.CRS.from_wkt(wkt)
+            crs = parse_crs(wkt)
             plane = horizontal(crs)
             ground_transform(plane, "EPSG:4979")
         except (CrsError, CRSError) as error:

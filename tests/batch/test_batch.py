@@ -28,6 +28,7 @@ from ortho_pipeline.batch.records import Record, locked
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
+from ortho_pipeline.files import Outputs
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions, options_of
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -329,6 +330,20 @@ def test_a_file_of_the_current_folder_is_not_meant(block, tmp_path, monkeypatch)
     (block.folder / "camera.json").write_text("{}")
     options = batch_plan.plan(block.file).jobs[0].scene.sensor_options
     assert options == {"camera": str(block.folder / "camera.json"), "band": "2", "all": "true"}
+
+
+def test_what_a_killed_run_left_beside_a_record_goes_though_the_scene_is_unchanged(block):
+    """Killed between the rename of the record and the removal of its lock, as a run was by `make faults`."""
+    (block.folder / "raw").mkdir(exist_ok=True)
+    for path in (block.folder / "raw").iterdir():
+        path.unlink()
+    block.scene("raw/one.tif")
+    assert block.run() == {"one": "done"}
+    state = block.out / ".run"
+    left = Outputs(state, "one.json")
+    (state / f"{left.prefix}lock.part").touch()
+    assert block.run() == {"one": "unchanged"}
+    assert not list(state.glob(".*.part"))
 
 
 def test_outputs_are_no_scenes(block):
