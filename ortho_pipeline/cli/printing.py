@@ -65,6 +65,10 @@ def print_fit(result: FitResult) -> None:
         click.echo(
             f"RMSE of the check points that are not outlying: {rest['total']:.3f}  ({counted(rest['n'], 'point')})"
         )
+    if result.matching:
+        click.echo(f"Matching: {result.matching.text()}. {result.matching.floor()}")
+        if absolute := result.matching.absolute_text():
+            click.echo(absolute)
     if document["map_scale"]:
         click.echo(f"Map scale: {document['map_scale']['statement']}")
     for role, found in document["covariance"].items():

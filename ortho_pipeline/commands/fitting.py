@@ -17,6 +17,7 @@ from ortho_pipeline.commands.scene_fit import (
     heights_where_wanted,
     on_surface,
     open_adjustable,
+    relative_to_reference,
 )
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import comparison as comparing
@@ -46,7 +47,8 @@ def fit(
     heights = open_surface(surface, scene) if has_surface(surface) else None
     adjusted = adjust(opened, points, scene, heights, match)
     return FitResult(
-        adjusted.scene, adjusted.fit, adjusted.warnings(heights), tuple(adjusted.removed_json()), points.near
+        adjusted.scene, adjusted.fit, adjusted.warnings(heights), tuple(adjusted.removed_json()), points.near,
+        adjusted.matched,
     )  # fmt: skip
 
 
@@ -103,24 +105,29 @@ def compare(
         heights=heights_around(given, heights), unsuited=opened.unsuited, ridge=ridge_of(points.ridge),
         significance=points.significance,
     )  # fmt: skip
-    result = CompareResult(opened, compared)
     best = compared.best
+    if matched is not None:
+        relative = () if best is None or best.fit is None else relative_to_reference(best.fit, match)
+        compared = replace(compared, notes=(*compared.notes, *matched.notices, *relative))
+    result = CompareResult(opened, compared, matched)
     if folder is None or best is None or best.fit is None:
         return result
+    document = CompareResult(opened, compared).to_json()
+    chosen = replace(best.fit, warnings=(*best.fit.warnings, *relative_to_reference(best.fit, match)))
     stem = Path(image).stem
     files = {name: Path(folder) / f"{stem}{ENDINGS[name]}" for name in ("residuals", "style", "report", "html")}
     inputs.check_paths(files, image, scene, points, surface, match)
     if best.model in {family.name for family in families()}:
-        opened = replace(opened, models={best.model: best.fit.model}, model_source="control points")
-    adjusted = Adjusted(opened, best.fit, matched=matched)
+        opened = replace(opened, models={best.model: chosen.model}, model_source="control points")
+    adjusted = Adjusted(opened, chosen, matched=matched)
     hashed = inputs.hashed(inputs.files_read(image, scene, points, surface, match, opened))
     asked = {"scene": scene, "surface": surface, **match_asked(match)}
     record = inputs.provenance(opened, points, heights, hashed, command, asked)
     made = report.build_report(
-        scene=opened, fit=best.fit, surface=heights, comparison=result.to_json(), near=points.near,
-        provenance=record, warnings=adjusted.warnings(heights),
+        scene=opened, fit=chosen, surface=heights, comparison=document, near=points.near,
+        provenance=record, warnings=adjusted.warnings(heights), matching=adjusted.matching,
     )  # fmt: skip
-    write_report(made, best.fit, files)
+    write_report(made, chosen, files)
     return replace(result, files=files)
 
 

@@ -105,7 +105,7 @@ def rectify(
     _write_models(model, exported, opened, whole, files, {**record, "adjustment": adjusted.record()})
     made = report.build_report(
         scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
-        warp=warped, near=points.near, provenance=record,
+        warp=warped, near=points.near, provenance=record, matching=adjusted.matching,
         warnings=[*adjusted.warnings(heights), *found.notes(), *placed.sparse(warped.valid_pixels), *complaints,
                   *warped.notes(output.memory)],
     )  # fmt: skip

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
+from ortho_pipeline.commands.control.matching import Matched
 from ortho_pipeline.display import notebook
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.estimation import comparison as comparing
@@ -17,9 +18,11 @@ from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.estimation.spatial_correlation import analyse_fit
 from ortho_pipeline.files import staged, together, write_text
+from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.map_scale import map_scale
+from ortho_pipeline.report.matching import MatchingRecord, matching_record
 from ortho_pipeline.report.records import SceneReport
 
 SCHEMA_VERSION = 1
@@ -53,6 +56,12 @@ class FitResult:
     warnings: tuple[Notice, ...] = ()
     removed: tuple[Mapping[str, Any], ...] = ()
     near: float | None = None
+    matched: Matched | None = None
+
+    @property
+    def matching(self) -> MatchingRecord | None:
+        """What was matched, and what its points say of the fit; None where nothing was."""
+        return None if self.matched is None else matching_record(self.matched.to_json(), self.fit)
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho fit --json`` (docs/formats.md)."""
@@ -66,6 +75,7 @@ class FitResult:
             "model_source": self.scene.model_source,
             **document,
             "removed": [dict(one) for one in self.removed],
+            "matching": json_value(self.matching),
             "map_scale": None if scale is None else scale.to_json(),
             "covariance": {role: one and one.to_json() for role, one in analyse_fit(self.fit, near=self.near).items()},
         }
@@ -97,6 +107,7 @@ class CompareResult:
 
     scene: Scene
     comparison: comparing.Comparison
+    matched: Matched | None = None
     files: Mapping[str, Path] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
@@ -106,6 +117,7 @@ class CompareResult:
             "image": str(self.scene.path),
             "sensor": self.scene.sensor,
             **self.comparison.to_json(),
+            **({} if self.matched is None else {"matching": self.matched.to_json()}),
             "files": {name: str(path) for name, path in self.files.items()},
         }
 

@@ -25,6 +25,7 @@ from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions
 from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.points.control_hull import uncovered
+from ortho_pipeline.report.matching import RELATIVE
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.footprint import lay
@@ -71,6 +72,11 @@ class Adjusted:
         """Return what the model was adjusted by as JSON values: now, or before where it comes adjusted from a file."""
         return self.fit.to_json() if self.scene.adjusted is None else dict(self.scene.adjusted)
 
+    @property
+    def matching(self) -> dict[str, Any] | None:
+        """The section ``matching`` of documents, None where nothing was matched."""
+        return None if self.matched is None else self.matched.to_json()
+
     def removed_json(self) -> list[dict[str, Any]]:
         """Return the removed parameters as JSON values."""
         return [{"name": one.name, "t": one.t, "p": one.p} for one in self.removed]
@@ -85,7 +91,7 @@ class Adjusted:
             found += surface.provenance.get("warnings", [])
         if self.matched is not None:
             found += self.matched.notices
-        found += [*self._relative(), *self.notes]
+        found += self.notes
         found += self._doubtful()
         found += marks_warning(points.select(adjusted.used & points.control))
         inside = ((points.image >= 0) & (points.image <= (scene.width, scene.height))).all(axis=1)
@@ -107,19 +113,6 @@ class Adjusted:
             text = f"parameters that the points do not justify were removed: {names}"
             found.append(Notice("parameters-removed", text, parameters=[one.name for one in self.removed]))
         return tuple(dict.fromkeys(found))
-
-    def _relative(self) -> list[Notice]:
-        """Return a notice if all control is matched: nothing then says where the reference itself lies."""
-        points = self.fit.points
-        if not self.fit.used.any() or not (points.groups[self.fit.used] >= 0).all():
-            return []
-        sigma = None if self.matched is None else self.matched.options.reference_sigma
-        floor = f"its own {metres(sigma)} per axis are the floor" if sigma else "how accurate that is was not stated"
-        text = (
-            f"all control was matched: accuracy is relative to the reference, and {floor}; an error that scene and "
-            "reference have in common is not seen"
-        )
-        return [Notice("relative-to-reference", text, reference_sigma_m=sigma)]
 
     def _doubtful(self) -> list[Notice]:
         """Return a notice for each point that was left out, and for each that contradicts the others and was not."""
@@ -231,7 +224,8 @@ def adjust(
     done = _from_points(scene, options, points, surface) if options.fit_model else _corrected(
         scene, options, opened, points, surface
     )  # fmt: skip
-    adjusted = dataclasses.replace(done.fit, significance=options.significance)
+    warnings = *done.fit.warnings, *relative_to_reference(done.fit, match)
+    adjusted = dataclasses.replace(done.fit, significance=options.significance, warnings=warnings)
     done = dataclasses.replace(done, fit=adjusted, matched=matched, notes=notes)
     if not options.prune:
         return done
@@ -240,6 +234,21 @@ def adjust(
         scene = dataclasses.replace(done.scene, models={options.fit_model: pruned.fit.model})
         done = dataclasses.replace(done, scene=scene)
     return dataclasses.replace(done, fit=pruned.fit, removed=tuple(pruned.removed))
+
+
+def relative_to_reference(adjusted: Fit, match: MatchOptions) -> list[Notice]:
+    """Return a notice if control was matched, here or by `ortho match`: it does not say where the reference lies."""
+    count, control = int((adjusted.points.groups[adjusted.used] >= 0).sum()), int(adjusted.used.sum())
+    if not count:
+        return []
+    sigma = match.reference_sigma
+    part = "all control was matched" if count == control else f"{count} of {control} control points were matched"
+    floor = f"its own {metres(sigma)} per axis are the floor" if sigma else "how accurate that is was not stated"
+    text = (
+        f"{part}: the accuracy is relative to the reference, and {floor}; an error that scene and reference have in "
+        "common is not seen"
+    )
+    return [Notice(RELATIVE, text, reference_sigma_m=sigma, matched=count, control=control)]
 
 
 def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:

@@ -188,7 +188,7 @@ class Solution:
         count = self.cofactors.shape[0]
         jacobian, residuals = self.errors.whitened(self.jacobian), self.errors.whitened(self.residuals)
         for group in groups:
-            rows = jacobian[group].reshape(-1, count)
+            rows = jacobian[group].reshape(2 * len(group), count)
             matrix = np.eye(len(rows)) - rows @ self.cofactors @ rows.T
             if np.linalg.eigvalsh(matrix)[0] > 1e-9:
                 solved = np.linalg.solve(matrix, residuals[group].ravel())

@@ -34,6 +34,7 @@ from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.adjustment_records import Adjustment, RmseOfView, RmsesOfView, RmsesOnGround, is_known
 from ortho_pipeline.report.delivered import accuracy_before
 from ortho_pipeline.report.map_scale import map_scale
+from ortho_pipeline.report.matching import matching_record
 from ortho_pipeline.report.plots import plots
 from ortho_pipeline.report.records import (
     ComparisonRecord,
@@ -97,6 +98,7 @@ def build_report(
     grid: Grid | None = None,
     warp: WarpResult | None = None,
     comparison: Mapping[str, Any] | None = None,
+    matching: Mapping[str, Any] | None = None,
     near: float | None = None,
     provenance: Mapping[str, Any] | None = None,
     warnings: Iterable[Notice] = (),
@@ -111,6 +113,8 @@ def build_report(
         Share (0 to 1) of the scene for which the DEM has a height.
     comparison : mapping, optional
         The document of ``ortho compare``.
+    matching : mapping, optional
+        From `commands.control.matching.Matched.to_json`.
     provenance : mapping, optional
         From `commands.inputs.provenance`.
     near : float, optional
@@ -122,6 +126,7 @@ def build_report(
     heights, doubts = (None, []) if surface is None else _heights_of_points(fit, surface, seen)
     noted = to_document([*warnings, *doubts])
     adjustment, rmse_m = _adjustment(fit, noted), record_of(RmsesOnGround, rmse_metres(fit))
+    matched = None if matching is None else matching_record(matching, fit)
     hull = control_hull(fit.points.image[fit.used], (scene.width, scene.height))
     return SceneReport(
         scene=_scene(scene, seen),
@@ -132,6 +137,7 @@ def build_report(
         map_scale=_map_scale(fit, seen),
         control_hull=None if hull is None else record_of(ControlHull, hull),
         comparison=None if comparison is None else record_of(ComparisonRecord, json_value(comparison)),
+        matching=matched,
         heights=heights,
         surface=None if surface is None else _surface(surface, coverage),
         rpc=None if exported is None else RpcRecord(exact=exported.exact, max_error_px=exported.max_error_px),
@@ -140,7 +146,9 @@ def build_report(
         provenance=record_of(Provenance, json_value(provenance or {})),
         warnings=tuple(noted["warnings"]),
         notices=tuple(noted["notices"]),
-        headline=headline(adjustment, rmse_m, accuracy_before(scene), adjusted=scene.adjusted is not None),
+        headline=headline(
+            adjustment, rmse_m, accuracy_before(scene), adjusted=scene.adjusted is not None, matching=matched
+        ),
     )
 
 

@@ -104,11 +104,13 @@ def _evidence(fit: Fit) -> dict[str, Array]:
     """Return residuals (px) by what they are evidence of, the best first; NaN for points that are none."""
     if not len(fit.points):
         return {}
-    found = {"check": np.where(fit.points.check[:, None], fit.residuals, np.nan)}
+    # A scale is a claim about the ground: points that were matched are relative to another image.
+    measured = (fit.points.groups < 0)[:, None]
+    found = {"check": np.where(fit.points.check[:, None] & measured, fit.residuals, np.nan)}
     if not len(fit.param_names):
-        found["delivered"] = np.where(fit.used[:, None], fit.residuals, np.nan)
+        found["delivered"] = np.where(fit.used[:, None] & measured, fit.residuals, np.nan)
     elif fit.redundancy > 0:
-        found["loo"] = fit.loo_residuals
+        found["loo"] = np.where(measured, fit.loo_residuals, np.nan)
     return found
 
 

@@ -18,6 +18,7 @@ from ortho_pipeline.report.adjustment_records import (
     RmsesOfView,
     RmsesOnGround,
 )
+from ortho_pipeline.report.matching import MatchingRecord
 
 Size = tuple[Annotated[int, Shape(minimum=1)], Annotated[int, Shape(minimum=1)]]
 
@@ -352,6 +353,7 @@ class SceneReport:
     map_scale: MapScaleRecord | None = None
     control_hull: ControlHull | None = None
     comparison: ComparisonRecord | None
+    matching: MatchingRecord | None = None
     heights: PointHeights | None
     surface: FlatGround | Dem | None
     rpc: RpcRecord | None

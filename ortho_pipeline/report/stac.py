@@ -21,6 +21,7 @@ from ortho_pipeline.files import sha256, staged, whole_or_nothing, write_json
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.raster.valid_area import grid_of, to_geojson, valid_outline
+from ortho_pipeline.report.matching import is_relative
 from ortho_pipeline.report.records import SceneReport, View
 
 if TYPE_CHECKING:
@@ -203,6 +204,13 @@ def _view(view: View | None) -> dict[str, Any]:
 def _accuracy(report: SceneReport) -> dict[str, Any]:
     """Return what points that took no part say: a radial RMSE in metres, bias and spread of check points."""
     found: dict[str, Any] = {}
+    if report.matching or is_relative(report.adjustment):
+        # Matches say nothing of where the reference lies; only points that somebody measured do.
+        tested = report.matching and report.matching.absolute
+        if not tested or tested.m is None:
+            return {}
+        return {"accuracy:geometric_rmse": round(tested.m, 4), "ortho:accuracy_from": "check points",
+                "ortho:accuracy_points": tested.n}  # fmt: skip
     for rmse, what in ((report.rmse_m.check, "check points"), (report.rmse_m.loo, "leave-one-out residuals")):
         if rmse:
             found = {"accuracy:geometric_rmse": round(rmse.total, 4), "ortho:accuracy_from": what,

@@ -9,6 +9,7 @@ from ortho_pipeline.display.notices import Notice, texts_but
 from ortho_pipeline.display.numbers import metres, px, share, short, signed, size_text
 from ortho_pipeline.errors import counted
 from ortho_pipeline.report.adjustment_records import Adjustment, Bias, Parameter, Rmse, RmseOnGround, RmsesOnGround
+from ortho_pipeline.report.matching import MatchingRecord, Tested, is_relative
 from ortho_pipeline.report.records import Dem, FlatGround, Headline, SceneReport
 
 #: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
@@ -28,7 +29,12 @@ def few_check_points(count: int) -> Notice:
 
 
 def headline(
-    adjustment: Adjustment, rmse_m: RmsesOnGround | None, before: Headline | None = None, *, adjusted: bool = False
+    adjustment: Adjustment,
+    rmse_m: RmsesOnGround | None,
+    before: Headline | None = None,
+    *,
+    adjusted: bool = False,
+    matching: MatchingRecord | None = None,
 ) -> Headline:
     """Say how accurate the result is, in words, from the best evidence that there is.
 
@@ -40,6 +46,8 @@ def headline(
         What is said where there are no points (`delivered.accuracy_before`).
     adjusted : bool
         Whether the model was adjusted before.
+    matching : MatchingRecord, optional
+        Where points were matched: their figures are relative to the reference.
     """
     if not adjustment.points:
         return before or Headline(
@@ -47,8 +55,11 @@ def headline(
         )
     rmse, ground = adjustment.rmse, rmse_m or RmsesOnGround(control=None, check=None, loo=None)
     notes = [*_fit_notes(adjustment), *_outlying_notes(adjustment)]
+    if matching is not None and matching.relative is not None:
+        return _of_matches(matching, matching.relative, notes)
+    to = ", relative to the reference" if is_relative(adjustment) else ""
     if check := rmse.check:
-        what = f"RMSE at {counted(check.n, 'check point')} that took no part in the adjustment"
+        what = f"RMSE at {counted(check.n, 'check point')} that took no part in the adjustment{to}"
         if check.n < ENOUGH_CHECK_POINTS:
             notes.append(FEW)
         return _headline(check, ground.check, what, notes)
@@ -62,10 +73,22 @@ def headline(
         return _headline(rmse.control, ground.control, what, notes)
     notes.append("No check points were kept apart.")
     if rmse.loo and adjustment.redundancy:
-        what = f"RMSE when each of {counted(rmse.loo.n, 'control point')} is left out in turn"
+        what = f"RMSE when each of {counted(rmse.loo.n, 'control point')} is left out in turn{to}"
         return _headline(rmse.loo, ground.loo, what, notes)
     what = "nothing is left over to test the fit with"
     return Headline(figure="Not tested", metres=None, what=what, notes=tuple(notes))
+
+
+def _of_matches(matching: MatchingRecord, relative: Tested, notes: list[str]) -> Headline:
+    """Say how well matches that were held out agree, and apart from that what measured points tell."""
+    if said := matching.absolute_text():
+        few = matching.absolute is not None and matching.absolute.n < ENOUGH_CHECK_POINTS
+        notes = [f"{said} {FEW}" if few else said, *notes]
+    cells = "in cells of the image that took no part in the adjustment, relative to the reference"
+    return Headline(
+        figure=px(relative.px), metres=None if relative.m is None else metres(relative.m),
+        what=f"RMSE at {counted(relative.n, 'match', 'matches')} {cells}", notes=(matching.floor(), *notes),
+    )  # fmt: skip
 
 
 def _headline(rmse: Rmse, ground: RmseOnGround | None, what: str, notes: Iterable[str]) -> Headline:
@@ -114,6 +137,8 @@ def summary_text(report: SceneReport) -> str:
         rows.append(("model", f"{adjustment.model}: {', '.join(values)}"))
     else:
         rows.append(("model", adjustment.model))
+    if report.matching:
+        rows.append(("matching", report.matching.text()))
     ground = f" ({head.metres})" if head.metres else ""
     rows.append(("accuracy", f"{head.figure}{ground}: {head.what}"))
     rows += [("", note) for note in head.notes]

@@ -160,6 +160,12 @@ def test_leave_one_out_leaves_a_whole_group_out(rpc: RPC) -> None:
     np.testing.assert_array_equal(alone.loo_residuals[5:], found.loo_residuals[5:])
 
 
+def test_a_model_without_parameters_is_held_against_points_of_groups(rpc: RPC) -> None:
+    points = measured(rpc, "shift", 12, 9, groups=np.repeat(np.arange(6), 2))
+    found = fit(ImageCorrection.identity(rpc, "none", (0.0, 0.0)), points)
+    np.testing.assert_allclose(found.loo_residuals, found.residuals)
+
+
 def test_parts_of_a_cross_validation_keep_groups_together(rpc: RPC) -> None:
     points = measured(rpc, "shift", 12, 9, groups=np.repeat(np.arange(6), 2))
     found = fit(ImageCorrection.identity(rpc, "shift", ORIGIN), points, robust=False)

@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import json
+import math
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 from click.testing import CliRunner, Result
 from osgeo import gdal
-from scenes import Case, Setting, write_raster
+from scenes import UTM, Case, Setting, View, write_raster
 
 import ortho_pipeline as op
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.control.matching import search_of
+
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 
 #: Small, with errors that are not noise: an affine one of the model, of the reference as a whole, and of the DEM.
-SETTING = Setting(side=420, seed=5, error=9.0, margin=40.0)
-FEW = ("--match-points", "120")
+SETTING = Setting(
+    side=360, seed=5, error=9.0, margin=40.0, fine=1.0, scene=View(noise=0.03), reference=View(noise=0.03)
+)
+FEW = ("--match-points", "80")
 
 
 @pytest.fixture(scope="module")
@@ -43,39 +51,204 @@ def document(done: Result) -> dict:
     return json.loads(done.stdout)
 
 
-def test_match_writes_points_that_say_where_the_truth_is(case: Case, tmp_path: Path) -> None:
-    found = document(matched(case, "match", "-o", tmp_path / "points.geojson", "--json"))["matching"]
+@pytest.fixture(scope="module")
+def written_points(case: Case, tmp_path_factory) -> tuple[Path, dict]:
+    """Return a file of matches, and what `ortho match` said."""
+    path = tmp_path_factory.mktemp("points") / "points.geojson"
+    return path, document(matched(case, "match", "-o", path, "--json"))
+
+
+@pytest.fixture(scope="module")
+def rectified(case: Case, tmp_path_factory) -> Path:
+    """Return the folder of an ortho that was made with a reference, in one command."""
+    folder = tmp_path_factory.mktemp("rectified")
+    done = matched(case, "rectify", "-o", folder, "--stac", "--acquired", "2020-01-01T00:00:00Z", "-of", "GTiff")
+    assert done.exit_code == 0, done.output
+    return folder
+
+
+def test_match_writes_points_that_say_where_the_truth_is(case: Case, written_points: tuple[Path, dict]) -> None:
+    path, said = written_points
+    found = said["matching"]
     assert found["kept"] + sum(found["reasons"].values()) == found["tried"]
     assert np.sum(found["coverage"]["kept"]) == found["kept"] == found["control"] + found["check"]
     assert 0.1 < found["check"] / found["kept"] < 0.3
     off = -(case.misfit(case.model)[0][4])
     np.testing.assert_allclose(found["shift_px"], off, atol=0.1)
-    points = op.read_points(tmp_path / "points.geojson")
+    points = op.read_points(path)
     truth = case.camera.image_of(points.to_crs("EPSG:32735").ground)
     assert np.sqrt(((truth - points.image) ** 2).mean()) < 0.15
     assert (points.groups >= 0).all()
     assert np.linalg.eigvalsh(points.covariance_image).min() > 0
 
 
-def test_csv_says_the_same_as_geojson(case: Case, tmp_path: Path) -> None:
-    for name in ("points.geojson", "points.csv"):
-        assert matched(case, "match", "-o", tmp_path / name).exit_code == 0
-    one, other = (op.read_points(tmp_path / name) for name in ("points.geojson", "points.csv"))
+def test_csv_says_the_same_as_geojson(case: Case, written_points: tuple[Path, dict], tmp_path: Path) -> None:
+    done = matched(case, "match", "-o", tmp_path / "points.csv")
+    assert done.exit_code == 0
+    assert f"{written_points[1]['matching']['kept']} of " in done.output
+    one, other = (op.read_points(path) for path in (written_points[0], tmp_path / "points.csv"))
     np.testing.assert_allclose(one.image, other.image, atol=1e-9)
     np.testing.assert_allclose(one.covariance_image, other.covariance_image, rtol=1e-9)
     assert (one.roles == other.roles).all()
     assert (one.groups == other.groups).all()
 
 
-def test_rectify_with_a_reference_lies_where_the_truth_is(case: Case, tmp_path: Path) -> None:
-    done = matched(case, "rectify", "-o", tmp_path / "out")
-    assert done.exit_code == 0, done.output
-    report = json.loads((tmp_path / "out" / "scene_report.json").read_text())
-    model = op.load_model(tmp_path / "out" / "scene_model.json")
+def test_rectify_with_a_reference_lies_where_the_truth_is(case: Case, rectified: Path) -> None:
+    report = json.loads((rectified / "scene_report.json").read_text())
+    model = op.load_model(rectified / "scene_model.json")
     assert np.abs(case.misfit(model)[0]).max() < 0.15
     assert {one["role"] for one in report["provenance"]["inputs"]} >= {"image", "reference", "DEM"}
     assert report["provenance"]["options"]["match"]["search"] == 30
     assert "relative-to-reference" in {one["code"] for one in report["notices"]}
+
+
+# -- honest ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def moved(tmp_path_factory) -> Case:
+    """A case whose reference lies 5 m east and 3 m south of the truth."""
+    return Case(replace(SETTING, offset=(5.0, -3.0)), tmp_path_factory.mktemp("moved")).write()
+
+
+def surveyed(case: Case, count: int = 6) -> op.Points:
+    """Return points that somebody measured without error."""
+    image = np.random.default_rng(2).uniform(0.1, 0.9, (count, 2)) * case.frame
+    return op.Points(
+        ids=tuple(f"m{k}" for k in range(count)), image=image, ground=case.ground_of(image),
+        roles=np.full(count, "control"), sigma_image=np.full(count, 0.1), sigma_ground=np.zeros((count, 3)),
+        crs=pyproj.CRS(UTM), source="survey",
+    )  # fmt: skip
+
+
+def test_measured_points_see_what_matches_cannot(moved: Case, tmp_path: Path) -> None:
+    op.write_points(surveyed(moved), tmp_path / "survey.csv")
+    words = ("--gcps", tmp_path / "survey.csv", "--reference-sigma", 2)
+    done = matched(moved, "rectify", "-o", tmp_path / "out", "-of", "GTiff", *words)
+    assert done.exit_code == 0, done.output
+    report = json.loads((tmp_path / "out" / "scene_report.json").read_text())
+    matching, control = report["matching"], [one for one in report["adjustment"]["points"] if one["role"] == "control"]
+    assert len(control) == matching["control"]
+    # The reference is off by hypot(5, 3) m: the points that were matched do not know, those measured do.
+    assert matching["absolute"]["n"] == 6
+    assert matching["absolute"]["m"] == pytest.approx(math.hypot(5, 3), abs=0.2)
+    assert matching["relative"]["n"] == matching["check"]
+    assert matching["relative"]["m"] < 0.3
+    head = report["headline"]
+    assert "relative to the reference" in head["what"]
+    assert any(note.startswith("Absolute: ") and "6 measured points" in note for note in head["notes"])
+    assert any("2.00 m per axis" in note for note in head["notes"])
+    # Six measured points test the scale of a map; matches do not.
+    assert (report["map_scale"]["evidence"], report["map_scale"]["n"]) == ("check", 6)
+    page = (tmp_path / "out" / "scene_report.html").read_text()
+    assert "relative to the reference" in page
+    assert "check points: measured, absolute" in page
+
+
+def test_measured_points_control_if_the_user_says_so(moved: Case, tmp_path: Path) -> None:
+    op.write_points(surveyed(moved), tmp_path / "survey.csv")
+    words = ("--gcps", tmp_path / "survey.csv", "--gcps-as", "control", "--select", "even:4", "--json")
+    found = document(matched(moved, "fit", *words))
+    roles = Counter(one["role"] for one in found["points"])
+    assert roles["control"] == found["matching"]["control"] + 4
+    assert found["matching"]["absolute"]["n"] == 2
+    notice = next(one for one in found["notices"] if one["code"] == "relative-to-reference")
+    assert notice["control"] - notice["matched"] == sum(
+        one["used"] for one in found["points"][:6]
+    )  # those that contradict the many are left out, and named
+
+
+def test_nothing_absolute_is_said_of_matches_alone(
+    case: Case, rectified: Path, written_points: tuple[Path, dict], tmp_path: Path
+) -> None:
+    # In one command, from a file of matches, of a STAC item, and of the model file that came of it.
+    own = json.loads((rectified / "scene_report.json").read_text())
+    filed = ortho("fit", case.scene_file, "--gcps", written_points[0], *heights(case), "--json")
+    for found in (own, document(filed)):
+        assert found["map_scale"] is None
+        assert "relative-to-reference" in {one["code"] for one in found["notices"]}
+    assert own["matching"]["absolute"] is None
+    item = json.loads((rectified / "scene_stac.json").read_text())["properties"]
+    assert not [name for name in item if name.startswith("accuracy:geometric")]
+    words = ("--model", rectified / "scene_model.json", *heights(case), "-o", tmp_path / "again", "-of", "GTiff")
+    again = ortho("rectify", case.scene_file, *words)
+    assert again.exit_code == 0, again.output
+    assert "relative to the reference" in again.output
+
+
+def test_a_reference_made_of_the_scene_is_a_notice(case: Case, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert ortho("rectify", case.scene_file, *heights(case), "-o", out, "-r", "cubic", "-of", "GTiff").exit_code == 0
+    words = (case.scene_file, "--reference", out / "scene_ortho.tif", *heights(case), *FEW, "--search", 20, "--json")
+
+    def notices() -> set[str]:
+        found = document(ortho("match", *words, "-o", tmp_path / "points.csv"))
+        return {one["code"] for one in found["notices"]}
+
+    # Its report names the scene; without it, no two images are that much alike.
+    assert "reference-made-of-scene" in notices()
+    (out / "scene_report.json").unlink()
+    assert "reference-made-of-scene" in notices()
+
+
+def test_the_matches_choose_the_correction(tmp_path: Path) -> None:
+    # Slopes of up to 2 px at the rim; a shift would leave them.
+    case = Case(replace(SETTING, kind="affine", slope=2.0), tmp_path / "affine").write()
+    found = document(matched(case, "fit", "--json"))
+    assert found["model"] == "rpc+affine"
+    assert {one["code"]: one for one in found["notices"]}["correction-by-matches"]["correction"] == "affine"
+    assert document(matched(case, "fit", "--correction", "shift", "--json"))["model"] == "rpc+shift"
+
+
+# -- how far to search -----------------------------------------------------------------------------------------------
+
+
+def test_the_search_is_what_the_scene_says_of_itself() -> None:
+    rpc = op.open_scene(SAMPLE / "scene.tif")
+    options = op.MatchOptions(reference=("ortho.tif",))
+    model = replace(rpc.model, err_bias=3.0, err_rand=4.0)
+    stated = replace(rpc, models={"rpc": model}, facts={})
+    assert search_of(stated, options, 0.5).distance == pytest.approx(15.0)
+    assert search_of(stated, replace(options, search=7.0), 0.5).distance == 7.0
+    # Never less than a few pixels: ERR_BIAS of a centimetre is a vendor's way to say nothing.
+    assert (
+        search_of(replace(stated, models={"rpc": replace(model, err_bias=0.01, err_rand=0.0)}), options, 0.5).distance
+        == 4.0
+    )
+    unknown = replace(stated, models={"rpc": replace(model, err_bias=None, err_rand=None)})
+    assert search_of(replace(unknown, facts={"position_sigma_m": 5.0}), options, 0.5).distance == pytest.approx(
+        15 * math.sqrt(2)
+    )
+    found = search_of(unknown, options, 1.0)
+    assert (found.distance, found.known) == (100.0, False)
+    assert search_of(unknown, options, 0.01).distance == pytest.approx(0.25 * 0.01 * min(unknown.width, unknown.height))
+
+
+def test_the_search_of_a_frame_is_what_its_orientation_is_known_to() -> None:
+    bilsat = op.open_scene(SAMPLE / "bilsat" / "bilsat.tif")
+    found = search_of(bilsat, op.MatchOptions(), 12.0)
+    assert found.known
+    # Attitude and position of the survey move the image as its sigmas say: 3 sigma of a metre to kilometres.
+    assert 36.0 < found.distance < 50_000.0
+
+
+# -- many scenes -----------------------------------------------------------------------------------------------------
+
+
+def test_a_run_matches_each_scene(case: Case, tmp_path: Path) -> None:
+    pipeline = tmp_path / "p.yaml"
+    for name in ("scene.tif", "reference.tif", "dem.tif"):
+        (tmp_path / name).symlink_to(case.folder / name)
+    pipeline.write_text(
+        "defaults:\n  surface: {dem: dem.tif, vertical: ellipsoid}\n"
+        "  match: {reference: reference.tif, search: 30, points: 60}\nscenes:\n  - image: scene.tif\n"
+    )
+    root = ("--root", Path("/"))
+    done = ortho("run", pipeline, *root, "--workers", 1)
+    assert done.exit_code == 0, done.output
+    report = json.loads((tmp_path / "out" / "scene" / "scene_report.json").read_text())
+    assert report["matching"]["search_m"] == 30
+    assert json.loads(ortho("run", pipeline, *root, "--list", "--json").stdout)["scenes"][0]["state"] == "done"
 
 
 # -- refused ---------------------------------------------------------------------------------------------------------

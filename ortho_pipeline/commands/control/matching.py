@@ -22,6 +22,7 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, SceneOptions
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.report.document import read_report
 from ortho_pipeline.surface.base import Surface
 
 if TYPE_CHECKING:
@@ -32,10 +33,11 @@ if TYPE_CHECKING:
 DEFAULT_SEARCH, _PART = 100.0, 0.25
 #: Many times the sigma that a scene states are searched, and never less than so many pixels.
 _SIGMAS, _LEAST = 3.0, 8.0
-#: Median correlation of chips from which the reference is probably made of the scene itself.
-_SAME = 0.995
-#: Fields per side of the image in which matches are counted.
-_FIELDS = 10
+#: A reference is probably made of the scene itself where the chips are as alike as that in the median, and the matches
+#: agree to so many pixels: two images of one place have noise, heights and light of their own, and do not.
+_SAME, _EXACT = 0.97, 0.02
+#: Fields of the image in which matches are counted hold about so many that were tried; at most so many per side.
+_PER_FIELD, _FIELDS = 5, 10
 
 
 @dataclass(frozen=True)
@@ -130,10 +132,10 @@ class Matched:
     def _coverage(self) -> dict[str, Any]:
         """Return how many matches were tried and kept in each field of the image, rows of columns."""
         counts = {}
+        side = int(np.clip(round(math.sqrt(len(self.kept) / _PER_FIELD)), 1, _FIELDS))
         for name, mask in (("tried", np.ones(len(self.kept), dtype=bool)), ("kept", self.kept)):
-            part = np.clip(self.matches.image[mask] / self.size * _FIELDS, 0, _FIELDS - 1).astype(int)
-            number = np.bincount(part[:, 1] * _FIELDS + part[:, 0], minlength=_FIELDS**2)
-            counts[name] = number.reshape(_FIELDS, _FIELDS)
+            part = np.clip(self.matches.image[mask] / self.size * side, 0, side - 1).astype(int)
+            counts[name] = np.bincount(part[:, 1] * side + part[:, 0], minlength=side**2).reshape(side, side)
         share = float((counts["kept"] > 0).mean())
         return {"share": share, **{name: number.tolist() for name, number in counts.items()}}
 
@@ -155,7 +157,7 @@ class Matched:
              + (f", +-{metres(sigma)} per axis" if sigma else ", its own accuracy is not stated")),
             ("matches", f"{said['kept']} of {said['tried']} tried{': ' + reasons if reasons else ''}"),
             ("", f"{said['control']} control, {said['check']} check (every fifth cell), in "
-             f"{said['coverage']['share']:.0%} of {_FIELDS} x {_FIELDS} fields of the image"),
+             f"{said['coverage']['share']:.0%} of the fields of the image"),
             ("search", f"{metres(self.search.distance)} ({self.search.source}); {levels}"),
             ("model off", f"column {column:+.2f} px, row {row:+.2f} px (measured minus delivered model), "
              f"{metres(said['shift_m'])}"),
@@ -300,19 +302,36 @@ def _refuse_scene(scene: Scene, reference: Reference) -> None:
 
 def _made_of_scene(scene: Scene, references: tuple[Reference, ...], matches: Matches) -> list[Notice]:
     """Return a notice if the reference looks as if it were made of the scene."""
-    name, alike = Path(scene.path).name, median_correlation(matches)
-    for one in references:
-        described = one.intensity.source.dataset.GetMetadata() or {}
-        if any(name in str(text) for text in described.values()):
-            text = f"{Path(one.path).name} names {name} in its metadata: if it was made of this scene, the matches "
-            return [Notice("reference-made-of-scene", f"{text}say nothing of where it lies", correlation=alike)]
-    if alike < _SAME:
+    name, alike, agreement = Path(scene.path).name, median_correlation(matches), _agreement(matches)
+    why = next((f"{Path(one.path).name} names {name} as its source" for one in references if _names(one, name)), None)
+    if why is None and alike >= _SAME and agreement < _EXACT:
+        why = f"scene and reference are the same to {px(agreement)} (correlation {alike:.3f}), as two images hardly are"
+    if why is None:
         return []
-    text = (
-        f"scene and reference are alike to the noise (correlation {alike:.3f} in the median): if the reference was "
-        "made of this scene, the matches say nothing of where it lies"
-    )
+    text = f"{why}: if the reference was made of this scene, the matches say nothing of where it lies"
     return [Notice("reference-made-of-scene", text, correlation=alike)]
+
+
+def _names(reference: Reference, image: str) -> bool:
+    """Tell whether a reference says that it was made of an image: in its metadata, or in the report beside it."""
+    described = reference.intensity.source.dataset.GetMetadata() or {}
+    if any(image in str(text) for text in described.values()):
+        return True
+    report = Path(reference.path.replace("_ortho.tif", "_report.json"))
+    if report.suffix != ".json" or not report.is_file():
+        return False
+    try:
+        return bool(read_report(report).scene.name == image)
+    except InputError:
+        return False
+
+
+def _agreement(matches: Matches) -> float:
+    """Return how far (px per axis) the matches are from an affine transformation of the model, robustly."""
+    kept = matches.reason == ""
+    design = np.column_stack([np.ones(int(kept.sum())), matches.image[kept]])
+    residuals = matches.offset[kept] - design @ np.linalg.lstsq(design, matches.offset[kept], rcond=None)[0]
+    return float(1.4826 * np.median(np.abs(residuals)))
 
 
 def median_correlation(matches: Matches) -> float:

@@ -1,0 +1,132 @@
+"""Matching with reference orthoimages as records: what was found, and what its points say of the adjusted model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_pipeline.display.numbers import metres, px, share
+from ortho_pipeline.errors import counted
+from ortho_pipeline.estimation.fit import Fit
+from ortho_pipeline.estimation.ground_residuals import in_metres
+from ortho_pipeline.files.documents import json_value, record, record_of
+from ortho_pipeline.report.adjustment_records import Adjustment, Count, Pair
+
+#: Code of the notice of an adjustment to matches: its figures are no absolute ones.
+RELATIVE = "relative-to-reference"
+
+
+@record
+class MatchLevel:
+    """A level of the search: chips of pixels that are `factor` image pixels wide."""
+
+    factor: Count
+    radius: Count
+    chips: Count
+    agreeing: Count
+    shift_px: Pair
+
+
+@record
+class MatchComponents:
+    """What the covariances of the matches are made of (docs/matching.md)."""
+
+    matching: float
+    height_m: float
+    other_px: float
+
+
+@record
+class MatchCoverage:
+    """Matches that were tried and kept in the fields of the image, rows of columns; share of fields with some."""
+
+    share: float
+    tried: tuple[tuple[Count, ...], ...]
+    kept: tuple[tuple[Count, ...], ...]
+
+
+@record
+class Tested:
+    """Root mean square at points that took no part, in pixels and in metres on the ground."""
+
+    n: Count
+    px: float
+    m: float | None
+
+
+@record
+class MatchingRecord:
+    """Matching of the scene with reference orthoimages; `shift_px` is measured minus delivered model.
+
+    `relative` is at matches that were held out, `absolute` at check points that somebody measured.
+    """
+
+    references: tuple[str, ...]
+    reference_sigma_m: float | None
+    dem_sigma_m: float | None
+    search_m: float
+    search_from: str
+    pixel_m: float
+    tried: Count
+    kept: Count
+    control: Count
+    check: Count
+    reasons: dict[str, int]
+    levels: tuple[MatchLevel, ...]
+    shift_px: Pair
+    shift_m: float
+    components: MatchComponents
+    sigma_px: float
+    correlation: float
+    coverage: MatchCoverage
+    relative: Tested | None
+    absolute: Tested | None
+
+    def floor(self) -> str:
+        """Say what the figures of matches leave out."""
+        if self.reference_sigma_m is None:
+            return "How accurate the reference itself is was not stated; it is not in the figure."
+        return (
+            f"The reference's own {metres(self.reference_sigma_m)} per axis are not in the figure: they are its floor."
+        )
+
+    def absolute_text(self) -> str | None:
+        """Say what points that somebody measured tell; None without any that took no part."""
+        if self.absolute is None:
+            return None
+        ground = "" if self.absolute.m is None else f" ({metres(self.absolute.m)})"
+        points = counted(self.absolute.n, "measured point")
+        return f"Absolute: {px(self.absolute.px)}{ground} RMSE at {points} that took no part."
+
+    def text(self) -> str:
+        """Say in a line what was matched."""
+        names = ", ".join(one.rpartition("/")[2] for one in self.references)
+        fields = f"in {share(self.coverage.share)} of the fields of the image"
+        return f"{self.kept} of {self.tried} matches with {names}, {fields}"
+
+
+def matching_record(matching: Mapping[str, Any], fit: Fit) -> MatchingRecord:
+    """Return the record of a matching (`Matched.to_json`) with what its points and those measured say of a fit."""
+    matched = fit.points.groups >= 0
+    tested = {
+        "relative": _tested(fit, fit.points.check & matched), "absolute": _tested(fit, fit.points.check & ~matched)
+    }  # fmt: skip
+    return record_of(MatchingRecord, json_value({**matching, **tested}))
+
+
+def is_relative(adjustment: Adjustment) -> bool:
+    """Tell whether an adjustment was to matches, now or when its model file was written."""
+    return any(one["code"] == RELATIVE for one in adjustment.notices)
+
+
+def _tested(fit: Fit, mask: NDArray[np.bool_]) -> Tested | None:
+    rows = mask & np.isfinite(fit.residuals).all(axis=1)
+    if not rows.any():
+        return None
+    shifts = in_metres(fit, fit.residuals)[rows]
+    ground = float(np.sqrt((shifts**2).sum(axis=1).mean())) if np.isfinite(shifts).all() else None
+    image = float(np.sqrt((fit.residuals[rows] ** 2).sum(axis=1).mean()))
+    return Tested(n=int(rows.sum()), px=image, m=ground)
