@@ -127,7 +127,7 @@ def compare(
         scene=opened, fit=chosen, surface=heights, comparison=document, near=points.near,
         provenance=record, warnings=adjusted.warnings(heights), matching=adjusted.matching,
     )  # fmt: skip
-    write_report(made, chosen, files)
+    write_report(made, chosen, files, matched)
     return replace(result, files=files)
 
 

@@ -109,7 +109,7 @@ def rectify(
         warnings=[*adjusted.warnings(heights), *found.notes(), *placed.sparse(warped.valid_pixels), *complaints,
                   *warped.notes(output.memory)],
     )  # fmt: skip
-    write_report(made, adjusted.fit, files)
+    write_report(made, adjusted.fit, files, adjusted.matched)
     if acquired is not None:
         stac_items.write_item(files["stac"], made, files, acquired, name or stem)
     inputs.refuse_changed(begun)

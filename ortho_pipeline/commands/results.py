@@ -75,7 +75,7 @@ class FitResult:
             "model_source": self.scene.model_source,
             **document,
             "removed": [dict(one) for one in self.removed],
-            **({} if self.matching is None else {"matching": json_value(self.matching)}),
+            "matching": json_value(self.matching),
             "map_scale": None if scale is None else scale.to_json(),
             "covariance": {role: one and one.to_json() for role, one in analyse_fit(self.fit, near=self.near).items()},
         }
@@ -137,12 +137,18 @@ def outputs_together(command: Callable[_P, _R]) -> Callable[_P, _R]:
     return wrapper
 
 
-def write_report(made: SceneReport, fit: Fit, files: dict[str, Path]) -> None:
-    """Write report and residuals; without points there are no residuals, and they are taken out of `files`."""
+def write_report(made: SceneReport, fit: Fit, files: dict[str, Path], matched: Matched | None = None) -> None:
+    """Write report and residuals; without points there are no residuals, and they are taken out of `files`.
+
+    Of what was matched the page shows the chips.
+    """
     if len(fit.points):
         write_text(files["residuals"], json.dumps(report.residuals_geojson(fit), allow_nan=False))
         write_text(files["style"], report.residuals_style(made))
     else:
         del files["residuals"], files["style"]
     report.write_report_json(made, files["report"])
-    report.write_report_html(made, files["html"], ortho=staged(files["ortho"]) if "ortho" in files else None)
+    report.write_report_html(
+        made, files["html"], ortho=staged(files["ortho"]) if "ortho" in files else None,
+        matches=None if matched is None else matched.matches,
+    )  # fmt: skip

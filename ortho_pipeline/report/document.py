@@ -33,6 +33,8 @@ from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.adjustment_records import Adjustment, RmseOfView, RmsesOfView, RmsesOnGround, is_known
 from ortho_pipeline.report.delivered import accuracy_before
+from ortho_pipeline.report.gallery.chips import gallery
+from ortho_pipeline.report.gallery.plots import residuals_by_axis
 from ortho_pipeline.report.map_scale import map_scale
 from ortho_pipeline.report.matching import matching_record
 from ortho_pipeline.report.plots import plots
@@ -59,6 +61,7 @@ if TYPE_CHECKING:
 
     from ortho_pipeline.exchange.rpc_fit import RpcExport
     from ortho_pipeline.hookspecs import Scene
+    from ortho_pipeline.imaging.matching import Matches
     from ortho_pipeline.raster.source import Grid
     from ortho_pipeline.surface.base import Surface
     from ortho_pipeline.warp.engine import WarpResult
@@ -375,7 +378,11 @@ def write_plots(report: SceneReport, folder: Path, stem: str, kind: str = "svg")
 
 
 def write_report_html(
-    report: SceneReport, path: str | PathLike[str], *, ortho: str | PathLike[str] | bytes | None = None
+    report: SceneReport,
+    path: str | PathLike[str],
+    *,
+    ortho: str | PathLike[str] | bytes | None = None,
+    matches: Matches | None = None,
 ) -> None:
     """Write the report as one page that needs no other file and no network.
 
@@ -383,6 +390,8 @@ def write_report_html(
     ----------
     ortho : path or bytes, optional
         The orthoimage, of which a preview is made, or the PNG of a preview.
+    matches : Matches, optional
+        Those that `report.matching` is of, whose chips are shown.
     """
     png = ortho if isinstance(ortho, bytes) or ortho is None else preview_png(ortho)
     adjustment = report.adjustment
@@ -402,6 +411,8 @@ def write_report_html(
         plotted_role=report.covariance.drawn_role,
         plot_style=style_sheet(),
         preview=base64.b64encode(png).decode() if png else None,
+        match_axes=residuals_by_axis(report)[0],
+        gallery=None if matches is None else gallery(report, matches),
     )
     write_text(path, page)
 

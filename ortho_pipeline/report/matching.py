@@ -31,6 +31,16 @@ class MatchLevel:
 
 
 @record
+class Candidate:
+    """A place in the image that was looked for in the references; `reason` is null where it became a point."""
+
+    id: str
+    image: Pair
+    score: float | None
+    reason: str | None
+
+
+@record
 class MatchComponents:
     """What the covariances of the matches are made of (docs/matching.md)."""
 
@@ -82,6 +92,7 @@ class MatchingRecord:
     sigma_px: float
     correlation: float
     coverage: MatchCoverage
+    candidates: tuple[Candidate, ...]
     relative: Tested | None
     absolute: Tested | None
 

@@ -13,6 +13,7 @@ import numpy as np
 from ortho_pipeline.display.drawing import Axes, Drawing, number, round_down
 from ortho_pipeline.errors import counted
 from ortho_pipeline.report.adjustment_records import Pair, Point, is_known
+from ortho_pipeline.report.gallery.plots import plot_match_histograms, plot_matches
 from ortho_pipeline.report.records import ComparedModel, Covariance, SceneReport
 
 #: Drawing area of the plot of vectors in CSS pixels, and the space around it.
@@ -35,6 +36,8 @@ def plots(report: SceneReport) -> dict[str, Drawing]:
         "neighbours": plot_neighbours,
         "relative": plot_relative,
         "comparison": plot_comparison,
+        "matches": plot_matches,
+        "match_histograms": plot_match_histograms,
     }
     made = {name: make(report) for name, make in makers.items()}
     return {name: drawing for name, drawing in made.items() if drawing is not None}

@@ -10,9 +10,13 @@ import pytest
 import trials
 from osgeo import gdal
 from scenes import Case, Setting, View, write_raster
+from scipy import ndimage
 from trials import Outcome, good_texture, grounds, matches, refusals, run, tried
 
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.imaging import matching
+from ortho_pipeline.raster.intensity import Intensity
+from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.surface.base import Surface
 
 #: What the default run has: grounds that are there without real images.
@@ -78,6 +82,31 @@ def test_matches_do_not_depend_on_threads(tmp_path):
     np.testing.assert_array_equal(one.image, two.image)
     np.testing.assert_array_equal(one.ground, two.ground)
     np.testing.assert_array_equal(one.sigma_image, two.sigma_image)
+
+
+def test_chips_show_the_same_where_it_was_found(tmp_path):
+    case = Case(PLAIN, tmp_path).write()
+    seen = matching.View(
+        Intensity(RasterSource(case.scene_file)), case.model, Surface.open(case.dem_file, "ellipsoid")
+    )  # fmt: skip
+    settings = matching.MatchSettings(search=30.0, points=60, threads=1)
+    found = matching.match(seen, matching.open_references([case.reference_file]), settings)
+    kept = found.reason == ""
+    assert np.isfinite(found.found[kept]).all()
+    assert np.isnan(found.found[np.isnan(found.target).all(axis=(1, 2))]).all()
+
+    def alike(times: float) -> float:
+        """Return the mean correlation of the chips once those of the target are moved by so many times `found`."""
+        pairs = zip(found.scene[kept], found.target[kept], times * found.found[kept], strict=True)
+        moved = [(one, ndimage.shift(other, (-row, -column), order=3, mode="nearest"))
+                 for one, other, (column, row) in pairs]  # fmt: skip
+        inner = slice(4, -4)
+        return float(np.mean([
+            np.corrcoef(one[inner, inner].ravel(), other[inner, inner].ravel())[0, 1] for one, other in moved
+        ]))  # fmt: skip
+
+    # As far from it on one side as on the other, so that interpolation smooths both alike.
+    assert alike(1.0) > max(alike(-1.0), alike(3.0)) + 1e-4
 
 
 # -- often, and honest -------------------------------------------------------------------------------------------------

@@ -82,6 +82,34 @@ def test_match_writes_points_that_say_where_the_truth_is(case: Case, written_poi
     assert np.linalg.eigvalsh(points.covariance_image).min() > 0
 
 
+def test_match_shows_what_it_found(case: Case, written_points: tuple[Path, dict], tmp_path: Path) -> None:
+    words = ("-o", tmp_path / "points.geojson", "--report", tmp_path / "matches.html", "--json")
+    found = document(matched(case, "match", *words))
+    assert set(found["files"]) == {"points", "html", "report"}
+    # The same as without a page.
+    path, plain = written_points
+    assert found["matching"] == plain["matching"]
+    assert (tmp_path / "points.geojson").read_bytes() == path.read_bytes()
+    numbers = json.loads((tmp_path / "matches.json").read_text())
+    assert numbers["matching"]["candidates"] == plain["matching"]["candidates"]
+    page = (tmp_path / "matches.html").read_text()
+    assert 'data-plot="matches"' in page
+    assert page.count('aria-label="Scene at m') == page.count('aria-label="Reference at m') >= 24
+    worst = max(math.hypot(*one["residual"]) for one in numbers["adjustment"]["points"])
+    assert f"<b>{worst:.2f} px</b>" in page
+
+
+def test_the_page_of_matches_is_a_page(case: Case, tmp_path: Path) -> None:
+    refused = matched(case, "match", "-o", tmp_path / "points.csv", "--report", tmp_path / "matches.pdf")
+    assert refused.exit_code == 2
+    assert ".html" in refused.output
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_page_of_an_ortho_shows_its_matches(rectified: Path) -> None:
+    assert "matches with the largest residuals" in (rectified / "scene_report.html").read_text()
+
+
 def test_csv_says_the_same_as_geojson(case: Case, written_points: tuple[Path, dict], tmp_path: Path) -> None:
     done = matched(case, "match", "-o", tmp_path / "points.csv")
     assert done.exit_code == 0

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.matching import match_scene
 from ortho_pipeline.commands.results import Result
-from ortho_pipeline.commands.scene_fit import on_surface
+from ortho_pipeline.commands.scene_fit import Adjusted, adjust, on_surface
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import write_points
+from ortho_pipeline.report import document as reports
+from ortho_pipeline.surface.base import Surface
 
 #: Suffixes of files that say all that is known of a match.
 _SUFFIXES = (".geojson", ".csv", ".tsv")
@@ -25,6 +29,7 @@ def match(
     *,
     scene: SceneOptions = SceneOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
+    report: str | os.PathLike[str] | None = None,
 ) -> Result:
     """Match a scene with reference orthoimages and write the control and check points that this gives.
 
@@ -32,6 +37,9 @@ def match(
     ----------
     output : path
         A ``.geojson`` or ``.csv`` file, written whole or not at all.
+    report : path, optional
+        A page ``.html`` of the matches and of how a model fits that is adjusted to them; its numbers are written beside
+        it as ``.json``.
 
     Raises
     ------
@@ -48,16 +56,44 @@ def match(
             "matches are not written in this format", file=output, field="output",
             remedy=f"one of {', '.join(_SUFFIXES)}",
         )  # fmt: skip
+    files |= _page(report)
     inputs.check_paths(files, image, scene, PointOptions(), surface, match)
     opened = inputs.open_scene(image, scene)
     heights = inputs.open_surface(surface, scene)
-    opened = on_surface(opened, heights)
-    matched = match_scene(opened, match, heights, scene)
+    adjusted = None if report is None else adjust(opened, PointOptions(), scene, heights, match)
+    matched = None if adjusted is None else adjusted.matched
+    if matched is None:
+        matched = match_scene(on_surface(opened, heights), match, heights, scene)
     read = inputs.files_read(image, scene, PointOptions(), surface, match, opened)
     record = inputs.provenance(
         opened, PointOptions(), heights, inputs.hashed(read), None, {"scene": scene, "surface": surface, "match": match}
     )  # fmt: skip
     write_points(matched.matches.points, output)
+    if adjusted is not None:
+        _write_page(adjusted, heights, record, files)
     document = {"matching": matched.to_json(), "provenance": record, **to_document([*opened.notices, *matched.notices])}
     text = "\n".join(f"{name:<10}{said}" for name, said in matched.summary())
     return Result(files, document, text)
+
+
+def _page(report: str | os.PathLike[str] | None) -> dict[str, Path]:
+    """Return the files of the page and its numbers, by what they are."""
+    if report is None:
+        return {}
+    page = Path(report)
+    if page.suffix.lower() != ".html":
+        raise InputError("the report of matches is a page", file=page, field="report", remedy="a name with `.html`")
+    return {"html": page, "report": page.with_suffix(".json")}
+
+
+def _write_page(
+    adjusted: Adjusted, surface: Surface | None, record: Mapping[str, Any], files: Mapping[str, Path]
+) -> None:
+    """Write what there is to see of the matches and of the model that they make."""
+    made = reports.build_report(
+        scene=adjusted.scene, fit=adjusted.fit, surface=surface, provenance=record, matching=adjusted.matching,
+        warnings=adjusted.warnings(surface),
+    )  # fmt: skip
+    reports.write_report_json(made, files["report"])
+    matches = None if adjusted.matched is None else adjusted.matched.matches
+    reports.write_report_html(made, files["html"], matches=matches)

@@ -125,6 +125,12 @@ class Matched:
             "sigma_px": float(np.median(points.sigma_image)),
             "correlation": median_correlation(matches),
             "coverage": self._coverage(),
+            "candidates": [
+                {"id": f"m{cell}", "image": place, "score": score, "reason": reason or None}
+                for cell, place, score, reason in zip(
+                    matches.cell, matches.image, matches.score, matches.reason, strict=True
+                )
+            ],
         }  # fmt: skip
         document: dict[str, Any] = json_value(found)
         return document

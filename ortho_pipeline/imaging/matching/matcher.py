@@ -15,10 +15,10 @@ from ortho_pipeline.errors import InputError, TooFewPoints, counted
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.geodesy.ellipsoid import units_per_metre
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
-from ortho_pipeline.imaging.matching.chips import Renderer, View, resolution_ratio, scene_chips
+from ortho_pipeline.imaging.matching.chips import View, resolution_ratio, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
 from ortho_pipeline.imaging.matching.least_squares import measure
-from ortho_pipeline.imaging.matching.search import Level, agreed, place, refuse_accident
+from ortho_pipeline.imaging.matching.search import Level, agreed, best_rendered, place, refuse_accident
 from ortho_pipeline.imaging.matching.targets import Target
 from ortho_pipeline.imaging.matching.weights import Components, components
 from ortho_pipeline.models import ImageCorrection
@@ -104,6 +104,9 @@ class Matches:
         The cell of the scene that it lies in.
     scene, target : (n, s, s)
         The chips as they were compared.
+    found : (n, 2)
+        Where the target's chip shows what the scene's has in its centre, chip px from the centre; NaN where nothing
+        was measured.
     factor : int
         Pixels of the scene in a chip pixel.
     levels : tuple of Level
@@ -121,6 +124,7 @@ class Matches:
     cell: NDArray[np.int_]
     scene: NDArray[np.float32]
     target: NDArray[np.float32]
+    found: Array
     factor: int
     levels: tuple[Level, ...]
     components: Components
@@ -257,32 +261,26 @@ class _Tried:
         self.reason = np.full(count, "hidden", dtype="<U12")
         self.score = np.zeros(count)
         self.offset = np.full((count, 2), np.nan)  # px, against the correction of the last step
+        self.found = np.full((count, 2), np.nan)  # chip px, in the target's chip
         self.covariance = np.full((count, 2, 2), np.nan)
         self.ground = np.full((count, 3), np.nan)
 
-    def _renderer(self, correction: SensorModel, index: NDArray[np.int_], radius: int) -> Renderer:
+    def _rendered(self, correction: SensorModel, index: NDArray[np.int_], radius: int) -> NDArray[np.float32]:
         seen = View(self.view.intensity, correction, self.view.surface)
-        origins = self.origins[index] - radius * self.factor
-        return Renderer(seen, self.targets, origins, SIDE + 2 * radius, self.factor)
+        return best_rendered(
+            seen, self.targets, self.origins[index] - radius * self.factor, SIDE + 2 * radius, self.factor
+        )  # fmt: skip
 
-    def _in_batches(self, work: Callable[[NDArray[np.int_]], None], count: int) -> None:
-        """Do a work on the numbers 0 to `count`, some at a time; how many does not depend on the threads."""
-        every = np.arange(count)
-        batches = [every[first : first + _BATCH] for first in range(0, count, _BATCH)]
-        if self.threads == 1:
-            for batch in batches:
-                work(batch)
-            return
+    def _in_batches(self, work: Callable[[NDArray[np.int_]], None], index: NDArray[np.int_]) -> None:
+        batches = [index[first : first + _BATCH] for first in range(0, len(index), _BATCH)]
         with ThreadPoolExecutor(self.threads) as pool:
             list(pool.map(work, batches))
 
     def search(self, correction: SensorModel) -> None:
         """Find each chip to a chip px about where the correction puts it."""
 
-        renderer = self._renderer(correction, np.arange(len(self.origins)), 2 * _RADIUS)
-
         def work(index: NDArray[np.int_]) -> None:
-            wide = renderer.render(index)
+            wide = self._rendered(correction, index, 2 * _RADIUS)
             inner = wide[:, _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
             fields = orientation(self.scene[index]), orientation(wide)
             found = peaks(surfaces(fields[0], fields[1][:, _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]))
@@ -300,7 +298,7 @@ class _Tried:
             passed = seen & (found.score >= _LEAST_SCORE) & found.inside & (found.ratio <= _UNIQUE) & (back <= _BACK)
             self.reason[index[passed]] = ""
 
-        self._in_batches(work, len(self.origins))
+        self._in_batches(work, np.arange(len(self.origins)))
 
     def _backward(
         self, correction: SensorModel, index: NDArray[np.int_], wide: NDArray[np.float32], shift: Array
@@ -346,22 +344,22 @@ class _Tried:
     def measure(self, correction: SensorModel) -> None:
         """Measure each chip that is still of use to a part of a pixel, rendered anew where the correction puts it."""
 
-        radius, good = _MEASURED, np.flatnonzero(self.reason == "")
-        renderer = self._renderer(correction, good, radius)
-
-        def work(batch: NDArray[np.int_]) -> None:
-            index, wide = good[batch], renderer.render(batch)
+        def work(index: NDArray[np.int_]) -> None:
+            radius = _MEASURED
+            wide = self._rendered(correction, index, radius)
             start = np.nan_to_num(self.offset[index] / self.factor)
             start = np.where(np.abs(start) < radius - 2, start, 0.0)
             found = measure(self.scene[index], wide, start)
             self.target[index] = wide[:, radius:-radius, radius:-radius]
+            self.found[index] = found.shift
             self.offset[index] = found.shift * self.factor
             self.covariance[index] = found.covariance * self.factor**2
             self.score[index] = found.correlation
             bad = ~np.isfinite(found.shift).all(axis=1)
             self.reason[index[bad]] = "not measured"
 
-        self._in_batches(work, len(good))
+        good = np.flatnonzero(self.reason == "")
+        self._in_batches(work, good)
         good = np.flatnonzero(self.reason == "")
         self.ground[good] = meet_surface(correction, self.centres[good] + self.offset[good], self.view.surface)
         self.reason[good[np.isnan(self.ground[good]).any(axis=1)]] = "hidden"
@@ -423,8 +421,8 @@ class _Tried:
             source=f"matched with {names}", covariance_image=covariance, groups=groups,
         )  # fmt: skip
         return Matches(
-            self.centres, delivered, self.score, self.reason, self.cells, self.scene, self.target, self.factor,
-            levels, parts, points,
+            self.centres, delivered, self.score, self.reason, self.cells, self.scene, self.target, self.found,
+            self.factor, levels, parts, points,
         )  # fmt: skip
 
 
