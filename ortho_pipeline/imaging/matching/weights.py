@@ -18,6 +18,8 @@ from scipy import optimize
 from ortho_pipeline.models.base import Array
 
 _ROUNDS = 4
+#: No match is more certain than this (px): residuals that are all of one direction leave nothing for the other.
+_LEAST = 0.01
 #: Squared residuals beyond this many times their expectation tell of blunders, not of weights.
 _BLUNDER = 9.0
 
@@ -86,4 +88,4 @@ def components(residuals: Array, matched: Array, along: Array) -> Components:
         found = optimize.nnls(design / length, observed / cut)[0] / length
         if not found.any():
             found[2] = max(float(scale), 1e-6)
-    return Components(float(found[0]), float(np.sqrt(found[1])), float(np.sqrt(found[2])))
+    return Components(float(found[0]), float(np.sqrt(found[1])), max(float(np.sqrt(found[2])), _LEAST))
