@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ortho_pipeline.block.adjustment import adjust as adjust
     from ortho_pipeline.block.intersection import intersect as intersect
+    from ortho_pipeline.block.point_files import read_block_points as read_block_points
     from ortho_pipeline.block.points import BlockPoints as BlockPoints
-    from ortho_pipeline.block.points import read_block_points as read_block_points
     from ortho_pipeline.commands import rectify as rectify
     from ortho_pipeline.commands.control.matching import match_scene as match_scene
     from ortho_pipeline.display.notices import Notice as Notice
@@ -89,7 +89,7 @@ _HOMES = {
     "load_model": "exchange.model_file",
     "match_scene": "commands.control.matching",
     "open_scene": "plugins",
-    "read_block_points": "block.points",
+    "read_block_points": "block.point_files",
     "read_points": "points",
     "read_rpc": "exchange.rpc",
     "rectify": "commands",

@@ -266,13 +266,18 @@ class BlockOptions:
     """
 
     points: Annotated[
-        PathLike,
+        PathLike | None,
         Option(
             "--points",
             "Rays: CSV (id,image,col,row[,x,y,h,role,...]), GeoJSON with 'ji' by image, or ODM gcp_list.txt.",
             "FILE",
         ),
-    ]
+    ] = None
+    ties: Annotated[
+        str | None,
+        Option("--ties", "Find tie points between the images by matching, besides those of `points.points`.",
+               choices=("auto",)),
+    ] = None  # fmt: skip
     gcps: Annotated[
         PathLike | None, Option("--gcps", "Ground of the points: CSV (id,x,y,h,...) or GeoJSON.", "FILE")
     ] = None

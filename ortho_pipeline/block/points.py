@@ -6,8 +6,6 @@ ground, one role and one identity however many images show it.
 
 from __future__ import annotations
 
-import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,24 +14,20 @@ import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_pipeline.errors import InputError, counted, reads
-from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, same_crs
+from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.geodesy.crs import ground_transform, horizontal, same_crs
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import is_usable
-from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE, Points
-from ortho_pipeline.points.formats import read_block_table
-from ortho_pipeline.points.ground import ground_of
+from ortho_pipeline.points import Points
 from ortho_pipeline.points.image_errors import (
     checked_covariance,
-    covariance_of,
     says_more,
     sigma_of_covariance,
-    sigmas_of,
 )
-from ortho_pipeline.points.rows import OF_GROUND, ROLES, Row, Table, origin_shift
+from ortho_pipeline.points.rows import ROLES
 
 #: Two statements of one point's ground are the same within this (degrees or metres): files round.
-_SAME_PLACE = 1e-9
+SAME_PLACE = 1e-9
 Index = NDArray[np.int64]
 
 
@@ -279,13 +273,43 @@ class BlockPoints:
         return ground_transform(self.crs, target if target.is_geocentric else horizontal(target))(self.ground)
 
 
+def joined(images: Sequence[str], tables: Sequence[BlockPoints]) -> BlockPoints:
+    """Return tables of some of these images as one, in the CRS of the first; their points are different ones.
+
+    Ids that two tables have get ``'`` behind them in the later one.
+    """
+    crs = tables[0].crs
+    ids: list[str] = []
+    grounds, points, places = [], [], []
+    for table in tables:
+        moved = table.known_in(crs) if not same_crs(table.crs, crs) else table.ground
+        grounds.append(moved)
+        points.append(table.point + len(ids))
+        places.append(np.array([list(images).index(name) for name in table.images], dtype=np.int64)[table.image])
+        mark = ""
+        while not set(ids).isdisjoint(name + mark for name in table.ids):
+            mark += "'"
+        ids += [name + mark for name in table.ids]
+
+    def all_of(name: str) -> Any:
+        return np.concatenate([getattr(table, name) for table in tables])
+
+    return BlockPoints(
+        ids=tuple(ids), ground=np.concatenate(grounds), roles=all_of("roles"), sigma_ground=all_of("sigma_ground"),
+        crs=crs, images=tuple(images), point=np.concatenate(points), image=np.concatenate(places),
+        measured=all_of("measured"), sigma_image=all_of("sigma_image"),
+        source=", ".join(dict.fromkeys(table.source for table in tables if table.source)),
+        shape_image=shape_of(all_of("covariance_image")),
+    )  # fmt: skip
+
+
 def _agree(
     one: str, name: str, role: str, other_role: str, ground: Array, other: Array, source: str
 ) -> None:  # fmt: skip
     """Refuse two statements of one point that differ."""
     for what, same in (
         ("role", role == other_role),
-        ("ground", np.allclose(ground, other, rtol=0, atol=_SAME_PLACE, equal_nan=True)),
+        ("ground", np.allclose(ground, other, rtol=0, atol=SAME_PLACE, equal_nan=True)),
     ):
         if not same:
             raise InputError(
@@ -302,171 +326,3 @@ def shape_of(covariance: Array) -> Array | None:
     shape = np.tile(np.eye(2), (len(covariance), 1, 1))
     shape[more] = covariance[more] / sigma_of_covariance(covariance[more])[:, None, None] ** 2
     return shape
-
-
-# -- reading ---------------------------------------------------------------------------------------------------------
-
-
-@reads("see docs/formats.md for what stands in a file of points")
-def read_block_points(
-    path: str | os.PathLike[str],
-    *,
-    gcps: str | os.PathLike[str] | None = None,
-    crs: str | pyproj.CRS | None = None,
-    vertical: str | Vertical | None = None,
-    pixel_origin: str = "corner",
-) -> BlockPoints:
-    """Read the points of a block: one line per ray as CSV, one feature per point as GeoJSON, or an ODM list.
-
-    Parameters
-    ----------
-    gcps : path, optional
-        Ground of the points in a file of its own (CSV ``id,x,y,h,...`` or GeoJSON).
-    crs, vertical : optional
-        What ground and heights are in, where the files do not say it.
-    pixel_origin : 'corner', 'center', 'corner-1' or 'center-1'
-        As in `read_points`.
-
-    Raises
-    ------
-    InputError, CrsError, DatumError
-        Names file and line, and what to do: for statements of one point that contradict each other, too.
-    """
-    rays = read_block_table(path)
-    shift = origin_shift(path, rays, pixel_origin)
-    _name_by_place(path, rays)
-    joined = _Joined()
-    where = _placed(path, rays, crs, vertical)
-    joined.add(path, rays.rows, where[0])
-    plane = where[1]
-    if gcps is not None:
-        known = read_block_table(gcps, OF_GROUND)
-        _refuse_twice(gcps, known.rows)
-        ground, other = _placed(gcps, known, crs, vertical)
-        plane = other if plane is None else plane
-        if plane is not None and other is not None and not same_crs(plane, other):
-            ground = ground_transform(other, plane)(ground)
-        joined.add(gcps, [row for row in known.rows if row.id in joined.index], ground, known.rows)
-        if not any(row.id in joined.index for row in known.rows):
-            raise InputError(
-                "none of these points was measured in an image", file=gcps, field="id",
-                remedy=f"the ids have to be those of {os.fspath(path)}",
-            )  # fmt: skip
-    return joined.points(path, rays.rows, shift, pyproj.CRS.from_epsg(4326) if plane is None else plane)
-
-
-def _name_by_place(path: str | os.PathLike[str], table: Table) -> None:
-    """Give rays without an id that of their ground: in an ODM list the label is optional, the ground is not."""
-    names: dict[tuple[float, ...], str] = {}
-    for row in table.rows:
-        if row.id is None:
-            if not math.isfinite(row.ground[0]):
-                raise InputError("a point without an id", file=path, field=row.where, remedy="give each point an id")
-            row.id = names.setdefault(row.ground, f"point {len(names) + 1}")
-
-
-def _placed(
-    path: str | os.PathLike[str], table: Table, crs: str | pyproj.CRS | None, vertical: str | Vertical | None
-) -> tuple[Array, pyproj.CRS | None]:
-    """Return the ground of the rows and its CRS; without any ground no CRS has to be known."""
-    for row in table.rows:
-        if math.isfinite(row.ground[0]) != math.isfinite(row.ground[1]) or (
-            math.isfinite(row.ground[2]) and not math.isfinite(row.ground[0])
-        ):
-            raise InputError("ground is x and y, or none", file=path, field=row.where, remedy="give both or neither")
-    if not any(math.isfinite(row.ground[0]) for row in table.rows):
-        return np.full((len(table.rows), 3), np.nan), None
-    return ground_of(path, table, crs, vertical)
-
-
-def _refuse_twice(path: str | os.PathLike[str], rows: Sequence[Row]) -> None:
-    first: dict[str | None, str] = {}
-    for row in rows:
-        if first.setdefault(row.id, row.where) != row.where:
-            raise InputError(
-                f"the id {row.id!r} stands twice, first in {first[row.id]}", file=path, field=row.where,
-                remedy="give each point once",
-            )  # fmt: skip
-
-
-class _Joined:
-    """Statements of one or two files on each point, refused where they contradict each other."""
-
-    def __init__(self) -> None:
-        self.index: dict[str, int] = {}
-        self.said: list[dict[str, tuple[Any, str]]] = []
-
-    def add(
-        self, path: str | os.PathLike[str], rows: Sequence[Row], ground: Array, of: Sequence[Row] | None = None
-    ) -> None:
-        """Take in rows; `ground` belongs to all rows of a file, `of`, where these are only some."""
-        place = {id(row): k for k, row in enumerate(of or rows)}
-        for row in rows:
-            number = self.index.setdefault(str(row.id), len(self.index))
-            if number == len(self.said):
-                self.said.append({})
-            x, y, h = ground[place[id(row)]].tolist()
-            where = f"{os.fspath(path)}, {row.where}"
-            said = {
-                "x": x, "y": y, "h": h, "role": row.role or None, "sigma_xy": row.sigma_xy, "sigma_h": row.sigma_h,
-            }  # fmt: skip
-            for name, value in said.items():
-                if value is None or (isinstance(value, float) and math.isnan(value)):
-                    continue
-                before, there = self.said[number].setdefault(name, (value, where))
-                same = abs(before - value) <= _SAME_PLACE if isinstance(value, float) else before == value
-                if not same:
-                    raise InputError(
-                        f"the {name} of the point {row.id!r} is {value} here and {before} in {there}", file=path,
-                        field=row.where, remedy="one point has one ground, one role and one accuracy",
-                    )  # fmt: skip
-
-    def points(
-        self, path: str | os.PathLike[str], rows: Sequence[Row], shift: float, crs: pyproj.CRS
-    ) -> BlockPoints:  # fmt: skip
-        """Return the table of the points, with the rays of `rows`."""
-        said = [{name: value for name, (value, _) in one.items()} for one in self.said]
-        images = tuple(dict.fromkeys(str(row.image_name) for row in rows))
-        ground = np.array([[one.get(name, math.nan) for name in ("x", "y", "h")] for one in said])
-        known = np.isfinite(ground[:, 0])
-        roles = [one.get("role", "control" if there else "tie") for one, there in zip(said, known, strict=True)]
-        measured = np.array([row.image for row in rows]) + shift
-        image = np.array([images.index(str(row.image_name)) for row in rows])
-        point = np.array([self.index[str(row.id)] for row in rows])
-        _refuse_same(path, tuple(self.index), [row.where for row in rows], ground, measured, image, point)
-        return BlockPoints(
-            ids=tuple(self.index), ground=ground, roles=np.array(roles, dtype="<U7"),
-            sigma_ground=np.array([[one.get("sigma_xy", 0.0)] * 2 + [one.get("sigma_h", 0.0)] for one in said]),
-            crs=crs, images=images, point=point, image=image, measured=measured,
-            sigma_image=(sigma := sigmas_of(rows, DEFAULT_SIGMA_IMAGE)), source=os.fspath(path),
-            shape_image=shape_of(covariance_of(rows, sigma)),
-        )  # fmt: skip
-
-
-def _refuse_same(
-    path: str | os.PathLike[str],
-    ids: tuple[str, ...],
-    wheres: Sequence[str],
-    ground: Array,
-    measured: Array,
-    image: Index,
-    point: Index,
-) -> None:
-    """Refuse one place under two ids, on the ground or in an image: a point that counts twice, or a wrong copy."""
-    places: dict[tuple[float, ...], int] = {}
-    for number, key in enumerate(map(tuple, ground.tolist())):
-        other = places.setdefault(key, number) if math.isfinite(key[0]) else number
-        if other != number:
-            raise InputError(
-                f"the points {ids[other]!r} and {ids[number]!r} have the same ground", file=path, field="x, y, h",
-                remedy="remove one of the two",
-            )  # fmt: skip
-    pixels: dict[tuple[float, ...], int] = {}
-    for ray, key in enumerate(zip(image.tolist(), *np.round(measured, 6).T.tolist(), strict=True)):
-        other = pixels.setdefault(key, ray)
-        if other != ray:
-            raise InputError(
-                f"the same pixel of the same image as in {wheres[other]}"
-                + ("" if point[other] == point[ray] else f", but of {ids[point[other]]!r} there"),
-                file=path, field=wheres[ray], remedy="remove one of the two",
-            )  # fmt: skip

@@ -10,11 +10,13 @@ from ortho_pipeline.cli.options import (
     folder_option,
     images_argument,
     json_option,
+    matching_options,
     sensor_options,
+    surface_options,
 )
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_result, print_warnings
-from ortho_pipeline.options import BlockOptions, SceneOptions
+from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, SurfaceOptions
 
 _models = click.option(
     "--models", multiple=True, type=click.Path(), metavar="FILE", help="A saved *_model.json of each image."
@@ -27,6 +29,8 @@ _models = click.option(
 @block_options
 @_models
 @adjustment_options
+@matching_options
+@surface_options
 @sensor_options
 @json_option
 def adjust(
@@ -34,6 +38,8 @@ def adjust(
     folder: str,
     points: BlockOptions,
     models: tuple[str, ...],
+    match: MatchOptions,
+    surface: SurfaceOptions,
     scene: SceneOptions,
     as_json: bool,
 ) -> None:
@@ -41,12 +47,16 @@ def adjust(
 
     Writes a model and an RPC of each image, the ground points with their sigmas, and one report. Points with ground
     coordinates control or check, the others tie the images together. With --models (repeated, in the order of the
-    images) the saved models, such as those of an earlier adjustment, are where it starts.
+    images) the saved models, such as those of an earlier adjustment, are where it starts. With --ties auto and
+    --reference points are found by matching, without a hand; that needs heights.
     """
     from ortho_pipeline.commands import block as blocks
 
     command = click.get_current_context().meta["command"]
-    print_result(blocks.adjust(images, folder, points, scene, models=models, command=command), as_json)
+    result = blocks.adjust(
+        images, folder, points, scene, models=models, match=match, surface=surface, command=command
+    )  # fmt: skip
+    print_result(result, as_json)
 
 
 @click.command(cls=Command)

@@ -177,7 +177,7 @@ sensor_options = _grouped("scene", SceneOptions, *_OF_IMAGES)
 point_options = _grouped("points", PointOptions)
 block_options = _grouped("points", BlockOptions, "points", "gcps", "crs", "vertical", "pixel_origin", "check", "model")
 #: The rest of that group, which is taken by its decorator too.
-adjustment_options = click_options("points", BlockOptions, "correction", "ground_sigma", "model_crs", "hold")
+adjustment_options = click_options("points", BlockOptions, "ties", "correction", "ground_sigma", "model_crs", "hold")
 surface_options = _grouped("surface", SurfaceOptions)
 match_options = _grouped("match", MatchOptions)
 matching_options = _grouped("match", MatchOptions, "reference", "search", "points", "dem_sigma", "reference_sigma")

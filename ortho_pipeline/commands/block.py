@@ -18,10 +18,11 @@ from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.intersection import Intersection
 from ortho_pipeline.block.intersection import intersect as intersect_rays
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
-from ortho_pipeline.block.points import BlockPoints, read_block_points
+from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
-from ortho_pipeline.commands.block_images import labels_of, points_of_images, start_of
+from ortho_pipeline.commands.block_images import labels_of, start_of
+from ortho_pipeline.commands.control.block_points import gather, read_points
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, counted
@@ -30,11 +31,9 @@ from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, writ
 from ortho_pipeline.files import json_text, together, write_json, write_text
 from ortho_pipeline.files.documents import json_position, json_value
 from ortho_pipeline.files.locations import located
-from ortho_pipeline.geodesy.crs import Vertical, parse_crs
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options import BlockOptions, PointOptions, SceneOptions, SurfaceOptions, numbers_of
-from ortho_pipeline.points import assign_roles
+from ortho_pipeline.options import BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.report import block as block_report
 from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
@@ -47,6 +46,8 @@ def adjust(
     scene: SceneOptions = SceneOptions(),
     *,
     models: Sequence[str | os.PathLike[str]] = (),
+    match: MatchOptions = MatchOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
     command: str | None = None,
 ) -> Result:
     """Adjust images and points together; write a model of each image, the points, adjusted RPCs and one report.
@@ -59,6 +60,10 @@ def adjust(
         Where all files go; those of images are called by their stems (with folders ahead where stems are the same).
     models : sequence of path
         Saved models (``*_model.json``) to start from, one for each image in their order; none: each image's own.
+    match : MatchOptions
+        References to take control points from, and how to match, also for ties (`points.ties`).
+    surface : SurfaceOptions
+        Heights, for matching.
 
     Returns
     -------
@@ -75,8 +80,9 @@ def adjust(
     files = _files(labels, Path(folder))
     _check_models(images, models)
     scenes = [replace(scene, model=model) for model in models] or [scene] * len(images)
-    _check_paths(files, images, points, scene, *models)
-    table, notes = _read(images, labels, points, scene.allow_network)
+    _check_paths(files, images, points, scene, *models, match=match, surface=surface)
+    gathered = gather(images, labels, scenes, points, match, surface)
+    table, notes = gathered.table, gathered.notices
     heights = _heights(table)
     starts = {
         label: start_of(image, points, own, table.in_image(label), heights)
@@ -94,13 +100,14 @@ def adjust(
         except InputError as error:
             notes.append(Notice("no-rpc", f"no RPC is written ({error.message})").in_image(label))
             del files[f"{label} rpc"]
-    record = _record(images, points, scenes, starts, command)
+    record = _record(images, points, scenes, starts, command, match, surface)
     made = block_report.build_report(
         fit=fit, starts=starts, exported=exported, provenance=record, warnings=[*_warnings(fit, starts), *notes]
     )
     with together(folder, "block"):
         _write(files, made, fit, starts, exported, record)
-    return Result(files, {"report": json_value(made)}, block_report.summary_text(made))
+    text = "\n".join([*gathered.text, block_report.summary_text(made)])
+    return Result(files, {"report": json_value(made), **gathered.document}, text)
 
 
 def intersect(
@@ -130,7 +137,7 @@ def intersect(
     writer = None if output is None else _writer(output)
     files = {} if output is None else {"points": Path(output)}
     _check_paths(files, images, points, scene, *models)
-    table, notes = _read(images, labels, points, scene.allow_network)
+    table, notes = read_points(images, labels, points, scene.allow_network)
     if models:
         plugins.Host.discover()  # model families of plugins, which a file may name
         files_of = dict(zip(labels, models, strict=True))
@@ -155,45 +162,6 @@ def intersect(
 
 
 # -- reading ---------------------------------------------------------------------------------------------------------
-
-
-def _read(
-    images: Sequence[str | os.PathLike[str]], labels: Sequence[str], options: BlockOptions, allow_network: bool
-) -> tuple[BlockPoints, list[Notice]]:
-    """Return the points of these images, and what people ought to know of them."""
-    read = read_block_points(
-        located(options.points, allow_network=allow_network),
-        gcps=None if options.gcps is None else located(options.gcps, allow_network=allow_network),
-        crs=None if options.crs is None else parse_crs(options.crs),
-        vertical=None if options.vertical is None else Vertical.parse(options.vertical),
-        pixel_origin=options.pixel_origin,
-    )  # fmt: skip
-    table, strangers = points_of_images(read, images, labels)
-    if options.check is not None:
-        table = assign_roles(table, options.check)
-    if options.ground_sigma is not None:
-        table = table.with_ground_sigma(*_sigmas(options.ground_sigma))
-    notes = []
-    if strangers:
-        text = f"points of images that are not given play no part: {', '.join(strangers[:10])}"
-        notes.append(Notice("images-not-given", text, images=strangers[:10]))
-    flat = table.control & ~np.isfinite(table.ground[:, 2])
-    if flat.any():
-        names = np.array(table.ids)[flat][:10].tolist()
-        text = f"control points without a height weigh in in plan only: {', '.join(names)}"
-        notes.append(Notice("control-without-height", text, points=names))
-    return table, notes
-
-
-def _sigmas(text: str) -> list[float]:
-    """Return what ``XY`` or ``XY,H`` says."""
-    found = numbers_of(text)
-    if len(found) not in (1, 2) or not all(sigma > 0 for sigma in found):
-        raise InputError(
-            f"{text!r} is not one sigma, or two", field="points.ground_sigma",
-            remedy="give metres in plan, or in plan and height, such as 0.5,1",
-        )  # fmt: skip
-    return found
 
 
 def _heights(table: BlockPoints) -> tuple[float, float] | None:
@@ -239,12 +207,14 @@ def _check_paths(
     options: BlockOptions,
     scene: SceneOptions,
     *more: str | os.PathLike[str],
+    match: MatchOptions = MatchOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
 ) -> None:
     if not files:
         return
     for image in images:
         for read in (options.points, options.gcps, *more):
-            inputs.check_paths(files, image, scene, PointOptions(gcps=read), SurfaceOptions())
+            inputs.check_paths(files, image, scene, PointOptions(gcps=read), surface, match)
 
 
 def _record(
@@ -253,17 +223,22 @@ def _record(
     scenes: Sequence[SceneOptions],
     starts: Mapping[str, Start],
     command: str | None,
+    match: MatchOptions,
+    surface: SurfaceOptions,
 ) -> dict[str, Any]:
     """Return what is needed to make the same result again."""
     read: dict[Path, str] = {}
     for image, scene, start in zip(images, scenes, starts.values(), strict=True):
         for given in (options.points, options.gcps):
-            for path, role in inputs.files_read(image, scene, PointOptions(gcps=given), opened=start.scene).items():
+            of_image = inputs.files_read(image, scene, PointOptions(gcps=given), surface, match, opened=start.scene)
+            for path, role in of_image.items():
                 read.setdefault(path, role)
     first = next(iter(starts.values())).scene
+    matched = options.ties is not None or match.reference
+    asked = {"match": match, "surface": surface} if matched else {}
     whole = inputs.provenance(
         first, PointOptions(), None, inputs.hashed(read), command,
-        {"block": options, "scene": replace(scenes[0], model=None)},
+        {"block": options, "scene": replace(scenes[0], model=None), **asked},
     )  # fmt: skip
     return {key: whole[key] for key in ("command", "inputs", "options", "software")}
 

@@ -51,9 +51,14 @@ def labels_of(images: Sequence[str | os.PathLike[str]]) -> list[str]:
 
 
 def points_of_images(
-    points: BlockPoints, images: Sequence[str | os.PathLike[str]], labels: Sequence[str]
+    points: BlockPoints, images: Sequence[str | os.PathLike[str]], labels: Sequence[str], *, whole: bool = True
 ) -> tuple[BlockPoints, list[str]]:
     """Return the points whose rays are in the images, with these called by their labels; and names that are of none.
+
+    Parameters
+    ----------
+    whole : bool
+        Each of the images has to have points.
 
     Raises
     ------
@@ -75,7 +80,7 @@ def points_of_images(
         else:
             strangers.append(name)
     without = [os.fspath(image) for k, image in enumerate(images) if k not in owner.values()]
-    if without:
+    if without and (whole or not owner):
         raise InputError(
             f"no point was measured in {without[0]}; there are points of {', '.join(points.images[:5])}",
             file=points.source, field="image", remedy="use the names of the images in the points file",

@@ -23,7 +23,7 @@ from ortho_rpc.dimap import read_dimap_pushbroom
 from ortho_pipeline import commands
 from ortho_pipeline.batch import plan as batch_plan
 from ortho_pipeline.batch.records import FileState, Record
-from ortho_pipeline.block.points import read_block_points
+from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.exchange.model_file import read_model_file, save_model
 from ortho_pipeline.exchange.rpc import rpc_of_dataset

@@ -11,7 +11,8 @@ import pytest
 from click.testing import CliRunner
 from osgeo import gdal
 
-from ortho_pipeline.block.points import BlockPoints, read_block_points
+from ortho_pipeline.block.point_files import read_block_points
+from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.block_images import labels_of, points_of_images
 from ortho_pipeline.errors import CrsError, DatumError, InputError

@@ -12,11 +12,13 @@ from click.testing import CliRunner
 from numpy.typing import NDArray
 from scenes import Case, Setting, write_raster
 
-from ortho_pipeline.block.points import read_block_points
+from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.control.ties import names_of
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.imaging import matching
+from ortho_pipeline.imaging.matching.weights import components
 from ortho_pipeline.imaging.ties import Ties, TieSettings, tie
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.raster.intensity import Intensity
@@ -179,3 +181,50 @@ def test_images_of_one_name_are_told_apart():
         "aft/BAND.tif",
         "other.tif",
     ]
+
+
+def test_an_adjustment_finds_ties_and_control_by_itself(tmp_path):
+    """Two scenes that are some ten pixels off, a reference and a DEM: the whole, in one command."""
+    scenes, _ = looks(tmp_path, [-12.0, 12.0], side=300, dem_sigma=1.0, margin=100.0)
+    scenes[0].write_reference()
+    images = [scene.scene_file for scene in scenes]
+    heights = "--dem", scenes[0].dem_file, "--dem-vertical", "ellipsoid", "--dem-sigma", 2
+    run("adjust", *images, "--ties", "auto", "--reference", scenes[0].reference_file, *heights, "--search", 25,
+        "--match-points", 60, "--correction", "affine", "-o", tmp_path / "out")  # fmt: skip
+    before, after = [], []
+    for scene in scenes:
+        model = load_model(tmp_path / "out" / f"{scene.scene_file.stem}_model.json")
+        before.append(scene.misfit(scene.model)[0])
+        after.append(scene.misfit(model)[0])
+    assert rms(np.array(before)) > 4.0
+    # Nine places to the corners, by a plan with the DEM's errors.
+    assert rms(np.array(after)) < 0.5
+    report = json.loads((tmp_path / "out" / "block_report.json").read_text())
+    assert {"relative-to-reference", "dem-sigma-by-default"} & {one["code"] for one in report["notices"]} == {
+        "relative-to-reference"
+    }
+    assert {one["role"] for one in report["provenance"]["inputs"]} >= {"reference", "DEM"}
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ([], "--points"),
+        (["--ties", "auto"], "--dem"),
+        (["--ties", "auto", "--height", 0, "--check", "fraction:0.2"], "--check"),
+        (["--ties", "auto", "--height", 0, "--reference-sigma", 1], "--reference-sigma"),
+        (["--points", "rays.csv", "--height", 0], "--height"),
+        (["--points", "rays.csv", "--search", 5], "--search"),
+    ],
+)
+def test_options_of_a_block_that_contradict_each_other_are_refused(tmp_path, words, named):
+    said = run("adjust", "a.tif", "b.tif", "-o", tmp_path / "out", *words, code=2)
+    assert named in said
+
+
+def test_residuals_of_one_direction_leave_a_covariance_that_can_be_inverted():
+    random = np.random.default_rng(1)
+    along = np.tile([0.4, 0.3], (40, 1))
+    parts = components(along * random.normal(0, 2, (40, 1)), np.tile(1e-4 * np.eye(2), (40, 1, 1)), along)
+    assert parts.height == pytest.approx(2.0, rel=0.4)
+    assert np.linalg.eigvalsh(parts.covariance(np.tile(1e-4 * np.eye(2), (40, 1, 1)), along)).min() > 0

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ortho_pipeline.block.points import read_block_points
+from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.points import Points, read_points, write_points
 

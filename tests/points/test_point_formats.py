@@ -13,7 +13,7 @@ import pyproj
 import pytest
 
 from ortho_pipeline import commands
-from ortho_pipeline.block.points import read_block_points
+from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.options import PointOptions
 from ortho_pipeline.points import Points, one_mark, read_points, write_points

@@ -17,7 +17,7 @@ from ortho_cartosat.simulation import BANDS, write_product
 from ortho_cartosat.truth import StereoPair
 
 from ortho_pipeline.block.adjustment import adjust
-from ortho_pipeline.block.points import read_block_points
+from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import read_model_file

@@ -1,0 +1,216 @@
+"""The points of a block as a command takes them: of a file, ties found by matching, matches with references."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.block.point_files import read_block_points
+from ortho_pipeline.block.points import BlockPoints, joined
+from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.block_images import points_of_images
+from ortho_pipeline.commands.control.matching import match_scene
+from ortho_pipeline.commands.control.ties import tie_scenes
+from ortho_pipeline.commands.scene_fit import on_surface
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.display.numbers import metres
+from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.files.locations import located
+from ortho_pipeline.geodesy.crs import Vertical, parse_crs
+from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, SurfaceOptions, numbers_of
+from ortho_pipeline.points import Points, assign_roles
+
+#: Ground of matches is exact (m): what is not known of it stands in the covariances in the image.
+_EXACT = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """The points of a block, what people ought to know of them, and the documents and texts of what was matched."""
+
+    table: BlockPoints
+    notices: list[Notice]
+    document: dict[str, Any]
+    text: list[str]
+
+
+def gather(
+    images: Sequence[str | os.PathLike[str]],
+    labels: Sequence[str],
+    scenes: Sequence[SceneOptions],
+    options: BlockOptions,
+    match: MatchOptions = MatchOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+) -> Gathered:
+    """Return the points of images, called by their labels, from wherever the options say.
+
+    Parameters
+    ----------
+    scenes : sequence of SceneOptions
+        How each image is opened.
+    surface : SurfaceOptions
+        Heights, for matching.
+
+    Raises
+    ------
+    InputError
+        If there are none, or options contradict each other; as `tie_scenes` and `match_scene`.
+    """
+    _refuse_contradictions(options, match, surface)
+    matched = options.ties is not None or bool(match.reference)
+    tables, notices, document, text = [], list[Notice](), dict[str, Any](), list[str]()
+    if options.points is not None:
+        table, notes = read_points(images, labels, options, scenes[0].allow_network, whole=not matched)
+        tables.append(table)
+        notices += notes
+    if matched:
+        heights = inputs.open_surface(surface, scenes[0])
+        opened = {
+            label: on_surface(inputs.open_scene(image, scene), heights)
+            for label, image, scene in zip(labels, images, scenes, strict=True)
+        }
+        if options.ties is not None:
+            tied = tie_scenes(opened, match, heights, scenes[0])
+            tables.append(tied.points)
+            notices += tied.notices
+            document["ties"] = tied.to_json()
+            text.append(tied.summary())
+        if match.reference:
+            found = _matches(opened, match, heights, scenes[0])
+            tables.append(found.table)
+            notices += found.notices
+            document |= found.document
+            text += found.text
+            if options.points is None:
+                notices.append(_relative(match.reference_sigma))
+    return Gathered(joined(labels, tables), notices, document, text)
+
+
+def _refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: SurfaceOptions) -> None:
+    if options.points is None and options.ties is None:
+        raise InputError(
+            "the images have no points in common", field="points.points",
+            remedy="give measured points with `points.points=FILE`, or `points.ties=auto` to find ties",
+        )  # fmt: skip
+    if options.points is None:
+        for name in ("gcps", "check", "ground_sigma"):
+            if getattr(options, name) is not None:
+                raise InputError(
+                    f"`points.{name}` is said of points of a file, and there are none", field=f"points.{name}",
+                    remedy="leave it out, or give `points.points`",
+                )  # fmt: skip
+    if options.ties is None and not match.reference:
+        for name in ("search", "points", "dem_sigma"):
+            if getattr(match, name) != getattr(MatchOptions, name):
+                raise InputError(
+                    "this is said of matching, and nothing is matched", field=f"match.{name}",
+                    remedy="leave it out, or give `points.ties=auto`",
+                )  # fmt: skip
+        if inputs.has_surface(surface):
+            raise InputError(
+                "heights serve matching, and nothing is matched",
+                field="surface.dem" if surface.dem is not None else "surface.height",
+                remedy="leave them out, or give `points.ties=auto`",
+            )  # fmt: skip
+    if match.reference_sigma is not None and not match.reference:
+        raise InputError(
+            "this is said of a reference, and there is none", field="match.reference_sigma",
+            remedy="leave it out, or give `match.reference`",
+        )  # fmt: skip
+
+
+def _relative(sigma: float | None) -> Notice:
+    floor = f"its own {metres(sigma)} per axis are the floor" if sigma else "how accurate that is was not stated"
+    text = (
+        f"all control was matched: accuracy is relative to the reference, and {floor}; an error that images and "
+        "reference have in common is not seen, and the sigmas know nothing of errors that neighbouring matches share"
+    )
+    return Notice("relative-to-reference", text, reference_sigma_m=sigma)
+
+
+def _matches(scenes: Any, match: MatchOptions, surface: Any, opened: SceneOptions) -> Gathered:
+    """Return the matches of each scene with the references; of those that no reference shows there are none."""
+    tables: dict[str, Points] = {}
+    notices, document, text = list[Notice](), dict[str, Any](), list[str]()
+    first: InputError | None = None
+    for label, scene in scenes.items():
+        try:
+            found = match_scene(scene, match, surface, opened)
+        except InputError as error:
+            first = first or error
+            notices.append(Notice("no-matches", f"not matched with the reference: {error.message}").in_image(label))
+            continue
+        points = found.matches.points
+        tables[label] = replace(
+            points, ids=tuple(f"{label} {name}" for name in points.ids), sigma_ground=np.full((len(points), 3), _EXACT)
+        )
+        notices += [notice.in_image(label) for notice in found.notices]
+        document[label] = found.to_json()
+        text.append(f"{label}: {counted(len(points), 'match', 'matches')} with the reference")
+    if not tables and first is not None:
+        raise first
+    return Gathered(BlockPoints.of(tables), notices, {"matching": document}, text)
+
+
+# -- of a file -------------------------------------------------------------------------------------------------------
+
+
+def read_points(
+    images: Sequence[str | os.PathLike[str]],
+    labels: Sequence[str],
+    options: BlockOptions,
+    allow_network: bool,
+    *,
+    whole: bool = True,
+) -> tuple[BlockPoints, list[Notice]]:
+    """Return the points of a file in these images, and what people ought to know of them.
+
+    Parameters
+    ----------
+    whole : bool
+        Each of the images has to have points.
+
+    Raises
+    ------
+    InputError
+        For a wrong file, or if there is none.
+    """
+    if options.points is None:
+        raise InputError("there are no points", field="points.points", remedy="give a file of points")
+    read = read_block_points(
+        located(options.points, allow_network=allow_network),
+        gcps=None if options.gcps is None else located(options.gcps, allow_network=allow_network),
+        crs=None if options.crs is None else parse_crs(options.crs),
+        vertical=None if options.vertical is None else Vertical.parse(options.vertical),
+        pixel_origin=options.pixel_origin,
+    )  # fmt: skip
+    table, strangers = points_of_images(read, images, labels, whole=whole)
+    if options.check is not None:
+        table = assign_roles(table, options.check)
+    if options.ground_sigma is not None:
+        table = table.with_ground_sigma(*_sigmas(options.ground_sigma))
+    notes = []
+    if strangers:
+        text = f"points of images that are not given play no part: {', '.join(strangers[:10])}"
+        notes.append(Notice("images-not-given", text, images=strangers[:10]))
+    flat = table.control & ~np.isfinite(table.ground[:, 2])
+    if flat.any():
+        names = np.array(table.ids)[flat][:10].tolist()
+        text = f"control points without a height weigh in in plan only: {', '.join(names)}"
+        notes.append(Notice("control-without-height", text, points=names))
+    return table, notes
+
+
+def _sigmas(text: str) -> list[float]:
+    """Return what ``XY`` or ``XY,H`` says."""
+    found = numbers_of(text)
+    if len(found) not in (1, 2) or not all(sigma > 0 for sigma in found):
+        raise InputError(
+            f"{text!r} is not one sigma, or two", field="points.ground_sigma",
+            remedy="give metres in plan, or in plan and height, such as 0.5,1",
+        )  # fmt: skip
+    return found
