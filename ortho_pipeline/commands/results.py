@@ -75,7 +75,7 @@ class FitResult:
             "model_source": self.scene.model_source,
             **document,
             "removed": [dict(one) for one in self.removed],
-            "matching": json_value(self.matching),
+            **({} if self.matching is None else {"matching": json_value(self.matching)}),
             "map_scale": None if scale is None else scale.to_json(),
             "covariance": {role: one and one.to_json() for role, one in analyse_fit(self.fit, near=self.near).items()},
         }

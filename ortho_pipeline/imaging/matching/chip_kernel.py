@@ -68,6 +68,35 @@ def positions(nodes, heights, left, top, middle, half, tolerance, out):
 
 
 @compiled
+def extent(places, out):
+    """Fill the least and greatest column and row of places ``(rows, columns, 2)``, and the mean steps down and across.
+
+    NaN where fewer than four neighbours are finite.
+    """
+    rows, columns = places.shape[:2]
+    out[:2], out[2:4], out[4:] = np.inf, -np.inf, 0.0
+    count, down, across = 0, 0, 0
+    for row in range(rows):
+        for column in range(columns):
+            x, y = places[row, column]
+            if np.isnan(x):
+                continue
+            count += 1
+            out[0], out[1], out[2], out[3] = min(out[0], x), min(out[1], y), max(out[2], x), max(out[3], y)
+            if row and not np.isnan(places[row - 1, column, 0]):
+                down += 1
+                out[4] += np.hypot(x - places[row - 1, column, 0], y - places[row - 1, column, 1])
+            if column and not np.isnan(places[row, column - 1, 0]):
+                across += 1
+                out[5] += np.hypot(x - places[row, column - 1, 0], y - places[row, column - 1, 1])
+    if count < 4 or not down or not across:
+        out[:] = np.nan
+        return
+    out[4] /= down
+    out[5] /= across
+
+
+@compiled
 def sample(pixels, left, top, factor, places, out):
     """Fill `out` ``(rows, columns)`` with intensities at `places` ``(rows, columns, 2)``, by cubic convolution.
 

@@ -9,6 +9,7 @@ does not depend on the sensor model.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,8 @@ _NODES, _EXACT = (3, 5, 9, 17), 0.002
 _TOLERANCE = 0.003
 #: Larger windows of a target or a DEM than this are not read for one chip: its model leads far away.
 _LARGEST = 64_000_000
+#: Part of a chip that a target shows, above which no other target is asked.
+_NEARLY_ALL = 0.95
 #: Chips whose lattice is held against the model.
 _PROBED = 24
 
@@ -78,36 +81,55 @@ def resolution_ratio(view: View, target: Target, image: Array) -> Array:
 
 def rendered_chips(view: View, target: Target, origins: NDArray[np.int_], size: int, factor: int) -> Pixels:
     """Return what the target shows at chips of the scene ``(n, size, size)``; NaN where it shows nothing."""
-    out = np.full((len(origins), size, size), np.nan, dtype=np.float32)
-    if not len(origins):
+    return Renderer(view, [target], origins, size, factor).render(np.arange(len(origins)))
+
+
+class Renderer:
+    """Renders what targets show at chips of a scene: of each chip the first target that shows nearly all of it.
+
+    The lattices of all chips are made at once, because models are fastest for many points; rendering may then be
+    shared among threads.
+    """
+
+    def __init__(
+        self, view: View, targets: Sequence[Target], origins: NDArray[np.int_], size: int, factor: int
+    ) -> None:
+        self._targets, self._size = targets, size
+        self._surface = view.surface
+        self._nodes = [_Nodes(view, target, np.asarray(origins, dtype=float), size * factor) for target in targets]
+
+    def render(self, index: NDArray[np.int_]) -> Pixels:
+        """Return the chips of these numbers ``(n, size, size)``; NaN where nothing is shown."""
+        out = np.full((len(index), self._size, self._size), np.nan, dtype=np.float32)
+        places = np.empty((self._size, self._size, 2))
+        one = np.empty((self._size, self._size), dtype=np.float32)
+        for row, k in enumerate(index.tolist()):
+            share = 0.0
+            for target, nodes in zip(self._targets, self._nodes, strict=True):
+                if share >= _NEARLY_ALL:
+                    break
+                if not nodes.positions(k, self._surface, places):
+                    continue
+                one[:] = np.nan
+                _read(target, places, one)
+                seen = float(np.isfinite(one).mean())
+                if seen > share:
+                    out[row], share = one, seen
         return out
-    nodes = _Nodes(view, target, np.asarray(origins, dtype=float), size * factor)
-    places = np.empty((size, size, 2))
-    for k in nodes.seen:
-        left, top, right, bottom = nodes.windows[k]
-        if (right - left) * (bottom - top) > _LARGEST:
-            continue
-        heights = view.surface.window(left, top, right - left, bottom - top)
-        chip_kernel.positions(
-            nodes.coefficients[k], heights, left, top, nodes.middle[k], nodes.half[k], _TOLERANCE, places
-        )  # fmt: skip
-        _read(target, places, out[k])
-    return out
 
 
 def _read(target: Target, places: Array, out: Pixels) -> None:
     """Fill `out` with the intensities of a target at places ``(rows, columns, 2)``."""
-    finite = places[np.isfinite(places).all(axis=2)]
-    if len(finite) < 4:
+    extent = np.empty(6)
+    chip_kernel.extent(places, extent)
+    if not np.isfinite(extent).all():
         return
-    low, high = np.floor(finite.min(axis=0)), np.ceil(finite.max(axis=0))
+    low, high = np.floor(extent[:2]), np.ceil(extent[2:4])
     size = target.intensity.width, target.intensity.height
     if (high < 0).any() or low[0] > size[0] or low[1] > size[1]:
         return
     # Pixels of the target in one of the chip: more than one are averaged, or detail would appear as false structure.
-    steps = [np.abs(np.diff(places, axis=axis)).sum(axis=2) for axis in (0, 1)]
-    step = math.sqrt(float(np.nanmedian(steps[0])) * float(np.nanmedian(steps[1])))
-    factor = max(1, round(step)) if math.isfinite(step) else 1
+    factor = max(1, round(math.sqrt(extent[4] * extent[5])))
     left, top = (int(value) - 3 * factor for value in low)
     columns, rows = (math.ceil((last - first) / factor) + 7 for first, last in zip(low, high, strict=True))
     if columns * rows * min(factor, EXACT) ** 2 > _LARGEST:
@@ -131,8 +153,19 @@ class _Nodes:
             self.coefficients = self._evaluate(np.arange(count), nodes)
             if self._error(nodes) <= _EXACT:
                 break
-        finite = np.atleast_1d(np.isfinite(self.coefficients).all(axis=(1, 2, 3, 4)))
-        self.seen = [k for k in self.seen if finite[k]]
+        self.shown = np.zeros(count, dtype=bool)
+        self.shown[self.seen] = np.isfinite(self.coefficients[self.seen]).all(axis=(1, 2, 3, 4))
+
+    def positions(self, k: int, surface: Surface, places: Array) -> bool:
+        """Fill the target's coordinates of the pixels of a chip; False where it shows nothing."""
+        left, top, right, bottom = self.windows[k]
+        if not self.shown[k] or (right - left) * (bottom - top) > _LARGEST:
+            return False
+        heights = surface.window(left, top, right - left, bottom - top)
+        chip_kernel.positions(
+            self.coefficients[k], heights, left, top, self.middle[k], self.half[k], _TOLERANCE, places
+        )  # fmt: skip
+        return True
 
     def _heights(self) -> list[int]:
         """Find the heights that the rays of each chip may meet; return the chips that meet any."""

@@ -15,10 +15,10 @@ from ortho_pipeline.errors import InputError, TooFewPoints, counted
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.geodesy.ellipsoid import units_per_metre
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
-from ortho_pipeline.imaging.matching.chips import View, resolution_ratio, scene_chips
+from ortho_pipeline.imaging.matching.chips import Renderer, View, resolution_ratio, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
 from ortho_pipeline.imaging.matching.least_squares import measure
-from ortho_pipeline.imaging.matching.search import Level, agreed, best_rendered, place, refuse_accident
+from ortho_pipeline.imaging.matching.search import Level, agreed, place, refuse_accident
 from ortho_pipeline.imaging.matching.targets import Target
 from ortho_pipeline.imaging.matching.weights import Components, components
 from ortho_pipeline.models import ImageCorrection
@@ -265,22 +265,29 @@ class _Tried:
         self.covariance = np.full((count, 2, 2), np.nan)
         self.ground = np.full((count, 3), np.nan)
 
-    def _rendered(self, correction: SensorModel, index: NDArray[np.int_], radius: int) -> NDArray[np.float32]:
+    def _renderer(self, correction: SensorModel, index: NDArray[np.int_], radius: int) -> Renderer:
         seen = View(self.view.intensity, correction, self.view.surface)
-        return best_rendered(
-            seen, self.targets, self.origins[index] - radius * self.factor, SIDE + 2 * radius, self.factor
-        )  # fmt: skip
+        origins = self.origins[index] - radius * self.factor
+        return Renderer(seen, self.targets, origins, SIDE + 2 * radius, self.factor)
 
-    def _in_batches(self, work: Callable[[NDArray[np.int_]], None], index: NDArray[np.int_]) -> None:
-        batches = [index[first : first + _BATCH] for first in range(0, len(index), _BATCH)]
+    def _in_batches(self, work: Callable[[NDArray[np.int_]], None], count: int) -> None:
+        """Do a work on the numbers 0 to `count`, some at a time; how many does not depend on the threads."""
+        every = np.arange(count)
+        batches = [every[first : first + _BATCH] for first in range(0, count, _BATCH)]
+        if self.threads == 1:
+            for batch in batches:
+                work(batch)
+            return
         with ThreadPoolExecutor(self.threads) as pool:
             list(pool.map(work, batches))
 
     def search(self, correction: SensorModel) -> None:
         """Find each chip to a chip px about where the correction puts it."""
 
+        renderer = self._renderer(correction, np.arange(len(self.origins)), 2 * _RADIUS)
+
         def work(index: NDArray[np.int_]) -> None:
-            wide = self._rendered(correction, index, 2 * _RADIUS)
+            wide = renderer.render(index)
             inner = wide[:, _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
             fields = orientation(self.scene[index]), orientation(wide)
             found = peaks(surfaces(fields[0], fields[1][:, _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]))
@@ -298,7 +305,7 @@ class _Tried:
             passed = seen & (found.score >= _LEAST_SCORE) & found.inside & (found.ratio <= _UNIQUE) & (back <= _BACK)
             self.reason[index[passed]] = ""
 
-        self._in_batches(work, np.arange(len(self.origins)))
+        self._in_batches(work, len(self.origins))
 
     def _backward(
         self, correction: SensorModel, index: NDArray[np.int_], wide: NDArray[np.float32], shift: Array
@@ -344,9 +351,11 @@ class _Tried:
     def measure(self, correction: SensorModel) -> None:
         """Measure each chip that is still of use to a part of a pixel, rendered anew where the correction puts it."""
 
-        def work(index: NDArray[np.int_]) -> None:
-            radius = _MEASURED
-            wide = self._rendered(correction, index, radius)
+        radius, good = _MEASURED, np.flatnonzero(self.reason == "")
+        renderer = self._renderer(correction, good, radius)
+
+        def work(batch: NDArray[np.int_]) -> None:
+            index, wide = good[batch], renderer.render(batch)
             start = np.nan_to_num(self.offset[index] / self.factor)
             start = np.where(np.abs(start) < radius - 2, start, 0.0)
             found = measure(self.scene[index], wide, start)
@@ -358,8 +367,7 @@ class _Tried:
             bad = ~np.isfinite(found.shift).all(axis=1)
             self.reason[index[bad]] = "not measured"
 
-        good = np.flatnonzero(self.reason == "")
-        self._in_batches(work, good)
+        self._in_batches(work, len(good))
         good = np.flatnonzero(self.reason == "")
         self.ground[good] = meet_surface(correction, self.centres[good] + self.offset[good], self.view.surface)
         self.reason[good[np.isnan(self.ground[good]).any(axis=1)]] = "hidden"

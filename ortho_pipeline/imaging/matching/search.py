@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, stats
 
 from ortho_pipeline.errors import InputError, counted
-from ortho_pipeline.imaging.matching.chips import View, rendered_chips, scene_chips
+from ortho_pipeline.imaging.matching.chips import Renderer, View, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
 from ortho_pipeline.imaging.matching.targets import Target
 from ortho_pipeline.models import ImageCorrection
@@ -194,28 +194,11 @@ def _correlated(
     """Correlate chips with the targets, each with the first that shows enough there."""
     wide = side + 2 * radius
     scene = scene_chips(view, origins, side, factor)
-    shown = best_rendered(view, targets, origins - radius * factor, wide, factor)
+    shown = Renderer(view, targets, origins - radius * factor, wide, factor).render(np.arange(len(origins)))
     surface = surfaces(orientation(scene), orientation(shown))
     known = (surface != 0).mean(axis=(1, 2)) > 0.2
     centres = origins + side * factor / 2
     return _Shown(centres[known], surface[known])
-
-
-def best_rendered(
-    view: View, targets: Sequence[Target], origins: NDArray[np.int_], side: int, factor: int
-) -> NDArray[np.float32]:
-    """Return what the targets show at chips ``(n, side, side)``: of each chip the first that shows nearly all of it."""
-    shown = np.full((len(origins), side, side), np.nan, dtype=np.float32)
-    share = np.zeros(len(origins))
-    for target in targets:
-        left = np.flatnonzero(share < 0.95)
-        if not len(left):
-            break
-        rendered = rendered_chips(view, target, origins[left], side, factor)
-        seen = np.isfinite(rendered).mean(axis=(1, 2))
-        better = seen > share[left]
-        shown[left[better]], share[left[better]] = rendered[better], seen[better]
-    return shown
 
 
 def _hypotheses(shown: _Shown, targets: Sequence[Target]) -> list[Array]:
