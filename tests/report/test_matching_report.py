@@ -69,11 +69,13 @@ def matches_of(points: Points, rejected: int = 6) -> Matches:
     image = np.concatenate([points.image, rng.uniform(0, 1000, (rejected, 2))])
     reason = np.array([""] * kept + [WHY[k % len(WHY)] for k in range(rejected)], dtype="<U12")
     score = rng.uniform(0.3, 0.9, total)
-    score[reason == "not measured"] = np.nan
+    lost = np.flatnonzero(reason == "not measured")
+    # One that is no number, and the others as the matcher has them.
+    score[lost], score[lost[:1]] = 0.0, np.nan
     scene, target = (rng.normal(500, 90, (total, SIDE, SIDE)).astype(np.float32) for _ in range(2))
     target[np.isin(reason, ["weak", "ambiguous"])] = np.nan
     found = rng.normal(0, 0.5, (total, 2))
-    found[np.isnan(target).all(axis=(1, 2)) | np.isnan(score)] = np.nan
+    found[np.isnan(target).all(axis=(1, 2)) | (reason == "not measured")] = np.nan
     order = np.argsort(image[:, 1])
     return Matches(
         image[order], rng.normal(0, 1, (total, 2)), score[order], reason[order], np.arange(total)[order],
@@ -185,6 +187,7 @@ def test_the_gallery_shows_the_worst_first_and_their_own_chips(plain: Case) -> N
     assert (found.kept, found.tried_rejected) == (40, 6)
     # Chips that the reference never showed cannot be shown; what has no score comes last.
     assert [tile.reason for tile in found.rejected][-1] == REASONS["not measured"]
+    assert (found.rejected[-1].score, found.rejected[-1].found) == (None, None)
     scores = [tile.score for tile in found.rejected[:-1]]
     assert len(scores) == 3
     assert scores == sorted(scores, reverse=True)

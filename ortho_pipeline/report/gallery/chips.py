@@ -121,7 +121,8 @@ def _tile(matches: Matches, index: int, one: Shown, place: int) -> Tile:
     return Tile(
         id=one.candidate.id if one.point is None else one.point.id,
         kind="rejected" if reason is not None else kinds[one.kind],
-        score=one.candidate.score,
+        # Of what was not measured it is no correlation.
+        score=one.candidate.score if np.isfinite(matches.found[index]).all() else None,
         residual=None if one.residual is None else one.length,
         reason=None if reason is None else in_words(reason),
         scene=scene,
