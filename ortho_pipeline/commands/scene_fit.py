@@ -219,7 +219,7 @@ def adjust(
     points, matched = control_of(scene, options, match, opened, surface, threads)
     notes: tuple[Notice, ...] = ()
     if matched is not None and options.correction is options.fit_model is opened.model is None:
-        correction, note = by_matches(scene, with_heights(points, surface))
+        correction, note = by_matches(scene, matched.matches.points)
         options, notes = dataclasses.replace(options, correction=correction), (note,)
     done = _from_points(scene, options, points, surface) if options.fit_model else _corrected(
         scene, options, opened, points, surface

@@ -35,7 +35,7 @@ DEFAULT_SEARCH, _PART = 100.0, 0.25
 _SIGMAS, _LEAST = 3.0, 8.0
 #: A reference is probably made of the scene itself where the chips are as alike as that in the median, and the matches
 #: agree to so many pixels: two images of one place have noise, heights and light of their own, and do not.
-_SAME, _EXACT = 0.97, 0.02
+_SAME, _EXACT = 0.97, 0.01
 #: Fields of the image in which matches are counted hold about so many that were tried; at most so many per side.
 _PER_FIELD, _FIELDS = 5, 10
 
@@ -269,11 +269,12 @@ def _stated(scene: Scene, pixel: float) -> tuple[float, str] | None:
         errors = [value for value in (model.err_bias, model.err_rand) if value is not None and value > 0]
         if errors:
             return math.hypot(*errors), "the errors that the RPC states (ERR_BIAS, ERR_RAND)"
+    names = model.param_names
     sigma = scene.facts.get("position_sigma_m")
-    if isinstance(sigma, int | float) and sigma > 0:
+    # Of what has an orientation it is the position of the sensor, and the attitude errs too.
+    if not names and isinstance(sigma, int | float) and sigma > 0:
         return float(sigma) * math.sqrt(2), "the accuracy of position in the metadata"
     known = {name: prior.sigma for name, prior in scene.priors.items() if math.isfinite(prior.sigma)}
-    names = model.param_names
     if names and set(names) <= set(known):
         centre = model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), model.reference_height)
         spread = model.param_partials(centre)[0] * np.array([known[name] for name in names])
