@@ -132,6 +132,18 @@ def test_ties_of_scenes_of_different_resolution(tmp_path):
         assert rms(across) / (1 if order[1] == 1 else 2) < 0.15
 
 
+@pytest.mark.slow
+def test_ties_are_found_where_heights_are_wrong_by_more_than_a_chip(tmp_path):
+    """A plane at the wrong height under hills of 15 m: matches lie up to 80 px along the line of sight."""
+    scenes, views = looks(tmp_path, [-20.0, 20.0], relief=15.0, margin=60.0)
+    views = [replace(view, surface=Surface.constant(340.0)) for view in views]
+    ties = tie(views, TieSettings(search=25.0, points=120, dem_sigma=25.0))
+    across, _, _ = apart(*scenes, ties, (0, 1))
+    # Slopes without a DEM shear chips; on the steep ones nothing is found.
+    assert len(across) >= 30
+    assert rms(across) < 0.3
+
+
 def test_scenes_without_common_ground_are_refused(tmp_path):
     _, views = looks(tmp_path, [-5.0, 5.0], side=280)
     away = ImageCorrection(views[1].model, "shift", (0.0, 0.0), np.array([5000.0, 0, 0, 0, 0, 0]))

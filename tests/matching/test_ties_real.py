@@ -13,9 +13,14 @@ import pytest
 from osgeo import gdal
 
 from ortho_pipeline.block.adjustment import adjust
-from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.block.points import BlockPoints, shape_of
 from ortho_pipeline.exchange.rpc import read_rpc, rpc_of_dataset
+from ortho_pipeline.imaging.matching import View
+from ortho_pipeline.imaging.ties import Ties, TieSettings, tie
 from ortho_pipeline.models import RPC, ImageCorrection
+from ortho_pipeline.points.image_errors import sigma_of_covariance
+from ortho_pipeline.raster.intensity import Intensity
+from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.surface.base import Surface
 
 pytestmark = pytest.mark.realdata
@@ -32,8 +37,8 @@ def pleiades(real: Path, name: str) -> tuple[dict[str, Path], dict[str, RPC], Su
     if name == "triplet":
         images = {k: real / "s2p" / "input_triplet" / f"img_0{k}.tif" for k in "123"}
         models = {k: rpc_of_dataset(gdal.Open(str(path)))[0] for k, path in images.items()}
-        dsm = real / "s2p" / "expected_output" / "triplet" / "dsm.tif"
-        return images, models, Surface.open(dsm, "ellipsoid", fill="nearest")
+        # A hill of 85 to 260 m, taken to be flat: heights are wrong by up to 130 m.
+        return images, models, Surface.constant(210.0)
     folder, names = real / "shareloc", {"ventoux": ("left_image", "right_image"), "gizeh": ("img1", "img2")}[name]
     images = {one: folder / "image" / f"phr_{name}" / f"{one}.tif" for one in names}
     models = {one: shifted(read_rpc(folder / "rpc" / f"phr_{name}" / f"{one}.geom"), images[one]) for one in names}
@@ -44,46 +49,41 @@ def pleiades(real: Path, name: str) -> tuple[dict[str, Path], dict[str, RPC], Su
     return images, models, Surface.constant(75.0)
 
 
-def pair(images: Mapping[str, Path], models: Mapping[str, RPC], surface: Surface, one: str, other: str) -> np.ndarray:
-    """Return ties ``(n, 4)``: column and row in one image and in the other."""
-    from ortho_pipeline.imaging.matching import MatchSettings, OtherScene, View, match
-    from ortho_pipeline.raster.intensity import Intensity
-    from ortho_pipeline.raster.source import RasterSource
-
-    view = View(Intensity(RasterSource(images[one])), models[one], surface)
-    target = OtherScene(Intensity(RasterSource(images[other])), models[other])
-    points = match(view, [target], MatchSettings(search=15.0, points=600)).points
-    return np.column_stack([points.image, models[other].ground_to_image(points.to_crs("EPSG:4979").ground)])
+def tied(images: Mapping[str, Path], models: Mapping[str, RPC], surface: Surface, dem_sigma: float) -> Ties:
+    """Return the ties between images."""
+    views = [View(Intensity(RasterSource(path)), models[name], surface) for name, path in images.items()]
+    return tie(views, TieSettings(search=15.0, points=700, dem_sigma=dem_sigma))
 
 
-def as_block(ties: Mapping[tuple[str, str], np.ndarray], names: tuple[str, ...]) -> BlockPoints:
-    """Return the ties of pairs as tie points that two images see each."""
-    counts = {key: len(rows) for key, rows in ties.items()}
-    total = sum(counts.values())
-    first = np.concatenate([np.full(count, names.index(key[0])) for key, count in counts.items()])
-    second = np.concatenate([np.full(count, names.index(key[1])) for key, count in counts.items()])
-    rows = np.concatenate(list(ties.values()))
+def as_block(ties: Ties, names: tuple[str, ...]) -> BlockPoints:
+    """Return ties as the points of a block."""
+    count = int(ties.track.max()) + 1
     return BlockPoints(
-        ids=tuple(map(str, range(total))), ground=np.full((total, 3), np.nan), roles=np.array(["tie"] * total),
-        sigma_ground=np.zeros((total, 3)), crs=pyproj.CRS(4326), images=names, point=np.tile(np.arange(total), 2),
-        image=np.concatenate([first, second]), measured=np.concatenate([rows[:, :2], rows[:, 2:]]),
-        sigma_image=np.full(2 * total, 0.2),
+        ids=tuple(map(str, range(count))), ground=np.full((count, 3), np.nan), roles=np.full(count, "tie"),
+        sigma_ground=np.zeros((count, 3)), crs=pyproj.CRS(4326), images=names, point=ties.track, image=ties.image,
+        measured=ties.measured, sigma_image=sigma_of_covariance(ties.covariance), shape_image=shape_of(ties.covariance),
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "median"), [("ventoux", 0.34), ("gizeh", 0.34), ("triplet", 0.34)])
-def test_ties_of_pleiades_images_meet(real, name, median):
+# Heights: SRTM of 90 m on a slope of Mont Ventoux, none at Gizeh, none and a hill in the triplet.
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "dem_sigma"), [("ventoux", 25.0), ("gizeh", 15.0), ("triplet", 40.0)])
+def test_ties_of_pleiades_images_meet(real, name, dem_sigma):
     images, models, surface = pleiades(real, name)
-    ties = {two: pair(images, models, surface, *two) for two in combinations(images, 2)}
-    for two, found in ties.items():
-        assert len(found) >= 300, two
+    ties = tied(images, models, surface, dem_sigma)
+    for two in combinations(range(len(images)), 2):
+        tracks = ties.of_pair(*two)
+        assert len(tracks) >= 300, two
+        found = ties.measured[(ties.image == two[0]) & np.isin(ties.track, tracks)]
         # Well spread: of 5 x 5 cells of what both images show, most have some.
-        low, high = found[:, :2].min(axis=0), found[:, :2].max(axis=0)
-        cells = {tuple(cell) for cell in ((found[:, :2] - low) / (high - low + 1e-6) * 5).astype(int).tolist()}
+        low, high = found.min(axis=0), found.max(axis=0)
+        cells = {tuple(cell) for cell in ((found - low) / (high - low + 1e-6) * 5).astype(int).tolist()}
         assert len(cells) >= 20, two
     start = {
         one: ImageCorrection.identity(model, "shift", (model.col_off, model.row_off)) for one, model in models.items()
     }
     after = adjust(start, as_block(ties, tuple(images)))
     apart = np.hypot(*after.residuals[after.used_rays].T)
-    assert np.nanmedian(apart) <= median
+    # The issue asks for 0.34 px, what the triplet's own authors reach.
+    assert np.nanmedian(apart) <= 0.1
+    assert len(after.rejected) < 0.02 * len(ties.track)

@@ -18,10 +18,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.ellipsoid import units_per_metre
+from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
 from ortho_pipeline.imaging.matching.chips import View, rendered_chips, resolution_ratio, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
 from ortho_pipeline.imaging.matching.least_squares import measure
@@ -49,6 +51,8 @@ SAMPLES = 32
 _BATCH, _JUDGED, FEWEST = 32, 8, 12
 #: Chip pixels that the heights displace by more than this are too fine for the first search.
 _BLURRED = 1.5
+#: Places that are asked where no correction stands out, and the chance that so many agree by accident.
+_ASKED, _ACCIDENT = 100, 1e-6
 #: Standard deviation (px) that any match has at least.
 _FLOOR = 0.02
 
@@ -181,20 +185,54 @@ class Pair:
         parallax = np.hypot(*_sight(view, target, view.model.ground_partials(ground), ground)[0].T)
         sigma = settings.dem_sigma * float(np.nanmedian(parallax)) if len(ground) else 0.0
         low, high = shown.min(axis=0), shown.max(axis=0)
-        window = (*(int(value) for value in low), *(math.ceil(value) for value in high))
+        window = int(low[0]), int(low[1]), math.ceil(high[0]), math.ceil(high[1])
         finest = base
         while sigma / finest > _BLURRED and min(high - low) / (2 * finest) >= 3 * 24:
             finest *= 2
         while True:
             try:
                 correction, _ = place(view, [target], max(search, 2.0 * finest), finest, window)
-            except InputError:
+            except InputError as error:
                 # The heights may be better than stated, and some grounds show nothing in large pixels.
-                if finest == base:
-                    raise
-                finest = max(base, finest // 2)
+                if finest > base:
+                    finest = max(base, finest // 2)
+                    continue
+                found = cls(view, target, _uncorrected(view, window), base, search + _HEIGHTS * sigma, settings)
+                return found._agreed(window, sigma, error)
             else:
                 return cls(view, target, correction, base, _HEIGHTS * sigma + 2 * finest, settings)
+
+    def _agreed(self, window: tuple[int, int, int, int], sigma: float, error: InputError) -> Pair:
+        """Return the pair shifted to where most chips agree across the epipolar direction, each found by itself.
+
+        That is how places are found where heights are wrong by more than chips are large, from chip to chip.
+        """
+        columns, rows = cells_of(window[2] - window[0], window[3] - window[1], _ASKED)
+        inside = np.ones((rows, columns), dtype=bool)
+        origins, _, _ = candidates(self.view, window, (columns, rows), SIDE, self.factor, inside)
+        chips = _Chips(self, origins + SIDE // 2 * self.factor)
+        chips.search()
+        good = np.isfinite(chips.offset).all(axis=1)
+        ground = meet_surface(self.correction, chips.centres + np.nan_to_num(chips.offset), self.view.surface)
+        along, _ = _sight(self.view, self.target, self.correction.ground_partials(ground), ground)
+        good &= np.isfinite(along).all(axis=1)
+        offset, count = chips.offset[good], int(good.sum())
+        if count < FEWEST:
+            raise error
+        unit = np.median(along[good], axis=0)
+        unit /= np.linalg.norm(unit)
+        place = offset @ np.stack([unit, (-unit[1], unit[0])], axis=1)
+        wide = max(2 * _HEIGHTS * sigma, 3.0 * self.factor), 1.5 * self.factor
+        apart = np.abs(place[:, None] - place)
+        near = (apart <= wide).all(axis=2)
+        most = near[int(near.sum(axis=1).argmax())]
+        chance = min(1.0, float(np.prod([2 * one / (2 * self.reach) for one in np.minimum(wide, self.reach)])))
+        if stats.binom.sf(int(most.sum()) - 2, count - 1, chance) * count > _ACCIDENT:
+            raise error
+        shift = np.zeros(6)
+        shift[[0, 3]] = -np.median(offset[most], axis=0)
+        correction = ImageCorrection(self.view.model, "affine", self.correction.origin, shift)
+        return replace(self, correction=correction, reach=2 * _HEIGHTS * sigma + 2 * self.factor)
 
     @property
     def shift(self) -> tuple[float, float]:
@@ -250,6 +288,10 @@ class Pair:
             places, second, covariance / 2, turned @ covariance @ turned.swapaxes(1, 2) / 2, height, sigma,
             chips.score, parts,
         )  # fmt: skip
+
+
+def _uncorrected(view: View, window: tuple[int, ...]) -> ImageCorrection:
+    return ImageCorrection.identity(view.model, "affine", ((window[0] + window[2]) / 2, (window[1] + window[3]) / 2))
 
 
 def shared(view: View, target: OtherScene) -> Array:
