@@ -77,6 +77,11 @@ def apart(first: Look, second: Look, ties: Ties, pair: tuple[int, int]) -> tuple
     return (off * across).sum(axis=1), (off * along).sum(axis=1), sigma
 
 
+def _each_scene_once(ties: Ties) -> None:
+    both = np.stack([ties.track, ties.image], axis=1)
+    assert len(np.unique(both, axis=0)) == len(both)
+
+
 def rms(values: Array) -> float:
     return float(np.sqrt((values**2).mean()))
 
@@ -91,21 +96,22 @@ def rms(values: Array) -> float:
 )  # fmt: skip
 def test_ties_lie_where_the_truth_is_whatever_the_heights_of_the_dem(tmp_path, angles, dem_sigma):
     scenes, views = looks(tmp_path, angles, dem_sigma=dem_sigma)
-    ties = tie(views, TieSettings(search=25.0, points=120, dem_sigma=dem_sigma))
+    ties = tie(views, TieSettings(search=25.0, points=60, dem_sigma=dem_sigma))
+    _each_scene_once(ties)
     for pair in ties.pairs:
         across, along, sigma = apart(scenes[pair.images[0]], scenes[pair.images[1]], ties, pair.images)
-        assert len(across) >= 80
+        assert len(across) >= 40
         assert rms(across) < 0.15
         # Along it slopes of the DEM's error displace a chip as a whole; heights are found to that.
         assert rms(along) < 0.35
         assert 0.7 < rms(across / sigma) < 1.4
 
 
+@pytest.mark.slow
 def test_a_track_has_each_scene_once_and_covers_the_overlap(tmp_path):
     _, views = looks(tmp_path, [-15.0, 0.0, 15.0], dem_sigma=2.0)
     ties = tie(views, TieSettings(search=25.0, points=100, dem_sigma=3.0))
-    both = np.stack([ties.track, ties.image], axis=1)
-    assert len(np.unique(both, axis=0)) == len(both)
+    _each_scene_once(ties)
     counts = np.bincount(ties.track)
     assert set(counts) <= {2, 3}
     assert (counts == 3).mean() > 0.6
