@@ -25,6 +25,8 @@ from ortho_pipeline.surface.base import Surface
 Pixels = NDArray[np.float32]
 #: Nodes per side of a chip's lattice, tried until it is this exact (pixels of the target).
 _NODES, _EXACT = (3, 5, 9, 17), 0.002
+#: Nodes are no farther apart than this (px), and the DEM is asked for at so many places per side.
+_SPACING, _PLACES = 128.0, 3
 #: Rays meet the surface within this height (m): a thousandth of a pixel where a metre moves a third of one.
 _TOLERANCE = 0.003
 #: Larger windows of a target or a DEM than this are not read for one chip: its model leads far away.
@@ -149,12 +151,13 @@ class _Nodes:
         self.middle, self.half = np.zeros(count), np.ones(count)
         self.seen = self._heights()
         self.coefficients = np.zeros((count, _NODES[0], _NODES[0], chip_kernel.LEVELS, 4))
-        for nodes in _NODES:
+        for nodes in (nodes for nodes in _NODES if extent / (nodes - 1) <= _SPACING or nodes == _NODES[-1]):
             self.coefficients = self._evaluate(np.arange(count), nodes)
             if self._error(nodes) <= _EXACT:
                 break
         self.shown = np.zeros(count, dtype=bool)
-        self.shown[self.seen] = np.isfinite(self.coefficients[self.seen]).all(axis=(1, 2, 3, 4))
+        # Beyond where a model is defined a chip has no pixels; the others are no worse for it.
+        self.shown[self.seen] = np.isfinite(self.coefficients[self.seen]).any(axis=(1, 2, 3, 4))
 
     def positions(self, k: int, surface: Surface, places: Array) -> bool:
         """Fill the target's coordinates of the pixels of a chip; False where it shows nothing."""
@@ -172,7 +175,9 @@ class _Nodes:
         model, surface = self._view.model, self._view.surface
         low, high = (np.full(len(self._origins), value) for value in model.height_range)
         limits = model.height_limits
-        corners = self._origins[:, None] + self._extent * np.array([(0, 0), (1, 0), (0, 1), (1, 1)], dtype=float)
+        steps = np.linspace(0.0, self._extent, _PLACES)
+        offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        corners = self._origins[:, None] + offsets
         left = np.arange(len(self._origins))
         found: list[int] = []
         for turn in range(4):
@@ -206,11 +211,14 @@ class _Nodes:
         return sorted(found)
 
     def _samples(self, corners: Array, low: Array, high: Array) -> Array:
-        """Return DEM sample coordinates ``(n, 8, 2)`` of corners ``(n, 4, 2)`` at two heights."""
+        """Return DEM sample coordinates ``(n, 2 m, 2)`` of places ``(n, m, 2)`` at two heights."""
         image = np.concatenate([corners, corners], axis=1).reshape(-1, 2)
-        heights = np.concatenate([np.repeat(low[:, None], 4, 1), np.repeat(high[:, None], 4, 1)], axis=1).ravel()
+        count = corners.shape[1]
+        heights = np.concatenate(
+            [np.repeat(low[:, None], count, 1), np.repeat(high[:, None], count, 1)], axis=1
+        ).ravel()
         ground = self._view.model.image_to_ground(image, heights)
-        return np.asarray(self._sampler(ground)).reshape(-1, 8, 2)
+        return np.asarray(self._sampler(ground)).reshape(-1, 2 * count, 2)
 
     def _evaluate(self, chips: NDArray[np.int_], nodes: int) -> Array:
         levels = -np.cos(np.pi * np.arange(chip_kernel.LEVELS) / (chip_kernel.LEVELS - 1))

@@ -36,7 +36,7 @@ _SIDE, _LEAST_SIDE = 48, 24
 #: Coarse chips per side of the scene, at most; and at least so many in all.
 _PER_SIDE, _FEWEST = 6, 5
 #: Radii of the coarsest search (chip px).
-_COMFORTABLE, _LARGEST_RADIUS = 40, 160
+_COMFORTABLE, _LARGEST_RADIUS = 100, 160
 #: Radius (chip px) of the searches after the first.
 _NEXT = 4
 #: The mean surface is blurred by so much (chip px): corrections are not the same everywhere.
