@@ -83,6 +83,49 @@ def test_sigmas_cover_though_neighbours_err_alike(rpc: RPC, share: float, part: 
     assert (claimed > 0.4).all(), claimed
 
 
+def correlation(family: int, distance: np.ndarray) -> np.ndarray:
+    """Return one of three correlations, from rough to smooth, whose range is 1."""
+    if family == 0:
+        return np.exp(-distance)
+    if family == 1:
+        return (1 + 2.146 * distance) * np.exp(-2.146 * distance)
+    return np.exp(-(distance**2))
+
+
+def drawn(rpc: RPC, kind: str, count: int, repeats: int) -> np.ndarray:
+    """Return (estimate - truth) / sigma ``(repeats, P)`` of scenes each with its own points and correlation.
+
+    For each axis family, range and ratio of shared to other variances are at random over all orders of magnitude.
+    """
+    found = []
+    for seed in range(repeats):
+        scene = Scene(rpc, count, 0.0, 0.1, 1000 + seed)
+        random = scene.random
+        distance = np.linalg.norm(scene.image[:, None] - scene.image, axis=2) / SIZE
+        near = np.median(np.partition(distance, 1, axis=1)[:, 1])
+        errors = random.normal(0, 1, (count, 2))
+        for axis in range(2):
+            part = np.exp(random.uniform(np.log(near), 0.0))
+            ratio = np.exp(random.uniform(-np.log(count), np.log(1e4)))
+            values, vectors = np.linalg.eigh(correlation(int(random.integers(3)), distance / part))
+            errors[:, axis] += vectors @ (np.sqrt(ratio * np.maximum(values, 0)) * random.normal(0, 1, count))
+        points = replace(scene.points(), image=scene.image + errors)
+        covariance = np.broadcast_to(np.diag(errors.var(axis=0)), (count, 2, 2))
+        fitted = adjusted(rpc, points.with_covariance_image(covariance, points.groups), kind)
+        found.append(fitted.values / fitted.sigmas)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("kind", ["shift", "affine"])
+def test_sigmas_cover_the_mean_over_all_correlations(rpc: RPC, kind: str) -> None:
+    """The mean square of (estimate - truth) / sigma is 1 where nothing is known of how errors are shared.
+
+    Two axes of 80 scenes: with the tails of Student's t of six degrees of freedom, a square has the variance 5.
+    """
+    square = (drawn(rpc, kind, 100, 80) ** 2).mean()
+    assert abs(square - 1) < 3 * np.sqrt(5 / 160), square
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["shift", "affine"])
 @pytest.mark.parametrize("count", [200, 1000])

@@ -2,23 +2,26 @@ r"""What neighbouring points err together, and what it does to the parameters of
 
 Matched points share the errors of the DEM and of the reference with their neighbours: of whitened errors :math:`u` of
 points with a group, along each of two axes, :math:`\mathrm{cov}(u_i, u_j) = \sigma_n^2 \delta_{ij} + \sigma_s^2
-e^{-d_{ij} / c}`. With whitened design :math:`A` and cofactors :math:`Q`, the covariance of the parameters of a weighted
+k(d_{ij} / c)`. With whitened design :math:`A` and cofactors :math:`Q`, the covariance of the parameters of a weighted
 fit is then :math:`Q A^T \Sigma A Q` (sandwich), not :math:`\sigma_0^2 Q`.
 
 Residuals hide the part that the model absorbs. So the function is estimated by restricted likelihood, which looks only
-at what no value of the parameters can explain: a few dozen smooth contrasts (cosines made orthogonal to the design),
-whose level tells how errors add up over the scene, against the rest, which tells their size. A range of half a scene is
-hardly told from a longer one. So no single function is taken: :math:`\Sigma` is the mean over all shares and ranges, up
-to the extent of the points, weighted by their likelihood. That is right on average over scenes, too careful where
-ranges are short, and a little too bold at half a scene (docs/accuracy.md). A constant part, and a shared part of less
-than 15 % of the variance over the whole scene, cannot be told from the shift: they are not seen at all.
+at what no value of the parameters can explain. How smooth errors are decides how much of them is long, and few
+residuals tell it: correlations :math:`k` from rough to smooth are tried (exponential, Matern of order 3/2, Gaussian),
+each with ranges from the distance of neighbours to the extent of the points, and with :math:`\sigma_s^2` from
+:math:`\sigma_n^2 / n`, which adds no more to a mean than noise does, to :math:`10^4 \sigma_n^2`. Beforehand families
+count alike, and ranges and ratios by their logarithms, because not even their order of magnitude is known.
+No single function is taken: :math:`\Sigma` is the mean over all of them, weighted by their likelihood. So the variance
+is right in the mean over scenes of all these kinds; it is not right for each kind alone (docs/accuracy.md). A constant
+part cannot be told from the shift: it is not seen at all.
 
-Source: Patterson and Thompson 1971 (restricted likelihood); Liang and Zeger 1986 (sandwich); Cressie 1993, section 2.6.
+Source: Patterson and Thompson 1971 (restricted likelihood); Liang and Zeger 1986 (sandwich); Cressie 1993, section 2.6;
+Stein 1999, section 2.10 (Matern); Handcock and Stein 1993 (mean over what is likely).
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -30,14 +33,19 @@ from ortho_pipeline.models.base import Array
 #: Fewer points with groups, or degrees of freedom, say nothing of a function: each group then counts as one point.
 FEWEST_POINTS = 30
 #: More points add time and no insight: so many are drawn from them.
-MOST_POINTS = 1000
-#: Ranges that are tried, in parts of the extent of the points, and shares of the variance that neighbours share.
-_RANGES = np.geomspace(0.015, 1.0, 10)
-_SHARES = np.concatenate([[0.0], np.linspace(0.15, 0.95, 17)])
-#: Chance beforehand that nothing is shared.
-_NOTHING = 0.1
-#: Smooth contrasts, and the largest part of the points that they may be.
-_CONTRASTS, _PART = 200, 0.5
+MOST_POINTS = 400
+#: The shortest range, in parts of the extent.
+_HEAP = 0.005
+#: (1 + x) e^-x is 1/e there.
+_MATERN = 2.1461932206
+#: Correlations by distance over range, 1/e at 1: exponential, Matern of order 3/2, Gaussian.
+_FAMILIES: tuple[Callable[[Array], Array], ...] = (
+    lambda x: np.exp(-x),
+    lambda x: (1.0 + _MATERN * x) * np.exp(-_MATERN * x),
+    lambda x: np.exp(-(x**2)),
+)
+#: Ranges and ratios of variances, shared over noise, that are tried; with the largest, noise is 1 % of what is shared.
+_RANGES, _RATIOS, _LARGEST = 8, 14, 1e4
 
 
 @dataclass(frozen=True)
@@ -80,7 +88,7 @@ def shared_errors(solution: Solution, image: Array) -> tuple[SharedErrors, Array
     shift = solution.errors.whitened(np.broadcast_to(np.eye(2), (len(solution.groups), 2, 2)))
     groups = len(np.unique(solution.groups[rows]))
     usual = variance * solution.cofactors
-    scene = _Scene.of(image[rows], residuals, np.concatenate([design, shift[rows]], axis=2), design.shape[2])
+    scene = _Scene.of(image[rows], residuals, np.concatenate([design, shift[rows]], axis=2))
     if scene is None:
         # All that is known is who shares: a group is one point.
         effective = float(len(solution.groups) - len(rows) + groups)
@@ -114,17 +122,15 @@ class _Scene:
     """Points that share errors, as the restricted likelihood takes them."""
 
     distance: Array  # (n, n) px
-    extent: float
-    basis: Array  # (n, p + m): an orthonormal basis of the design, then contrasts
-    absorbed: int  # p
+    ranges: Array  # px
+    span: Array  # (n, p): an orthonormal basis of the design
     axes: Array  # (2, 2): rows are the axes
-    smooth: Array  # (m, 2) contrasts of residuals along the axes
-    rest: Array  # (2,) sum of squares of what else is left
+    left: Array  # (n, 2) residuals along the axes, without what the design explains
     design: Array  # (p, 2, K): the whole design along the axes, in the basis
     weight: float  # points over those that were drawn
 
     @classmethod
-    def of(cls, image: Array, residuals: Array, design: Array, count: int) -> _Scene | None:
+    def of(cls, image: Array, residuals: Array, design: Array) -> _Scene | None:
         """Return the scene of points ``(n, 2)``, their whitened residuals, and design ``(n, 2, K)``."""
         given = len(image)
         order = np.lexsort(image.T)
@@ -132,79 +138,58 @@ class _Scene:
             order = np.sort(np.random.default_rng(0).permutation(given)[:MOST_POINTS])
             order = np.lexsort(image.T)[order]
         image, residuals, design = image[order], residuals[order], design[order]
-        n = len(image)
-        low, size = image.min(axis=0), np.ptp(image, axis=0)
-        extent = float(size.max())
+        extent = float(np.ptp(image, axis=0).max())
         columns = np.concatenate([design[:, 0], design[:, 1]], axis=1)
         scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-        left, singular, _ = np.linalg.svd(columns / scale, full_matrices=False)
-        span = left[:, singular > 1e-9 * singular[0]]
-        p = span.shape[1]
-        contrasts = min(_CONTRASTS, int(_PART * (n - p)))
-        if n < FEWEST_POINTS or contrasts < 6 or not extent > 0:
+        span, singular, _ = np.linalg.svd(columns / scale, full_matrices=False)
+        span = span[:, singular > 1e-9 * singular[0]]
+        n, p = span.shape
+        if n < FEWEST_POINTS or n - p < FEWEST_POINTS / 2 or not extent > 0:
             return None
-        place = (image - low) / np.where(size > 0, size, 1.0)
-        waves = _waves(size, contrasts + p)
-        cosines = np.cos(np.pi * place[:, :1] * waves[:, 0]) * np.cos(np.pi * place[:, 1:] * waves[:, 1])
-        cosines -= span @ (span.T @ cosines)
-        basis, triangle = np.linalg.qr(cosines - span @ (span.T @ cosines))
-        # Waves that the model takes up are gone.
-        basis = basis[:, np.abs(np.diag(triangle)) > 1e-3 * math.sqrt(n)][:, :contrasts]
-        smooth = basis.T @ residuals
-        whole = residuals - span @ (span.T @ residuals)
-        rest = whole - basis @ smooth
-        m, freedom = basis.shape[1], n - p - basis.shape[1]
-        excess = smooth.T @ smooth / m - rest.T @ rest / freedom
-        axes = np.linalg.eigh(excess)[1].T[::-1]
-        turned = np.einsum("ij,njk->nik", axes, design)
         distance = np.hypot(image[:, None, 0] - image[:, 0], image[:, None, 1] - image[:, 1])
-        return cls(
-            distance, extent, np.hstack([span, basis]), p, axes, smooth @ axes.T, ((rest @ axes.T) ** 2).sum(axis=0),
-            np.einsum("np,nik->pik", span, turned), given / n,
-        )  # fmt: skip
+        # Points that lie in heaps, or upon each other, tell of no range within a heap.
+        least = np.clip(np.median(np.partition(distance, 1, axis=1)[:, 1]), _HEAP * extent, extent / 2)
+        ranges = np.geomspace(least, extent, _RANGES)
+        left = residuals - span @ (span.T @ residuals)
+        # The axes differ most in what is shared over the middle one of the ranges.
+        near = _FAMILIES[1](distance / ranges[_RANGES // 2])
+        axes = np.linalg.eigh(left.T @ near @ left)[1].T[::-1]
+        turned = np.einsum("ij,njk->nik", axes, design)
+        inside = np.einsum("np,nik->pik", span, turned)
+        return cls(distance, ranges, span, axes, left @ axes.T, inside, given / n)
 
     def middle(self, variance: float) -> tuple[Array, Any]:
         """Return the excess of A^T Sigma A ``(K, K)`` over independent errors of `variance`, and what is likely."""
-        n, p, m = len(self.basis), self.absorbed, len(self.smooth)
-        freedom = n - p - m
+        n, p = self.span.shape
+        ratios = np.geomspace(1.0 / n, _LARGEST, _RATIOS)
         logs, scales, inner = [], [], []
-        for part in _RANGES:
-            kernel = np.exp(-self.distance / (part * self.extent))
-            product = self.basis.T @ (kernel @ self.basis)
-            values, vectors = np.linalg.eigh(product[p:, p:])
-            inner.append(product[:p, :p])
-            level = (n - np.trace(product)) / freedom
-            turned = (vectors.T @ self.smooth) ** 2
-            each = 1 - _SHARES[:, None] + _SHARES[:, None] * values
-            other = 1 - _SHARES + _SHARES * level
-            squares = (turned.T[:, None, :] / each).sum(axis=2) + self.rest[:, None] / other
-            logs.append(-0.5 * (np.log(each).sum(axis=1) + freedom * np.log(other) + (n - p) * np.log(squares)))
-            scales.append(squares / (n - p - 2))
-        log, scale = np.array(logs), np.array(scales)  # (ranges, axes, shares)
-        prior = np.full(len(_SHARES), (1 - _NOTHING) / (len(_SHARES) - 1))
-        prior[0] = _NOTHING
-        chance = np.exp(log - log.max(axis=(0, 2), keepdims=True)) * prior
+        for family in _FAMILIES:
+            for distance in self.ranges:
+                kernel = family(self.distance / distance)
+                half = kernel @ self.span
+                inside = self.span.T @ half
+                # With the design taken out on both sides: p of the values are zero, and say nothing below.
+                cross = (half - self.span @ (inside / 2)) @ self.span.T
+                values, vectors = np.linalg.eigh(kernel - cross - cross.T)
+                each = 1.0 + ratios[:, None] * np.maximum(values, 0.0)
+                squares = ((vectors.T @ self.left) ** 2).T @ (1.0 / each).T  # (axes, ratios)
+                logs.append(-0.5 * (np.log(each).sum(axis=1) + (n - p) * np.log(squares)))
+                scales.append(squares / (n - p - 2))
+                inner.append(inside)
+        log, scale = np.array(logs), np.array(scales)  # (kernels, axes, ratios)
+        chance = np.exp(log - log.max(axis=(0, 2), keepdims=True))
         chance /= chance.sum(axis=(0, 2), keepdims=True)
-        noise = (chance * scale * (1 - _SHARES)).sum(axis=(0, 2))
-        shared = (chance * scale * _SHARES).sum(axis=2)  # (ranges, axes)
+        noise = (chance * scale).sum(axis=(0, 2))
+        shared = (chance * scale * ratios).sum(axis=2)  # (kernels, axes)
         size = self.design.shape[2]
         excess = np.zeros((size, size))
         for axis in range(2):
             rows = self.design[:, axis]
-            cross = sum(part * (matrix - np.eye(p)) for part, matrix in zip(shared[:, axis], inner, strict=True))
+            between = np.einsum("k,kij->ij", shared[:, axis], np.array(inner) - np.eye(p))
             own = noise[axis] + shared[:, axis].sum() - variance
-            excess += self.weight * own * rows.T @ rows + self.weight**2 * rows.T @ cross @ rows
+            excess += self.weight * own * rows.T @ rows + self.weight**2 * rows.T @ between @ rows
         share = shared / np.maximum(shared.sum(axis=0), 1e-300)
-        ranges = self.extent * np.exp((share * np.log(_RANGES)[:, None]).sum(axis=0))
+        mean = np.exp(share.T @ np.log(np.tile(self.ranges, len(_FAMILIES))))
         return excess, tuple(
-            (float(pair[0]), float(pair[1])) for pair in (np.sqrt(noise), np.sqrt(shared.sum(axis=0)), ranges)
+            (float(pair[0]), float(pair[1])) for pair in (np.sqrt(noise), np.sqrt(shared.sum(axis=0)), mean)
         )
-
-
-def _waves(size: Array, count: int) -> Array:
-    """Return so many pairs of half waves over the two sides of an area, the longest first, without the constant."""
-    side = np.where(size > 0, size / size.max(), 1e-9)
-    many = np.stack(np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij"), axis=-1).reshape(-1, 2)
-    many = many[many.prod(axis=1) <= 2 * count]
-    frequency = np.hypot(*(many / side).T)
-    return many[np.argsort(frequency, kind="stable")][1 : count + 1]
