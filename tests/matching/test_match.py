@@ -53,10 +53,9 @@ def test_matches_over_all_good_textures_are_within_015_px_of_the_truth():
 
 
 @pytest.mark.parametrize("change", [
-    {"pushbroom": False, "heading_deg": 100.0},
-    {"reference_crs": "EPSG:3857"},
-    {"scene": View(dtype="uint8"), "reference": View(bands="aba")},
-    {"scene": View(holes=0.15), "reference": View(holes=0.1)},
+    pytest.param({"pushbroom": False, "heading_deg": 100.0}, marks=pytest.mark.slow),
+    pytest.param({"scene": View(dtype="uint8"), "reference": View(bands="aba")}, marks=pytest.mark.slow),
+    {"scene": View(holes=0.15), "reference": View(holes=0.1), "reference_crs": "EPSG:3857"},
     {"reference": View(season=1)},
     {"error": 90.0, "kind": "affine", "margin": 110.0},
 ], ids="+".join)  # fmt: skip
@@ -112,14 +111,14 @@ def test_chips_show_the_same_where_it_was_found(tmp_path):
 # -- often, and honest -------------------------------------------------------------------------------------------------
 
 
-def test_ten_scenes_of_all_kinds_are_matched_or_refused_never_wrong():
-    """Ten of what `benchmarks/match.py --truth` runs, smaller and without real grounds: one failure is allowed."""
-    drawn = [trials.drawn(20 * k, ("country",)) for k in range(10)]
+def test_five_scenes_of_all_kinds_are_matched_or_refused_never_wrong():
+    """Five of what `benchmarks/match.py --truth` runs, smaller and without real grounds: one failure is allowed."""
+    drawn = [trials.drawn(40 * k, ("country",)) for k in range(5)]
     rows = run(
         replace(one, side=one.side * 3 // 5, error=min(one.error, 60.0), margin=min(one.margin, 90.0)) for one in drawn
     )
     assert not any(row["wrong"] for row in rows), told(rows)
-    assert sum(row["succeeded"] for row in rows) >= 9, told(rows)
+    assert sum(row["succeeded"] for row in rows) >= 4, told(rows)
 
 
 @pytest.mark.slow
@@ -129,6 +128,7 @@ def test_200_scenes_of_all_kinds():
     assert np.mean([row["succeeded"] for row in rows]) >= 0.95, told(rows)
 
 
+@pytest.mark.slow
 def test_sigmas_of_the_parameters_are_not_far_from_true():
     rows = run(trials.coverage(6)[:6:2])
     assert not any(row["refused"] for row in rows), told(rows)
@@ -145,7 +145,7 @@ def test_sigmas_of_the_parameters_are_true():
 # -- refused -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("what", ["place", "chessboard", "water", "beyond", "roofs"])
+@pytest.mark.parametrize("what", ["place", "roofs"])
 def test_what_cannot_be_matched_is_refused(what):
     rows = refusals(what, 1)
     assert all(row["refused"] for row in rows), told(rows)
