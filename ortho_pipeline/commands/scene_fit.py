@@ -25,7 +25,6 @@ from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions
 from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.points.control_hull import uncovered
-from ortho_pipeline.report.matching import RELATIVE
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.footprint import lay
@@ -248,7 +247,7 @@ def relative_to_reference(adjusted: Fit, match: MatchOptions) -> list[Notice]:
         f"{part}: the accuracy is relative to the reference, and {floor}; an error that scene and reference have in "
         "common is not seen"
     )
-    return [Notice(RELATIVE, text, reference_sigma_m=sigma, matched=count, control=control)]
+    return [Notice("relative-to-reference", text, reference_sigma_m=sigma, matched=count, control=control)]
 
 
 def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:

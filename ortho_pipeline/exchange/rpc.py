@@ -273,6 +273,9 @@ def write_tagged_copy(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]
 
 
 def _sidecar_names(path: Path) -> list[Path]:
+    # A raster in memory has no name, and nothing beside it.
+    if not path.name:
+        return []
     return [path.with_name(path.stem + end) for end in ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", ".RPC", ".rpc")]
 
 

@@ -89,7 +89,9 @@ class Tied:
     def summary(self) -> str:
         """Return what people read of it."""
         said = self.to_json()
-        tracks = ", ".join(f"{number} in {count} images" for count, number in said["tracks_by_images"].items())
+        tracks = ", ".join(
+            f"{number} in {counted(int(count), 'image')}" for count, number in said["tracks_by_images"].items()
+        )
         lines = [f"{counted(said['tracks'], 'tie point')}: {tracks}; {px(said['sigma_px'])} in the median"]
         for one in said["pairs"]:
             pair = f"{one['images'][0]} - {one['images'][1]}"
