@@ -48,11 +48,14 @@ demo: setup
 	echo "Ortho:   $(CURDIR)/out/demo/scene_ortho.tif   (any GIS opens it)"
 	echo "Report:  $(CURDIR)/out/demo/scene_report.html (any browser opens it)"
 
+# Each worker has one processor: threads of BLAS would only wait for each other.
+PYTEST = OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS)
+
 test: setup
-	@$(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow"
+	@$(PYTEST) -m "not slow"
 
 test-all: setup
-	@$(BIN)/python -m pytest -q -n $(WORKERS)
+	@$(PYTEST)
 
 faults: N := $(if $(filter file,$(origin N)),400,$(N))
 faults: setup
@@ -62,7 +65,7 @@ check: setup
 	@$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow"
+	$(PYTEST) -m "not slow"
 
 fuzz: setup
 	@$(BIN)/python tests/attack/fuzz.py -n $(N) -j $(WORKERS) $(addprefix --reader ,$(READER)) $(addprefix --keep ,$(KEEP))
