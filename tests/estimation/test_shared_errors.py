@@ -71,7 +71,7 @@ def spread(rpc: RPC, kind: str, count: int, share: float, part: float, repeats: 
     return np.sqrt(np.mean(np.square([claimed, usual]), axis=1))
 
 
-@pytest.mark.parametrize(("share", "part"), [(0.9, 0.1), (0.9, 0.5)])
+@pytest.mark.parametrize(("share", "part"), [pytest.param(0.9, 0.1, marks=pytest.mark.slow), (0.9, 0.5)])
 def test_sigmas_cover_though_neighbours_err_alike(rpc: RPC, share: float, part: float) -> None:
     """Independent points would claim 3 and 10 times too little; here never too little by more than a third.
 

@@ -65,6 +65,7 @@ def test_what_scene_and_reference_are_like_does_not_matter(tmp_path, change):
     assert found.off < 0.3, found
 
 
+@pytest.mark.slow
 def test_stripes_of_a_detector_do_not_attract_matches(tmp_path):
     found = outcome(tmp_path, scene=View(stripes=0.1), heading_deg=180.0)
     assert found.refused or found.off < 0.3, found
