@@ -25,6 +25,7 @@ from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.image_errors import sigma_of_covariance
+from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.surface.rays import meet_surface
 
 #: Side of a chip (chip px), and radius of the last search about the corrected model.
@@ -49,6 +50,8 @@ _ROUNDS, _STANDS = 3, 0.02
 _MEASURED, _JUDGED = 4, 6
 #: Fewer matches than this are no control.
 FEWEST = 12
+#: Bytes of a job, of which GDAL's cache has a quarter.
+_MEMORY = 512_000_000
 #: Chips that are worked on together.
 _BATCH = 32
 #: Why a match was not kept, in words.
@@ -139,6 +142,9 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     InputError
         If there is no overlap, no place stands out, or what was found could be an accident; with the reason.
     """
+    # Left alone, GDAL keeps blocks in a share of the machine's memory; chips lie beside each other and need few.
+    seen = [view.intensity, *(target.intensity for target in targets)]
+    limit_cache(_MEMORY, settings.threads, *(one.source.block for one in seen))
     shown = _shown(view, targets)
     base = _base(view, targets, shown)
     reach = max(settings.search / metres_per_pixel(view), 2.0 * base)
@@ -148,8 +154,8 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     # The targets may show a part of that rectangle only.
     share = len(shown) / _SAMPLES**2 * view.size[0] * view.size[1] / (extent[0] * extent[1])
     grid = cells_of(*extent, round(settings.points / min(max(share, 0.05), 1.0)))
-    seen = View(view.intensity, correction, view.surface)
-    origins, cells, _ = candidates(view, region, grid, SIDE, base, _cells_shown(seen, targets, region, grid))
+    corrected = View(view.intensity, correction, view.surface)
+    origins, cells, _ = candidates(view, region, grid, SIDE, base, _cells_shown(corrected, targets, region, grid))
     tried = _Tried(view, targets, origins, cells, base, settings.threads)
     tried.search(correction)
     tried.refuse_accident(correction, reach)
