@@ -139,7 +139,7 @@ def test_odm_orientations_are_those_given_and_project_as_opensfm_does(real):
         shot = document["shots"][name]
         image = np.random.default_rng(0).uniform(0, 1, (100, 2)) * (1368, 912)
         ground = topocentric.image_to_ground(image, 80.0)
-        local = topocentric._working(ground)
+        local = topocentric.working_frame.from_ground(ground)
         x, y, z = Rotation.from_rotvec(shot["rotation"]).apply(local).T + np.array(shot["translation"])[:, None]
         x, y = x / z, y / z
         r2 = x**2 + y**2
