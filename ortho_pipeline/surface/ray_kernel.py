@@ -26,13 +26,44 @@ def clearance(u, v, t, heights, left, top, middle, half):
 
 
 @compiled
-def march(image, nodes, origin, spacing, heights, left, top, middle, half, tolerance, found):
-    """Fill `found` ``(N,)`` with the heights at which rays first meet the terrain, from above; NaN where they do not.
+def first_meeting(u, v, heights, left, top, middle, half, tolerance):
+    """Return the normalised height at which a ray first meets the terrain, from above; NaN where it does not.
 
     Steps are at most one DEM sample long in plan, so that no ridge is stepped over; the bracket is then narrowed by
     false position, with a bisection every third time, until ray and terrain differ by less than `tolerance` (m).
     """
-    u, v = np.empty(5), np.empty(5)
+    length = 2.0 * np.hypot(u[1] + u[3], v[1] + v[3])
+    if not length < 1e5:
+        return np.nan
+    steps = int(length) + 1
+    high, above = 1.0, clearance(u, v, 1.0, heights, left, top, middle, half)
+    low, below = high, above
+    for step in range(1, steps + 1):
+        low = 1.0 - 2.0 * step / steps
+        below = clearance(u, v, low, heights, left, top, middle, half)
+        if below <= 0.0:
+            break
+        high, above = low, below
+    if not (below <= 0.0 and above > 0.0):
+        return np.nan
+    for turn in range(60):
+        t = 0.5 * (high + low) if turn % 3 == 2 else high - above * (low - high) / (below - above)
+        miss = clearance(u, v, t, heights, left, top, middle, half)
+        if abs(miss) <= tolerance:
+            return t
+        if miss > 0.0:
+            high, above = t, miss
+        elif miss <= 0.0:
+            low, below = t, miss
+        else:
+            break
+    return np.nan
+
+
+@compiled
+def march(image, nodes, origin, spacing, heights, left, top, middle, half, tolerance, found):
+    """Fill `found` ``(N,)`` with the heights at which rays first meet the terrain; NaN where they do not."""
+    u, v = np.empty(nodes.shape[2]), np.empty(nodes.shape[2])
     for k in range(image.shape[0]):
         found[k] = np.nan
         px, py = (image[k, 0] - origin[0]) / spacing, (image[k, 1] - origin[1]) / spacing
@@ -41,7 +72,7 @@ def march(image, nodes, origin, spacing, heights, left, top, middle, half, toler
         i, j = min(int(px), nodes.shape[1] - 2), min(int(py), nodes.shape[0] - 2)
         fx, fy = px - i, py - j
         w00, w10, w01, w11 = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
-        for m in range(5):
+        for m in range(nodes.shape[2]):
             u[m] = (
                 w00 * nodes[j, i, m, 0] + w10 * nodes[j, i + 1, m, 0]
                 + w01 * nodes[j + 1, i, m, 0] + w11 * nodes[j + 1, i + 1, m, 0]
@@ -50,28 +81,4 @@ def march(image, nodes, origin, spacing, heights, left, top, middle, half, toler
                 w00 * nodes[j, i, m, 1] + w10 * nodes[j, i + 1, m, 1]
                 + w01 * nodes[j + 1, i, m, 1] + w11 * nodes[j + 1, i + 1, m, 1]
             )  # fmt: skip
-        length = 2.0 * np.hypot(u[1] + u[3], v[1] + v[3])
-        if not length < 1e5:
-            continue
-        steps = int(length) + 1
-        high, above = 1.0, clearance(u, v, 1.0, heights, left, top, middle, half)
-        for step in range(1, steps + 1):
-            low = 1.0 - 2.0 * step / steps
-            below = clearance(u, v, low, heights, left, top, middle, half)
-            if below <= 0.0:
-                break
-            high, above = low, below
-        if not (below <= 0.0 and above > 0.0):
-            continue
-        for turn in range(60):
-            t = 0.5 * (high + low) if turn % 3 == 2 else high - above * (low - high) / (below - above)
-            miss = clearance(u, v, t, heights, left, top, middle, half)
-            if abs(miss) <= tolerance:
-                found[k] = middle + half * t
-                break
-            if miss > 0.0:
-                high, above = t, miss
-            elif miss <= 0.0:
-                low, below = t, miss
-            else:
-                break
+        found[k] = middle + half * first_meeting(u, v, heights, left, top, middle, half, tolerance)

@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 MANY = 20_000
 #: Spacings (px) of the lattice, tried one after the other.
 _SPACINGS = (128, 64, 32, 16)
-_LEVELS = 5
+#: Coefficients of a polynomial along a ray, as `ray_kernel.clearance` has them.
+LEVELS = 5
 #: More DEM samples under the points than this are not held in memory at once.
 _MOST_SAMPLES = 64_000_000
 _PROBES = 500
@@ -66,6 +67,23 @@ def meet_surface(model: SensorModel, image: ArrayLike, surface: Surface, *, tole
     ground = model.image_to_ground(image, height)
     ground[np.isnan(height)] = np.nan
     return ground
+
+
+def levels(count: int) -> Array:
+    """Return normalised heights to evaluate a model at: the Chebyshev-Lobatto nodes of [-1, 1], upwards."""
+    return -np.cos(np.pi * np.arange(count) / (count - 1))
+
+
+def polynomials(values: Array) -> Array:
+    """Return the coefficients ``(..., n, k)`` of polynomials in normalised height through values ``(..., n, k)``.
+
+    Parameters
+    ----------
+    values : (..., n, k)
+        At the n `levels`.
+    """
+    inverse = np.linalg.inv(np.vander(levels(values.shape[-2]), increasing=True))
+    return np.einsum("kl,...la->...ka", inverse, values)
 
 
 class _Ray:
@@ -150,7 +168,7 @@ def _march_many(
     middle, half = (low + high) / 2, (high - low) / 2
     for spacing in _SPACINGS:
         size = (extent // spacing).astype(int) + 2
-        if size.prod() * _LEVELS > len(image):
+        if size.prod() * LEVELS > len(image):
             return None  # the lattice would cost more than it saves
         nodes = _ray_lattice(ray, origin, size, spacing, middle, half)
         if _lattice_error(ray, nodes, origin, extent, spacing, middle, half) * 2 * steepest <= tolerance:
@@ -162,17 +180,12 @@ def _march_many(
     return None
 
 
-def _levels() -> Array:
-    return -np.cos(np.pi * np.arange(_LEVELS) / (_LEVELS - 1))
-
-
 def _ray_lattice(ray: _Ray, origin: Array, size: NDArray[np.int_], spacing: int, middle: float, half: float) -> Array:
     """Return the coefficients ``(rows, columns, levels, 2)`` of DEM coordinates as polynomials in height."""
     columns, rows = np.meshgrid(origin[0] + spacing * np.arange(size[0]), origin[1] + spacing * np.arange(size[1]))
-    image = np.repeat(np.column_stack([columns.ravel(), rows.ravel()]), _LEVELS, axis=0)
-    uv = ray.samples(image, np.tile(middle + half * _levels(), columns.size))
-    polynomial = np.linalg.inv(np.vander(_levels(), increasing=True))
-    return np.einsum("kl,nla->nka", polynomial, uv.reshape(-1, _LEVELS, 2)).reshape(size[1], size[0], _LEVELS, 2)
+    image = np.repeat(np.column_stack([columns.ravel(), rows.ravel()]), LEVELS, axis=0)
+    uv = ray.samples(image, np.tile(middle + half * levels(LEVELS), columns.size))
+    return polynomials(uv.reshape(size[1], size[0], LEVELS, 2))
 
 
 def _lattice_error(
@@ -186,7 +199,7 @@ def _lattice_error(
     fx, fy = (place - np.floor(place)).T[:, :, None, None]
     upper = nodes[j, i] * (1 - fx) + nodes[j, i + 1] * fx
     lower = nodes[j + 1, i] * (1 - fx) + nodes[j + 1, i + 1] * fx
-    found = np.einsum("nk,nka->na", t[:, None] ** np.arange(_LEVELS), upper * (1 - fy) + lower * fy)
+    found = np.einsum("nk,nka->na", t[:, None] ** np.arange(LEVELS), upper * (1 - fy) + lower * fy)
     error = np.abs(found - ray.samples(image, middle + half * t)).max(axis=1)
     return float(np.where(np.isnan(error), np.inf, error).max())
 

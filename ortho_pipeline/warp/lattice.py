@@ -44,6 +44,7 @@ from ortho_pipeline.geodesy.crs import GroundTransform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface, Window
+from ortho_pipeline.surface.rays import levels, polynomials
 from ortho_pipeline.warp import lattice_kernel
 from ortho_pipeline.warp.block_kernel import DemWindow, Lattice, heights_at
 
@@ -144,11 +145,6 @@ def _positions(spacing: int) -> tuple[Array, Array]:
     return columns, rows
 
 
-def _levels(count: int) -> Array:
-    """Return normalised heights at which the model is evaluated: Chebyshev-Lobatto nodes of [-1, 1]."""
-    return -np.cos(np.pi * np.arange(count) / (count - 1))
-
-
 def _scatter(blocks: list[OutputBlock], area: Array) -> Array:
     """Return `VERIFIED` points of each block ``(blocks, n, 3)``: column and row offsets, normalised height.
 
@@ -236,19 +232,17 @@ class Lattices:
                 self.refined += block.spacing != REFINEMENTS[0][0]
         return [block for block in blocks if block.window is not None]
 
-    def _evaluate(self, blocks: list[OutputBlock], spacing: int, levels: int, uv: Array) -> Array:
+    def _evaluate(self, blocks: list[OutputBlock], spacing: int, count: int, uv: Array) -> Array:
         """Set the lattices of `blocks` from exact model evaluations; return a bound on the error of each ``(blocks,)``.
 
         Infinite for a block into which the scene may come between nodes that the model does not project.
         """
         columns, rows = self._offsets(blocks, *_positions(spacing))
-        steps = _levels(levels)
         middle = np.array([block.middle for block in blocks])[:, None, None, None]
         half = np.array([block.half for block in blocks])[:, None, None, None]
-        heights = np.broadcast_to(middle + half * steps, (*columns.shape, levels))
+        heights = np.broadcast_to(middle + half * levels(count), (*columns.shape, count))
         image = self._exact.image(columns, rows, heights)
-        polynomial = np.linalg.inv(np.vander(steps, increasing=True))
-        coefficients = np.einsum("kl,...la->...ka", polynomial, image)
+        coefficients = polynomials(image)
         for k, block in enumerate(blocks):
             self._set(block, spacing, coefficients[k], image[k], uv[k])
         return self._bounds(blocks, image, coefficients, uv)

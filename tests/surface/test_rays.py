@@ -102,3 +102,11 @@ def test_a_fill_rule_goes_on_beyond_the_dem_for_many_points_too(model, surface, 
     # The compiled inverse of many points and the one of few agree to rounding.
     np.testing.assert_allclose(ground[:2000], meet_surface(model, image[:2000], half), atol=1e-9)
     assert np.isfinite(ground).all()
+
+
+@pytest.mark.parametrize("count", [3, 5, 7])
+def test_polynomials_in_height_go_through_their_values(count):
+    values = np.random.default_rng(count).normal(size=(2, 3, count, 2))
+    powers = np.vander(rays.levels(count), increasing=True)
+    np.testing.assert_allclose(np.einsum("lk,...ka->...la", powers, rays.polynomials(values)), values, atol=1e-13)
+    assert rays.levels(count)[[0, -1]].tolist() == [-1.0, 1.0]

@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ortho_pipeline.files.compiled import compiled
-from ortho_pipeline.surface.ray_kernel import clearance
-
-#: Powers of height in the polynomials of a node, as `surface.ray_kernel` has them.
-LEVELS = 5
+from ortho_pipeline.surface.ray_kernel import first_meeting
 
 
 @compiled
@@ -21,50 +18,26 @@ def positions(nodes, heights, left, top, middle, half, tolerance, out):
     """
     rows, columns = out.shape[:2]
     last = nodes.shape[0] - 1
-    u, v, s, t = np.empty(LEVELS), np.empty(LEVELS), np.empty(LEVELS), np.empty(LEVELS)
+    levels = nodes.shape[2]
+    u, v, s, t = np.empty(levels), np.empty(levels), np.empty(levels), np.empty(levels)
     for row in range(rows):
         y = (row + 0.5) / rows * last
         j = min(int(y), last - 1)
         fy = y - j
         for column in range(columns):
-            out[row, column, 0] = out[row, column, 1] = np.nan
             x = (column + 0.5) / columns * last
             i = min(int(x), last - 1)
             fx = x - i
             w00, w10, w01, w11 = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
-            for k in range(LEVELS):
+            for k in range(levels):
                 a, b, c, d = nodes[j, i, k], nodes[j, i + 1, k], nodes[j + 1, i, k], nodes[j + 1, i + 1, k]
                 u[k] = w00 * a[0] + w10 * b[0] + w01 * c[0] + w11 * d[0]
                 v[k] = w00 * a[1] + w10 * b[1] + w01 * c[1] + w11 * d[1]
                 s[k] = w00 * a[2] + w10 * b[2] + w01 * c[2] + w11 * d[2]
                 t[k] = w00 * a[3] + w10 * b[3] + w01 * c[3] + w11 * d[3]
-            length = 2.0 * np.hypot(u[1] + u[3], v[1] + v[3])
-            if not length < 1e5:
-                continue
-            steps = int(length) + 1
-            high, above = 1.0, clearance(u, v, 1.0, heights, left, top, middle, half)
-            low, below = high, above
-            for step in range(1, steps + 1):
-                low = 1.0 - 2.0 * step / steps
-                below = clearance(u, v, low, heights, left, top, middle, half)
-                if below <= 0.0:
-                    break
-                high, above = low, below
-            if not (below <= 0.0 and above > 0.0):
-                continue
-            for turn in range(40):
-                z = 0.5 * (high + low) if turn % 3 == 2 else high - above * (low - high) / (below - above)
-                miss = clearance(u, v, z, heights, left, top, middle, half)
-                if abs(miss) <= tolerance:
-                    out[row, column, 0] = s[0] + z * (s[1] + z * (s[2] + z * (s[3] + z * s[4])))
-                    out[row, column, 1] = t[0] + z * (t[1] + z * (t[2] + z * (t[3] + z * t[4])))
-                    break
-                if miss > 0.0:
-                    high, above = z, miss
-                elif miss <= 0.0:
-                    low, below = z, miss
-                else:
-                    break
+            z = first_meeting(u, v, heights, left, top, middle, half, tolerance)
+            out[row, column, 0] = s[0] + z * (s[1] + z * (s[2] + z * (s[3] + z * s[4])))
+            out[row, column, 1] = t[0] + z * (t[1] + z * (t[2] + z * (t[3] + z * t[4])))
 
 
 @compiled

@@ -21,6 +21,7 @@ from ortho_pipeline.imaging.matching.targets import Target
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.intensity import EXACT, Intensity
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.rays import LEVELS, levels, polynomials
 
 Pixels = NDArray[np.float32]
 #: Nodes per side of a chip's lattice, tried until it is this exact (pixels of the target).
@@ -150,7 +151,7 @@ class _Nodes:
         self.windows: list[tuple[int, int, int, int]] = [(0, 0, 0, 0)] * count
         self.middle, self.half = np.zeros(count), np.ones(count)
         self.seen = self._heights()
-        self.coefficients = np.zeros((count, _NODES[0], _NODES[0], chip_kernel.LEVELS, 4))
+        self.coefficients = np.zeros((count, _NODES[0], _NODES[0], LEVELS, 4))
         for nodes in (nodes for nodes in _NODES if extent / (nodes - 1) <= _SPACING or nodes == _NODES[-1]):
             self.coefficients = self._evaluate(np.arange(count), nodes)
             if self._error(nodes) <= _EXACT:
@@ -221,17 +222,15 @@ class _Nodes:
         return np.asarray(self._sampler(ground)).reshape(-1, 2 * count, 2)
 
     def _evaluate(self, chips: NDArray[np.int_], nodes: int) -> Array:
-        levels = -np.cos(np.pi * np.arange(chip_kernel.LEVELS) / (chip_kernel.LEVELS - 1))
         steps = np.linspace(0.0, self._extent, nodes)
         columns, rows = np.meshgrid(steps, steps)
         offsets = np.stack([columns, rows], axis=-1)
         image = self._origins[chips][:, None, None] + offsets
-        image = np.broadcast_to(image[:, :, :, None], (*image.shape[:3], len(levels), 2))
-        heights = self.middle[chips][:, None] + self.half[chips][:, None] * levels
+        image = np.broadcast_to(image[:, :, :, None], (*image.shape[:3], LEVELS, 2))
+        heights = self.middle[chips][:, None] + self.half[chips][:, None] * levels(LEVELS)
         heights = np.broadcast_to(heights[:, None, None], image.shape[:4])
         values = self._exact(image.reshape(-1, 2), heights.ravel()).reshape(*image.shape[:4], 4)
-        polynomial = np.linalg.inv(np.vander(levels, increasing=True))
-        return np.ascontiguousarray(np.einsum("kl,nijla->nijka", polynomial, values))
+        return np.ascontiguousarray(polynomials(values))
 
     def _exact(self, image: Array, heights: Array) -> Array:
         """Return positions in DEM and target ``(N, 4)`` of image points at heights."""
@@ -247,7 +246,7 @@ class _Nodes:
         image = self._origins[chips] + cell * 0.5
         heights = self.middle[chips] + 0.7 * self.half[chips]
         found = self.coefficients[chips][:, :2, :2].mean(axis=(1, 2))
-        powers = 0.7 ** np.arange(chip_kernel.LEVELS)
+        powers = 0.7 ** np.arange(LEVELS)
         error = np.abs(np.einsum("k,nka->na", powers, found) - self._exact(image, heights))[:, 2:]
         error = error[np.isfinite(error).all(axis=1)]
         return float(error.max(initial=0.0))
