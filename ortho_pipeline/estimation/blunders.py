@@ -22,6 +22,7 @@ import numpy as np
 from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
 from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
+from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points
 
@@ -167,8 +168,7 @@ def _snooping_start(
         standardised = solution.errors.whitened(solution.residuals)
         good = np.linalg.det(redundancy) > 1e-6
         squares = np.zeros(len(redundancy))
-        solved = np.linalg.solve(redundancy[good], standardised[good][:, :, None])[:, :, 0]
-        squares[good] = (standardised[good] * solved).sum(axis=1)
+        squares[good] = squared_distances(standardised[good], redundancy[good])
         freedom = solution.freedom - 2
         if solution.sigma0 is None or freedom < 1:
             break
@@ -200,7 +200,7 @@ def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
     jacobian[~np.isfinite(jacobian).all(axis=(1, 2))] = 0.0
     spread = np.eye(2) + jacobian @ solution.cofactors @ jacobian.transpose(0, 2, 1)
     standardised = np.minimum(problem.errors.whitened(np.minimum(miss, _FAR)), _FAR)
-    distance = (standardised * np.linalg.solve(spread, standardised[:, :, None])[:, :, 0]).sum(axis=1)
+    distance = squared_distances(standardised, spread)
     freedom = max(solution.freedom, 1.0)
     scale = max(solution.sigma0 or 0.0, _SCALE_FLOOR)
     return fdtrc(2, freedom, distance / 2 / scale**2), np.hypot(miss[:, 0], miss[:, 1])
@@ -293,7 +293,7 @@ def _outlying_checks(solution: Solution, points: Points, sigma0: float) -> list[
         jacobian = np.zeros((len(miss), 2, 0))
     spread = np.eye(2) + jacobian @ solution.cofactors @ jacobian.transpose(0, 2, 1)
     standardised = problem.errors.whitened(miss)
-    squares = (standardised * np.linalg.solve(spread, standardised[:, :, None])[:, :, 0]).sum(axis=1)
+    squares = squared_distances(standardised, spread)
     scale, freedom = max(sigma0, _SCALE_FLOOR) ** 2, max(solution.freedom, 1.0)
     own = float(np.median(squares)) / _MEDIAN_OF_TWO
     if len(squares) >= _OWN_SCATTER and own > scale:

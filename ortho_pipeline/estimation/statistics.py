@@ -14,6 +14,14 @@ import numpy as np
 from ortho_pipeline.geodesy.ellipsoid import Array
 
 
+def squared_distances(residuals: Array, covariance: Array) -> Array:
+    r"""Return :math:`r^T C^{-1} r` ``(n,)`` of residuals ``(n, k)`` and their covariances ``(n, k, k)``.
+
+    Under the normal distribution they follow chi-squared of k degrees of freedom.
+    """
+    return np.asarray(np.einsum("ni,ni->n", residuals, np.linalg.solve(covariance, residuals[:, :, None])[:, :, 0]))
+
+
 def correlation_of(covariance: Array) -> Array:
     """Return the correlation matrix ``(P, P)`` of a covariance matrix; NaN for what has no variance."""
     sigma = np.sqrt(np.diag(covariance))

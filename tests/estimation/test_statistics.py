@@ -10,7 +10,7 @@ import pytest
 
 from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.estimation.family_fit import fit_family
-from ortho_pipeline.estimation.statistics import correlation_of, student_of, total_correlation_of
+from ortho_pipeline.estimation.statistics import correlation_of, squared_distances, student_of, total_correlation_of
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.selection import select_control
 
@@ -150,3 +150,12 @@ def test_check_points_stay_check_points():
 def test_other_texts_are_refused(spec):
     with pytest.raises(InputError):
         select_control(make_points(10), spec)
+
+
+def test_squared_distances_are_those_in_whitened_coordinates():
+    random = np.random.default_rng(5)
+    root = np.tril(random.normal(size=(20, 2, 2))) + 2 * np.eye(2)
+    standard = random.normal(size=(20, 2))
+    residuals = np.einsum("nij,nj->ni", root, standard)
+    found = squared_distances(residuals, root @ root.transpose(0, 2, 1))
+    np.testing.assert_allclose(found, (standard**2).sum(axis=1), rtol=1e-10)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError, TooFewPoints, counted
+from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.geodesy.ellipsoid import units_per_metre
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
@@ -398,7 +399,7 @@ class _Tried:
             residuals = off - design @ _robust(design, off)
             self.components = components(residuals, self.covariance[good], along)
             total = self.components.covariance(self.covariance[good], along)
-            distance = np.einsum("ni,ni->n", residuals, np.linalg.solve(total, residuals[:, :, None])[:, :, 0])
+            distance = squared_distances(residuals, total)
             bad = distance > _SIGMAS**2
             if not bad.any():
                 return

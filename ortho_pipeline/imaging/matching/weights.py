@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize
 
+from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.models.base import Array
 
 _ROUNDS = 4
@@ -69,7 +70,7 @@ def components(residuals: Array, matched: Array, along: Array) -> Components:
     found = np.array([0.0, 0.0, max(float(scale), 1e-6)])
     for _ in range(_ROUNDS):
         expected = parts @ found + 1e-9 * np.eye(2)
-        distance = np.einsum("ni,ni->n", residuals, np.linalg.solve(expected, residuals[:, :, None])[:, :, 0])
+        distance = squared_distances(residuals, expected)
         good = distance <= _BLUNDER
         if good.sum() < 8:
             break

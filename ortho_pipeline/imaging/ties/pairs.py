@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.ellipsoid import units_per_metre
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
@@ -275,7 +276,7 @@ class Pair:
                 chips.covariance[index], along[index]
             )
             apart = residuals[index]
-            distance = np.einsum("ni,ni->n", apart, np.linalg.solve(total, apart[:, :, None])[:, :, 0])
+            distance = squared_distances(apart, total)
             bad = distance > _SIGMAS**2
             if not bad.any():
                 break
@@ -349,7 +350,7 @@ def _fitted(design: Array, offset: Array, matched: Array, along: Array) -> tuple
     parts = components(residuals, matched, along)
     for _ in range(3):
         total = replace(parts, other=max(parts.other, _FLOOR)).covariance(matched, along)
-        distance = np.einsum("ni,ni->n", residuals, np.linalg.solve(total, residuals[:, :, None])[:, :, 0])
+        distance = squared_distances(residuals, total)
         weight = np.linalg.inv(total) / np.maximum(1.0, np.sqrt(distance) / 2.0)[:, None, None]
         rows = np.einsum("nk,ij->nijk", design, np.eye(2)).reshape(len(design), 2, 2 * design.shape[1])
         normal = np.einsum("nip,nij,njq->pq", rows, weight, rows)
