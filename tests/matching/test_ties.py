@@ -161,8 +161,16 @@ def test_scenes_of_different_places_have_no_ties(tmp_path):
     scenes, views = looks(tmp_path, [-5.0], side=280)
     other = Look(replace(scenes[0].setting, seed=1), tmp_path, 1)
     write_raster(other.scene_file, other.rendered(), "uint16", rpc=other.model)
-    with pytest.raises(InputError, match=r"there are no ties: scene0.tif and scene1.tif: "):
+    with pytest.raises(InputError, match=r"there are no ties: scene0.tif and scene1.tif: ") as refused:
         tie([*views, other.view(views[0].surface)], TieSettings(search=25.0))
+    assert "reference" not in str(refused.value)
+
+
+def test_resolutions_that_are_too_different_are_said_of_both_images(tmp_path):
+    _, views = looks(tmp_path, [-14.0], side=280)
+    coarse = ImageCorrection(views[0].model, "affine", (0.0, 0.0), np.array([0.0, -0.9, 0, 0, 0, -0.9]))
+    with pytest.raises(InputError, match=r"a pixel of scene0.tif is 0.1 pixels of scene0.tif"):
+        tie([views[0], replace(views[0], model=coarse)], TieSettings(search=25.0))
 
 
 def run(*args: object, code: int = 0) -> str:

@@ -197,7 +197,7 @@ def match_scene(
         For references that are none, a scene without model or heights, and what matching refuses.
     """
     from ortho_pipeline.imaging.matching import MatchSettings, View, match, open_references
-    from ortho_pipeline.imaging.matching.matcher import metres_per_pixel
+    from ortho_pipeline.imaging.matching.targets import metres_per_pixel
 
     if surface is None:
         raise InputError(

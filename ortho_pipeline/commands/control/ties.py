@@ -121,7 +121,7 @@ def tie_scenes(
         For a scene without a model, fewer than two scenes, and scenes that cannot be tied together.
     """
     from ortho_pipeline.imaging.matching import View
-    from ortho_pipeline.imaging.matching.matcher import metres_per_pixel
+    from ortho_pipeline.imaging.matching.targets import metres_per_pixel
     from ortho_pipeline.imaging.ties import TieSettings, tie
 
     if len(scenes) < 2:

@@ -3,9 +3,8 @@
 Imports `surface` and what is below; a sensor model is only asked where it puts things.
 """
 
-from ortho_pipeline.imaging.matching.chips import View
 from ortho_pipeline.imaging.matching.matcher import REASONS, Matches, MatchSettings, match
-from ortho_pipeline.imaging.matching.targets import OtherScene, Reference, Target, open_references
+from ortho_pipeline.imaging.matching.targets import OtherScene, Reference, Target, View, open_references
 
 __all__ = [
     "REASONS",

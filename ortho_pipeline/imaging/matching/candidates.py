@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ortho_pipeline.imaging.matching.chips import View
+from ortho_pipeline.imaging.matching.targets import View
 from ortho_pipeline.models.base import Array
 
 #: Largest window (chip px) that is looked at in a cell: so the cost does not depend on the size of the scene.

@@ -10,16 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import CoverageError
 from ortho_pipeline.imaging.matching import chip_kernel
-from ortho_pipeline.imaging.matching.targets import Target
-from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.raster.intensity import EXACT, Intensity
+from ortho_pipeline.imaging.matching.targets import Target, View
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.raster.intensity import EXACT
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import LEVELS, levels, polynomials
 
@@ -38,27 +37,6 @@ _NEARLY_ALL = 0.95
 _PROBED = 24
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """A scene as a matcher sees it.
-
-    Parameters
-    ----------
-    intensity : Intensity
-    model : SensorModel
-    surface : Surface
-    """
-
-    intensity: Intensity
-    model: SensorModel
-    surface: Surface
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Columns and rows."""
-        return self.intensity.width, self.intensity.height
-
-
 def scene_chips(view: View, origins: NDArray[np.int_], size: int, factor: int) -> Pixels:
     """Return intensities ``(n, size, size)`` of chips of `size` means of `factor` x `factor` pixels.
 
@@ -69,17 +47,6 @@ def scene_chips(view: View, origins: NDArray[np.int_], size: int, factor: int) -
     """
     read = [view.intensity.read(int(column), int(row), size, size, factor) for column, row in origins]
     return np.array(read, dtype=np.float32).reshape(len(origins), size, size)
-
-
-def resolution_ratio(view: View, target: Target, image: Array) -> Array:
-    """Return pixels of the target per pixel of the scene ``(n,)`` at image points; NaN where it shows nothing."""
-    heights = np.full(len(image), view.model.reference_height)
-    around = [
-        target.project(view.model.image_to_ground(image + step, heights), view.model.crs)
-        for step in ((0.0, 0.0), (8.0, 0.0), (0.0, 8.0))
-    ]
-    across, down = (around[1] - around[0]) / 8, (around[2] - around[0]) / 8
-    return np.sqrt(np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]))
 
 
 def rendered_chips(view: View, target: Target, origins: NDArray[np.int_], size: int, factor: int) -> Pixels:

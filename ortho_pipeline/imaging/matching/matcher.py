@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,14 +11,30 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError, TooFewPoints, counted
 from ortho_pipeline.estimation.statistics import squared_distances
-from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
+from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.ellipsoid import units_per_metre
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
-from ortho_pipeline.imaging.matching.chips import Renderer, View, resolution_ratio, scene_chips
-from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
+from ortho_pipeline.imaging.matching.chip_search import (
+    FEWEST,
+    MEASURED,
+    SIDE,
+    SIGMAS,
+    doubts,
+    found_again,
+    in_batches,
+)
+from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.least_squares import measure
 from ortho_pipeline.imaging.matching.search import Level, agreed, place, refuse_accident
-from ortho_pipeline.imaging.matching.targets import Target
+from ortho_pipeline.imaging.matching.targets import (
+    SAMPLES,
+    Target,
+    View,
+    chip_factor,
+    metres_per_pixel,
+    shown_by,
+    spread_over,
+)
 from ortho_pipeline.imaging.matching.weights import Components, components
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
@@ -29,32 +43,16 @@ from ortho_pipeline.points.image_errors import sigma_of_covariance
 from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.surface.rays import meet_surface
 
-#: Side of a chip (chip px), and radius of the last search about the corrected model.
-SIDE, _RADIUS = 40, 4
-#: A second peak of more than this part of the first: the place is not unique.
-_UNIQUE = 0.85
-#: Correlation of orientations below which a match could as well be noise.
-_LEAST_SCORE = 0.25
-#: Forward and backward match differ by less than this (chip px).
-_BACK = 0.7
-#: A match within so many chip px of the correction that most agree on belongs to them; and within so many sigmas.
-_NEAR, _SIGMAS = 2.5, 3.5
-#: Part of a chip that the target shows at least.
-_SEEN = 0.8
-#: Resolutions of scene and target differ by at most this factor.
-_RATIO = 8.0
-#: Points per side at which it is asked what a target shows of the scene.
-_SAMPLES = 32
+#: Radius (chip px) of the search about the corrected model.
+_RADIUS = 4
+#: A match within so many chip px of the correction that most agree on belongs to them.
+_NEAR = 2.5
 #: Rounds of rendering and measuring; the last is the one whose correction moves by less than this (px).
 _ROUNDS, _STANDS = 3, 0.02
-#: Radius (chip px) of what is rendered to measure in, and rounds of judging.
-_MEASURED, _JUDGED = 4, 6
-#: Fewer matches than this are no control.
-FEWEST = 12
+#: Rounds of judging.
+_JUDGED = 6
 #: Bytes of a job, of which GDAL's cache has a quarter.
 _MEMORY = 512_000_000
-#: Chips that are worked on together.
-_BATCH = 32
 #: Why a match was not kept, in words.
 REASONS = {
     "hidden": "the target shows too little of the chip",
@@ -147,13 +145,13 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     seen = [view.intensity, *(target.intensity for target in targets)]
     limit_cache(_MEMORY, settings.threads, *(one.source.block for one in seen))
     shown = _shown(view, targets)
-    base = _base(view, targets, shown)
+    base = chip_factor(view, targets, shown)
     reach = max(settings.search / metres_per_pixel(view), 2.0 * base)
     region = _region(view, shown)
     correction, levels = place(view, targets, reach, base, region)
     extent = region[2] - region[0], region[3] - region[1]
     # The targets may show a part of that rectangle only.
-    share = len(shown) / _SAMPLES**2 * view.size[0] * view.size[1] / (extent[0] * extent[1])
+    share = len(shown) / SAMPLES**2 * view.size[0] * view.size[1] / (extent[0] * extent[1])
     grid = cells_of(*extent, round(settings.points / min(max(share, 0.05), 1.0)))
     corrected = View(view.intensity, correction, view.surface)
     origins, cells, _ = candidates(view, region, grid, SIDE, base, _cells_shown(corrected, targets, region, grid))
@@ -177,22 +175,20 @@ def _shown(view: View, targets: Sequence[Target]) -> Array:
     InputError
         If there are none.
     """
-    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-    columns, rows = np.meshgrid(steps * view.size[0], steps * view.size[1])
-    image = np.column_stack([columns.ravel(), rows.ravel()])
+    image = spread_over(view)
     inside = _inside(view, targets, image)
-    if inside.sum() < _SAMPLES:
+    if inside.sum() < SAMPLES:
         raise InputError(
-            f"the reference shows {'nothing' if not inside.any() else 'next to nothing'} of the scene",
-            file=targets[0].path, field="match.reference",
-            remedy="give a reference of this place; if it is, the model of the scene leads elsewhere (`ortho info`)",
+            f"{targets[0].called} shows {'nothing' if not inside.any() else 'next to nothing'} of the scene",
+            file=targets[0].path, field=targets[0].field,
+            remedy="give images of the same place; if they are, the model of the scene leads elsewhere (`ortho info`)",
         )  # fmt: skip
     return image[inside]
 
 
 def _region(view: View, shown: Array) -> tuple[int, int, int, int]:
     """Return the rectangle (left, top, right, bottom) of the scene about points ``(n, 2)`` that a target shows."""
-    half = np.array(view.size) / (2 * _SAMPLES)
+    half = np.array(view.size) / (2 * SAMPLES)
     low = np.maximum(np.floor(shown.min(axis=0) - half), 0).astype(int)
     high = np.minimum(np.ceil(shown.max(axis=0) + half), view.size).astype(int)
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])
@@ -204,12 +200,7 @@ def _inside(view: View, targets: Sequence[Target], image: Array) -> NDArray[np.b
     # Where the model is off, the surface may end too soon: its reference height stands in.
     lost = np.isnan(ground).any(axis=1)
     ground[lost] = view.model.image_to_ground(image[lost], view.model.reference_height)
-    found = np.zeros(len(image), dtype=bool)
-    for target in targets:
-        places = target.project(ground, view.model.crs)
-        with np.errstate(invalid="ignore"):
-            found |= ((places >= 0) & (places <= (target.intensity.width, target.intensity.height))).all(axis=1)
-    return found
+    return shown_by(targets, ground, view.model.crs)
 
 
 def _cells_shown(
@@ -221,35 +212,6 @@ def _cells_shown(
     ]
     columns, rows = np.meshgrid(*steps)
     return _inside(view, targets, np.column_stack([columns.ravel(), rows.ravel()])).reshape(rows.shape)
-
-
-def _base(view: View, targets: Sequence[Target], shown: Array) -> int:
-    """Return how many pixels of the scene are as large as one of the target, at least 1.
-
-    Raises
-    ------
-    InputError
-        If the resolutions are too different to be compared.
-    """
-    ratios = np.concatenate([resolution_ratio(view, target, shown) for target in targets])
-    ratio = float(np.nanmedian(ratios))
-    if not 1 / _RATIO <= ratio <= _RATIO:
-        raise InputError(
-            f"a pixel of the scene is {ratio:.3g} pixels of the reference", file=targets[0].path,
-            field="match.reference", remedy=f"give a reference of a resolution within 1/{_RATIO:.0f} to {_RATIO:.0f} "
-            "times that of the scene",
-        )  # fmt: skip
-    return max(1, round(1 / ratio))
-
-
-def metres_per_pixel(view: View) -> float:
-    """Return the size (m) of a pixel on the ground in the middle of the scene."""
-    middle = np.array(view.size) / 2
-    image = middle + np.array([(0.0, 0.0), (8.0, 0.0), (0.0, 8.0)])
-    ground = view.model.image_to_ground(image, view.model.reference_height)
-    placed = ground_transform(view.model.crs, "EPSG:4978")(ground)
-    across, down = placed[1] - placed[0], placed[2] - placed[0]
-    return math.sqrt(float(np.linalg.norm(np.cross(across, down)))) / 8
 
 
 class _Tried:
@@ -277,17 +239,6 @@ class _Tried:
         origins = self.origins[index] - radius * self.factor
         return Renderer(seen, self.targets, origins, SIDE + 2 * radius, self.factor)
 
-    def _in_batches(self, work: Callable[[NDArray[np.int_]], None], count: int) -> None:
-        """Do a work on the numbers 0 to `count`, some at a time; how many does not depend on the threads."""
-        every = np.arange(count)
-        batches = [every[first : first + _BATCH] for first in range(0, count, _BATCH)]
-        if self.threads == 1:
-            for batch in batches:
-                work(batch)
-            return
-        with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(work, batches))
-
     def search(self, correction: SensorModel) -> None:
         """Find each chip to a chip px about where the correction puts it."""
 
@@ -295,37 +246,14 @@ class _Tried:
 
         def work(index: NDArray[np.int_]) -> None:
             wide = renderer.render(index)
-            inner = wide[:, _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
-            fields = orientation(self.scene[index]), orientation(wide)
-            found = peaks(surfaces(fields[0], fields[1][:, _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]))
-            back = self._backward(correction, index, wide, found.shift)
-            self.score[index] = found.score
-            self.offset[index] = found.shift * self.factor
-            seen = np.isfinite(inner).mean(axis=(1, 2)) >= _SEEN
-            for name, passed in (
-                ("backward", back <= _BACK),
-                ("ambiguous", found.inside & (found.ratio <= _UNIQUE)),
-                ("weak", found.score >= _LEAST_SCORE),
-                ("hidden", seen),
-            ):
-                self.reason[index[~passed]] = name
-            passed = seen & (found.score >= _LEAST_SCORE) & found.inside & (found.ratio <= _UNIQUE) & (back <= _BACK)
-            self.reason[index[passed]] = ""
+            around = scene_chips(
+                self.view, self.origins[index] - _RADIUS * self.factor, SIDE + 2 * _RADIUS, self.factor
+            )
+            found = found_again(self.scene[index], wide, _RADIUS)
+            self.score[index], self.offset[index] = found.score, found.shift * self.factor
+            self.reason[index] = doubts(found, wide, around, _RADIUS)
 
-        self._in_batches(work, len(self.origins))
-
-    def _backward(
-        self, correction: SensorModel, index: NDArray[np.int_], wide: NDArray[np.float32], shift: Array
-    ) -> Array:
-        """Return how far (chip px) from where it began the way back from the target ends ``(n,)``."""
-        whole = np.clip(np.round(shift), -_RADIUS, _RADIUS).astype(int)
-        start = 2 * _RADIUS + whole
-        there = np.stack([
-            chip[row : row + SIDE, column : column + SIDE] for chip, (column, row) in zip(wide, start, strict=True)
-        ])  # fmt: skip
-        around = scene_chips(self.view, self.origins[index] - _RADIUS * self.factor, SIDE + 2 * _RADIUS, self.factor)
-        found = peaks(surfaces(orientation(there), orientation(around)))
-        return np.hypot(*(found.shift + (shift - whole)).T)
+        in_batches(work, np.arange(len(self.origins)), self.threads)
 
     def refuse_accident(self, correction: ImageCorrection, reach: float) -> None:
         """Raise an error if as many matches could as well agree by chance, at any place of the whole search."""
@@ -358,7 +286,7 @@ class _Tried:
     def measure(self, correction: SensorModel) -> None:
         """Measure each chip that is still of use to a part of a pixel, rendered anew where the correction puts it."""
 
-        radius, good = _MEASURED, np.flatnonzero(self.reason == "")
+        radius, good = MEASURED, np.flatnonzero(self.reason == "")
         renderer = self._renderer(correction, good, radius)
 
         def work(batch: NDArray[np.int_]) -> None:
@@ -374,7 +302,7 @@ class _Tried:
             bad = ~np.isfinite(found.shift).all(axis=1)
             self.reason[index[bad]] = "not measured"
 
-        self._in_batches(work, len(good))
+        in_batches(work, np.arange(len(good)), self.threads)
         good = np.flatnonzero(self.reason == "")
         self.ground[good] = meet_surface(correction, self.centres[good] + self.offset[good], self.view.surface)
         self.reason[good[np.isnan(self.ground[good]).any(axis=1)]] = "hidden"
@@ -400,7 +328,7 @@ class _Tried:
             self.components = components(residuals, self.covariance[good], along)
             total = self.components.covariance(self.covariance[good], along)
             distance = squared_distances(residuals, total)
-            bad = distance > _SIGMAS**2
+            bad = distance > SIGMAS**2
             if not bad.any():
                 return
             self.reason[good[bad]] = "contradicts"
@@ -410,8 +338,8 @@ class _Tried:
         why = ", ".join(f"{count} {REASONS[name]}" for name, count in counts.items() if count)
         return TooFewPoints(
             f"{counted(int((self.reason == '').sum()), 'match')} of {len(self.reason)} tried"
-            f"{': ' + why if why else ''}", file=self.targets[0].path, field="match.reference",
-            remedy="give a reference that is more alike (season, resolution), or control points by hand",
+            f"{': ' + why if why else ''}", file=self.targets[0].path, field=self.targets[0].field,
+            remedy="give images that are more alike (season, resolution), or points that are measured by hand",
         )  # fmt: skip
 
     def matches(self, settings: MatchSettings, levels: tuple[Level, ...]) -> Matches:

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from scipy import ndimage, stats
 
 from ortho_pipeline.errors import InputError, counted
-from ortho_pipeline.imaging.matching.chips import Renderer, View, scene_chips
+from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
-from ortho_pipeline.imaging.matching.targets import Target
+from ortho_pipeline.imaging.matching.targets import Target, View
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
 
@@ -172,7 +172,7 @@ def _coarsest(region: Region, reach: float, base: int) -> tuple[int, int, int]:
     if radius > _LARGEST_RADIUS:
         raise InputError(
             f"a search over {reach:.0f} px is too wide for an image of {larger} x {smaller} px",
-            field="match.search", remedy="search less far, or give control points by hand",
+            field="match.search", remedy="search less far, or measure points by hand",
         )  # fmt: skip
     return factor, min(side, smaller // factor), radius
 
@@ -250,9 +250,9 @@ def _standing_out(compared: Sequence[_Shown], targets: Sequence[Target], reach: 
         raise InputError(
             f"no place within {reach:.0f} px stands out: the best two of {len(compared)} are too much alike "
             f"(correlation {means[best]:.2f} and {means[other]:.2f} in the mean of {counted(len(common), 'chip')})",
-            file=targets[0].path, field="match.reference",
-            remedy="check that the reference shows this place, search farther (`match.search`) if the model may be "
-            "off by more, or give control points by hand where the ground is uniform or repeats itself",
+            file=targets[0].path, field=targets[0].field,
+            remedy=f"check that {targets[0].called} shows this place, search farther (`match.search`) if the model "
+            "may be off by more, or measure points by hand where the ground is uniform or repeats itself",
         )  # fmt: skip
     return best
 
@@ -323,16 +323,16 @@ def refuse_accident(
     share = min(1.0, math.pi * tolerance**2 / (2 * _NEXT + 1) ** 2)
     if float(stats.binom.sf(agreeing - 1, chips, share)) * places > _ACCIDENT:
         raise InputError(
-            f"the scene and the reference do not agree: {agreeing} of {counted(chips, 'chip')} fit together within "
-            f"{reach:.0f} px of where the model puts them, which chance does as well",
-            file=targets[0].path, field="match.reference",
-            remedy="check that the reference shows this place, search farther (`match.search`) if the model may be "
-            "off by more, or give control points by hand",
+            f"the scene and {targets[0].called} do not agree: {agreeing} of {counted(chips, 'chip')} fit together "
+            f"within {reach:.0f} px of where the model puts them, which chance does as well",
+            file=targets[0].path, field=targets[0].field,
+            remedy=f"check that {targets[0].called} shows this place, search farther (`match.search`) if the model "
+            "may be off by more, or measure points by hand",
         )  # fmt: skip
 
 
 def _no_overlap(targets: Sequence[Target], count: int) -> InputError:
     return InputError(
-        f"the reference shows too little of the scene ({counted(count, 'chip')} in both)", file=targets[0].path,
-        field="match.reference", remedy="give references that cover the scene, and heights that do",
+        f"{targets[0].called} shows too little of the scene ({counted(count, 'chip')} in both)", file=targets[0].path,
+        field=targets[0].field, remedy="give images that overlap more, and heights that cover them",
     )  # fmt: skip

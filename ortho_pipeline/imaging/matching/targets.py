@@ -1,7 +1,8 @@
-"""Images that a scene is matched with: reference orthoimages, or another scene. Each says where ground lies in it."""
+"""A scene, the images that it is matched with (reference orthoimages, or another scene), and what they show of it."""
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,12 +10,40 @@ from typing import Any, Protocol
 
 import numpy as np
 import pyproj
+from numpy.typing import NDArray
 
 from ortho_pipeline.errors import CrsError, InputError
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.surface.base import Surface
+
+#: Points per side of a scene at which it is asked what targets show of it.
+SAMPLES = 32
+#: Resolutions of scene and target differ by at most this factor.
+_RATIO = 8.0
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A scene as a matcher sees it.
+
+    Parameters
+    ----------
+    intensity : Intensity
+    model : SensorModel
+    surface : Surface
+    """
+
+    intensity: Intensity
+    model: SensorModel
+    surface: Surface
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Columns and rows."""
+        return self.intensity.width, self.intensity.height
 
 
 class Target(Protocol):
@@ -25,6 +54,16 @@ class Target(Protocol):
 
     @property
     def path(self) -> str: ...
+
+    @property
+    def called(self) -> str:
+        """What errors call it."""
+        ...
+
+    @property
+    def field(self) -> str:
+        """The option that it was given by."""
+        ...
 
     def project(self, ground: Array, crs: str) -> Array:
         """Return the pixel positions ``(N, 2)`` of ground ``(N, 3)``; NaN where there are none."""
@@ -42,6 +81,16 @@ class OtherScene:
     def path(self) -> str:
         """The file."""
         return self.intensity.source.path
+
+    @property
+    def called(self) -> str:
+        """The name of its file."""
+        return os.path.basename(self.path)
+
+    @property
+    def field(self) -> str:
+        """The images of a block."""
+        return "images"
 
     def project(self, ground: Array, crs: str) -> Array:
         """Project ground by the model."""
@@ -101,6 +150,16 @@ class Reference:
         return self.intensity.source.path
 
     @property
+    def called(self) -> str:
+        """One for all references."""
+        return "the reference"
+
+    @property
+    def field(self) -> str:
+        """The references of a match."""
+        return "match.reference"
+
+    @property
     def corners(self) -> Array:
         """Map coordinates ``(4, 2)`` of the corners."""
         pixels = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * (self.intensity.width, self.intensity.height)
@@ -123,3 +182,60 @@ def open_references(paths: Sequence[str | os.PathLike[str]], **access: Any) -> t
     if not paths:
         raise InputError("there is no reference", field="reference", remedy="give an orthoimage")
     return tuple(Reference.open(path, **access) for path in paths)
+
+
+def spread_over(view: View) -> Array:
+    """Return points ``(SAMPLES**2, 2)`` spread over a scene."""
+    steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    columns, rows = np.meshgrid(steps * view.size[0], steps * view.size[1])
+    return np.column_stack([columns.ravel(), rows.ravel()])
+
+
+def shown_by(targets: Sequence[Target], ground: Array, crs: str) -> NDArray[np.bool_]:
+    """Tell which ground ``(n, 3)`` lies in one of the targets at least."""
+    found = np.zeros(len(ground), dtype=bool)
+    for target in targets:
+        places = target.project(ground, crs)
+        with np.errstate(invalid="ignore"):
+            found |= ((places >= 0) & (places <= (target.intensity.width, target.intensity.height))).all(axis=1)
+    return found
+
+
+def chip_factor(view: View, targets: Sequence[Target], shown: Array) -> int:
+    """Return how many pixels of a scene are as large as one of the targets at points ``(n, 2)``, at least 1.
+
+    Raises
+    ------
+    InputError
+        If the resolutions are too different to be compared.
+    """
+    ratio = float(np.nanmedian(np.concatenate([_resolution_ratio(view, target, shown) for target in targets])))
+    if not 1 / _RATIO <= ratio <= _RATIO:
+        first = targets[0]
+        raise InputError(
+            f"a pixel of {os.path.basename(view.intensity.source.path)} is {ratio:.3g} pixels of {first.called}",
+            file=first.path, field=first.field,
+            remedy=f"match images whose resolutions differ by at most {_RATIO:.0f} times",
+        )  # fmt: skip
+    return max(1, round(1 / ratio))
+
+
+def _resolution_ratio(view: View, target: Target, image: Array) -> Array:
+    """Return pixels of the target per pixel of the scene ``(n,)`` at image points; NaN where it shows nothing."""
+    heights = np.full(len(image), view.model.reference_height)
+    around = [
+        target.project(view.model.image_to_ground(image + step, heights), view.model.crs)
+        for step in ((0.0, 0.0), (8.0, 0.0), (0.0, 8.0))
+    ]
+    across, down = (around[1] - around[0]) / 8, (around[2] - around[0]) / 8
+    return np.sqrt(np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]))
+
+
+def metres_per_pixel(view: View) -> float:
+    """Return the size (m) of a pixel on the ground in the middle of a scene."""
+    middle = np.array(view.size) / 2
+    image = middle + np.array([(0.0, 0.0), (8.0, 0.0), (0.0, 8.0)])
+    ground = view.model.image_to_ground(image, view.model.reference_height)
+    placed = ground_transform(view.model.crs, "EPSG:4978")(ground)
+    across, down = placed[1] - placed[0], placed[2] - placed[0]
+    return math.sqrt(float(np.linalg.norm(np.cross(across, down)))) / 8

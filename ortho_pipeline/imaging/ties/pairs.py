@@ -11,9 +11,7 @@ as heights may be wrong, and judged against each other across it.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,31 +23,33 @@ from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.ellipsoid import units_per_metre
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
-from ortho_pipeline.imaging.matching.chips import View, rendered_chips, resolution_ratio, scene_chips
-from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
+from ortho_pipeline.imaging.matching.chip_search import (
+    FEWEST,
+    MEASURED,
+    SIDE,
+    SIGMAS,
+    doubts,
+    found_again,
+    in_batches,
+    seen,
+)
+from ortho_pipeline.imaging.matching.chips import rendered_chips, scene_chips
 from ortho_pipeline.imaging.matching.least_squares import measure
 from ortho_pipeline.imaging.matching.search import place
-from ortho_pipeline.imaging.matching.targets import OtherScene
+from ortho_pipeline.imaging.matching.targets import OtherScene, View, chip_factor, shown_by, spread_over
 from ortho_pipeline.imaging.matching.weights import Components, components
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.surface.rays import meet_surface
 
-#: Side of a chip (chip px); it is even, so that a chip of any factor has its centre between the same pixels.
-SIDE = 40
-#: Radii (chip px) of the search of a chip: of the coarsest level at least, of those after it, and of what is rendered
-#: to measure in.
-_FIRST, _NEXT, _MEASURED = 6, 4, 4
-#: Heights are searched and believed within so many of their sigmas; places across the epipolar direction as well.
-_HEIGHTS, _SIGMAS = 3.0, 3.5
-#: As in `matching.matcher`: score, second peak, way back (chip px), and part of a chip that is seen, of a good match.
-_LEAST_SCORE, _UNIQUE, _BACK, _SEEN = 0.25, 0.85, 0.7, 0.8
-#: Resolutions of two scenes differ by at most this factor.
-_RATIO = 8.0
-#: Points per side at which it is asked what both scenes show.
-SAMPLES = 32
-#: Chips that are worked on together; rounds of judging; fewer matches than this cannot be judged.
-_BATCH, _JUDGED, FEWEST = 32, 8, 12
+#: Radii (chip px) of the search of a chip: of the coarsest level at least, and of those after it.
+_FIRST, _NEXT = 6, 4
+#: Part of a chip that is seen at least where it is searched coarsely.
+_GLIMPSED = 0.3
+#: Heights are searched and believed within so many of their sigmas.
+_HEIGHTS = 3.0
+#: Rounds of judging.
+_JUDGED = 8
 #: Chip pixels that the heights displace by more than this are too fine for the first search.
 _BLURRED = 1.5
 #: Places that are asked where no correction stands out, and the chance that so many agree by accident.
@@ -60,7 +60,7 @@ _FLOOR = 0.02
 
 @dataclass(frozen=True)
 class TieSettings:
-    """What a user may choose.
+    """Choices of a user.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class TieSettings:
 
 @dataclass(frozen=True)
 class PairSummary:
-    """What came of a pair of scenes.
+    """Result of a pair of scenes.
 
     Parameters
     ----------
@@ -173,14 +173,7 @@ class Pair:
         InputError
             If resolutions are too different, or no place stands out.
         """
-        ratio = float(np.nanmedian(resolution_ratio(view, target, shown)))
-        if not 1 / _RATIO <= ratio <= _RATIO:
-            raise InputError(
-                f"a pixel of {os.path.basename(view.intensity.source.path)} is {ratio:.3g} pixels of "
-                f"{os.path.basename(target.path)}", file=target.path, field="image",
-                remedy=f"tie scenes whose resolutions differ by at most {_RATIO:.0f} times",
-            )  # fmt: skip
-        base = max(1, round(1 / ratio))
+        base = chip_factor(view, [target], shown)
         ground = meet_surface(view.model, shown, view.surface)
         ground = ground[np.isfinite(ground).all(axis=1)]
         parallax = np.hypot(*_sight(view, target, view.model.ground_partials(ground), ground)[0].T)
@@ -277,7 +270,7 @@ class Pair:
             )
             apart = residuals[index]
             distance = squared_distances(apart, total)
-            bad = distance > _SIGMAS**2
+            bad = distance > SIGMAS**2
             if not bad.any():
                 break
             good[index[bad]] = False
@@ -297,19 +290,13 @@ def _uncorrected(view: View, window: tuple[int, ...]) -> ImageCorrection:
 
 def shared(view: View, target: OtherScene) -> Array:
     """Return those of points ``(n, 2)`` spread over a scene that another one shows, as the models have it."""
-    steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
-    columns, rows = np.meshgrid(steps * view.size[0], steps * view.size[1])
-    image = np.column_stack([columns.ravel(), rows.ravel()])
+    image = spread_over(view)
     return image[shows(view, target, image)]
 
 
 def shows(view: View, target: OtherScene, image: Array) -> NDArray[np.bool_]:
     """Tell which image points ``(n,)`` of a scene another one shows, as the models have it."""
-    ground = meet_surface(view.model, image, view.surface)
-    places = target.project(ground, view.model.crs)
-    with np.errstate(invalid="ignore"):
-        size = (target.intensity.width, target.intensity.height)
-        return np.asarray(((places >= 0) & (places <= size)).all(axis=1))
+    return shown_by([target], meet_surface(view.model, image, view.surface), view.model.crs)
 
 
 def _sight(view: View, target: OtherScene, partials: Array, ground: Array) -> tuple[Array, Array]:
@@ -397,32 +384,16 @@ class _Chips:
             origins = self.centres[index] - SIDE // 2 * factor
             start = np.round(self.offset[index]).astype(int)
             wide = self._rendered(origins + start - 2 * radius * factor, SIDE + 4 * radius, factor)
-            inner = wide[:, radius:-radius, radius:-radius]
-            scene = scene_chips(self.pair.view, origins, SIDE, factor)
-            found = peaks(surfaces(orientation(scene), orientation(wide)[:, radius:-radius, radius:-radius]))
+            found = found_again(scene_chips(self.pair.view, origins, SIDE, factor), wide, radius)
             self.offset[index] = start + found.shift * factor
-            passed = np.isfinite(inner).mean(axis=(1, 2)) > 0.3
             if finest:
-                passed = (np.isfinite(inner).mean(axis=(1, 2)) >= _SEEN) & (found.score >= _LEAST_SCORE)
-                passed &= found.inside & (found.ratio <= _UNIQUE)
-                passed &= self._backward(origins, wide, found.shift, radius) <= _BACK
-            self.offset[index[~passed]] = np.nan
+                around = scene_chips(self.pair.view, origins - radius * factor, SIDE + 2 * radius, factor)
+                lost = doubts(found, wide, around, radius) != ""
+            else:
+                lost = seen(wide, radius) <= _GLIMPSED
+            self.offset[index[lost]] = np.nan
 
         return work
-
-    def _backward(
-        self, origins: NDArray[np.int_], wide: NDArray[np.float32], shift: Array, radius: int
-    ) -> Array:  # fmt: skip
-        """Return how far (chip px) from where it began the way back ends ``(n,)``."""
-        whole = np.clip(np.round(shift), -radius, radius).astype(int)
-        there = np.stack([
-            chip[row : row + SIDE, column : column + SIDE]
-            for chip, (column, row) in zip(wide, 2 * radius + whole, strict=True)
-        ])  # fmt: skip
-        factor = self.pair.factor
-        around = scene_chips(self.pair.view, origins - radius * factor, SIDE + 2 * radius, factor)
-        found = peaks(surfaces(orientation(there), orientation(around)))
-        return np.hypot(*(found.shift + (shift - whole)).T)
 
     def measure(self) -> None:
         """Measure each chip that was found to a part of a pixel."""
@@ -431,7 +402,7 @@ class _Chips:
         def work(index: NDArray[np.int_]) -> None:
             origins = self.centres[index] - SIDE // 2 * factor
             start = np.round(self.offset[index]).astype(int)
-            wide = self._rendered(origins + start - _MEASURED * factor, SIDE + 2 * _MEASURED, factor)
+            wide = self._rendered(origins + start - MEASURED * factor, SIDE + 2 * MEASURED, factor)
             scene = scene_chips(self.pair.view, origins, SIDE, factor)
             found = measure(scene, wide, (self.offset[index] - start) / factor)
             self.offset[index] = start + found.shift * factor
@@ -444,7 +415,4 @@ class _Chips:
         return rendered_chips(self.seen, self.pair.target, origins, size, factor)
 
     def _in_batches(self, work: Callable[[NDArray[np.int_]], None]) -> None:
-        index = np.flatnonzero(np.isfinite(self.offset).all(axis=1))
-        batches = [index[first : first + _BATCH] for first in range(0, len(index), _BATCH)]
-        with ThreadPoolExecutor(self.pair.settings.threads) as pool:
-            list(pool.map(work, batches))
+        in_batches(work, np.flatnonzero(np.isfinite(self.offset).all(axis=1)), self.pair.settings.threads)

@@ -16,20 +16,9 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
-from ortho_pipeline.imaging.matching.chips import View
-from ortho_pipeline.imaging.matching.matcher import metres_per_pixel
-from ortho_pipeline.imaging.matching.targets import OtherScene
-from ortho_pipeline.imaging.ties.pairs import (
-    FEWEST,
-    SAMPLES,
-    SIDE,
-    Matched,
-    Pair,
-    PairSummary,
-    TieSettings,
-    shared,
-    shows,
-)
+from ortho_pipeline.imaging.matching.chip_search import FEWEST, SIDE
+from ortho_pipeline.imaging.matching.targets import SAMPLES, OtherScene, View, metres_per_pixel
+from ortho_pipeline.imaging.ties.pairs import Matched, Pair, PairSummary, TieSettings, shared, shows
 from ortho_pipeline.models.base import Array
 
 #: Cells of a scene are at most so many times those wanted of its smallest overlap.
