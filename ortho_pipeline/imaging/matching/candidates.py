@@ -35,8 +35,8 @@ def candidates(
     size: int,
     factor: int,
     inside: NDArray[np.bool_],
-) -> tuple[NDArray[np.int_], NDArray[np.int_], Array]:
-    """Return first pixels ``(n, 2)`` of chips, their cells ``(n,)``, and their structure ``(n,)``, one of each cell.
+) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """Return first pixels ``(n, 2)`` of chips, the one with the most structure of each cell, and their cells ``(n,)``.
 
     Parameters
     ----------
@@ -57,17 +57,15 @@ def candidates(
         top, bottom = (region[1] + height * place / cells[1] for place in (row, row + 1))
         place = _best(view, (left, top, right, bottom), size, factor)
         if place is not None:
-            found.append((*place[0], number, place[1]))
-    table = np.array(found, dtype=float).reshape(-1, 4)
+            found.append((*place, number))
+    table = np.array(found, dtype=int).reshape(-1, 3)
     # Cells may choose the same place on the side that they share.
     table = table[np.sort(np.unique(table[:, :2], axis=0, return_index=True)[1])]
-    return table[:, :2].astype(int), table[:, 2].astype(int), table[:, 3]
+    return table[:, :2], table[:, 2]
 
 
-def _best(
-    view: View, cell: tuple[float, float, float, float], size: int, factor: int
-) -> tuple[tuple[int, int], float] | None:
-    """Return the first pixel of the chip with the most structure whose centre lies in a cell, and that structure."""
+def _best(view: View, cell: tuple[float, float, float, float], size: int, factor: int) -> tuple[int, int] | None:
+    """Return the first pixel of the chip with the most structure whose centre lies in a cell."""
     width, height = view.size
     middle = (cell[0] + cell[2]) / 2, (cell[1] + cell[3]) / 2
     # Centres of chips: within the cell, and not so near to the border that a chip does not fit.
@@ -90,7 +88,7 @@ def _best(
     if not np.isfinite(value).any():
         return None
     j, i = np.unravel_index(int(np.nanargmax(value)), value.shape)
-    return (left + int(i) * factor, top + int(j) * factor), float(value[j, i])
+    return left + int(i) * factor, top + int(j) * factor
 
 
 def _structure(pixels: NDArray[np.float32], size: int, saturated: float) -> Array:

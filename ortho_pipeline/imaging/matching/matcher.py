@@ -154,16 +154,15 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     share = len(shown) / SAMPLES**2 * view.size[0] * view.size[1] / (extent[0] * extent[1])
     grid = cells_of(*extent, round(settings.points / min(max(share, 0.05), 1.0)))
     corrected = View(view.intensity, correction, view.surface)
-    origins, cells, _ = candidates(view, region, grid, SIDE, base, _cells_shown(corrected, targets, region, grid))
+    origins, cells = candidates(view, region, grid, SIDE, base, _cells_shown(corrected, targets, region, grid))
     tried = _Tried(view, targets, origins, cells, base, settings.threads)
     tried.search(correction)
-    tried.refuse_accident(correction, reach)
-    for _ in range(_ROUNDS):
-        correction = tried.agreed(correction)
+    for turn in range(_ROUNDS):
+        correction = tried.agreed(correction, None if turn else reach)
         tried.measure(correction)
         if tried.moved(correction) < _STANDS:
             break
-    tried.judge(targets)
+    tried.judge()
     return tried.matches(settings, tuple(levels))
 
 
@@ -255,29 +254,26 @@ class _Tried:
 
         in_batches(work, np.arange(len(self.origins)), self.threads)
 
-    def refuse_accident(self, correction: ImageCorrection, reach: float) -> None:
-        """Raise an error if as many matches could as well agree by chance, at any place of the whole search."""
-        good = np.flatnonzero(self.reason == "")
-        if len(good) < FEWEST:
-            raise self._too_few()
-        near = _NEAR * self.factor
-        _, agreeing = agreed(correction, self.centres[good], self.offset[good], self.score[good], near)
-        places = (2 * reach / self.factor + 1) ** 2
-        refuse_accident(int(agreeing.sum()), len(good), _NEAR, places, self.targets, reach)
+    def agreed(self, correction: ImageCorrection, searched: float | None) -> ImageCorrection:
+        """Return the correction that most offsets agree on; the others are of no use any more.
 
-    def agreed(self, correction: ImageCorrection) -> ImageCorrection:
-        """Return the correction that most offsets agree on; the others are of no use any more."""
+        Raises
+        ------
+        InputError
+            If as many could as well agree by chance, at any place of a search `searched` (px) wide.
+        """
         good = np.flatnonzero(self.reason == "")
         if len(good) < FEWEST:
             raise self._too_few()
         better, agreeing = agreed(
             correction, self.centres[good], self.offset[good], self.score[good], _NEAR * self.factor
         )  # fmt: skip
+        if searched is not None:
+            places = (2 * searched / self.factor + 1) ** 2
+            refuse_accident(int(agreeing.sum()), len(good), _NEAR, places, self.targets, searched)
         self.reason[good[~agreeing]] = "contradicts"
-        step = better.ground_to_image(self._some(correction, good)) - correction.ground_to_image(
-            self._some(correction, good)
-        )
-        self.offset[good] += step
+        before = correction.ground_to_image(self._some(correction, good))
+        self.offset[good] += better.ground_to_image(self._some(correction, good)) - before
         return better
 
     def _some(self, correction: SensorModel, index: NDArray[np.int_]) -> Array:
@@ -312,7 +308,7 @@ class _Tried:
         good = self.reason == ""
         return float(np.hypot(*np.median(self.offset[good], axis=0))) if good.any() else 0.0
 
-    def judge(self, targets: Sequence[Target]) -> None:
+    def judge(self) -> None:
         """Estimate what the covariances are made of, and leave out what contradicts the others by its own."""
         origin = np.array(self.view.size) / 2
         for _ in range(_JUDGED):

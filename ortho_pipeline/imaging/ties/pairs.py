@@ -203,7 +203,7 @@ class Pair:
         """
         columns, rows = cells_of(window[2] - window[0], window[3] - window[1], _ASKED)
         inside = np.ones((rows, columns), dtype=bool)
-        origins, _, _ = candidates(self.view, window, (columns, rows), SIDE, self.factor, inside)
+        origins, _ = candidates(self.view, window, (columns, rows), SIDE, self.factor, inside)
         chips = _Chips(self, origins + SIDE // 2 * self.factor)
         chips.search()
         good = np.isfinite(chips.offset).all(axis=1)

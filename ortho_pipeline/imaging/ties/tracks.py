@@ -167,7 +167,7 @@ class _Block:
                     lacking[other][cell] = False
         wanted = np.any(list(lacking.values()), axis=0).reshape(rows, columns)
         factor = min(pair.factor for pair in placed.values())
-        origins, numbers, _ = candidates(view, (0, 0, *view.size), (columns, rows), SIDE, factor, wanted)
+        origins, numbers = candidates(view, (0, 0, *view.size), (columns, rows), SIDE, factor, wanted)
         nothing = np.full((2, 2), np.nan)
         begun = [_Track({home: (origin + SIDE // 2 * float(factor), nothing)}) for origin in origins]
         return begun, [{other for other in placed if lacking[other][number]} for number in numbers.tolist()]
