@@ -1,13 +1,15 @@
 """The search: how far a model is off, coarse to fine, and whether what was found can be believed.
 
 Coarse chips all over the scene are compared with wide windows of the target. A model is off by much the same
-everywhere, so the mean of all correlation surfaces has one peak, far above what any single chip shows. It is
-believed if
+everywhere, so the mean of all correlation surfaces has a peak far above what any single chip shows. Its highest places
+are hypotheses: under each the target is rendered anew and compared again, because relief lies where it belongs only
+where the model is right. The best of them is believed if
 
-- it is *unique*: the mean correlation is clearly higher than at the best other place, and over the chips so by a paired
-  t-test, which stripes, chessboards and rows of equal roofs do not pass;
-- it is *no accident*: at each finer level so many chips agree on a smooth correction that it would happen by chance,
-  over all places searched, once in a million times (binomial test).
+- it is *unique*: its mean correlation is clearly higher than that of any other (`_CLEARLY`), and over the chips so by a
+  paired t-test, which stripes, chessboards and rows of equal roofs do not pass;
+- its chips *agree* on a smooth correction, at each finer level better than chance would have it (binomial test);
+- it is *no accident*: as many of the chips of the last search, which is the matcher's, would agree by chance at any of
+  all places searched once in a million times.
 
 Source: Moisan and Stival 2004 (a-contrario consensus).
 """
@@ -16,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,19 +100,11 @@ def place(
     """
     middle = (region[0] + region[2]) / 2, (region[1] + region[3]) / 2
     correction = ImageCorrection.identity(view.model, "affine", middle)
-    factor, side, radius = _coarsest(region, reach, base)
-    hypotheses = _hypotheses(_correlated(view, targets, _spread(region, side, factor), side, factor, radius), targets)
-    step = [np.zeros(6) for _ in hypotheses]
-    for one, shift in zip(step, hypotheses, strict=True):
-        one[[0, 3]] = -shift * factor
-    # Each is rendered anew: only where a model is right does relief lie where it belongs.
-    corrections = [followed_by(correction, one) for one in step]
-    compared = [
-        _correlated(
-            View(view.intensity, one, view.surface), targets, _spread(region, side, factor), side, factor, _NEXT
-        )
-        for one in corrections
-    ]
+    factor, radius = _coarsest(region, reach, base)
+    side = _chip_side(region, factor, 3)
+    hypotheses = _hypotheses(_correlated(view, targets, region, side, factor, radius), targets)
+    corrections = [_shifted(correction, -shift * factor) for shift in hypotheses]
+    compared = [_correlated(replace(view, model=one), targets, region, side, factor, _NEXT) for one in corrections]
     best = _standing_out(compared, targets, reach)
     correction, shown = corrections[best], compared[best]
     levels: list[Level] = []
@@ -122,21 +116,12 @@ def place(
         # That it is the right place among all is for the many chips of the last search to say.
         refuse_accident(int(agreeing.sum()), len(agreeing), _AGREE, 1.0, targets, reach)
         mean = correction.coefficients[[0, 3]]
-        levels.append(
-            Level(
-                factor,
-                radius if not levels else _NEXT,
-                len(agreeing),
-                int(agreeing.sum()),
-                (float(mean[0]), float(mean[1])),
-            )
-        )
+        levels.append(Level(factor, radius, len(agreeing), int(agreeing.sum()), (float(mean[0]), float(mean[1]))))
         if factor <= base:
             return correction, levels
-        factor = max(base, factor // 2)
-        side = min(_SIDE, min(_extent(region)) // factor)
-        seen = View(view.intensity, correction, view.surface)
-        shown = _correlated(seen, targets, _spread(region, side, factor), side, factor, _NEXT)
+        factor, radius = max(base, factor // 2), _NEXT
+        side = _chip_side(region, factor, 1)
+        shown = _correlated(replace(view, model=correction), targets, region, side, factor, radius)
         if len(shown.centres) < 3:
             raise _no_overlap(targets, len(shown.centres))
 
@@ -157,8 +142,14 @@ def _extent(region: Region) -> tuple[int, int]:
     return region[2] - region[0], region[3] - region[1]
 
 
-def _coarsest(region: Region, reach: float, base: int) -> tuple[int, int, int]:
-    """Return factor, side and radius of the coarsest level: the largest pixels that still give several chips."""
+def _chip_side(region: Region, factor: int, beside: int) -> int:
+    """Return the side (chip px) of chips of which so many lie beside each other, if they are not too small then."""
+    whole = min(_extent(region)) // factor
+    return min(max(_LEAST_SIDE, min(_SIDE, whole // beside)), whole)
+
+
+def _coarsest(region: Region, reach: float, base: int) -> tuple[int, int]:
+    """Return factor and radius of the coarsest level: the largest pixels that still give several chips."""
     smaller, larger = sorted(_extent(region))
     factor = base
     while reach / factor > _COMFORTABLE or factor == base:
@@ -167,14 +158,13 @@ def _coarsest(region: Region, reach: float, base: int) -> tuple[int, int, int]:
         if (across // _LEAST_SIDE) * (along // _LEAST_SIDE) < _FEWEST + 4 or factor >= reach:
             break
         factor = next_factor
-    side = max(_LEAST_SIDE, min(_SIDE, smaller // factor // 3))
     radius = max(_NEXT, math.ceil(reach / factor) + 2)
     if radius > _LARGEST_RADIUS:
         raise InputError(
             f"a search over {reach:.0f} px is too wide for an image of {larger} x {smaller} px",
             field="match.search", remedy="search less far, or measure points by hand",
         )  # fmt: skip
-    return factor, min(side, smaller // factor), radius
+    return factor, radius
 
 
 def _spread(region: Region, side: int, factor: int) -> NDArray[np.int_]:
@@ -188,10 +178,9 @@ def _spread(region: Region, side: int, factor: int) -> NDArray[np.int_]:
     return np.column_stack([columns.ravel(), rows.ravel()])
 
 
-def _correlated(
-    view: View, targets: Sequence[Target], origins: NDArray[np.int_], side: int, factor: int, radius: int
-) -> _Shown:
-    """Correlate chips with the targets, each with the first that shows enough there."""
+def _correlated(view: View, targets: Sequence[Target], region: Region, side: int, factor: int, radius: int) -> _Shown:
+    """Correlate chips spread over a region with the targets, each with the first that shows enough there."""
+    origins = _spread(region, side, factor)
     wide = side + 2 * radius
     scene = scene_chips(view, origins, side, factor)
     shown = Renderer(view, targets, origins - radius * factor, wide, factor).render(np.arange(len(origins)))
@@ -291,6 +280,13 @@ def agreed(
     if slopes:
         step[1:3], step[4:6] = -coefficients[1:, 0], -coefficients[1:, 1]
     return followed_by(correction, step), agreeing
+
+
+def _shifted(correction: ImageCorrection, shift: Array) -> ImageCorrection:
+    """Return a correction that is followed by a shift (px)."""
+    step = np.zeros(6)
+    step[[0, 3]] = shift
+    return followed_by(correction, step)
 
 
 def followed_by(correction: ImageCorrection, step: Array) -> ImageCorrection:
