@@ -347,6 +347,13 @@ class SurfaceOptions:
     height: Annotated[
         float | None, Option("--height", "One ellipsoidal height, no DEM.", "M", kind="number")
     ] = None  # fmt: skip
+    sigma: Annotated[
+        float | PathLike | None,
+        Option(
+            "--dem-sigma", "Standard deviation of the heights, metres: a number or a raster, such as Copernicus' HEM.",
+            "M|FILE", kind="number or word", unset="unknown",
+        ),
+    ] = None  # fmt: skip
 
 
 @_documented
@@ -457,13 +464,6 @@ class MatchOptions:
     points: Annotated[
         int, Option("--match-points", "About how many matches are wanted.", "N", kind="integer", above=0)
     ] = 500
-    dem_sigma: Annotated[
-        float | None,
-        Option(
-            "--dem-sigma", "Standard deviation of the heights of the DEM.", "M", kind="number", above=0,
-            unset="what the residuals tell",
-        ),
-    ] = None  # fmt: skip
     reference_sigma: Annotated[
         float | None,
         Option(

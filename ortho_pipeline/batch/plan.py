@@ -241,6 +241,8 @@ class _Planner:
         values: dict[str, Any] = dict(settings.surface)
         values["dem"] = self._file(values["dem"], image, f"{where}.surface.dem")
         values["fill"] = str(values["fill"])
+        if isinstance(values["sigma"], str):
+            values["sigma"] = self._perhaps_file(values["sigma"], image, f"{where}.surface.sigma")
         if values["vertical"] is not None:
             values["vertical"] = self._perhaps_file(values["vertical"], image, f"{where}.surface.vertical")
         return SurfaceOptions(**values)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -24,7 +25,7 @@ from ortho_pipeline.files.locations import archive_of, located
 from ortho_pipeline.files.process_limits import startable_threads
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions, number_of
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.surface.base import Surface
@@ -143,13 +144,39 @@ def open_surface(
         raise InputError(
             "`surface.dem` and `surface.height` exclude each other", field="surface.height", remedy="give one of them"
         )
-    if options.height is not None:
-        return Surface.constant(options.height)
-    if options.dem is None:
+    if options.dem is None and options.height is None:
         raise InputError(
             "there are no heights", field="surface.dem", remedy="give `surface.dem=FILE` or `surface.height=METRES`"
         )
-    return open_dem(options.dem, options, scene, memory)
+    sigma = open_sigma(options, scene, memory)
+    if options.height is not None:
+        return Surface.constant(options.height).with_sigma(sigma)
+    assert options.dem is not None
+    return open_dem(options.dem, options, scene, memory).with_sigma(sigma)
+
+
+def open_sigma(
+    options: SurfaceOptions, scene: SceneOptions = SceneOptions(), memory: int = OutputOptions.memory
+) -> float | Surface | None:
+    """Return the standard deviation of heights: a number (m), a raster of such, or None where nobody says.
+
+    Raises
+    ------
+    InputError
+        For a number that is not positive, and a raster that cannot be read.
+    """
+    if options.sigma is None:
+        return None
+    number = math.nan if isinstance(options.sigma, os.PathLike) else number_of(options.sigma)
+    if number > 0:
+        return number
+    if not isinstance(options.sigma, float | int) and math.isnan(number):
+        with of_option("surface.sigma"):
+            return Surface.open(options.sigma, "ellipsoid", override=True, fill="mask", memory=memory, **scene.access)
+    raise InputError(
+        f"{options.sigma} is no standard deviation", field="surface.sigma",
+        remedy="give metres, or a raster of them such as Copernicus' height error mask",
+    )  # fmt: skip
 
 
 def open_dem(
@@ -190,11 +217,20 @@ def has_surface(options: SurfaceOptions) -> bool:
         "surface.vertical": options.vertical is not None,
         "surface.override_vertical": options.override_vertical,
         "surface.fill": options.fill != SurfaceOptions.fill,
+        "surface.sigma": options.sigma is not None and options.height is None,
     }
     for field in (field for field, given in idle.items() if given and options.dem is None):
         raise InputError("this is said of a DEM, and there is none", field=field,
                          remedy="leave it out, or give `surface.dem`")  # fmt: skip
     return options.dem is not None or options.height is not None
+
+
+def sigma_file(options: SurfaceOptions) -> str | os.PathLike[str] | None:
+    """Return the raster of standard deviations of heights, None where there is none."""
+    given = options.sigma
+    if given is None or isinstance(given, float | int):
+        return None
+    return given if isinstance(given, os.PathLike) or math.isnan(number_of(given)) else None
 
 
 # -- points ----------------------------------------------------------------------------------------------------------
@@ -266,7 +302,7 @@ def given_files(
     match: MatchOptions = MatchOptions(),
 ) -> list[str | os.PathLike[str]]:
     """Return the files that the user gave."""
-    given = (image, *scene.files.values(), point_file(points), surface.dem, *match.reference)
+    given = (image, *scene.files.values(), point_file(points), surface.dem, sigma_file(surface), *match.reference)
     return [path for path in given if path is not None]
 
 
@@ -331,6 +367,7 @@ def files_read(
         add("DEM", [surface.dem, *_files_of(surface.dem, scene)])
     if surface.vertical is not None:
         add("geoid", [surface.vertical])
+    add("DEM accuracy", [sigma_file(surface)])
     for reference in match.reference:
         add("reference", [reference, *_files_of(reference, scene)])
     return read

@@ -25,6 +25,7 @@ from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.points.formats import read_block_table
 from ortho_pipeline.points.ground import ground_of
 from ortho_pipeline.points.rows import OF_HEIGHTS
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
 
 Array = NDArray[np.float64]
@@ -37,6 +38,8 @@ _NMAD = 1.4826
 _GROSS = 5.0
 #: The 90 % quantile of fewer differences is one of the largest of them, and is not given.
 _ENOUGH = 10
+#: Places per side at which a raster of standard deviations is looked at for a typical one.
+_PLACES = 64
 
 
 @dataclass(frozen=True)
@@ -153,6 +156,20 @@ def slopes_at(surface: DemSurface, lonlat: Array) -> Array:
 
     rise = np.hypot(away(90.0) - away(270.0), away(0.0) - away(180.0)) / (2 * step)
     return np.degrees(np.arctan(rise))
+
+
+def typical_sigma(surface: Surface) -> float | None:
+    """Return the standard deviation (m) of the heights of a surface, of a raster their root mean square.
+
+    None where nobody says, or the raster holds none.
+    """
+    sigma = surface.sigma
+    if not isinstance(sigma, DemSurface):
+        return sigma if isinstance(sigma, float | int) else None
+    rows, columns = sigma.shape
+    u, v = np.meshgrid(np.linspace(0, columns - 1, _PLACES), np.linspace(0, rows - 1, _PLACES))
+    squares = sigma.heights(np.column_stack(sigma.grid.lonlat(u.ravel(), v.ravel())), "EPSG:4979") ** 2
+    return float(np.sqrt(np.nanmean(squares))) if np.isfinite(squares).any() else None
 
 
 def read_check_heights(

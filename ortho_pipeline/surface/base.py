@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
 import math
 import os
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 import pyproj
@@ -49,9 +50,12 @@ class Surface(abc.ABC):
     ----------
     fill : 'error', 'mask', 'nearest' or float
         What stands for a void: NaN for the first two; a height with the others.
+    sigma : float, Surface or None
+        Standard deviation (m) of the heights; as a surface it has them for heights. None where nobody says.
     """
 
     fill: str | float
+    sigma: float | Surface | None
 
     @staticmethod
     def constant(height: float) -> FlatSurface:
@@ -122,6 +126,10 @@ class Surface(abc.ABC):
         InputError
             If there is no such rule.
         """
+
+    def with_sigma(self, sigma: float | Surface | None) -> Self:
+        """Return this surface with another standard deviation of its heights."""
+        return dataclasses.replace(self, sigma=sigma)  # type: ignore[type-var]
 
     @abc.abstractmethod
     def around(self, lon: float) -> Surface:

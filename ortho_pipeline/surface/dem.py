@@ -11,7 +11,7 @@ import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -134,6 +134,7 @@ class DemSurface(Surface):
         The provenance, but for `fill`.
     cache_bytes : int
         Of heights that are kept after they were read.
+    sigma : float, Surface or None
     """
 
     file: DemFile
@@ -143,6 +144,7 @@ class DemSurface(Surface):
     fill: str | float
     record: Mapping[str, Any]
     cache_bytes: int
+    sigma: float | Surface | None = None
     # What is kept follows from all of the above, so no two surfaces share it.
     _tiles: Tiles = field(init=False, repr=False)
 
@@ -150,9 +152,7 @@ class DemSurface(Surface):
         object.__setattr__(self, "_tiles", Tiles(self.cache_bytes))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Copies and pickles, too.
-        given = self.file, self.grid, self.vertical, self.metres_per_unit, self.fill, self.record, self.cache_bytes
-        return DemSurface, given
+        return DemSurface, tuple(getattr(self, one.name) for one in fields(self) if one.init)
 
     # -- what it is --------------------------------------------------------------------------------------------------
 
@@ -196,8 +196,9 @@ class DemSurface(Surface):
 
     def around(self, lon: float) -> DemSurface:
         """Return this DEM with its seam opposite to `lon` (degrees) if it goes round the world, else as it is."""
+        sigma = self.sigma.around(lon) if isinstance(self.sigma, Surface) else self.sigma
         grid = self.grid.around(lon)
-        return self if grid is self.grid else replace(self, grid=grid)
+        return self if grid is self.grid and sigma is self.sigma else replace(self, grid=grid, sigma=sigma)
 
     @property
     def nearest_reach(self) -> int:

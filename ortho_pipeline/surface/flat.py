@@ -32,6 +32,7 @@ class FlatSurface(Surface):
 
     height: float
     fill: str | float = "error"
+    sigma: float | Surface | None = None
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.height):

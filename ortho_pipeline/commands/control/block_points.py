@@ -104,7 +104,7 @@ def _refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: 
                     remedy="leave it out, or give `points.points`",
                 )  # fmt: skip
     if options.ties is None and not match.reference:
-        for name in ("search", "points", "dem_sigma"):
+        for name in ("search", "points"):
             if getattr(match, name) != getattr(MatchOptions, name):
                 raise InputError(
                     "this is said of matching, and nothing is matched", field=f"match.{name}",

@@ -23,6 +23,7 @@ from ortho_pipeline.options import MatchOptions, SceneOptions
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report.document import read_report
+from ortho_pipeline.surface.accuracy import typical_sigma
 from ortho_pipeline.surface.base import Surface
 
 if TYPE_CHECKING:
@@ -74,6 +75,8 @@ class Matched:
     pixel : float
         Size (m) of a pixel on the ground.
     notices : tuple of Notice
+    dem_sigma : float, optional
+        What the heights were said to be good for (m).
     """
 
     matches: Matches
@@ -83,6 +86,7 @@ class Matched:
     size: tuple[int, int]
     pixel: float
     notices: tuple[Notice, ...] = ()
+    dem_sigma: float | None = None
 
     @property
     def kept(self) -> np.ndarray:
@@ -105,7 +109,7 @@ class Matched:
         found = {
             "references": list(self.references),
             "reference_sigma_m": self.options.reference_sigma,
-            "dem_sigma_m": self.options.dem_sigma,
+            "dem_sigma_m": self.dem_sigma,
             "search_m": self.search.distance,
             "search_from": self.search.source,
             "pixel_m": self.pixel,
@@ -218,14 +222,16 @@ def match_scene(
     pixel = metres_per_pixel(view)
     search = search_of(scene, options, pixel)
     settings = MatchSettings(
-        search=search.distance, points=options.points, dem_sigma=options.dem_sigma or 0.0,
+        search=search.distance, points=options.points, dem_sigma=typical_sigma(surface) or 0.0,
         reference_sigma=options.reference_sigma or 0.0, threads=threads or os.cpu_count() or 1,
     )  # fmt: skip
     with _of_references():
         matches = match(view, references, settings)
     paths = tuple(one.path for one in references)
     notices = [*_default_search(search), *_made_of_scene(scene, references, matches)]
-    return Matched(matches, paths, options, search, (scene.width, scene.height), pixel, tuple(notices))
+    return Matched(
+        matches, paths, options, search, (scene.width, scene.height), pixel, tuple(notices), typical_sigma(surface)
+    )
 
 
 @contextmanager

@@ -29,6 +29,7 @@ from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, Sur
 from ortho_pipeline.points.image_errors import sigma_of_covariance
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.surface.accuracy import typical_sigma
 from ortho_pipeline.surface.base import Surface
 
 if TYPE_CHECKING:
@@ -141,11 +142,12 @@ def tie_scenes(
     ]
     search = max(one.distance for one in searches)
     usual = FLAT_SIGMA if surface.provenance.get("constant_height") is not None else DEM_SIGMA
-    sigma = usual if options.dem_sigma is None else options.dem_sigma
+    stated = typical_sigma(surface)
+    sigma = usual if stated is None else stated
     found = tie(views, TieSettings(search, options.points, sigma, threads or os.cpu_count() or 1))
     notices = [*_few(found, tuple(scenes))]
-    if options.dem_sigma is None:
-        text = f"nobody says how accurate the heights are: taken to be within {metres(sigma)} (`match.dem_sigma`)"
+    if stated is None:
+        text = f"nobody says how accurate the heights are: taken to be within {metres(sigma)} (`surface.sigma`)"
         notices.append(Notice("dem-sigma-by-default", text, dem_sigma_m=sigma))
     return Tied(_points(found, tuple(scenes)), found, search, sigma, tuple(notices))
 

@@ -84,7 +84,7 @@ def tie(views: Sequence[View], settings: TieSettings) -> Ties:
         raise InputError(
             f"there are no ties: {said}", file=views[0].intensity.source.path, field="images",
             remedy="search farther (`match.search`) if the models may be off by more, state how wrong the heights may "
-            "be (`match.dem_sigma`), or measure tie points by hand",
+            "be (`surface.sigma`), or measure tie points by hand",
         )  # fmt: skip
     return block.ties()
 

@@ -1,0 +1,61 @@
+"""The standard deviation of heights: a number or a raster, held by the surface, known to all that use it."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.commands.inputs import files_read, has_surface, open_surface
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import SurfaceOptions
+from ortho_pipeline.surface.accuracy import typical_sigma
+from ortho_pipeline.surface.base import Surface
+
+
+@pytest.fixture
+def quality(tiny):
+    """Write a raster of standard deviations: 3 m in the east, 1 m in the west, a void."""
+    dem = gdal.Open(str(tiny.dem))
+    path = tiny.folder / "hem.tif"
+    copy = gdal.GetDriverByName("GTiff").CreateCopy(str(path), dem)
+    values = np.full((dem.RasterYSize, dem.RasterXSize), 3.0, dtype=np.float32)
+    values[:, :65], values[60:70, 40:50] = 1.0, -32767.0
+    copy.GetRasterBand(1).SetNoDataValue(-32767.0)
+    copy.WriteArray(values)
+    return path
+
+
+def test_a_number_goes_with_the_surface_wherever_it_goes(tiny):
+    for options in (
+        SurfaceOptions(dem=tiny.dem, vertical="ellipsoid", sigma="2.5"),
+        SurfaceOptions(height=500, sigma=2.5),
+    ):
+        surface = open_surface(options)
+        assert surface.sigma == 2.5
+        assert typical_sigma(surface) == 2.5
+        for same in (surface.with_fill("mask"), surface.around(20.0), pickle.loads(pickle.dumps(surface))):
+            assert same.sigma == 2.5
+    assert typical_sigma(Surface.constant(500.0)) is None
+
+
+def test_a_raster_is_read_where_it_lies_and_its_voids_are_unknown(tiny, quality):
+    options = SurfaceOptions(dem=tiny.dem, vertical="ellipsoid", sigma=quality)
+    surface = open_surface(options)
+    assert isinstance(surface.sigma, Surface)
+    assert typical_sigma(surface) == pytest.approx(np.sqrt(5.0), rel=0.02)
+    places = np.array([[20.015, -30.0], [19.985, -30.0]])
+    np.testing.assert_allclose(surface.sigma.heights(places, "EPSG:4979"), [3.0, 1.0])
+    read = files_read(tiny.image, surface=options)
+    assert read[quality] == "DEM accuracy"
+
+
+@pytest.mark.parametrize("sigma", [0.0, -3, "0", "nan", "no_such_file.tif"])
+def test_what_is_no_standard_deviation_is_refused(tiny, sigma):
+    with pytest.raises(InputError) as caught:
+        open_surface(SurfaceOptions(dem=tiny.dem, vertical="ellipsoid", sigma=sigma))
+    assert caught.value.remedy
+    with pytest.raises(InputError, match="there is none"):
+        has_surface(SurfaceOptions(sigma=sigma))
