@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import products
 import seeds
 from ortho_bilsat.survey import read_survey
 from ortho_cartosat.metadata import read_metadata as read_cartosat
 from ortho_ikonos.metadata import read_header, read_metadata
 from ortho_orbview3.product import read_product
 from ortho_rpc.dimap import read_dimap_pushbroom
+from ortho_spot.dimap import read_spot
 
 from ortho_pipeline import commands
 from ortho_pipeline.batch import plan as batch_plan
@@ -302,6 +304,11 @@ def _frame_model(folder: Path) -> bytes:
     return (folder / "m").read_bytes()
 
 
+def _spot(path: Path) -> Any:
+    found = read_spot(path)
+    return [found.model, found.facts, found.bands_differ]
+
+
 def _cartosat(path: Path) -> Any:
     metadata = read_cartosat(path)
     return [metadata.view and 0.0, metadata.size, metadata.altitude, metadata.corners, *_product("BANDA.tif")(path)]
@@ -342,6 +349,8 @@ READERS = (
     Reader("rpc-tag", "tiff", "one.tif", _tiff(seeds.image), _tagged),
     Reader("dimap-polynomials", "xml", "DIM_X.XML", _text(seeds.dimap_text()), read_dimap_pushbroom),
     Reader("dimap-lists", "xml", "DIM_X.XML", _text(seeds.dimap_text(listed=True)), read_dimap_pushbroom),
+    Reader("spot-metadata", "xml", "METADATA.DIM", _text(products.spot_text()), _spot),
+    Reader("spot-detectors", "xml", "METADATA.DIM", _text(products.spot_text(every=True, corrected=True)), _spot),
     Reader("ikonos-metadata", "text", _PO, _sample("ikonos", _PO), read_metadata),
     Reader("ikonos-header", "text", "po_39001_hdr.txt", _ikonos_header, read_header),
     Reader("orbview3-label", "text", _ORB, _sample("orbview3", _ORB), read_product),

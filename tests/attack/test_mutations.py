@@ -22,7 +22,15 @@ from ortho_pipeline.report.stac import acquisition_time
 
 #: Mutants of each reader: hundreds, but as many as take about a second where a file takes milliseconds.
 FEW, MANY = 150, 5000
-DEAR = {"cartosat-met": 25, "dimap-lists": 60, "dimap-polynomials": 60, "bilsat-survey": 60, "points-geojson": 100}
+DEAR = {
+    "cartosat-met": 25,
+    "dimap-lists": 60,
+    "dimap-polynomials": 60,
+    "spot-metadata": 40,
+    "spot-detectors": 40,
+    "bilsat-survey": 60,
+    "points-geojson": 100,
+}
 
 
 def attacked(name: str, folder: Path, count: int, first: int = 0, real: Path | None = None) -> Tally:

@@ -27,8 +27,8 @@ from ortho_pipeline.models.base import Array
 
 #: Names of c_F as parameters; the corrections are ``dx_0``, ``dx_1`` ... and ``dy_0`` ...
 PRINCIPAL = ("principal_column", "principal_line", "focal_length")
-
-
+#: A table of look angles is followed by polynomials of at most this degree, to this miss (px).
+TABLE_DEGREE, TABLE_MISS = 9, 0.005
 #: Columns or rows: more than any line scanner takes in one pass.
 MOST_PIXELS = 10_000_000
 
@@ -96,6 +96,34 @@ class LineCamera:
         line = -float(v[0]) * focal if len(v) else 0.0
         return cls(width, height, -float(u[0]) * focal, line, focal, rest, along_rest)
 
+    @classmethod
+    def of_table(cls, width: int, height: int, columns: ArrayLike, across: ArrayLike, along: ArrayLike) -> Self:
+        """Make the camera that follows look directions (u, v, 1) given at columns, one for each detector or fewer.
+
+        Parameters
+        ----------
+        columns, across, along : (n,)
+            Columns from the outer corner of the first pixel, and u and v there.
+
+        Raises
+        ------
+        InputError
+            If no polynomial of `TABLE_DEGREE` or less follows them within `TABLE_MISS` pixels.
+        """
+        x, u, v = (np.asarray(value, dtype=np.float64).ravel() for value in (columns, across, along))
+        xi = 2 * x / width - 1
+        if len(x) < 2 or not np.isfinite([x, u, v]).all() or not (np.diff(x) > 0).all():
+            raise InputError("look angles are finite numbers at two or more growing columns", field="columns")
+        start, slope = np.polynomial.polynomial.polyfit(xi, u, 1)
+        if not abs(slope) > 1e-12:
+            raise InputError("a line whose look angle does not change with the column is not an image", field="across")
+        half = width / 2
+        focal = half / float(slope)
+        x0, y0 = half - focal * float(start), -focal * float(v.mean())
+        dx = _followed(xi, focal * u - half * (1 + xi) - (focal * start - half))
+        dy = _followed(xi, focal * v + y0)
+        return cls(width, height, x0, y0, focal, dx, dy)
+
     @property
     def size(self) -> tuple[int, int]:
         """Columns and rows of the image."""
@@ -153,3 +181,19 @@ class LineCamera:
     @staticmethod
     def _full(terms: Array) -> Array:
         return terms if len(terms) else np.zeros(1)
+
+
+def _followed(xi: Array, wanted: Array) -> Array:
+    """Return the shortest polynomial in xi that follows values (px); empty where none is needed."""
+    if np.abs(wanted).max() <= TABLE_MISS / 100:
+        return np.zeros(0)
+    for degree in range(min(TABLE_DEGREE, len(xi) - 1) + 1):
+        terms = np.asarray(np.polynomial.polynomial.polyfit(xi, wanted, degree), dtype=np.float64)
+        # Rather one degree more than a pattern that could be seen: the terms cost nothing.
+        if (miss := np.abs(polyval(xi, terms) - wanted).max()) <= TABLE_MISS / 100:
+            return terms
+    if not miss <= TABLE_MISS:
+        raise InputError(
+            f"the look angles are up to {miss:.3g} px off any smooth line of detectors", field="across, along"
+        )
+    return terms

@@ -78,12 +78,12 @@ def pushbroom_of_tables(
         raise InputError("a matrix of this table is not a rotation", field="attitude")
     # Half an image beyond both ends, as far as the tables go: points outside of the image are legal.
     low, high = max(-last / 2, times[0], turn_times[0]), min(1.5 * last, times[-1], turn_times[-1])
-    origin, velocity = _lagrange(times, positions, np.array([last / 2]))
+    origin, velocity = lagrange(times, positions, np.array([last / 2]))
     orbital = orbital_axes(origin[0], velocity[0])
     path_breaks = np.linspace(low, high, 1 + (splines.path or max(2, math.ceil((high - low) / _PATH_PIECE))))
     sites = np.linspace(low, high, 4 * (len(path_breaks) + degree))
     path = Spline.fitted(
-        sites, (_lagrange(times, positions, sites)[0] - origin) @ orbital, degree, path_breaks, min(degree, 2)
+        sites, (lagrange(times, positions, sites)[0] - origin) @ orbital, degree, path_breaks, min(degree, 2)
     )
     body = orbital.T @ turns
     mounted = None if mounting is None else np.asarray(mounting, dtype=np.float64)
@@ -93,7 +93,7 @@ def pushbroom_of_tables(
     angles = np.unwrap(angles_of(body), axis=0)
     turned = _attitude_spline(turn_times, angles, (low, high), splines)
     near = (turn_times >= turned.breaks[0]) & (turn_times <= turned.breaks[-1])
-    observed = (_lagrange(times, positions, path.sites)[0] - origin) @ orbital
+    observed = (lagrange(times, positions, path.sites)[0] - origin) @ orbital
     model = Pushbroom(
         camera=camera,
         line_period=line_period,
@@ -175,7 +175,7 @@ def _table(
     return times, values
 
 
-def _lagrange(times: Array, values: Array, wanted: Array) -> tuple[Array, Array]:
+def lagrange(times: Array, values: Array, wanted: Array) -> tuple[Array, Array]:
     """Return values and rates ``(n, 3)`` at `wanted` ``(n,)`` by Lagrange's polynomial through eight neighbours."""
     count = min(_NEIGHBOURS, len(times))
     found, rates = np.empty((len(wanted), 3)), np.empty((len(wanted), 3))
