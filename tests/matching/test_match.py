@@ -85,7 +85,8 @@ def test_matches_do_not_depend_on_threads(tmp_path):
 
 
 def test_chips_show_the_same_where_it_was_found(tmp_path):
-    case = Case(PLAIN, tmp_path).write()
+    # A reference that errs from place to place, or all chips would lie within a hundredth of a pixel of each other.
+    case = Case(replace(PLAIN, reference_sigma=0.5, reference_length=80.0), tmp_path).write()
     seen = matching.View(
         Intensity(RasterSource(case.scene_file)), case.model, Surface.open(case.dem_file, "ellipsoid")
     )  # fmt: skip
@@ -106,7 +107,7 @@ def test_chips_show_the_same_where_it_was_found(tmp_path):
         ]))  # fmt: skip
 
     # As far from it on one side as on the other, so that interpolation smooths both alike.
-    assert alike(1.0) > max(alike(-1.0), alike(3.0)) + 1e-4
+    assert alike(1.0) > max(alike(-1.0), alike(3.0)) + 0.01
 
 
 # -- often, and honest -------------------------------------------------------------------------------------------------

@@ -2,11 +2,17 @@ r"""Least-squares matching: the sub-pixel shift between two chips, with its cova
 
 The chip of the scene is the target's but for a shift, a gain and an offset, :math:`T(p) = a R(p + d) + b + e`; the gain
 may be negative. Where intensities do not follow such a rule (other seasons, other bands) the orientation of gradients
-takes their place, whose gain is positive and whose offset is none. The gradients are the target's alone: with a mean of
-both chips', as is often done, chips that differ by more than noise are drawn away from the shift of the best likeness.
+takes their place, whose gain is positive and whose offset is none. The normal equations are those of the scene's
+gradients: :math:`\sum \nabla T (T - a R(d)) = 0` is where the covariance of both chips is largest. With the target's
+gradients it would also be where the energy of the target's chip is least, and interpolation makes that less the farther
+from whole pixels it is: shifts would be pushed away from them, the more the noisier the images are, by all of their
+length and more. With a mean of both gradients, as is often done, chips that differ by more than noise are drawn away
+from the shift of the best likeness. What is finer than a pixel can show is blurred away before, because interpolation
+moves it.
 
-The covariance is :math:`\sigma^2 (J^T J)^{-1}`. Neighbouring residuals are alike, so it is too small by a factor that
-only the scatter of many matches tells (`weights`).
+With the normal matrix :math:`N = a \sum \nabla T \nabla R^T` the covariance is
+:math:`\sigma^2 N^{-1} (\sum \nabla T \nabla T^T) N^{-T}`. Neighbouring residuals are alike, so it is too small by a
+factor that only the scatter of many matches tells (`weights`).
 
 Source: Gruen 1985, Adaptive least squares correlation.
 """
@@ -32,6 +38,8 @@ _FARTHEST = 1.5
 _ALIKE = 0.4
 #: Standard deviation (chip px) of the blur that is taken away: shadows, haze and seasons differ in what is broad.
 _BROAD = 2.5
+#: The same of the blur that takes away noise and what is too fine for interpolation.
+_FINE = 0.7
 #: Rim (chip px) that is left out: interpolation and gradients reach over it.
 RIM = 3
 
@@ -73,11 +81,16 @@ def measure(scene: NDArray[np.float32], target: NDArray[np.float32], start: Arra
 
 
 def _detail(chips: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return chips without what is broad, as shadows and seasons make it; NaN where they are."""
+    """Return chips without what is broad, as shadows and seasons make it, nor too fine; NaN where they are."""
     valid = np.isfinite(chips)
-    weight = ndimage.gaussian_filter(valid.astype(np.float32), (0, _BROAD, _BROAD), truncate=2.0)
-    broad = ndimage.gaussian_filter(np.where(valid, chips, 0.0).astype(np.float32), (0, _BROAD, _BROAD), truncate=2.0)
-    return np.asarray(chips - broad / np.maximum(weight, 1e-3), dtype=np.float32)
+    weight, filled = valid.astype(np.float32), np.where(valid, chips, 0.0).astype(np.float32)
+
+    def blurred(sigma: float, truncate: float) -> NDArray[np.float32]:
+        over = ndimage.gaussian_filter(weight, (0, sigma, sigma), truncate=truncate)
+        values = ndimage.gaussian_filter(filled, (0, sigma, sigma), truncate=truncate)
+        return np.asarray(values / np.maximum(over, 1e-3), dtype=np.float32)
+
+    return np.where(valid, blurred(_FINE, 3.0) - blurred(_BROAD, 2.0), np.float32(np.nan))
 
 
 def _layers(chips: NDArray[np.float32]) -> NDArray[np.float32]:

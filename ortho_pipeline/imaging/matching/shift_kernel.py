@@ -19,14 +19,14 @@ def shifts(scene, target, start, offset, rim, limits, shift, covariance, correla
     inner = size - 2 * rim
     reach = (target.shape[2] - size) // 2
     chip, moved = np.empty((layers, inner, inner)), np.empty((layers, inner, inner))
-    slopes = np.empty((2, layers, inner, inner))
+    own, slopes = np.empty((2, layers, inner, inner)), np.empty((2, layers, inner, inner))
     seen, whole = np.empty((inner, inner), dtype=np.bool_), np.empty((inner, inner), dtype=np.bool_)
     weights, derived, found = np.empty((2, 4)), np.empty((2, 4)), np.empty(6)
     for k in range(count):
         shift[k, :] = np.nan
         covariance[k, :, :] = np.nan
         correlation[k] = 0.0
-        _inner(scene[k], rim, chip, whole)
+        _inner(scene[k], rim, chip, own, whole)
         x, y = start[k, 0], start[k, 1]
         for _ in range(int(limits[0])):
             if not (abs(x) < reach - 2 and abs(y) < reach - 2):
@@ -38,7 +38,7 @@ def shifts(scene, target, start, offset, rim, limits, shift, covariance, correla
             _weights(y - top, weights[1], derived[1])
             first = reach + rim
             used = _moved(target[k], first + left, first + top, weights, derived, whole, moved, slopes, seen)
-            if 2 * used < inner * inner or not _step(chip, moved, slopes, seen, offset, found):
+            if 2 * used < inner * inner or not _step(chip, own, moved, slopes, seen, offset, found):
                 break
             x += found[0]
             y += found[1]
@@ -51,9 +51,13 @@ def shifts(scene, target, start, offset, rim, limits, shift, covariance, correla
 
 
 @compiled
-def _step(chip, moved, slopes, seen, offset, found):
-    """Fill one step of the shift, its covariance (xx, yy, xy) and the correlation; False where there is none."""
-    number, a_mean, b_mean = 0, 0.0, 0.0
+def _step(chip, own, moved, slopes, seen, offset, found):
+    """Fill one step of the shift, its covariance (xx, yy, xy) and the correlation; False where there is none.
+
+    `own` and `slopes` are the derivatives of the scene's chip and of the target's: the normal equations are those of
+    the first, and the second tell how their right-hand side changes with the shift.
+    """
+    number, a_mean, b_mean, x_mean, y_mean = 0, 0.0, 0.0, 0.0, 0.0
     for m in range(chip.shape[0]):
         for i in range(chip.shape[1]):
             for j in range(chip.shape[2]):
@@ -61,45 +65,55 @@ def _step(chip, moved, slopes, seen, offset, found):
                     number += 1
                     a_mean += chip[m, i, j]
                     b_mean += moved[m, i, j]
-    a_mean, b_mean = (a_mean / number, b_mean / number) if offset else (0.0, 0.0)
-    aa, bb, ab, xa, ya, xb, yb, xx, yy, xy, sx, sy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                    x_mean += own[0, m, i, j]
+                    y_mean += own[1, m, i, j]
+    # The offset is an unknown as well: what the gradients have in common is its.
+    share = 1.0 / number if offset else 0.0
+    a_mean, b_mean, x_mean, y_mean = a_mean * share, b_mean * share, x_mean * share, y_mean * share
+    aa, bb, ab, xa, ya, xb, yb = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    xx, yy, xy, xu, xv, yu, yv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for m in range(chip.shape[0]):
         for i in range(chip.shape[1]):
             for j in range(chip.shape[2]):
                 if seen[i, j]:
                     a, b = chip[m, i, j] - a_mean, moved[m, i, j] - b_mean
-                    gx, gy = slopes[0, m, i, j], slopes[1, m, i, j]
+                    x, y = own[0, m, i, j] - x_mean, own[1, m, i, j] - y_mean
+                    u, v = slopes[0, m, i, j], slopes[1, m, i, j]
                     aa, bb, ab = aa + a * a, bb + b * b, ab + a * b
-                    xa, ya, xb, yb = xa + gx * a, ya + gy * a, xb + gx * b, yb + gy * b
-                    xx, yy, xy, sx, sy = xx + gx * gx, yy + gy * gy, xy + gx * gy, sx + gx, sy + gy
+                    xa, ya, xb, yb = xa + x * a, ya + y * a, xb + x * b, yb + y * b
+                    xx, yy, xy = xx + x * x, yy + y * y, xy + x * y
+                    xu, xv, yu, yv = xu + x * u, xv + x * v, yu + y * u, yv + y * v
     if not (aa > 1e-9 and bb > 1e-9) or ab == 0.0 or (ab < 0.0 and not offset):
         return False
     gain = ab / bb
-    if offset:
-        # The offset is an unknown as well: what the gradients have in common is its.
-        xx, yy, xy = xx - sx * sx / number, yy - sy * sy / number, xy - sx * sy / number
-    xx, yy, xy = gain * gain * xx, gain * gain * yy, gain * gain * xy
-    xr, yr = gain * (xa - gain * xb), gain * (ya - gain * yb)
-    determinant = xx * yy - xy * xy
-    if not determinant > 1e-9 * (xx + yy) ** 2:
+    xu, xv, yu, yv = gain * xu, gain * xv, gain * yu, gain * yv
+    determinant = xu * yv - xv * yu
+    # Where the likeness has its best place both are positive.
+    if not (xu + yv > 0.0 and determinant > 1e-9 * (xu + yv) ** 2):
         return False
-    variance = (aa - gain * ab) / max(number - 4, 1)
-    found[0], found[1] = (yy * xr - xy * yr) / determinant, (xx * yr - xy * xr) / determinant
-    found[2], found[3] = variance * yy / determinant, variance * xx / determinant
-    found[4], found[5] = -variance * xy / determinant, ab / np.sqrt(aa * bb)
+    xr, yr = xa - gain * xb, ya - gain * yb
+    found[0], found[1] = (yv * xr - xv * yr) / determinant, (xu * yr - yu * xr) / determinant
+    variance = (aa - gain * ab) / max(number - 4, 1) / determinant**2
+    found[2] = variance * (yv * yv * xx - 2 * yv * xv * xy + xv * xv * yy)
+    found[3] = variance * (yu * yu * xx - 2 * yu * xu * xy + xu * xu * yy)
+    found[4] = variance * (-yv * yu * xx + (xu * yv + xv * yu) * xy - xv * xu * yy)
+    found[5] = ab / np.sqrt(aa * bb)
     return True
 
 
 @compiled
-def _inner(scene, rim, chip, whole):
-    """Fill the inner part of a chip, and where all of its layers are valid."""
+def _inner(scene, rim, chip, own, whole):
+    """Fill the inner part of a chip, its derivatives (columns, rows), and where all of its layers have both."""
     layers, inner = chip.shape[0], chip.shape[1]
     for i in range(inner):
         for j in range(inner):
             whole[i, j] = True
             for m in range(layers):
-                chip[m, i, j] = scene[m, i + rim, j + rim]
-                if np.isnan(chip[m, i, j]):
+                row, column = i + rim, j + rim
+                chip[m, i, j] = scene[m, row, column]
+                own[0, m, i, j] = 0.5 * (scene[m, row, column + 1] - scene[m, row, column - 1])
+                own[1, m, i, j] = 0.5 * (scene[m, row + 1, column] - scene[m, row - 1, column])
+                if np.isnan(chip[m, i, j] + own[0, m, i, j] + own[1, m, i, j]):
                     whole[i, j] = False
 
 
