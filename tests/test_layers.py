@@ -241,7 +241,7 @@ def texts(path: Path) -> Iterator[str]:
 
 @pytest.mark.parametrize(
     "path",
-    [path for path in FILES + PLUGIN_FILES if path.parent.name != "cli" and path.name != "options.py"],
+    [path for path in FILES + PLUGIN_FILES if path.parent.name not in ("cli", "options")],
     ids=lambda path: str(path.relative_to(ROOT)),
 )
 def test_messages_name_options_by_their_fields(path: Path) -> None:

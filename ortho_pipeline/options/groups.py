@@ -1,116 +1,15 @@
-"""Options of a user, grouped as the pipeline takes them.
-
-Each option is stated here, once: its field and default, and in an `Option` what the command line and the pipeline file
-make their own options from. Messages name an option as ``group.field`` between backticks, with a value after an equals
-sign where one is meant (``surface.height=500``): so it is called in Python and in the pipeline file, and the command
-line shows its flag.
-"""
+"""Options of a user, grouped as the pipeline takes them."""
 
 # Annotations are read from the classes: as values, not as text.
-import inspect
-import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Annotated, Any, Literal, Protocol, TypeVar, get_args
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Protocol
 
-#: What a file of points calls the first pixel -> what is added to reach (0, 0) at its outer corner.
-PIXEL_ORIGINS = {
-    "corner": 0.0,  # (0, 0) is the outer corner of the first pixel: GDAL, QGIS, this package
-    "center": 0.5,  # (0, 0) is its centre: RPC files, OpenCV
-    "corner-1": -1.0,  # (1, 1) is its outer corner: ENVI
-    "center-1": -0.5,  # (1, 1) is its centre: MATLAB, Fortran, DIMAP, much older software
-}
-#: Types of pixels that an ortho may have, by GDAL's names.
-PIXEL_TYPES = ("Byte", "UInt16", "Int16", "UInt32", "Int32", "Float32", "Float64")
-#: What is adjusted: nothing, the image points, or the parameters of the model itself.
-CORRECTIONS = ("none", "shift", "shift-drift", "affine", "model")
-
-#: How the value of an option is written, where choices or a field that is true or false do not say it.
-Kind = Literal[
-    "text", "file", "number", "integer", "pair", "box", "one or two", "number or word", "number or nan", "bytes",
-    "integers", "files", "folders", "keys",
-]  # fmt: skip
-PathLike = str | os.PathLike[str]
+from ortho_pipeline.options.option import CORRECTIONS, PIXEL_ORIGINS, PIXEL_TYPES, Option, PathLike, documented
 
 
-def is_usable(number: float) -> bool:
-    """Tell whether a number can be computed with: it is 0, or its cube and that of its inverse are numbers too."""
-    return number == 0 or 1e-100 <= abs(number) <= 1e100
-
-
-def number_of(text: str | float) -> float:
-    """Return the number that a user gave; NaN for what is none, or none to compute with (`is_usable`)."""
-    try:
-        number = float(text)
-    except (ValueError, OverflowError):
-        return math.nan
-    return number if is_usable(number) else math.nan
-
-
-def numbers_of(text: str) -> list[float]:
-    """Return the numbers that a user gave with commas between, each as `number_of` has it."""
-    return [number_of(part) for part in text.split(",")]
-
-
-@dataclass(frozen=True)
-class Option:
-    """The flag and help of a field, and the values that it may have.
-
-    Parameters
-    ----------
-    flags : str
-        On the command line, the one that messages show first.
-    help : str
-        One sentence.
-    metavar : str
-        What stands for the value; its forms, if there are several, with bars between.
-    unset : str
-        What holds where the option is not given and the field has no default that says it.
-    choices : sequence of str
-        The only values.
-    above, below : float, optional
-        Bounds that are no values themselves.
-    in_file : bool
-        Whether the file of `ortho run` has it.
-    """
-
-    flags: str
-    help: str = ""
-    metavar: str | None = None
-    unset: str = ""
-    kind: Kind = "text"
-    choices: Sequence[str] = ()
-    above: float | None = None
-    below: float | None = None
-    in_file: bool = True
-
-
-_T = TypeVar("_T")
-
-
-def options_of(group: type) -> dict[str, Option]:
-    """Return the option of each field of a group."""
-    return {one.name: get_args(one.type)[1] for one in fields(group)}
-
-
-def _documented(group: type[_T]) -> type[_T]:
-    """Add the parameters to the docstring of a group."""
-    lines = []
-    for one in fields(group):  # type: ignore[arg-type]
-        option: Option = get_args(one.type)[1]
-        said = " ".join(part for part in (option.help, option.unset and f"Default: {option.unset}.") if part)
-        kind = (
-            f"{{{', '.join(map(repr, option.choices))}}}"
-            if option.choices
-            else inspect.formatannotation(get_args(one.type)[0])
-        )
-        lines.append(f"{one.name} : {kind}\n    {said}")
-    group.__doc__ = f"{group.__doc__}\n\nParameters\n----------\n" + "\n".join(lines)
-    return group
-
-
-@_documented
+@documented
 @dataclass(frozen=True)
 class SceneOptions:
     """How the image is opened."""
@@ -185,7 +84,7 @@ _CHECK = Option("--check", "Points that check and do not control.", "every:N|ids
 _MODEL_CRS = "Ground of fitted models: geocentric, geographic, utm or EPSG:n."
 
 
-@_documented
+@documented
 @dataclass(frozen=True)
 class PointOptions:
     """Which points there are, and what is adjusted to them.
@@ -257,7 +156,7 @@ class PointOptions:
     ] = None  # fmt: skip
 
 
-@_documented
+@documented
 @dataclass(frozen=True)
 class BlockOptions:
     """Which points of a block there are, and what is adjusted to them.
@@ -322,7 +221,7 @@ class BlockOptions:
     ] = None  # fmt: skip
 
 
-@_documented
+@documented
 @dataclass(frozen=True)
 class SurfaceOptions:
     """Where heights come from: a DEM, or one ellipsoidal height in metres."""
@@ -356,7 +255,7 @@ class SurfaceOptions:
     ] = None  # fmt: skip
 
 
-@_documented
+@documented
 @dataclass(frozen=True)
 class OutputOptions:
     """Form of the ortho, and how it is computed.
@@ -442,7 +341,7 @@ class OutputOptions:
     ] = None
 
 
-@_documented
+@documented
 @dataclass(frozen=True)
 class MatchOptions:
     """Control points without hands: the scene is matched with reference orthoimages."""

@@ -1,0 +1,53 @@
+"""Options of a user, grouped as the pipeline takes them.
+
+Each option is stated here, once: its field and default, and in an `Option` what the command line and the pipeline file
+make their own options from. Messages name an option as ``group.field`` between backticks, with a value after an equals
+sign where one is meant (``surface.height=500``): so it is called in Python and in the pipeline file, and the command
+line shows its flag.
+
+Imports nothing but `errors`. A new option is a field in `groups`.
+"""
+
+from ortho_pipeline.options.groups import (
+    GROUPS,
+    BlockOptions,
+    MatchOptions,
+    OutputOptions,
+    PointOptions,
+    PointTable,
+    SceneOptions,
+    SurfaceOptions,
+)
+from ortho_pipeline.options.option import (
+    CORRECTIONS,
+    PIXEL_ORIGINS,
+    PIXEL_TYPES,
+    Kind,
+    Option,
+    PathLike,
+    is_usable,
+    number_of,
+    numbers_of,
+    options_of,
+)
+
+__all__ = [
+    "CORRECTIONS",
+    "GROUPS",
+    "PIXEL_ORIGINS",
+    "PIXEL_TYPES",
+    "BlockOptions",
+    "Kind",
+    "MatchOptions",
+    "Option",
+    "OutputOptions",
+    "PathLike",
+    "PointOptions",
+    "PointTable",
+    "SceneOptions",
+    "SurfaceOptions",
+    "is_usable",
+    "number_of",
+    "numbers_of",
+    "options_of",
+]
