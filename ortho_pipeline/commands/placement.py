@@ -79,7 +79,7 @@ def place_scene(
     InputError
         For wrong points, a DEM that does not cover the scene, a grid that is none.
     """
-    adjusted = adjust(opened, points, scene, surface, match, output.threads)
+    adjusted = adjust(opened, points, scene, surface, match, output.threads, output.memory)
     model, size = adjusted.model, (opened.width, opened.height)
     with completed(adjusted.scene.model_source, of="model"):
         found = lay(model, surface, *size)

@@ -22,7 +22,7 @@ from ortho_pipeline.estimation.family_fit import OWN, Removed, fit_family, fit_o
 from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
-from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions
 from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.points.control_hull import uncovered
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
@@ -204,10 +204,12 @@ def adjust(
     surface: Surface | None,
     match: MatchOptions = MatchOptions(),
     threads: int | None = None,
+    memory: int = OutputOptions.memory,
 ) -> Adjusted:
     """Adjust the model of a scene, or fit the family of the options to the points alone.
 
-    Without points nothing is adjusted, and the model is as it was delivered. `threads` match, if a reference is given.
+    Without points nothing is adjusted, and the model is as it was delivered. `threads` match
+    with `memory` (bytes), if a reference is given.
 
     Raises
     ------
@@ -215,7 +217,7 @@ def adjust(
         If points are missing or wrong, or do not determine the model.
     """
     scene = on_surface(scene, surface)
-    points, matched = control_of(scene, options, match, opened, surface, threads)
+    points, matched = control_of(scene, options, match, opened, surface, threads, memory)
     notes: tuple[Notice, ...] = ()
     if matched is not None and options.correction is options.fit_model is opened.model is None:
         correction, note = by_matches(scene, matched.matches.points)

@@ -18,6 +18,7 @@ from scenes import UTM, Case, Setting, View, write_raster
 import ortho_pipeline as op
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.control.matching import search_of
+from ortho_pipeline.errors import InputError
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 
@@ -278,6 +279,20 @@ def test_a_run_matches_each_scene(case: Case, tmp_path: Path) -> None:
     report = json.loads((tmp_path / "out" / "scene" / "scene_report.json").read_text())
     assert report["matching"]["search_m"] == 30
     assert json.loads(ortho("run", pipeline, *root, "--list", "--json").stdout)["scenes"][0]["state"] == "done"
+
+
+@pytest.mark.parametrize("command", ["rectify", "match"])
+def test_the_memory_of_a_job_is_that_of_its_matching(case: Case, tmp_path: Path, monkeypatch, command: str) -> None:
+    asked = []
+
+    def match(view, targets, settings):
+        asked.append(settings.memory)
+        raise InputError("enough is seen")
+
+    monkeypatch.setattr("ortho_pipeline.imaging.matching.match", match)
+    memory = ("--memory", 300) if command == "rectify" else ()
+    assert matched(case, command, "-o", tmp_path / "out.csv", *memory).exit_code == 2
+    assert asked == [300_000_000 if memory else 512_000_000]
 
 
 # -- refused ---------------------------------------------------------------------------------------------------------

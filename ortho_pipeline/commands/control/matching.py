@@ -19,7 +19,7 @@ from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options import MatchOptions, SceneOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report.document import read_report
@@ -183,6 +183,7 @@ def match_scene(
     surface: Surface | None,
     opened: SceneOptions = SceneOptions(),
     threads: int | None = None,
+    memory: int = OutputOptions.memory,
 ) -> Matched:
     """Match a scene with the references of the options.
 
@@ -194,6 +195,8 @@ def match_scene(
         What may be opened.
     threads : int, optional
         As many as there are processors without; no result depends on it.
+    memory : int
+        Bytes.
 
     Raises
     ------
@@ -223,7 +226,7 @@ def match_scene(
     search = search_of(scene, options, pixel)
     settings = MatchSettings(
         search=search.distance, points=options.points, dem_sigma=typical_sigma(surface) or 0.0,
-        reference_sigma=options.reference_sigma or 0.0, threads=threads or os.cpu_count() or 1,
+        reference_sigma=options.reference_sigma or 0.0, threads=threads or os.cpu_count() or 1, memory=memory,
     )  # fmt: skip
     with _of_references():
         matches = match(view, references, settings)

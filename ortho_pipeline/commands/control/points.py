@@ -15,7 +15,7 @@ from ortho_pipeline.errors import InputError, counted, of_option
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import Vertical, parse_crs
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions
 from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, read_points
 from ortho_pipeline.points.selection import select_control
 from ortho_pipeline.raster import source as raster
@@ -29,6 +29,7 @@ def control_of(
     opened: SceneOptions,
     surface: Surface | None,
     threads: int | None = None,
+    memory: int = OutputOptions.memory,
 ) -> tuple[Points, Matched | None]:
     """Return what a scene is adjusted to and held against: points of a file, matches with a reference, or both.
 
@@ -54,7 +55,7 @@ def control_of(
             remedy="leave it out, or give `match.gcps_as=control`",
         )  # fmt: skip
     surveyed = None if options.gcps is None else read_control(scene, replace(options, correction=None), opened)
-    matched = match_scene(scene, match, surface, opened, threads)
+    matched = match_scene(scene, match, surface, opened, threads, memory)
     points = matched.matches.points
     if surveyed is None:
         return points, matched

@@ -51,8 +51,6 @@ _NEAR = 2.5
 _ROUNDS, _STANDS = 3, 0.02
 #: Rounds of judging.
 _JUDGED = 6
-#: Bytes of a job, of which GDAL's cache has a quarter.
-_MEMORY = 512_000_000
 #: Why a match was not kept, in words.
 REASONS = {
     "hidden": "the target shows too little of the chip",
@@ -79,6 +77,8 @@ class MatchSettings:
     reference_sigma : float
         Standard deviation (m) per axis of the reference's own places.
     threads : int
+    memory : int
+        Bytes that are meant for all of the work, of which GDAL's cache has a part.
     """
 
     search: float
@@ -86,6 +86,7 @@ class MatchSettings:
     dem_sigma: float = 0.0
     reference_sigma: float = 0.0
     threads: int = 1
+    memory: int = 512_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +144,7 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     """
     # Left alone, GDAL keeps blocks in a share of the machine's memory; chips lie beside each other and need few.
     seen = [view.intensity, *(target.intensity for target in targets)]
-    limit_cache(_MEMORY, settings.threads, *(one.source.block for one in seen))
+    threads = limit_cache(settings.memory, settings.threads, *(one.source.block for one in seen))
     shown = _shown(view, targets)
     base = chip_factor(view, targets, shown)
     reach = max(settings.search / metres_per_pixel(view), 2.0 * base)
@@ -155,7 +156,7 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     grid = cells_of(*extent, round(settings.points / min(max(share, 0.05), 1.0)))
     corrected = View(view.intensity, correction, view.surface)
     origins, cells = candidates(view, region, grid, SIDE, base, _cells_shown(corrected, targets, region, grid))
-    tried = _Tried(view, targets, origins, cells, base, settings.threads)
+    tried = _Tried(view, targets, origins, cells, base, threads)
     tried.search(correction)
     for turn in range(_ROUNDS):
         correction = tried.agreed(correction, None if turn else reach)

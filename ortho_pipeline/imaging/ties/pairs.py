@@ -71,12 +71,15 @@ class TieSettings:
     dem_sigma : float
         Standard deviation (m) of the DEM's heights.
     threads : int
+    memory : int
+        Bytes that are meant for all of the work, of which GDAL's cache has a part.
     """
 
     search: float
     points: int = 500
     dem_sigma: float = 10.0
     threads: int = 1
+    memory: int = 512_000_000
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from ortho_pipeline.imaging.matching.chip_search import FEWEST, SIDE
 from ortho_pipeline.imaging.matching.targets import SAMPLES, OtherScene, View, metres_per_pixel
 from ortho_pipeline.imaging.ties.pairs import Matched, Pair, PairSummary, TieSettings, shared, shows
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.raster.block_cache import limit_cache
 
 #: Cells of a scene are at most so many times those wanted of its smallest overlap.
 _MOST = 10
@@ -64,6 +65,9 @@ def tie(views: Sequence[View], settings: TieSettings) -> Ties:
     InputError
         If no two of them show the same ground, or none that do could be matched; with the reason.
     """
+    blocks = sorted(view.intensity.source.block for view in views)
+    # A thread looks at two scenes.
+    settings = replace(settings, threads=limit_cache(settings.memory, settings.threads, *blocks[-2:]))
     targets = [OtherScene(view.intensity, view.model) for view in views]
     overlaps = _overlaps(views, targets)
     if not overlaps:
