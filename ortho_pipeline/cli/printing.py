@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -16,6 +17,9 @@ from ortho_pipeline.errors import counted
 
 if TYPE_CHECKING:
     from ortho_pipeline.commands.results import CompareResult, FitResult, Result
+
+#: More points than this are not all printed, but so many of them.
+_PRINTED, _WORST = 60, 20
 
 
 def print_json(document: Any) -> None:
@@ -40,27 +44,30 @@ def print_result(result: Result, as_json: bool) -> None:
 
 
 def print_fit(result: FitResult) -> None:
-    """Print parameters, every residual and the RMSEs."""
+    """Print parameters, residuals (of many points the largest) and the RMSEs."""
     document = result.to_json()
     click.echo(f"Sensor {document['sensor']}, model {document['model']} of {document['model_source']}")
     _print_parameters(document)
     wide = max([len(point["id"]) for point in document["points"]] + [5])
     click.echo(f"\n{'point':<{wide}}  role     used    column       row   left out: col.    row")
-    for point in document["points"]:
+    points, rest = _worst(document["points"])
+    for point in points:
         numbers = [*point["residual"], *point["loo_residual"]]
         shown = "".join(f"{'-' if value is None else f'{value:+.3f}':>10}" for value in numbers)
         click.echo(f"{point['id']:<{wide}}  {point['role']:<8} {'yes' if point['used'] else 'no':<4}{shown}")
+    if rest:
+        click.echo(f"and {counted(rest, 'point')} with smaller residuals (--json has all)")
     click.echo("\nResiduals are measured minus predicted, in pixels; 'left out': had the point taken no part.")
     if document["raw_bias"] and document["parameters"]:
         bias = document["raw_bias"]
         click.echo(f"Model as delivered: column {bias['col']:+.3f}, row {bias['row']:+.3f} on average")
-    for which, label in (("control", "control"), ("check", "check"), ("loo", "leave-one-out")):
-        rmse = document["rmse"][which]
+    labels = {"control": "control", "check": "check", "loo": "leave-one-out", "matched": "matched"}
+    for which, rmse in document["rmse"].items():
         text = "no points" if rmse is None else (
             f"column {rmse['col']:.3f}, row {rmse['row']:.3f}, both {rmse['total']:.3f}  "
             f"({counted(rmse['n'], 'point')})"
         )  # fmt: skip
-        click.echo(f"RMSE {label:<14} {text}")
+        click.echo(f"RMSE {labels[which]:<14} {text}")
     if document["outlying"] and (rest := document["rmse_of_agreeing_checks"]):
         click.echo(
             f"RMSE of the check points that are not outlying: {rest['total']:.3f}  ({counted(rest['n'], 'point')})"
@@ -77,6 +84,17 @@ def print_fit(result: FitResult) -> None:
     sigma0 = "unknown" if document["sigma0"] is None else f"{document['sigma0']:.3g}"
     click.echo(f"Redundancy {document['redundancy']}, sigma0 {sigma0}")
     print_warnings(document["warnings"])
+
+
+def _worst(points: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], int]:
+    """Return the points to print, and how many are left: of many those with the largest residuals, the worst first."""
+
+    def size(point: Mapping[str, Any]) -> float:
+        return math.hypot(*(math.inf if value is None else value for value in point["residual"]))
+
+    if len(points) <= _PRINTED:
+        return points, 0
+    return sorted(points, key=size, reverse=True)[:_WORST], len(points) - _WORST
 
 
 def _print_parameters(document: Mapping[str, Any]) -> None:

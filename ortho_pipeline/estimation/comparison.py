@@ -75,7 +75,7 @@ class Row:
             return {**row, "rmse": nothing, "rmse_m": dict(nothing), **dict.fromkeys(unknown), **to_document(())}
         return {
             **row,
-            "rmse": {name: self.fit.rmse(name) for name in which},
+            "rmse": self.fit.rmses,
             "rmse_m": rmse_metres(self.fit),
             "condition": json_value(float(self.fit.condition)),
             "redundancy": self.fit.redundancy,

@@ -132,20 +132,29 @@ class Fit:
     def rmse(self, which: str) -> dict[str, float | int] | None:
         """Return root mean squares in pixels for 'control' (used), 'check' or 'loo'; None where there is no point.
 
-        'agreeing' is the check points without the outlying ones: never the accuracy, but what one wrong point hides.
+        'matched' is of matches that check beside measured points, whose 'check' then is. 'agreeing' is the check points
+        without the outlying ones: never the accuracy, but what one wrong point hides.
         """
         if which == "loo":
             residuals = self.loo_residuals[np.isfinite(self.loo_residuals).all(axis=1)]
         elif which == "control":
             residuals = self.residuals[self.used]
         else:
-            checks = self.points.check
-            if which == "agreeing":
+            checks = self.points.tests
+            if which == "matched":
+                checks = self.points.check & ~checks
+            elif which == "agreeing":
                 checks = checks & ~np.isin(np.array(self.points.ids), [one.id for one in self.outlying])
             residuals = self.residuals[checks]
             # A point that does not project has no residual; a warning names it.
             residuals = residuals[np.isfinite(residuals).all(axis=1)]
         return root_mean_square(residuals)
+
+    @property
+    def rmses(self) -> dict[str, dict[str, float | int] | None]:
+        """All of `rmse`, 'matched' only where there is one."""
+        both = ("matched",) if (self.points.check & ~self.points.tests).any() else ()
+        return {which: self.rmse(which) for which in ("control", "check", "loo", *both)}
 
     @property
     def raw_bias(self) -> dict[str, float | int] | None:
@@ -209,7 +218,7 @@ class Fit:
                 }
                 for i in range(len(points))
             ],
-            "rmse": {which: self.rmse(which) for which in ("control", "check", "loo")},
+            "rmse": self.rmses,
             "raw_bias": self.raw_bias,
             "redundancy": self.redundancy,
             "sigma0": self.sigma0,

@@ -98,9 +98,12 @@ def rmse_metres(fit: Fit) -> dict[str, Any]:
     shifts = in_metres(fit, fit.residuals)
     values = {
         "control": shifts[fit.used],
-        "check": shifts[fit.points.check],
+        "check": shifts[fit.points.tests],
         "loo": in_metres(fit, fit.loo_residuals),
     }
+    held_out = fit.points.check & ~fit.points.tests
+    if held_out.any():
+        values["matched"] = shifts[held_out]
     found = {}
     for name, rows in values.items():
         rmse = root_mean_square(rows[np.isfinite(rows).all(axis=1)])

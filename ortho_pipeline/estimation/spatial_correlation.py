@@ -234,7 +234,7 @@ def analyse_fit(fit: Fit, *, near: float | None = None) -> dict[str, CovarianceA
         "control": analyse(where[fit.used], shifts[fit.used], near=near, design=_design(fit)[fit.used])
         if fit.used.any()
         else None,
-        "check": analyse(where[points.check], shifts[points.check], near=near) if points.check.any() else None,
+        "check": analyse(where[points.tests], shifts[points.tests], near=near) if points.check.any() else None,
     }
 
 

@@ -162,6 +162,15 @@ class Points:
         """Which points are check points ``(N,)``."""
         return self.roles == "check"
 
+    @property
+    def tests(self) -> NDArray[np.bool_]:
+        """Check points that test the result ``(N,)``: those that somebody measured, or matches where there is no other.
+
+        Matches (points with a group) that check are relative to their reference, and have a figure of their own.
+        """
+        measured = self.check & (self.groups < 0)
+        return measured if measured.any() else self.check
+
     def select(self, mask: ArrayLike) -> Points:
         """Return the points of a mask ``(N,)`` or of indices, in their order."""
         index = np.arange(len(self))[np.asarray(mask)]

@@ -60,20 +60,26 @@ class RmseOfView:
 
 @record
 class Rmses:
-    """Over control points (the fit), check points, and control points left out in turn."""
+    """Over control points (the fit), check points, and control points left out in turn.
+
+    Where check points were measured beside matches, `check` is of those, absolute, and `matched` of the matches that
+    were held out, relative to their reference.
+    """
 
     control: Rmse | None
     check: Rmse | None
     loo: Rmse | None
+    matched: Rmse | None = None
 
 
 @record
 class RmsesOnGround:
-    """Over control points (the fit), check points, and control points left out in turn."""
+    """As `Rmses`."""
 
     control: RmseOnGround | None
     check: RmseOnGround | None
     loo: RmseOnGround | None
+    matched: RmseOnGround | None = None
 
 
 @record

@@ -198,7 +198,7 @@ def _view_rmse(fit: Fit) -> RmsesOfView:
         rmse = root_mean_square(rows[np.isfinite(rows).all(axis=1)])
         return None if rmse is None else RmseOfView(along=rmse["col"], across=rmse["row"], n=int(rmse["n"]))
 
-    return RmsesOfView(control=over(fit.used), check=over(fit.points.check))
+    return RmsesOfView(control=over(fit.used), check=over(fit.points.tests))
 
 
 def _surface(surface: Surface, coverage: float | None) -> FlatGround | Dem:

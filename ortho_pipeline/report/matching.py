@@ -48,6 +48,16 @@ class MatchComponents:
     height_m: float
     other_px: float
 
+    def text(self) -> str:
+        """Say what there is of each part."""
+        said = []
+        if self.matching > 0:
+            said.append(f"{self.matching:.3g} times the variance that least-squares matching states")
+        if self.height_m > 0:
+            said.append(f"heights off by {metres(self.height_m)}")
+        said.append(f"{px(self.other_px)} per axis of what is neither")
+        return ", ".join(said)
+
 
 @record
 class MatchCoverage:

@@ -71,9 +71,11 @@ def plot_residuals(report: SceneReport) -> Drawing | None:
     """Draw the residual vectors over the frame of the image, with the hull of the control points.
 
     Used control points are dots, check points squares, points that were left out crosses without an arrow. Points
-    outside of the image are drawn where they are, tie points not at all.
+    outside of the image are drawn where they are, tie points not at all, matches on a map of their own.
     """
-    points = _shown(report)
+    # The map of matches has their residuals.
+    matched = set() if report.matching is None else {one.image for one in report.matching.candidates}
+    points = [point for point in _shown(report) if point.image not in matched]
     if not points:
         return None
     width, height = report.scene.size

@@ -32,6 +32,7 @@ from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpb
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
+from ortho_pipeline.imaging.matching import open_references
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.options import PointOptions, SceneOptions
 from ortho_pipeline.points import read_points
@@ -143,6 +144,13 @@ def _image(path: Path) -> Any:
     source = RasterSource(path)
     window = source.read(0, 0, min(64, dataset.RasterXSize), min(64, dataset.RasterYSize))
     return [0.0, float(window.size)]
+
+
+def _reference(path: Path) -> Any:
+    (reference,) = open_references([path])
+    intensity = reference.intensity
+    part = intensity.read(0, 0, min(intensity.width, 40), min(intensity.height, 40), 1)
+    return [reference.pixel_from_map, reference.corners, part[np.isfinite(part)]]
 
 
 def _scene(**options: Any) -> Callable[[Path], Any]:
@@ -388,6 +396,7 @@ READERS = (
     Reader("crs-wkt", "text", "crs.txt", _text(_WKT), _system, of_files=False),
     Reader("crs-proj", "text", "crs.txt", _text(_UTM), _system, of_files=False),
     Reader("dem", "tiff", "dem.tif", _tiff(seeds.dem), _dem),
+    Reader("reference", "tiff", "ortho.tif", _tiff(seeds.dem), _reference),
     Reader("image", "tiff", "one.tif", _tiff(seeds.image), _image),
     Reader("vrt", "xml", "one.vrt", _with_image(seeds.vrt), _image),
     Reader("geoid-grid", "binary", "geoid.gtx", lambda folder: seeds.geoid_gtx(), _grid, of_files=False),

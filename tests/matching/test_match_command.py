@@ -162,6 +162,11 @@ def test_measured_points_see_what_matches_cannot(moved: Case, tmp_path: Path) ->
     assert matching["absolute"]["n"] == 6
     assert matching["absolute"]["m"] == pytest.approx(math.hypot(5, 3), abs=0.2)
     assert matching["relative"]["n"] == matching["check"]
+    # Never in one figure.
+    for rmse in (report["adjustment"]["rmse"], report["rmse_m"]):
+        assert (rmse["check"]["n"], rmse["matched"]["n"]) == (6, matching["check"])
+        assert rmse["check"]["total"] > 10 * rmse["matched"]["total"]
+    assert report["view_rmse"]["check"]["n"] == report["covariance"]["check"]["n"] == 6
     assert matching["relative"]["m"] < 0.3
     head = report["headline"]
     assert "relative to the reference" in head["what"]
@@ -172,6 +177,9 @@ def test_measured_points_see_what_matches_cannot(moved: Case, tmp_path: Path) ->
     page = (tmp_path / "out" / "scene_report.html").read_text()
     assert "relative to the reference" in page
     assert "check points: measured, absolute" in page
+    assert "0 times" not in page
+    # The map of matches has the residuals of matches, the plot those of the others.
+    assert "Residual vectors of 6 points" in page
 
 
 def test_measured_points_control_if_the_user_says_so(moved: Case, tmp_path: Path) -> None:
@@ -187,6 +195,17 @@ def test_measured_points_control_if_the_user_says_so(moved: Case, tmp_path: Path
     )  # those that contradict the many are left out, and named
 
 
+def test_of_many_points_the_worst_are_printed(case: Case, written_points: tuple[Path, dict]) -> None:
+    words = ("fit", case.scene_file, "--gcps", written_points[0], *heights(case))
+    points = document(ortho(*words, "--json"))["points"]
+    assert len(points) > 60
+    done = ortho(*words)
+    lines = [line for line in done.stdout.splitlines() if line.startswith("m") and len(line.split()) == 7]
+    worst = sorted(points, key=lambda one: -math.hypot(*one["residual"]))[:20]
+    assert [line.split()[0] for line in lines] == [one["id"] for one in worst]
+    assert f"and {len(points) - 20} points with smaller residuals" in done.stdout
+
+
 def test_nothing_absolute_is_said_of_matches_alone(
     case: Case, rectified: Path, written_points: tuple[Path, dict], tmp_path: Path
 ) -> None:
@@ -197,6 +216,10 @@ def test_nothing_absolute_is_said_of_matches_alone(
         assert found["map_scale"] is None
         assert "relative-to-reference" in {one["code"] for one in found["notices"]}
     assert own["matching"]["absolute"] is None
+    assert "matched" not in own["adjustment"]["rmse"] or own["adjustment"]["rmse"]["matched"] is None
+    page = (rectified / "scene_report.html").read_text()
+    assert 'data-plot="matches"' in page
+    assert 'data-plot="residuals"' not in page
     item = json.loads((rectified / "scene_stac.json").read_text())["properties"]
     assert not [name for name in item if name.startswith("accuracy:geometric")]
     words = ("--model", rectified / "scene_model.json", *heights(case), "-o", tmp_path / "again", "-of", "GTiff")

@@ -23,6 +23,7 @@ from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report.document import read_report
+from ortho_pipeline.report.matching import MatchComponents
 from ortho_pipeline.surface.accuracy import typical_sigma
 from ortho_pipeline.surface.base import Surface
 
@@ -160,7 +161,6 @@ class Matched:
             f"{one['agreeing']} of {counted(one['chips'], 'chip')} of 1/{one['factor']} resolution agree"
             for one in said["levels"]
         )
-        parts = said["components"]
         sigma = self.options.reference_sigma
         return [
             ("reference", ", ".join(Path(one).name for one in self.references)
@@ -171,9 +171,8 @@ class Matched:
             ("search", f"{metres(self.search.distance)} ({self.search.source}); {levels}"),
             ("model off", f"column {column:+.2f} px, row {row:+.2f} px (measured minus delivered model), "
              f"{metres(said['shift_m'])}"),
-            ("accuracy", f"{px(said['sigma_px'])} in the middle of the matches, relative to the reference: matching "
-             f"{parts['matching']:.3g} times what it says itself, heights {parts['height_m']:.3g} m, other "
-             f"{parts['other_px']:.3g} px"),
+            ("accuracy", f"{px(said['sigma_px'])} in the middle of the matches, relative to the reference: "
+             f"{MatchComponents(**said['components']).text()}"),
         ]  # fmt: skip
 
 
