@@ -7,7 +7,7 @@ of the working frame to those of the camera (x right, y up in the image, z backw
 .. math:: x - x_0 = -f\, w_1 / w_3, \qquad y - y_0 = -f\, w_2 / w_3 .
 
 Lens, principal point and the step to pixels are in `ortho_pipeline.models.lens`, the two kinds of working frame in
-`ortho_pipeline.models.frame.working_frame`, refraction, which is optional, in `ortho_pipeline.models.frame.refraction`.
+`ortho_pipeline.models.frame.working_frame`, refraction, which is optional, in `ortho_pipeline.models.light.refraction`.
 
 Source: Ok and Turker, equations 1-7; McGlone 1996. Symbols: X_L ... kappa, f (focal_length), x0, y0 and M as there.
 """
@@ -41,7 +41,6 @@ from ortho_pipeline.models.frame.orientation import (
     geocentric_of_platform,
     require_metres,
 )
-from ortho_pipeline.models.frame.refraction import FLATTEST
 from ortho_pipeline.models.frame.working_frame import (
     GEOGRAPHIC,
     MAP,
@@ -52,6 +51,7 @@ from ortho_pipeline.models.frame.working_frame import (
     require_frame,
 )
 from ortho_pipeline.models.lens import INTERIOR, Interior
+from ortho_pipeline.models.light.refraction import FLATTEST
 
 PARAMETERS = (*EXTERIOR, *INTERIOR)
 #: Warning for a camera whose `FrameCamera.sees_ground` is false.

@@ -10,9 +10,9 @@ import numpy as np
 
 from ortho_pipeline.geodesy.ellipsoid import rotation_of_angles
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.models.frame.refraction import RefractionCorrection, refraction_correction
 from ortho_pipeline.models.frame.working_frame import WorkingFrame
 from ortho_pipeline.models.lens import Interior
+from ortho_pipeline.models.light.refraction import RefractionCorrection, refraction_correction
 
 _REFRACTION_STEPS = 12
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ortho_pipeline.files.compiled import compiled, inlined
+from ortho_pipeline.models.light.refraction import FLATTEST, SCALE_HEIGHT
 
 
 class Trajectory(NamedTuple):
@@ -38,8 +39,9 @@ class Camera(NamedTuple):
     ----------
     mount, lever : (3, 3), (3,)
         Its axes and its place in those of the platform.
-    numbers : (8,)
-        x0, y0, F, columns, line period, semi-major axis, squared eccentricity, largest miss (px) when done.
+    numbers : (10,)
+        x0, y0, F, columns, line period, semi-major axis, squared eccentricity, largest miss (px) when done; and of the
+        light its bend at the ellipsoid (m) and its seconds per metre (`LightPath.numbers`).
     dx, dy : (n,), (m,)
         Polynomials of the distortion.
     """
@@ -62,6 +64,16 @@ def _horner(pieces, i, k, d):
 
 
 @inlined
+def _in_orbit(orbit, x, y, z):
+    """Turn a vector from ECEF into orbital axes."""
+    return (
+        orbit[0, 0] * x + orbit[1, 0] * y + orbit[2, 0] * z,
+        orbit[0, 1] * x + orbit[1, 1] * y + orbit[2, 1] * z,
+        orbit[0, 2] * x + orbit[1, 2] * y + orbit[2, 2] * z,
+    )
+
+
+@inlined
 def _series(terms, xi):
     """Value and slope of a polynomial at xi."""
     value, slope = 0.0, 0.0
@@ -72,8 +84,11 @@ def _series(terms, xi):
 
 
 @inlined
-def _in_camera(px, py, pz, t, ends, origins, pieces, mount, lever):
-    """Vector from camera to point in camera axes at time t and its rate; (px, py, pz) is in orbital axes."""
+def _in_camera(px, py, pz, t, ends, origins, pieces, mount, lever, up, bend, slowness):
+    """Vector along which a point is seen in camera axes at time t, and its rate; (px, py, pz) is in orbital axes.
+
+    How the way of the light changes with time is left out of the rate: Newton's steps are shorter by a part of 1e-5.
+    """
     i, above = 0, ends.shape[0]
     while i < above:
         between = (i + above) // 2
@@ -88,6 +103,13 @@ def _in_camera(px, py, pz, t, ends, origins, pieces, mount, lever):
     y, dy = py - s, -s_rate
     s, s_rate = _horner(pieces, i, 2, d)
     z, dz = pz - s, -s_rate
+    if bend > 0.0:
+        level = x * up[0] + y * up[1] + z * up[2]
+        lift = bend / max(level * level / (x * x + y * y + z * z), FLATTEST * FLATTEST)
+        x, y, z = x + lift * up[0], y + lift * up[1], z + lift * up[2]
+    if slowness > 0.0:
+        late = slowness * math.sqrt(x * x + y * y + z * z)
+        x, y, z = x - late * dx, y - late * dy, z - late * dz
     roll, roll_rate = _horner(pieces, i, 3, d)
     pitch, pitch_rate = _horner(pieces, i, 4, d)
     yaw, yaw_rate = _horner(pieces, i, 5, d)
@@ -122,7 +144,7 @@ def project(ground: Any, trajectory: Trajectory, camera: Camera, limits: Any, im
     """
     orbit, centre, ends, origins, pieces = trajectory
     mount, lever, numbers, dx, dy = camera
-    x0, y0, focal, columns, period, major, e2, verified = numbers
+    x0, y0, focal, columns, period, major, e2, verified, bend, slowness = numbers
     half = columns / 2.0
     for k in range(ground.shape[0]):
         image[k, 0], image[k, 1] = np.nan, np.nan
@@ -136,14 +158,16 @@ def project(ground: Any, trajectory: Trajectory, camera: Camera, limits: Any, im
         # Seen from below the horizon there is only the far side of the Earth.
         if not gx * x + gy * y + gz * z < 0.0:
             continue
-        px = orbit[0, 0] * x + orbit[1, 0] * y + orbit[2, 0] * z
-        py = orbit[0, 1] * x + orbit[1, 1] * y + orbit[2, 1] * z
-        pz = orbit[0, 2] * x + orbit[1, 2] * y + orbit[2, 2] * z
+        px, py, pz = _in_orbit(orbit, x, y, z)
+        up = _in_orbit(orbit, cos_lat * math.cos(lon), cos_lat * math.sin(lon), sin_lat)
+        lifting = bend * math.exp(-ground[k, 2] / SCALE_HEIGHT)
         # The scan is so nearly linear in time that from the middle Newton's method needs four steps.
         t = 0.5 * (limits[1, 0] + limits[1, 1])
         col, miss, w = half, np.inf, 0.0
         for _ in range(20):
-            a, b, w, a_rate, b_rate, w_rate = _in_camera(px, py, pz, t, ends, origins, pieces, mount, lever)
+            a, b, w, a_rate, b_rate, w_rate = _in_camera(
+                px, py, pz, t, ends, origins, pieces, mount, lever, up, lifting, slowness
+            )
             a, b = a / w, b / w
             a_rate, b_rate = (a_rate - a * w_rate) / w, (b_rate - b * w_rate) / w
             if miss == np.inf:

@@ -20,6 +20,7 @@ def by_ground(model: Pushbroom, ground: Array) -> Array:
     state = State(model, ground)
     moved = np.swapaxes(enu_from_ecef(ground), 1, 2).copy()
     moved[:, :, :2] *= metres_per_degree(ground)[:, None, :]
+    moved[:, :, 2] *= model.light.rise(ground[:, 2], state.cosine)[:, None]
     by_camera = model.mounting.T @ np.swapaxes(state.turn, 1, 2) @ model.orbital.T
     return state.image_by(by_camera @ moved)
 
@@ -81,14 +82,17 @@ class State:
         self.model, self.column, self.times = model, image[:, 0], image[:, 1] * model.line_period
         angles, rates = flight.attitude(self.times), flight.attitude(self.times, 1)
         self.turn = rotations(angles)
+        rate, up = flight.path(self.times, 1), enu_from_ecef(ground)[:, 2] @ flight.orbital
         line = (geocentric(ground) - flight.origin) @ flight.orbital - flight.path(self.times)
+        #: Of the zenith angle at the point.
+        self.cosine = -(line * up).sum(axis=1) / np.linalg.norm(line, axis=1)
+        line = model.light.apparent(line, rate, up, ground[:, 2])
         back = np.swapaxes(self.turn, 1, 2)
         place = np.einsum("nij,nj->ni", back, line)
         #: d(vector in platform axes)/d(roll, pitch, yaw)
         self.by_angles = -np.cross(np.swapaxes(turning_axes(angles), 1, 2), place[:, None, :]).swapaxes(1, 2)
         self.vector = (place - model.lever) @ model.mounting
-        rate = np.einsum("nij,nj->ni", self.by_angles, rates)
-        rate -= np.einsum("nij,nj->ni", back, flight.path(self.times, 1))
+        rate = np.einsum("nij,nj->ni", self.by_angles, rates) - np.einsum("nij,nj->ni", back, rate)
         x, y, z = self.vector.T
         zero, one = np.zeros_like(z), np.ones_like(z)
         #: d(u, v)/d(vector in camera axes)

@@ -17,6 +17,9 @@ Axes, which the paper leaves to its references:
 - **camera** (:math:`R_M`): x along the line to the left of the flight, y forward, z to the ground; see
   `ortho_pipeline.models.pushbroom.line_camera` for u, v. :math:`C_M` is the camera's place in the platform (metres).
 
+Aberration and refraction, where the attitude does not hold them already, are those of
+`ortho_pipeline.models.light.path` (`light`).
+
 Path and attitude are the splines plus an offset and a drift per second about the middle of the scene: the systematic
 part of a vendor's tables, which those observe without. Beyond its knots the path goes on with its curvature, the
 attitude with its slope.
@@ -49,6 +52,7 @@ from ortho_pipeline.models.base import (
     checked_names,
     ground_of_grid,
 )
+from ortho_pipeline.models.light import AS_GIVEN, LightPath
 from ortho_pipeline.models.pushbroom import kernel as pushbroom_kernel
 from ortho_pipeline.models.pushbroom.constraints import Observations, OrbitShape
 from ortho_pipeline.models.pushbroom.flight import Flight
@@ -90,6 +94,8 @@ class Pushbroom(SensorModel):
     shape : OrbitShape
     path_observations, attitude_observations : tuple of Observations
         What is known beforehand: `constraints` brings it into an adjustment.
+    light : LightPath
+        What the attitude does not have of aberration and refraction.
     """
 
     kind: ClassVar[str] = "pushbroom"
@@ -109,6 +115,7 @@ class Pushbroom(SensorModel):
     shape: OrbitShape
     path_observations: tuple[Observations, ...] = ()
     attitude_observations: tuple[Observations, ...] = ()
+    light: LightPath = AS_GIVEN
 
     def __post_init__(self) -> None:
         shapes = {"origin": (3,), "orbital": (3, 3), "mounting": (3, 3), "lever": (3,), "path_line": (2, 3)}
@@ -255,7 +262,7 @@ class Pushbroom(SensorModel):
         return image
 
     def rays(self, image: ArrayLike) -> tuple[Array, Array]:
-        """Return origin and unit direction ``(N, 3)`` in ECEF of the rays of image points ``(N, 2)``."""
+        """Return origin and unit direction ``(N, 3)`` in ECEF of the rays of image points ``(N, 2)`` in space."""
         image = as_image(image)
         low, high = self._limits.T
         times = image[:, 1] * self.line_period
@@ -264,7 +271,8 @@ class Pushbroom(SensorModel):
         column, times = np.where(good, image[:, 0], np.nan), np.where(good, times, np.nan)
         look = np.column_stack([self.camera.directions(column), np.ones(len(image))])
         look /= np.linalg.norm(look, axis=1)[:, None]
-        return self.flight.lines(times, look @ self.mounting.T, self.lever)
+        origin, direction = self.flight.lines(times, look @ self.mounting.T, self.lever)
+        return origin, self.light.straight(direction, self.flight.positions(times, 1))
 
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
         """Follow the rays of image points ``(N, 2)`` to an ellipsoidal height; NaN where they do not get there."""
@@ -272,6 +280,9 @@ class Pushbroom(SensorModel):
         wanted = np.broadcast_to(np.asarray(height, dtype=np.float64), (len(origin),))
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             ground = meet_height(origin, direction, wanted)
+            if self.light.refraction:
+                cosine = -(enu_from_ecef(ground)[:, 2] * direction).sum(axis=1)
+                ground = meet_height(origin, direction, wanted + self.light.lift(wanted, cosine))
             # Beside the antimeridian, stay on the side of the sub-satellite point.
             foot = math.degrees(math.atan2(self.origin[1], self.origin[0]))
             ground[:, 0] = foot + np.remainder(ground[:, 0] - foot + 180.0, 360.0) - 180.0
@@ -298,21 +309,31 @@ class Pushbroom(SensorModel):
             data[name] = getattr(self, name).to_dict()
         for name in ("path_observations", "attitude_observations"):
             data[name] = [table.to_dict() for table in getattr(self, name)]
-        return data
+        # Files of cameras without it are as they were before there was any.
+        data.pop("light", None)
+        return data | ({} if self.light == AS_GIVEN else {"light": self.light.to_dict()})
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
         """Make the model from what `to_dict` returned."""
-        parts: dict[str, Any] = {}
-        for name, make in (("camera", LineCamera), ("path", Spline), ("attitude", Spline), ("shape", OrbitShape)):
-            if not isinstance(data.get(name), dict):
-                raise InputError(f"a pushbroom has its {name}", field=name)
-            parts[name] = make(**data[name])
-        for name in ("path_observations", "attitude_observations"):
-            if not isinstance(data.get(name), list | tuple):
-                raise InputError("a list of tables belongs here, which may be empty", field=name)
-            parts[name] = tuple(Observations(**table) for table in data[name])
-        return super().from_dict({**data, **parts})
+        return super().from_dict({**data, **_parts(data)})
+
+
+def _parts(data: dict[str, Any]) -> dict[str, Any]:
+    """Return what is more than numbers in the plain data of a model."""
+    parts: dict[str, Any] = {}
+    for name, make in (("camera", LineCamera), ("path", Spline), ("attitude", Spline), ("shape", OrbitShape)):
+        if not isinstance(data.get(name), dict):
+            raise InputError(f"a pushbroom has its {name}", field=name)
+        parts[name] = make(**data[name])
+    for name in ("path_observations", "attitude_observations"):
+        if not isinstance(data.get(name), list | tuple):
+            raise InputError("a list of tables belongs here, which may be empty", field=name)
+        parts[name] = tuple(Observations(**table) for table in data[name])
+    if not isinstance(light := data.get("light", {}), dict):
+        raise InputError("aberration and refraction belong here", field="light")
+    parts["light"] = LightPath(**light)
+    return parts
 
 
 def _finite(value: Array, shape: tuple[int, ...], field: str) -> Array:
@@ -328,6 +349,6 @@ def _compiled_camera(model: Pushbroom) -> pushbroom_kernel.Camera:
     camera = model.camera
     numbers = np.array(
         [camera.principal_column, camera.principal_line, camera.focal_length, camera.width, model.line_period,
-         SEMI_MAJOR, ECCENTRICITY_SQUARED, _LAST_STEP]
+         SEMI_MAJOR, ECCENTRICITY_SQUARED, _LAST_STEP, *model.light.numbers]
     )  # fmt: skip
     return pushbroom_kernel.Camera(model.mounting, model.lever, numbers, camera.dx, camera.dy)
