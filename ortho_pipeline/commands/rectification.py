@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.points import match_asked
 from ortho_pipeline.commands.inputs import has_surface, open_surface
+from ortho_pipeline.commands.layers import budget as layers
 from ortho_pipeline.commands.placement import place_scene, source_of
-from ortho_pipeline.commands.results import ENDINGS, OF_STAC, Result, outputs_together, write_report
+from ortho_pipeline.commands.results import ENDINGS, Result, outputs, outputs_together, write_report
 from ortho_pipeline.commands.scene_fit import adjust, open_adjustable
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, completed
@@ -69,7 +70,7 @@ def rectify(
     -------
     Result
         `files` has ortho, model, rpc, vrt (unless no RPC stands for the model), residuals and style (with points
-        only), report, html, and stac with thumbnail and overview (if asked for).
+        only), report, html, and, if asked for, accuracy with its style, and stac with thumbnail and overview.
 
     Raises
     ------
@@ -78,9 +79,7 @@ def rectify(
         written, an old side-car that would attach to the ortho.
     """
     stem = Path(image).stem
-    files = {
-        kind: Path(folder) / f"{stem}{ending}" for kind, ending in ENDINGS.items() if kind not in OF_STAC or output.stac
-    }
+    files = outputs(folder, stem, output)
     points = inputs.point_options(points)
     inputs.check_paths(files, image, scene, points, surface, match, overwrite)
     inputs.require_heights(surface)
@@ -98,7 +97,9 @@ def rectify(
         opened = adjusted.scene
         exported, complaints = _as_rpc(model)
         source = source_of(opened, image, scene, output)
+        budget, notes = layers.budget_of(placed, match, output)
         warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
+        accuracy = layers.write_layers(placed, budget, warped, files, output)
         asked = {"scene": scene, "surface": surface, "output": output, **match_asked(match)}
         record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
     whole = raster.open_dataset(image, **scene.access)
@@ -107,8 +108,9 @@ def rectify(
         scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
         warp=warped, near=points.near, provenance=record, matching=adjusted.matching,
         warnings=[*adjusted.warnings(heights), *found.notes(), *placed.sparse(warped.valid_pixels), *complaints,
-                  *warped.notes(output.memory)],
+                  *notes, *warped.notes(output.memory)],
     )  # fmt: skip
+    made = report.with_layers(made, accuracy=accuracy)
     write_report(made, adjusted.fit, files, adjusted.matched)
     if acquired is not None:
         stac_items.write_item(files["stac"], made, files, acquired, name or stem)
@@ -143,6 +145,7 @@ def check(
     _acquired(opened.facts, output)
     placed = place_scene(opened, points, scene, open_surface(surface, scene, output.memory), output, match)
     Profile.of(source_of(placed.scene, image, scene, output), output.dtype, output.nodata)
+    layers.budget_of(placed, match, output)
     return placed.to_json()
 
 

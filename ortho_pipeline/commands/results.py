@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import json
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,7 @@ from ortho_pipeline.estimation.spatial_correlation import analyse_fit
 from ortho_pipeline.files import staged, together, write_text
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.options import OutputOptions
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.map_scale import map_scale
 from ortho_pipeline.report.matching import MatchingRecord, matching_record
@@ -39,9 +41,11 @@ ENDINGS = {
     "stac": "_stac.json",
     "thumbnail": "_thumbnail.png",
     "overview": "_overview.png",
+    "accuracy": "_accuracy.tif",
+    "accuracy_style": "_accuracy.qml",
 }
-#: Outputs that are only made with a STAC item.
-OF_STAC = ("stac", "thumbnail", "overview")
+#: Outputs that are only made where an option asks for them: field of `OutputOptions` -> what it asks for.
+_ASKED = {"stac": ("stac", "thumbnail", "overview"), "accuracy_raster": ("accuracy", "accuracy_style")}
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -120,6 +124,12 @@ class CompareResult:
             **({} if self.matched is None else {"matching": self.matched.to_json()}),
             "files": {name: str(path) for name, path in self.files.items()},
         }
+
+
+def outputs(folder: str | os.PathLike[str], stem: str, asked: OutputOptions) -> dict[str, Path]:
+    """Return the paths of the outputs of a scene by what they are, of those that are made if all goes well."""
+    idle = {kind for field, kinds in _ASKED.items() if not getattr(asked, field) for kind in kinds}
+    return {kind: Path(folder) / f"{stem}{ending}" for kind, ending in ENDINGS.items() if kind not in idle}
 
 
 def outputs_together(command: Callable[_P, _R]) -> Callable[_P, _R]:

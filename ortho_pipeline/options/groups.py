@@ -335,6 +335,20 @@ class OutputOptions:
             "--tolerance", "Bound on the warper's geometric error, in source pixels.", "PX", kind="number", above=0
         ),
     ] = 0.01  # fmt: skip
+    accuracy_raster: Annotated[
+        bool,
+        Option(
+            "--accuracy-raster", "Write a raster of how accurate the ortho is at each place; `surface.sigma` says how "
+            "good the heights are.",
+        ),
+    ] = False  # fmt: skip
+    layer_step: Annotated[
+        int,
+        Option(
+            "--layer-step", "Pixels of the ortho to one of `output.accuracy_raster`, per side.", "N", kind="integer",
+            above=0,
+        ),
+    ] = 16  # fmt: skip
     stac: Annotated[bool, Option("--stac", "Write a STAC item of the ortho too.")] = False
     acquired: Annotated[
         str | None, Option("--acquired", "Time of acquisition (RFC 3339), where the metadata have none.", "TIME")

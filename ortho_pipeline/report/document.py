@@ -10,7 +10,7 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,6 +35,7 @@ from ortho_pipeline.report.adjustment_records import Adjustment, RmseOfView, Rms
 from ortho_pipeline.report.delivered import accuracy_before
 from ortho_pipeline.report.gallery.chips import gallery
 from ortho_pipeline.report.gallery.plots import residuals_by_axis
+from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.report.map_scale import map_scale
 from ortho_pipeline.report.matching import matching_record
 from ortho_pipeline.report.plots import plots
@@ -74,6 +75,7 @@ _MAX_BYTES = 50_000_000
 _REMEDY = "give a <stem>_report.json"
 
 __all__ = [
+    "accuracy_style",
     "build_report",
     "headline",
     "plots",
@@ -83,6 +85,7 @@ __all__ = [
     "residuals_geojson",
     "residuals_style",
     "summary_text",
+    "with_layers",
     "write_plots",
     "write_report_html",
     "write_report_json",
@@ -258,6 +261,14 @@ def _warped(warp: WarpResult) -> WarpRecord:
     return record_of(WarpRecord, {name: value for name, value in asdict(warp).items() if name != "seconds"})
 
 
+def with_layers(report: SceneReport, *, accuracy: AccuracyLayer | None) -> SceneReport:
+    """Return the report with what layers beside the ortho say; the headline gives the accuracy over the scene."""
+    if accuracy is None:
+        return report
+    head = report.headline
+    return replace(report, accuracy=accuracy, headline=replace(head, notes=(accuracy.statement, *head.notes)))
+
+
 def residuals_geojson(fit: Fit) -> dict[str, Any]:
     """Return the points as GeoJSON in lon, lat (WGS 84), one flat property per number, as GIS want them.
 
@@ -289,6 +300,16 @@ def residuals_geojson(fit: Fit) -> dict[str, Any]:
         geometry = {"type": "Point", "coordinates": position} if len(position) >= 2 else None
         features.append({"type": "Feature", "geometry": geometry, "properties": properties})
     return {"type": "FeatureCollection", "features": features}
+
+
+def accuracy_style(layer: AccuracyLayer) -> str:
+    """Return a QGIS style (QML) for the raster of accuracy: ce90 in five steps of colour."""
+    low, _, high = layer.range_m
+    high = max(high, 1.01 * low)
+    colours = ("#2563a8", "#7fb3d5", "#f4f1de", "#e59866", "#b4500b")
+    values = [low + (high - low) * k / (len(colours) - 1) for k in range(len(colours))]
+    stops = [(f"{value:.6g}", metres(value), colour) for value, colour in zip(values, colours, strict=True)]
+    return render("report/accuracy.qml.j2", low=stops[0][0], high=stops[-1][0], stops=stops)
 
 
 def residuals_style(report: SceneReport) -> str:

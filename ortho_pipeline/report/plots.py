@@ -14,6 +14,7 @@ from ortho_pipeline.display.drawing import Axes, Drawing, number, round_down
 from ortho_pipeline.errors import counted
 from ortho_pipeline.report.adjustment_records import Pair, Point, is_known
 from ortho_pipeline.report.gallery.plots import plot_match_histograms, plot_matches
+from ortho_pipeline.report.layers.accuracy import plot_accuracy
 from ortho_pipeline.report.records import ComparedModel, Covariance, SceneReport
 
 #: Drawing area of the plot of vectors in CSS pixels, and the space around it.
@@ -37,6 +38,7 @@ def plots(report: SceneReport) -> dict[str, Drawing]:
         "relative": plot_relative,
         "comparison": plot_comparison,
         "matches": plot_matches,
+        "accuracy": lambda report: plot_accuracy(report.accuracy),
         "match_histograms": plot_match_histograms,
     }
     made = {name: make(report) for name, make in makers.items()}

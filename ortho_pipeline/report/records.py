@@ -18,6 +18,7 @@ from ortho_pipeline.report.adjustment_records import (
     RmsesOfView,
     RmsesOnGround,
 )
+from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.report.matching import MatchingRecord
 
 Size = tuple[Annotated[int, Shape(minimum=1)], Annotated[int, Shape(minimum=1)]]
@@ -359,6 +360,7 @@ class SceneReport:
     rpc: RpcRecord | None
     ortho: OrthoRecord | None
     warp: WarpRecord | None
+    accuracy: AccuracyLayer | None = None
     provenance: Provenance
     warnings: tuple[str, ...]
     notices: tuple[NoticeDocument, ...] = ()

@@ -39,6 +39,7 @@ _URIS = {
 _SHA256 = "1220"
 #: Longer side in pixels of the pictures of an item, by their key among the files.
 _PICTURES = {"thumbnail": 256, "overview": 1024}
+_COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 #: Files beside the ortho: key, title, media type, roles.
 _ASSETS = (
     ("thumbnail", "Orthoimage, small", "image/png", ["thumbnail"]),
@@ -46,6 +47,7 @@ _ASSETS = (
     ("report", "Accuracy report", "application/json", ["metadata"]),
     ("html", "Accuracy report as a page", "text/html", ["metadata"]),
     ("model", "Adjusted sensor model", "application/json", ["metadata"]),
+    ("accuracy", "Accuracy of each place", _COG, ["data", "metadata"]),
     ("residuals", "Residuals of the points", "application/geo+json", ["metadata"]),
 )
 

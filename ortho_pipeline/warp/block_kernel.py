@@ -137,7 +137,7 @@ def _row_heights(dem, u0, du, v0, dv, spacing, tx, out):
     count = tx.size
     if cubic_dem or max(abs(du), abs(dv)) * _RUN > spacing:
         for k in range(count):
-            out[k] = _dem_height_at(heights, u0 + du * tx[k], v0 + dv * tx[k], dem_left, dem_top, cubic_dem)
+            out[k] = dem_height_at(heights, u0 + du * tx[k], v0 + dv * tx[k], dem_left, dem_top, cubic_dem)
         return
     # A coarse DEM: many pixels lie between the same four samples, and need only one look at them.
     k = 0
@@ -158,7 +158,7 @@ def _row_heights(dem, u0, du, v0, dv, spacing, tx, out):
                 out[m] = (h00 + h10 * fu) + (h01 + h11 * fu) * fv
         else:
             for m in range(k, end):
-                out[m] = _dem_height_at(heights, u0 + du * tx[m], v0 + dv * tx[m], dem_left, dem_top, False)
+                out[m] = dem_height_at(heights, u0 + du * tx[m], v0 + dv * tx[m], dem_left, dem_top, False)
         k = end
 
 
@@ -167,11 +167,11 @@ def heights_at(uv: Any, dem: DemWindow, out: Any) -> None:
     """Fill `out` ``(n, m)`` with the heights at DEM coordinates `uv` ``(n, m, 2)``; NaN outside of the window."""
     for j in range(out.shape[0]):
         for i in range(out.shape[1]):
-            out[j, i] = _dem_height_at(dem.heights, uv[j, i, 0], uv[j, i, 1], dem.left, dem.top, dem.cubic)
+            out[j, i] = dem_height_at(dem.heights, uv[j, i, 0], uv[j, i, 1], dem.left, dem.top, dem.cubic)
 
 
 @compiled
-def _dem_height_at(heights, u, v, dem_left, dem_top, cubic_dem):
+def dem_height_at(heights, u, v, dem_left, dem_top, cubic_dem):
     """Interpolate the DEM at sample coordinates (u, v); NaN outside of its window."""
     rows, columns = heights.shape
     if not (dem_left <= u <= dem_left + columns - 1 and dem_top <= v <= dem_top + rows - 1):

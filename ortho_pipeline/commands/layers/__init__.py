@@ -1,0 +1,1 @@
+"""Layers beside an ortho: what they are made from."""

@@ -1,0 +1,201 @@
+"""Layers beside an ortho: what is known of its errors, gathered from scene, points, surface and options."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ortho_pipeline.commands.placement import Placement
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.display.numbers import metres
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import write_text
+from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.process_limits import Resources
+from ortho_pipeline.models import RPC, ImageCorrection, Pieces, SensorModel
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.options import MatchOptions, OutputOptions
+from ortho_pipeline.report.document import accuracy_style
+from ortho_pipeline.report.layers.accuracy import AccuracyLayer
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import DemSurface
+
+if TYPE_CHECKING:
+    from ortho_pipeline.warp.engine import WarpResult
+    from ortho_pipeline.warp.layers.accuracy import AccuracyResult, Budget
+
+#: Standard deviation (m) of geoids by the name of the height datum: commission errors over land; of any other, national
+#: ones and grids of one's own. Source: Lemoine et al. 1998 (EGM96), Pavlis et al. 2012 (EGM2008).
+_GEOIDS = {"EPSG:5773": 0.5, "EPSG:3855": 0.2}
+_OTHER_GEOID = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """What is known of the errors, and in words what is not and what is assumed."""
+
+    budget: Budget
+    unknown: tuple[str, ...]
+    assumptions: tuple[str, ...]
+    adjusted: bool
+
+
+def budget_of(placed: Placement, match: MatchOptions, output: OutputOptions) -> tuple[Known | None, list[Notice]]:
+    """Return what is known of the errors of an ortho, None where nobody asks, and what there is to say about it.
+
+    Raises
+    ------
+    InputError
+        If nothing is known of them.
+    """
+    if not output.accuracy_raster:
+        return None, []
+    from ortho_pipeline.warp.layers.accuracy import Budget
+
+    surface, fit = placed.surface, placed.adjusted.fit
+    covariance = _covariance(placed)
+    stated = None if covariance is not None else stated_accuracy(placed.model)
+    datum = 0.0 if surface.sigma is None else _datum(surface)
+    shared, shared_unknown = _shared(fit.warnings, placed.scene.adjusted, match)
+    budget = Budget(covariance=covariance, stated=stated, heights=surface.sigma, datum=datum, reference=shared)
+    unknown = [name for name, missing in (("model", not budget.knows_model), ("heights", surface.sigma is None),
+                                          ("reference", shared_unknown)) if missing]  # fmt: skip
+    if not budget.knows_model and surface.sigma is None:
+        raise InputError(
+            "nothing is known of the errors of this ortho: its model has no stated accuracy, and the heights have none",
+            field="output.accuracy_raster",
+            remedy="give `surface.sigma`, or control points with `points.gcps`, or leave it out",
+        )  # fmt: skip
+    known = Known(budget, tuple(unknown), tuple(_assumptions(budget, surface)), covariance is not None)
+    if not unknown:
+        return known, []
+    names = {"model": "the model", "heights": "the heights (`surface.sigma`)",
+             "reference": "the reference (`match.reference_sigma`)"}  # fmt: skip
+    said = " and of ".join(names[name] for name in unknown)
+    text = f"the raster of accuracy knows nothing of the errors of {said}: its figures are the least that there is"
+    return known, [Notice("accuracy-in-part", text, unknown=unknown)]
+
+
+def stated_accuracy(model: SensorModel) -> float | None:
+    """Return the standard deviation (m, per axis) that a vendor states of an RPC: ERR_BIAS and ERR_RAND together."""
+    while isinstance(model, ImageCorrection | Pieces):
+        model = model.model if isinstance(model, ImageCorrection) else model.first
+    if not isinstance(model, RPC):
+        return None
+    # What is not positive stands for unknown: -1 in the standard, 0 of some programs.
+    given = [value for value in (model.err_bias, model.err_rand) if value is not None and value > 0]
+    return math.hypot(*given) if given else None
+
+
+def _covariance(placed: Placement) -> Array | None:
+    """Return the covariance of the model's parameters, now or before; None where nothing was adjusted."""
+    from ortho_pipeline.warp.layers.accuracy import predictive
+
+    fit, before = placed.adjusted.fit, placed.scene.adjusted
+    if len(fit.param_names) and fit.used.any():
+        return predictive(fit.covariance, math.inf if fit.sigma0 is None else fit.degrees_of_freedom)
+    if before is None or not placed.model.param_names:
+        return None
+    found = _of_record(before, placed.model.param_names)
+    return None if found is None else predictive(found, _number(before.get("statistics"), "degrees_of_freedom"))
+
+
+def _of_record(adjusted: Mapping[str, Any], names: tuple[str, ...]) -> Array | None:
+    """Return the covariance of parameters that a model file tells of; None where it does not tell of all."""
+    try:
+        parameters = adjusted["parameters"]
+        sigmas = np.array([float(parameters[name]["sigma"]) for name in names])
+        correlation = np.array(adjusted["statistics"]["correlation"], dtype=float)
+    except (KeyError, TypeError, ValueError):
+        return None
+    if list(parameters) != list(names) or correlation.shape != (len(names),) * 2:
+        return None
+    # A parameter that a prior holds has no correlation to speak of.
+    correlation = np.where(np.isfinite(correlation), correlation, np.eye(len(names)))
+    return np.asarray(sigmas[:, None] * correlation * sigmas) if np.isfinite(sigmas).all() else None
+
+
+def _number(statistics: Any, name: str) -> float:
+    value = statistics.get(name) if isinstance(statistics, Mapping) else None
+    return float(value) if isinstance(value, int | float) and value > 0 else math.inf
+
+
+def _datum(surface: Surface) -> float:
+    """Return the standard deviation (m) of what the heights of a surface are measured above."""
+    if not isinstance(surface, DemSurface) or surface.vertical.is_ellipsoid:
+        return 0.0
+    return _GEOIDS.get(surface.vertical.name, _OTHER_GEOID)
+
+
+def _shared(warnings: tuple[Notice, ...], before: Mapping[str, Any] | None, match: MatchOptions) -> tuple[float, bool]:
+    """Return the standard deviation (m) of a reference that points were matched with, and whether it is unknown."""
+    matched = any(one.code == "relative-to-reference" for one in warnings)
+    earlier = [one for one in (before or {}).get("notices", ()) if one.get("code") == "relative-to-reference"]
+    sigma = match.reference_sigma if matched else earlier[0].get("reference_sigma_m") if earlier else None
+    return float(sigma or 0.0), bool((matched or earlier) and not sigma)
+
+
+def _assumptions(budget: Budget, surface: Surface) -> list[str]:
+    said = ["errors of the model, of the heights and of the reference are independent of each other",
+            "the model follows the scene but for its parameters",
+            "an error is where the ortho shows a point, at its height, less where that is"]  # fmt: skip
+    if budget.datum:
+        said.insert(1, f"the height datum is good to {metres(budget.datum)}")
+    if budget.stated is not None:
+        said.append(f"the model is as good as its vendor states, {metres(budget.stated)} per axis")
+    if isinstance(surface.sigma, float | int):
+        said.append(f"the heights are as good as {metres(surface.sigma)} everywhere")
+    return said
+
+
+def write_layers(
+    placed: Placement, known: Known | None, warped: WarpResult, files: Mapping[str, Path], output: OutputOptions
+) -> AccuracyLayer | None:
+    """Write the raster of accuracy and its style, if it was asked for, and return what the report says of it."""
+    if known is None:
+        return None
+    from ortho_pipeline.warp.layers.accuracy import write_accuracy
+    from ortho_pipeline.warp.layers.sight import Sight
+
+    budget = dataclasses.replace(known.budget, interpolation_px=warped.max_error_px)
+    scene = placed.scene
+    found = write_accuracy(
+        budget, Sight(placed.model, placed.grid), placed.surface, (scene.width, scene.height), files["accuracy"],
+        heights=placed.footprint.heights, step=output.layer_step, resources=Resources(output.memory, output.threads),
+        metadata={"ASSUMPTIONS": "; ".join(known.assumptions), "UNKNOWN": ", ".join(known.unknown) or "nothing"},
+    )  # fmt: skip
+    if not found.known:
+        raise InputError(
+            "the standard deviations of the heights reach no pixel of the ortho", field="surface.sigma",
+            remedy="give a raster of this place, or a number",
+        )  # fmt: skip
+    layer = _record(found, known, output.layer_step)
+    write_text(files["accuracy_style"], accuracy_style(layer))
+    return layer
+
+
+def _record(found: AccuracyResult, known: Known, step: int) -> AccuracyLayer:
+    shares, budget = dict(found.shares), known.budget
+    even = shares.pop("even")
+    stated = 0.0 if known.adjusted or not budget.stated else budget.stated**2
+    part = stated / (stated + budget.reference**2) if even else 0.0
+    by = "points" if known.adjusted else "model"
+    return AccuracyLayer(
+        ce90_m=found.ce90, range_m=found.quantiles, sigma_m=found.sigma,
+        shares={
+            by: shares["model"] + even * part, "heights": shares["heights"], "reference": even * (1.0 - part),
+            "interpolation": shares["interpolation"],
+        },
+        unknown=known.unknown, known=found.known, assumptions=known.assumptions, cell=found.cell * step,
+        cells=tuple(tuple(row) for row in json_value(_rounded(found.cells))),
+    )  # fmt: skip
+
+
+def _rounded(values: Array) -> list[list[float]]:
+    """Return values with three digits: those of a map."""
+    return [[float(f"{value:.3g}") for value in row] for row in values.tolist()]

@@ -1,0 +1,1 @@
+"""Layers beside an ortho in the report: their records, words and maps."""

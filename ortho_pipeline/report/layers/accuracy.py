@@ -1,0 +1,95 @@
+"""The layer of accuracy in the report: its record, what it says in words, its map and its style in QGIS."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from ortho_pipeline.display.drawing import Drawing
+from ortho_pipeline.display.numbers import metres, share
+from ortho_pipeline.files.documents import Shape, record
+
+#: What makes up the error of an ortho, in words.
+_NAMES = {
+    "points": "the points that the model was adjusted to",
+    "model": "the model as it was delivered",
+    "heights": "the heights",
+    "reference": "the reference that was matched with",
+    "interpolation": "the warp",
+}
+#: Side of the map in CSS pixels.
+_SIDE = 420.0
+Share = Annotated[float, Shape(minimum=0)]
+
+
+@record
+class AccuracyLayer:
+    """How accurate the pixels of the ortho are; docs/accuracy.md says what each number is.
+
+    `ce90_m` holds 90 % of the errors of all pixels together, `range_m` is 5, 50 and 95 % of the pixels' own, `sigma_m`
+    the root mean square east and north. `shares` are parts of the mean variance, `unknown` is what nobody said anything
+    of, `cells` the mean ce90 in cells of `cell` pixels of the ortho, from the northwest.
+    """
+
+    ce90_m: float
+    range_m: tuple[float, float, float]
+    sigma_m: tuple[float, float]
+    shares: dict[str, Share]
+    unknown: tuple[str, ...]
+    known: Share
+    assumptions: tuple[str, ...]
+    cell: int
+    cells: tuple[tuple[float | None, ...], ...]
+
+    @property
+    def dominant(self) -> str:
+        """The largest part of the variance."""
+        return max(self.shares, key=lambda name: self.shares[name])
+
+    @property
+    def statement(self) -> str:
+        """Return what the layer comes to in words."""
+        ordered = sorted(((part, name) for name, part in self.shares.items() if part >= 0.01), reverse=True)
+        parts = ", ".join(f"{share(part)} {_NAMES[name]}" for part, name in ordered)
+        low, _, high = self.range_m
+        least = "" if not self.unknown else "at least "
+        said = (
+            f"CE90 over the scene is {least}{metres(self.ce90_m)} ({metres(low)} to {metres(high)} over nine tenths of "
+            f"it). Of the variance, {parts}."
+        )
+        if self.unknown:
+            said += f" Nothing is known of {' and '.join(_NAMES[name] for name in self.unknown)}."
+        if self.known < 1.0:
+            said += f" For {share(1.0 - self.known)} of the pixels the heights have no stated accuracy."
+        return said
+
+
+def plot_accuracy(layer: AccuracyLayer | None) -> Drawing | None:
+    """Draw the map of ce90: the darker, the less accurate, with a scale in metres."""
+    if layer is None or not any(value is not None for row in layer.cells for value in row):
+        return None
+    values = [value for row in layer.cells for value in row if value is not None]
+    low, high = min(values), max(values)
+    rows, columns = len(layer.cells), max(len(row) for row in layer.cells)
+    side = _SIDE / max(rows, columns)
+    drawing = Drawing(_SIDE, rows * side + 52, "Map of the 90 % circular error of the ortho", "accuracy")
+
+    def strength(value: float) -> float:
+        # Even where all is alike, a cell is told from no cell.
+        return 0.12 + 0.88 * (value - low) / (high - low) if high > 1.02 * low else 0.5
+
+    left = (_SIDE - columns * side) / 2
+    for j, row in enumerate(layer.cells):
+        for i, value in enumerate(row):
+            if value is not None:
+                with drawing.titled(f"CE90 {metres(value)}"):
+                    drawing.rect("minus", left + i * side, j * side, side, side, strength(value))
+    drawing.rect("frame", left, 0, columns * side, rows * side)
+    base, wide = rows * side + 14, 180.0
+    steps = 24
+    for k in range(steps):
+        value = low + (high - low) * (k + 0.5) / steps
+        drawing.rect("minus", left + k * wide / steps, base, wide / steps, 12, strength(value))
+    drawing.text(left, base + 28, metres(low), quiet=True)
+    drawing.text(left + wide, base + 28, metres(high), quiet=True, anchor="end")
+    drawing.text(left + wide + 14, base + 11, "CE90")
+    return drawing

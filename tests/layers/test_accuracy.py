@@ -1,0 +1,143 @@
+"""The layer of accuracy: its parts against errors that are drawn, its file against the parts at its pixels."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pyproj
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.warp.layers.accuracy import Budget, layer_grid, parts_at, write_accuracy
+from ortho_pipeline.warp.layers.error_ellipse import circular_error
+from ortho_pipeline.warp.layers.sight import Sight
+
+UTM = pyproj.CRS.from_epsg(32634)
+SIZE = (400, 300)
+
+
+def corrected(model) -> ImageCorrection:
+    return ImageCorrection(model, "affine", (200.0, 150.0), np.array([0.4, 1e-4, -2e-4, -0.3, 2e-4, 1e-4]))
+
+
+#: Of shifts and slopes that are correlated.
+COVARIANCE = (
+    np.diag([0.5, 2e-3, 1e-3, 0.8, 1e-3, 2e-3]) @ (0.7 * np.eye(6) + 0.3) @ np.diag([0.5, 2e-3, 1e-3, 0.8, 1e-3, 2e-3])
+)
+
+
+def grid_of(tiny, side: float = 4.8) -> Grid:
+    lon, lat = tiny.model.lon_off, tiny.model.lat_off
+    x, y = pyproj.Transformer.from_crs(4326, UTM, always_xy=True).transform(lon, lat)
+    return Grid.of_extent(UTM, (x - 1000, y - 750, x + 1000, y + 750), (side, side))
+
+
+def test_the_parts_are_the_spread_of_errors_that_are_drawn(tiny):
+    """An image point is met again on the ground by the true model at the true height: exact, and nothing linear."""
+    model, random, count = corrected(tiny.model), np.random.default_rng(4), 20_000
+    sight = Sight(model, grid_of(tiny))
+    column, row, height = 130.3, 250.8, 540.0
+    budget = Budget(covariance=COVARIANCE, heights=6.0, datum=2.0, reference=0.5)
+    parts = parts_at(budget, sight, *(np.array([value]) for value in (column, row, height)))
+    params = model.params + random.multivariate_normal(np.zeros(6), COVARIANCE, count)
+    heights = height + random.normal(0, np.hypot(6.0, 2.0), count)
+    x, y = sight.grid.xy(np.array([column]), np.array([row]))
+    ground = sight.ground(np.full(count, column), np.full(count, row), heights)
+    seen = model.model.ground_to_image(ground)
+    slopes = np.einsum("nij,nj->ni", params[:, [1, 2, 4, 5]].reshape(-1, 2, 2), seen - model.origin)
+    image = seen + params[:, [0, 3]] + slopes
+    there = pyproj.Transformer.from_crs(4979, UTM, always_xy=True)
+    met = model.image_to_ground(image, height)
+    shown = np.stack(there.transform(met[:, 0], met[:, 1]), axis=1) - [x[0], y[0]] + random.normal(0, 0.5, (count, 2))
+    drawn = np.cov(shown.T)
+    total = parts.total[0]
+    # A variance of 20,000 draws is known to 1 %.
+    np.testing.assert_allclose([drawn[0, 0], drawn[1, 1]], total[:2], rtol=0.04)
+    assert drawn[0, 1] == pytest.approx(total[2], abs=0.04 * np.sqrt(total[0] * total[1]))
+    for name, one in zip(parts._fields, parts, strict=True):
+        assert (one[0, :2].sum() > 0) == (name != "interpolation")
+
+
+def test_the_file_holds_what_the_parts_say_at_its_pixels(tiny, tmp_path):
+    model, grid = corrected(tiny.model), grid_of(tiny)
+    dem = Surface.open(tiny.dem, "ellipsoid")
+    budget = Budget(covariance=COVARIANCE, heights=4.0, datum=0.5, interpolation_px=0.3)
+    path = tmp_path / "accuracy.tif"
+    made = write_accuracy(budget, Sight(model, grid), dem, SIZE, path, heights=(480.0, 520.0), step=2)
+    dataset = gdal.Open(str(path))
+    bands, small = dataset.ReadAsArray().astype(float), layer_grid(grid, 2)
+    assert dataset.GetGeoTransform() == pytest.approx(small.geotransform)
+    assert [dataset.GetRasterBand(k + 1).GetDescription() for k in range(4)] == ["sigma_e", "sigma_n", "rho", "ce90"]
+    assert [dataset.GetRasterBand(k + 1).GetUnitType() for k in range(4)] == ["m", "m", "", "m"]
+    columns, rows = (part.ravel() + 0.5 for part in np.meshgrid(np.arange(small.width), np.arange(small.height)))
+    heights = dem.heights(np.stack(small.xy(columns, rows), axis=1), UTM)
+    sight = Sight(model, small)
+    image = sight.image(columns, rows, heights)
+    inside = ((image >= 0) & (image <= SIZE)).all(axis=1)
+    wanted = parts_at(budget, sight, columns, rows, heights).total
+    found = bands.reshape(4, -1)
+    np.testing.assert_array_equal(np.isfinite(found[3]), inside)
+    assert 0.3 < inside.mean() < 0.95
+    for k in range(2):
+        np.testing.assert_allclose(found[k][inside], np.sqrt(wanted[inside, k]), rtol=0.005)
+    np.testing.assert_allclose(found[3][inside], circular_error(wanted[inside]), rtol=0.005)
+    rho = wanted[inside, 2] / np.sqrt(wanted[inside, 0] * wanted[inside, 1])
+    np.testing.assert_allclose(found[2][inside], rho, atol=0.005)
+    shares = np.array([one[inside, :2].sum() for one in parts_at(budget, sight, columns, rows, heights)])
+    np.testing.assert_allclose(list(made.shares.values()), shares / shares.sum(), atol=0.005)
+    assert made.quantiles[0] < made.ce90 < made.quantiles[2]
+    assert np.nanmax(made.cells) <= np.nanmax(found[3])
+    assert made.known == 1.0
+
+
+def test_heights_of_unknown_quality_have_no_accuracy_and_void_ones_neither(tiny, tmp_path):
+    """A raster of standard deviations with a void: no number stands for what nobody knows."""
+    grid, path, quality = grid_of(tiny), tmp_path / "accuracy.tif", tmp_path / "hem.tif"
+    dem = gdal.Open(str(tiny.dem))
+    copy = gdal.GetDriverByName("GTiff").CreateCopy(str(quality), dem)
+    values = np.full((dem.RasterYSize, dem.RasterXSize), 3.0, dtype=np.float32)
+    values[:, :65] = 1.0
+    values[60:70, 40:50] = -32767.0
+    copy.GetRasterBand(1).SetNoDataValue(-32767.0)
+    copy.WriteArray(values)
+    copy = None
+    sigma = Surface.open(quality, "ellipsoid", override=True, fill="mask")
+    write = {"heights": (480.0, 520.0), "step": 4}
+    sight, surface = Sight(tiny.model, grid), Surface.open(tiny.dem, "ellipsoid")
+    made = write_accuracy(Budget(heights=sigma), sight, surface, SIZE, path, **write)
+    ce90 = gdal.Open(str(path)).ReadAsArray()[3]
+    one = write_accuracy(Budget(heights=1.0), sight, surface, SIZE, path, **write)
+    even = gdal.Open(str(path)).ReadAsArray()[3]
+    ratio = ce90 / even
+    assert 0.9 < made.known < 1.0
+    assert one.known == 1.0
+    middle = ratio.shape[1] // 2
+    np.testing.assert_allclose(ratio[:, middle + 5 :][np.isfinite(ratio[:, middle + 5 :])], 3.0, rtol=1e-5)
+    np.testing.assert_allclose(np.nanmin(ratio), 1.0, rtol=1e-5)
+    void = np.isnan(ce90) & np.isfinite(even)
+    assert void.any()
+
+
+def test_the_layer_does_not_depend_on_the_memory(tiny, tmp_path):
+    from ortho_pipeline.files.process_limits import Resources
+
+    sight, surface = Sight(corrected(tiny.model), grid_of(tiny)), Surface.open(tiny.dem, "ellipsoid")
+    found = []
+    for memory in (512_000_000, 16_000):
+        path = tmp_path / f"{memory}.tif"
+        write_accuracy(
+            Budget(covariance=COVARIANCE, heights=4.0), sight, surface, SIZE, path, heights=(480.0, 520.0), step=1,
+            resources=Resources(memory),
+        )  # fmt: skip
+        found.append(gdal.Open(str(path)).ReadAsArray())
+    np.testing.assert_array_equal(*found)
+
+
+def test_what_a_vendor_states_is_a_radius_on_the_ground(tiny):
+    sight = Sight(dataclasses.replace(tiny.model, err_bias=8.0, err_rand=1.0), grid_of(tiny))
+    parts = parts_at(Budget(stated=3.0), sight, np.array([100.0]), np.array([90.0]), np.array([500.0]))
+    np.testing.assert_allclose(parts.total, [[9.0, 9.0, 0.0]])
