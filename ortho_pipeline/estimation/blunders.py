@@ -66,6 +66,8 @@ def find_blunders(problem: Problem, ridge: float | str | None = None) -> tuple[n
         if ridge is not None:
             problem, _ = regularised(problem, keep, ridge)
         keep = _snooping_start(problem, problem.solve(keep), keep)
+    if not keep.all():
+        problem = _restarted(problem, keep)
     reasons: dict[int, str] = {}
     # Suspicion first falls on too many: re-admit the excluded that agree with the others, until none is left that does.
     while not keep.all():
@@ -87,6 +89,17 @@ def _common(problem: Problem) -> Solution:
         return problem.solve(everything, linear=True)
 
 
+def _restarted(problem: Problem, keep: np.ndarray) -> Problem:
+    """Return the problem started from some points, if they determine it.
+
+    Gross errors in the start are then gone, also from the direction in which it takes errors of the ground to move.
+    """
+    try:
+        return problem.started(problem.solve(keep).model)
+    except (DegeneratePoints, NotConverged, TooFewPoints):
+        return problem
+
+
 def _reason(size: float) -> str:
     if not math.isfinite(size):
         return "gross error: the other points put it outside of the model"
@@ -105,14 +118,14 @@ def _median_start(problem: Problem, solution: Solution) -> np.ndarray:
         linear = solution.residuals - solution.jacobian @ step
         residuals = problem.image - found.model.ground_to_image(problem.ground)
         with np.errstate(invalid="ignore"):
-            bent = ~(np.abs(residuals - linear) / problem.errors.sigma < 0.1).all(axis=1)
+            bent = ~(np.abs(problem.errors.whitened(residuals - linear)) < 0.1).all(axis=1)
         if not bent.any() or not np.isfinite(residuals).all():
             return keep
         # The common solution was so far off that the model is not linear on the way: look again from the clean one.
         jacobian = found.model.param_partials(problem.ground)
         solution = Solution(
-            found.model, jacobian, residuals, problem.errors, found.cofactors, found.freedom, found.effective,
-            found.sigma0, found.condition, problem.groups,
+            found.model, jacobian, residuals, problem.started(found.model).errors, found.cofactors, found.freedom,
+            found.effective, found.sigma0, found.condition, problem.points.groups,
         )  # fmt: skip
         again = _median_subset(solution, len(problem.priors))
         if (again == keep).all():
@@ -199,7 +212,7 @@ def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
     jacobian = problem.errors.whitened(solution.model.param_partials(problem.ground))
     jacobian[~np.isfinite(jacobian).all(axis=(1, 2))] = 0.0
     spread = np.eye(2) + jacobian @ solution.cofactors @ jacobian.transpose(0, 2, 1)
-    standardised = np.minimum(problem.errors.whitened(np.minimum(miss, _FAR)), _FAR)
+    standardised = np.clip(problem.errors.whitened(np.clip(miss, -_FAR, _FAR)), -_FAR, _FAR)
     distance = squared_distances(standardised, spread)
     freedom = max(solution.freedom, 1.0)
     scale = max(solution.sigma0 or 0.0, _SCALE_FLOOR)

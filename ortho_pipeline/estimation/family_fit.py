@@ -278,7 +278,7 @@ def k_fold(found: Fit, k: int = 10, seed: int = 0) -> Array:
         problem, _ = regularised(problem, np.ones(len(rows), dtype=bool), found.ridge)
     solution = problem.solve(np.ones(len(rows), dtype=bool))
     # Points that share errors stay together; without any, each is a unit of its own.
-    names = np.where(problem.groups >= 0, problem.groups, -1 - np.arange(len(rows)))
+    names = np.where(problem.points.groups >= 0, problem.points.groups, -1 - np.arange(len(rows)))
     units = list(dict.fromkeys(names.tolist()))
     if len(units) < k:
         raise InputError(f"{counted(len(units), 'group')} of points cannot be divided into {k}", field="k")

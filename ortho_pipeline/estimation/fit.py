@@ -278,6 +278,9 @@ def fit(
     problem, warnings = _posed(model, points, raw, priors, known_bad)
     keep, rejected, problem, strength = _searched(problem, points, ridge, robust=robust)
     solution = problem.solve(keep)
+    if rejected:
+        # A start that gross errors had a part in took those of the ground to move in directions of their making.
+        solution = problem.started(solution.model).solve(keep)
     ratio = _corner_ratio(solution, points.source, strength)
     warnings += _uncertain_edge(ratio) + _unstable(solution, strength)
     used = np.zeros(len(points), dtype=bool)

@@ -1,9 +1,9 @@
 r"""The least-squares problem of one image: image measurements of control points, priors, and a regularisation.
 
 With image residuals :math:`v = l - f(x)` (measured minus predicted), weights :math:`W = \Sigma^{-1}` with a 2 x 2
-block for each point (`ImageErrors`: whitened by its Cholesky factor), and as further
-observations each `Prior` and each of the model's own (`SensorModel.constraints`), the estimate minimises
-:math:`v^T W v`. Then
+block :math:`\Sigma = C + G S G^T` for each point (`ImageErrors`: C of the measurement, S of the ground, which the start
+moves by its partials G), and as further observations each `Prior` and each of the model's own
+(`SensorModel.constraints`), the estimate minimises :math:`v^T W v`. Then
 
 - redundancy :math:`r` = observations - parameters, :math:`\sigma_0^2 = v^T W v / r`,
 - covariance :math:`C = \sigma_0^2 (J^T W J)^{-1}` (a-priori :math:`\sigma_0 = 1` where :math:`r = 0`),
@@ -36,6 +36,8 @@ from ortho_pipeline.points.image_errors import says_more
 
 #: A scaled normal matrix beyond this condition is taken as singular: the points do not determine the model.
 CONDITION_LIMIT = 1e6
+#: An error across a direction that is smaller than this part of that along it is rounding.
+_ROUNDING = 1e-14
 
 
 @dataclass(frozen=True)
@@ -60,74 +62,90 @@ def priors_at(model: SensorModel, sigmas: Mapping[str, float]) -> dict[str, Prio
 
 @dataclass(frozen=True, eq=False)
 class ImageErrors:
-    """A-priori errors of image measurements: standard deviations ``(n, 2)`` px of column and row, their correlation.
+    """A-priori errors of image measurements: Cholesky factors ``(n, 2, 2)`` px of their covariances, lower triangles.
 
-    The Cholesky factor L of a covariance is ((s0, 0), (r s1, sqrt(1 - r^2) s1)): with a correlation r of zero,
-    whitening is a division by the standard deviations.
+    Whitening is a division by the standard deviations where column and row err independently.
     """
 
-    sigma: Array
-    correlation: Array  # (n,)
+    factor: Array
 
     def __getitem__(self, rows: np.ndarray) -> ImageErrors:
-        return ImageErrors(self.sigma[rows], self.correlation[rows])
+        return ImageErrors(self.factor[rows])
 
     @classmethod
-    def of(cls, model: SensorModel, points: Points, rows: np.ndarray) -> ImageErrors:
-        """Return the errors of some points, which are in the CRS of the model, with those of their ground.
+    def of(cls, model: SensorModel, points: Points) -> ImageErrors:
+        """Return the errors of points, which are in the CRS of the model, with what those of their ground move.
 
-        A point whose measurement errs alike in all directions keeps independent axes: of what an error of its ground
-        adds, the standard deviations count and not the correlation.
+        Raises
+        ------
+        InputError
+            If a point states no error at all in some direction of the image.
         """
-        ground = points.ground[rows]
-        sigma = np.broadcast_to(points.sigma_image[rows][:, None], (len(rows), 2)).astype(float)
-        from_ground = np.zeros((len(rows), 2, 3))
-        if (points.sigma_ground[rows] > 0).any():
-            spread = points.sigma_ground[rows] * units_per_metre(points.crs, ground)
-            from_ground = model.ground_partials(ground) * spread[:, None, :]
-            sigma = np.sqrt(sigma**2 + (from_ground**2).sum(axis=2))
-        correlation = np.zeros(len(rows))
-        full = says_more(points.covariance_image[rows])
-        if full.any():
-            moved = from_ground[full]
-            covariance = points.covariance_image[rows][full] + moved @ moved.transpose(0, 2, 1)
-            sigma[full] = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-            correlation[full] = covariance[:, 0, 1] / sigma[full].prod(axis=1)
-        return cls(sigma, correlation)
+        factor = _factors(points.sigma_image, points.covariance_image)
+        known = (points.sigma_ground > 0).any(axis=1)
+        if known.any():
+            ground = points.ground[known]
+            spread = points.sigma_ground[known] * units_per_metre(points.crs, ground)
+            moved = model.ground_partials(ground) * spread[:, None, :]
+            factor[known] = _summed(np.concatenate([factor[known], moved], axis=2))
+        exact = (np.diagonal(factor, axis1=1, axis2=2) <= 0).any(axis=1)
+        if exact.any():
+            name = points.ids[int(np.flatnonzero(exact)[0])]
+            raise InputError(
+                f"the point {name} has no error in some direction of the image", file=points.source or None,
+                field="sigma_image", remedy="give each measurement a positive standard deviation",
+            )  # fmt: skip
+        return cls(factor)
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations ``(n, 2)`` px of column and row."""
+        return np.asarray(np.linalg.norm(self.factor, axis=2))
 
     @property
     def covariance(self) -> Array:
         """Covariances ``(n, 2, 2)`` px^2."""
-        found = np.zeros((len(self.sigma), 2, 2))
-        found[:, 0, 0], found[:, 1, 1] = (self.sigma**2).T
-        found[:, 0, 1] = found[:, 1, 0] = self.correlation * self.sigma.prod(axis=1)
-        return found
+        return self.factor @ self.factor.transpose(0, 2, 1)
 
     def whitened(self, values: Array) -> Array:
         """Return values ``(n, 2)`` or ``(n, 2, P)`` of px as multiples of independent standard deviations."""
-        flat = values.ndim == 2
-        white = values / (self.sigma if flat else self.sigma[:, :, None])
-        some = np.flatnonzero(self.correlation)
-        if len(some):
-            along = self.correlation[some] if flat else self.correlation[some][:, None]
-            white[some, 1] = (white[some, 1] - along * white[some, 0]) / np.sqrt(1 - along**2)
+        factor = self.factor.reshape(-1, 2, 2, *(1,) * (values.ndim - 2))
+        white = np.empty(values.shape)
+        white[:, 0] = values[:, 0] / factor[:, 0, 0]
+        white[:, 1] = (values[:, 1] - factor[:, 1, 0] * white[:, 0]) / factor[:, 1, 1]
         return white
 
     def restored(self, white: Array) -> Array:
         """Return whitened values ``(n, 2)`` in px."""
-        values = white * self.sigma
-        some = np.flatnonzero(self.correlation)
-        along = self.correlation[some]
-        values[some, 1] = self.sigma[some, 1] * (along * white[some, 0] + np.sqrt(1 - along**2) * white[some, 1])
-        return values
+        return (self.factor @ white[:, :, None])[:, :, 0]
 
     def mean_square(self, white: Array) -> Array:
         """Return the mean square distance ``(n,)`` px^2 of errors whose whitened covariance is ``(n, 2, 2)``."""
-        across = self.sigma[:, 1] * np.sqrt(1 - self.correlation**2)
-        along = self.sigma[:, 1] * self.correlation
-        first = self.sigma[:, 0] ** 2 + along**2
-        both = 2 * along * across * white[:, 0, 1]
-        return np.asarray(white[:, 0, 0] * first + both + white[:, 1, 1] * across**2)
+        return np.einsum("nij,njk,nik->n", self.factor, white, self.factor)
+
+
+def _factors(sigma: Array, covariance: Array) -> Array:
+    """Return the Cholesky factors ``(n, 2, 2)`` of covariances; of those without directions `sigma` ``(n,)`` counts."""
+    factor = np.zeros((len(sigma), 2, 2))
+    factor[:, 0, 0] = factor[:, 1, 1] = sigma
+    full = says_more(covariance)
+    factor[full] = np.linalg.cholesky(covariance[full])
+    return factor
+
+
+def _summed(parts: Array) -> Array:
+    """Return the Cholesky factors ``(n, 2, 2)`` of A A^T for each A ``(n, 2, k)``.
+
+    By orthogonalising the rows of A, not from A A^T: where one direction errs far more than the other, as with heights
+    that are hardly known, the difference of squares would be lost to rounding.
+    """
+    column, row = parts[:, 0], parts[:, 1]
+    first = np.linalg.norm(column, axis=1)
+    axis = np.divide(column, first[:, None], out=np.zeros_like(column), where=first[:, None] > 0)
+    along = (row * axis).sum(axis=1)
+    across = np.linalg.norm(row - along[:, None] * axis, axis=1)
+    across[across <= _ROUNDING * np.abs(along)] = 0.0
+    return np.stack([np.stack([first, np.zeros_like(first)], axis=1), np.stack([along, across], axis=1)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,12 +220,9 @@ class Problem:
 
     model: SensorModel
     rows: np.ndarray  # indices of the control points in the table
-    ground: Array
-    image: Array
-    errors: ImageErrors  # those of the ground included
+    points: Points  # those rows of it
+    errors: ImageErrors  # those of the ground included, as `model` moves them
     priors: Mapping[str, Prior]
-    source: str
-    groups: np.ndarray  # (n,) of points that share errors, -1 of others
     ridge: Mapping[str, float] = field(default_factory=dict)  # sigma of the pseudo-observation of zero
 
     @classmethod
@@ -221,17 +236,26 @@ class Problem:
                 remedy=f"its parameters are {', '.join(model.param_names) or 'none'}",
             )
         rows = np.flatnonzero(usable)
-        errors = ImageErrors.of(model, points, rows)
-        ground, image, groups = points.ground[rows], points.image[rows], points.groups[rows]
-        return cls(model, rows, ground, image, errors, dict(priors), points.source, groups)
+        chosen = points.select(rows)
+        return cls(model, rows, chosen, ImageErrors.of(model, chosen), dict(priors))
+
+    @property
+    def ground(self) -> Array:
+        """Ground of the points ``(n, 3)`` in the CRS of the model."""
+        return self.points.ground
+
+    @property
+    def image(self) -> Array:
+        """Their measurements ``(n, 2)`` px."""
+        return self.points.image
 
     def with_ridge(self, ridge: Mapping[str, float]) -> Problem:
         """Return this problem with a pseudo-observation of zero for each of these parameters."""
         return replace(self, ridge=dict(ridge))
 
     def started(self, model: SensorModel) -> Problem:
-        """Return this problem with other start values."""
-        return replace(self, model=model)
+        """Return this problem with other start values, and errors of the ground as that model moves them."""
+        return replace(self, model=model, errors=ImageErrors.of(model, self.points))
 
     def solve(self, keep: np.ndarray, *, linear: bool = False) -> Solution:
         """Adjust to the points in the mask `keep` ``(n,)``.
@@ -263,7 +287,7 @@ class Problem:
         sigma0 = math.sqrt(float(observed @ observed) / freedom) if freedom > 1 - 1e-6 else None
         return Solution(
             model, jacobian, residuals, errors, solved.cofactors, freedom, effective, sigma0, condition,
-            self.groups[keep],
+            self.points.groups[keep],
         )  # fmt: skip
 
     def _enough(self, points: int) -> None:
@@ -274,7 +298,7 @@ class Problem:
             raise TooFewPoints(
                 f"{counted(points, 'control point does', 'control points do')} not determine "
                 f"{counted(count, 'parameter')}",
-                file=self.source,
+                file=self.points.source,
                 remedy=f"give at least {counted(least, 'control point')}, or a simpler model",
             )
 
@@ -282,7 +306,7 @@ class Problem:
         if condition > CONDITION_LIMIT:
             raise DegeneratePoints(
                 f"the control points do not determine all parameters (condition {condition:.1e})",
-                file=self.source,
+                file=self.points.source,
                 remedy="spread the points over the image (and over height, for 3D models), or take a simpler model",
             )
 

@@ -81,12 +81,16 @@ def test_whitening_is_a_division_where_axes_are_independent_and_can_be_undone() 
     random = np.random.default_rng(0)
     sigma, values = random.uniform(0.1, 2, (30, 2)), random.normal(0, 5, (30, 2))
     jacobian = random.normal(0, 1, (30, 2, 4))
-    plain = ImageErrors(sigma, np.zeros(30))
+    plain = ImageErrors(sigma[:, :, None] * np.eye(2))
     np.testing.assert_array_equal(plain.whitened(values), values / sigma)
     np.testing.assert_array_equal(plain.whitened(jacobian), jacobian / sigma[:, :, None])
     np.testing.assert_array_equal(plain.restored(values), values * sigma)
-    errors = ImageErrors(sigma, random.uniform(-0.99, 0.99, 30))
-    factor = np.linalg.cholesky(errors.covariance)
+    correlation = random.uniform(-0.99, 0.99, 30)[:, None, None] * (1 - np.eye(2)) + np.eye(2)
+    covariance = correlation * sigma[:, :, None] * sigma[:, None, :]
+    factor = np.linalg.cholesky(covariance)
+    errors = ImageErrors(factor)
+    np.testing.assert_allclose(errors.covariance, covariance, rtol=1e-12)
+    np.testing.assert_allclose(errors.sigma, sigma, rtol=1e-12)
     np.testing.assert_allclose(factor @ errors.whitened(jacobian), jacobian, atol=1e-12)
     np.testing.assert_allclose(errors.restored(errors.whitened(values)), values, atol=1e-12)
     half = random.normal(0, 1, (30, 2, 2))
@@ -98,7 +102,7 @@ def test_whitening_is_a_division_where_axes_are_independent_and_can_be_undone() 
 def test_errors_of_the_ground_add_to_a_covariance_with_their_correlation(rpc: RPC) -> None:
     points = measured(rpc, "shift", 5, 3, sigma_ground=np.full((5, 3), [0.4, 0.3, 2.0]))
     start = ImageCorrection.identity(rpc, "shift", ORIGIN)
-    errors = ImageErrors.of(start, points, np.arange(5))
+    errors = ImageErrors.of(start, points)
     metre = np.array([0.4 / 111_320 / np.cos(np.radians(points.ground[:, 1])), np.full(5, 0.3 / 110_850)]).T
     spread = np.column_stack([metre, np.full(5, 2.0)])
     moved = start.ground_partials(points.ground) * spread[:, None, :]
@@ -115,7 +119,7 @@ def test_sigmas_cover_with_strongly_anisotropic_errors(rpc: RPC, kind: str) -> N
     for seed in range(1000):
         points = measured(rpc, kind, 25, seed)
         problem = Problem.of(start, points, points.control, {})
-        solution = problem.solve(problem.groups < 0, linear=True)
+        solution = problem.solve(problem.points.groups < 0, linear=True)
         step = solution.cofactors @ np.einsum(
             "nip,ni->p", problem.errors.whitened(solution.jacobian),
             problem.errors.whitened(points.image - start.ground_to_image(points.ground)),
