@@ -19,7 +19,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.imaging import matching
 from ortho_pipeline.imaging.matching.weights import components
-from ortho_pipeline.imaging.ties import Ties, TieSettings, tie
+from ortho_pipeline.imaging.ties import Pair, Ties, TieSettings, tie
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
@@ -122,6 +122,26 @@ def test_a_track_has_each_scene_once_and_covers_the_overlap(tmp_path):
     values = np.linalg.eigvalsh(ties.covariance)
     assert (values > 0).all()
     assert np.sqrt(values.max()) < 0.6
+
+
+def test_a_track_goes_on_where_its_home_cannot_be_matched(tmp_path, monkeypatch):
+    """The first and the last scene have nothing that is alike; the one between them has ties with both."""
+    scenes, views = looks(tmp_path, [-10.0, 0.0, 10.0], side=300, dem_sigma=2.0)
+    place = Pair.place.__func__
+
+    def refused(cls, view, target, *more):
+        if view is views[0] and target.path == str(scenes[2].scene_file):
+            raise InputError("no place stands out")
+        return place(cls, view, target, *more)
+
+    monkeypatch.setattr(Pair, "place", classmethod(refused))
+    ties = tie(views, TieSettings(search=25.0, points=40, dem_sigma=3.0))
+    _each_scene_once(ties)
+    assert [one.images for one in ties.pairs if one.reason] == [(0, 2)]
+    # What both pairs show of a place is one track, and the far ends of it are the same place.
+    assert len(ties.of_pair(0, 2)) > 0.5 * len(ties.of_pair(0, 1))
+    across, _, _ = apart(scenes[0], scenes[2], ties, (0, 2))
+    assert rms(across) < 0.2
 
 
 def test_ties_of_scenes_of_different_resolution(tmp_path):
