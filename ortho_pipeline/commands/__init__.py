@@ -1,25 +1,43 @@
 """The work behind each command: paths in, paths out.
 
-Imports everything below; parses no command line and prints nothing.
+Imports everything below; parses no command line and prints nothing. What a command needs is loaded when it is first
+asked for.
 """
 
 from __future__ import annotations
 
-from ortho_pipeline.commands.fitting import compare, fit
-from ortho_pipeline.commands.rectification import check, export, rectify
-from ortho_pipeline.commands.scene import dem_check, doctor, edge, info, models, sensors, write_plots
+import importlib
+from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "check",
-    "compare",
-    "dem_check",
-    "doctor",
-    "edge",
-    "export",
-    "fit",
-    "info",
-    "models",
-    "rectify",
-    "sensors",
-    "write_plots",
-]
+if TYPE_CHECKING:
+    from ortho_pipeline.commands.fitting import compare as compare
+    from ortho_pipeline.commands.fitting import fit as fit
+    from ortho_pipeline.commands.rectification import check as check
+    from ortho_pipeline.commands.rectification import export as export
+    from ortho_pipeline.commands.rectification import rectify as rectify
+    from ortho_pipeline.commands.scene import dem_check as dem_check
+    from ortho_pipeline.commands.scene import doctor as doctor
+    from ortho_pipeline.commands.scene import edge as edge
+    from ortho_pipeline.commands.scene import info as info
+    from ortho_pipeline.commands.scene import models as models
+    from ortho_pipeline.commands.scene import sensors as sensors
+    from ortho_pipeline.commands.scene import write_plots as write_plots
+
+_NAMES = {
+    "fitting": ("compare", "fit"),
+    "rectification": ("check", "export", "rectify"),
+    "scene": ("dem_check", "doctor", "edge", "info", "models", "sensors", "write_plots"),
+}
+#: Public name -> module that holds it.
+_HOMES = {name: module for module, names in _NAMES.items() for name in names}
+
+__all__ = sorted(_HOMES)  # noqa: PLE0605
+
+if not TYPE_CHECKING:  # a checker knows the names from above, and no others
+
+    def __getattr__(name: str) -> Any:
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+        globals()[name] = value
+        return value

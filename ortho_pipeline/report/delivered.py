@@ -12,7 +12,6 @@ from ortho_pipeline.files.documents import record_of
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
 from ortho_pipeline.report.adjustment_records import Adjustment
-from ortho_pipeline.report.block_records import AdjustedImage
 from ortho_pipeline.report.records import Headline
 from ortho_pipeline.report.wording import headline
 
@@ -49,6 +48,8 @@ def _of_scene(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
 
 
 def _of_block(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
+    from ortho_pipeline.report.block_records import AdjustedImage  # few scenes come from a block
+
     image = record_of(AdjustedImage, {name: one for name, one in adjusted.items() if name not in ("gauge", "sigma0")})
     sigma0 = f", sigma0 {float(adjusted['sigma0']):.3g}" if adjusted["sigma0"] else ""
     notes = (f"The block: {adjusted['gauge']}{sigma0}.", _source(scene))
