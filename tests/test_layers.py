@@ -15,7 +15,10 @@ from pathlib import Path
 
 import pytest
 
-from ortho_pipeline.options import GROUPS, BlockOptions, options_of
+from ortho_pipeline.estimation import comparison
+from ortho_pipeline.models.correction import FREE
+from ortho_pipeline.options import CORRECTIONS, GROUPS, RESAMPLING, BlockOptions, options_of
+from ortho_pipeline.warp import engine
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "ortho_pipeline"
@@ -108,6 +111,12 @@ def is_module(dotted: str) -> bool:
 
 def parse(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def test_what_a_user_may_choose_is_what_there_is() -> None:
+    """`options` is read before NumPy is there, so it repeats these names."""
+    assert CORRECTIONS == (*FREE, "model") == (*comparison.CORRECTIONS, "model")
+    assert tuple(engine._KERNELS) == RESAMPLING
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))

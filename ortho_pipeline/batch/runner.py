@@ -26,10 +26,10 @@ from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
+from ortho_pipeline.options import EXECUTORS
 from ortho_pipeline.report.stac import write_catalog
 from ortho_pipeline.warp import mosaic
 
-EXECUTORS = ("sequential", "processes", "dask")
 #: Larger files beside an image are not metadata.
 _COMPANION_BYTES = 5_000_000
 #: A larger file is not a report on a mosaic.

@@ -14,6 +14,7 @@ from ortho_pipeline.cli.options import json_option
 from ortho_pipeline.cli.parsing import Command, Megabytes
 from ortho_pipeline.cli.printing import print_json, progress
 from ortho_pipeline.errors import counted
+from ortho_pipeline.options import EXECUTORS
 
 if TYPE_CHECKING:
     from ortho_pipeline.batch.plan import Plan
@@ -41,7 +42,7 @@ class _Shard(click.ParamType):
 @click.argument("pipeline_file", metavar="PIPELINE.yaml", type=click.Path(), required=False)
 @click.option(
     "--executor",
-    type=click.Choice(["sequential", "processes", "dask"]),
+    type=click.Choice(EXECUTORS),
     help="Who does the work  [default: processes; dask with --scheduler]",
 )
 @click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes  [default: all processors]")

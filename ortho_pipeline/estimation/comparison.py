@@ -35,11 +35,12 @@ from ortho_pipeline.estimation.statistics import student_of
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.models import ImageCorrection, SensorModel, families, family_of
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.models.correction import FREE
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.control_hull import uncovered
 
 #: What is adjusted over a scene's own model.
-CORRECTIONS = ("none", "shift", "shift-drift", "affine")
+CORRECTIONS = tuple(FREE)
 #: Chance of calling the corrections of the scene's own model worse than another one that is as good, one-sided.
 _SIGNIFICANTLY_WORSE = 0.05
 #: Smaller differences of the RMSE, as a factor, are not worth a parameter, nor another model than the scene's own.

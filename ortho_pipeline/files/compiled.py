@@ -16,25 +16,27 @@ from numba.core.dispatcher import Dispatcher
 
 log = logging.getLogger(__name__)
 
+_njit = functools.partial(numba.njit, nogil=True, error_model="numpy", boundscheck=False)
+
 
 def compiled(function: Callable[..., Any]) -> Any:
     """Compile a function that runs without the interpreter lock; indices are not checked, and x / 0 is infinite."""
-    return _made(function)
-
-
-def inlined(function: Callable[..., Any]) -> Any:
-    """Compile a function into each compiled one that calls it."""
-    return _made(function, inline="always")
-
-
-def _made(function: Callable[..., Any], **options: Any) -> Any:
-    made = numba.njit(nogil=True, error_model="numpy", boundscheck=False, **options)(function)
+    made: Any = _njit()(function)
     try:
         made._cache = _Cache(function)  # as enable_caching() does with numba's own
     except RuntimeError:
         # Neither the package's folder nor the user's cache can be written, as in many containers.
         _say_once()
     return made
+
+
+def inlined(function: Callable[..., Any]) -> Any:
+    """Compile a function into each compiled one that calls it, and is kept with it.
+
+    LLVM does it: numba's own ``inline="always"`` copies the function before types are known, and infers them anew for
+    each copy, which took most of the time of compiling.
+    """
+    return _njit(forceinline=True)(function)
 
 
 class _Cache(FunctionCache):

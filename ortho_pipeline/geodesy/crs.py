@@ -90,6 +90,7 @@ def parse_crs(text: str | pyproj.CRS) -> pyproj.CRS:
         ) from error
 
 
+@functools.lru_cache(maxsize=64)  # PROJ takes some milliseconds, which a fit of 20 points would mostly consist of
 def horizontal(crs: str | pyproj.CRS) -> pyproj.CRS:
     """Return the two-dimensional part of a compound or 3D system.
 

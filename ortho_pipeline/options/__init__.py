@@ -20,8 +20,10 @@ from ortho_pipeline.options.groups import (
 )
 from ortho_pipeline.options.option import (
     CORRECTIONS,
+    EXECUTORS,
     PIXEL_ORIGINS,
     PIXEL_TYPES,
+    RESAMPLING,
     Kind,
     Option,
     PathLike,
@@ -33,9 +35,11 @@ from ortho_pipeline.options.option import (
 
 __all__ = [
     "CORRECTIONS",
+    "EXECUTORS",
     "GROUPS",
     "PIXEL_ORIGINS",
     "PIXEL_TYPES",
+    "RESAMPLING",
     "BlockOptions",
     "Kind",
     "MatchOptions",

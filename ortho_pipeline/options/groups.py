@@ -6,7 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Protocol
 
-from ortho_pipeline.options.option import CORRECTIONS, PIXEL_ORIGINS, PIXEL_TYPES, Option, PathLike, documented
+from ortho_pipeline.options.option import (
+    CORRECTIONS,
+    PIXEL_ORIGINS,
+    PIXEL_TYPES,
+    RESAMPLING,
+    Option,
+    PathLike,
+    documented,
+)
 
 
 @documented
@@ -281,9 +289,7 @@ class OutputOptions:
     align: Annotated[
         bool, Option("--align -tap", "Widen `output.extent` to whole multiples of the resolution.")
     ] = False  # fmt: skip
-    resampling: Annotated[
-        str, Option("--resampling -r", choices=("nearest", "bilinear", "cubic", "lanczos", "average"))
-    ] = "bilinear"
+    resampling: Annotated[str, Option("--resampling -r", choices=RESAMPLING)] = "bilinear"
     bands: Annotated[
         Sequence[int] | None,
         Option(

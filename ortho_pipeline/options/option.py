@@ -19,6 +19,9 @@ PIXEL_ORIGINS = {
 PIXEL_TYPES = ("Byte", "UInt16", "Int16", "UInt32", "Int32", "Float32", "Float64")
 #: What is adjusted: nothing, the image points, or the parameters of the model itself.
 CORRECTIONS = ("none", "shift", "shift-drift", "affine", "model")
+#: Kernels of resampling, and who does the work of a run.
+RESAMPLING = ("nearest", "bilinear", "cubic", "lanczos", "average")
+EXECUTORS = ("sequential", "processes", "dask")
 
 #: How the value of an option is written, where choices or a field that is true or false do not say it.
 Kind = Literal[

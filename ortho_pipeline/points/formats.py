@@ -1,4 +1,7 @@
-"""Point files as they are written: which reader a file is for, and which of its points belong to an image."""
+"""Point files as they are written: which reader a file is for, and which of its points belong to an image.
+
+A new format is a reader, in `link_lists` if it is a list of another program, and one entry of `_FORMATS`.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +10,77 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.points.delimited import is_header, read_csv
 from ortho_pipeline.points.geojson import read_geojson
 from ortho_pipeline.points.link_lists import LINK_TABLE, odm_crs, read_asp, read_envi, read_links, read_odm, read_qgis
-from ortho_pipeline.points.rows import OF_BLOCK, OWN_IMAGE, Columns, Placement, Row, Table, load_text, short
-
-_FORMATS = (
-    "CSV/TSV (id,col,row,x,y,h,...), GeoJSON with 'ji', QGIS .points, ODM gcp_list.txt, ENVI .pts, ASP .gcp, "
-    "ArcGIS link table"
+from ortho_pipeline.points.rows import (
+    OF_BLOCK,
+    OF_GROUND,
+    OF_HEIGHTS,
+    OWN_IMAGE,
+    Columns,
+    Placement,
+    Row,
+    Table,
+    load_text,
+    short,
 )
+
+
+class _Format(NamedTuple):
+    """A format: its name, its reader, what a file of it has to hold, and how one is known.
+
+    `known` takes the suffix, the first characters and the first line. `of_block` says which columns of a block's table
+    it can hold. `wanted` is the remedy of errors whose own place knows no better one.
+    """
+
+    name: str
+    reader: Callable[..., Table]
+    wanted: str
+    known: Callable[[str, str, str], object]
+    of_block: tuple[Columns, ...] = ()
+
+
+#: In the order in which they are tried: content tells them apart, then the suffix.
+_FORMATS = (
+    _Format(
+        "GeoJSON with 'ji'", read_geojson,
+        "write a FeatureCollection of Points [lon, lat, height] with the property 'ji' = [column, row]",
+        lambda suffix, start, first: start.startswith(("{", "[")) or suffix in (".geojson", ".json"),
+        (OF_BLOCK, OF_GROUND, OF_HEIGHTS),
+    ),
+    _Format(
+        "QGIS .points", read_qgis,
+        "write mapX,mapY,sourceX,sourceY,enable and so on, as the georeferencer of QGIS does",
+        lambda suffix, start, first: suffix == ".points" or re.match(r"(?i)mapX\s*,", first),
+    ),
+    _Format(
+        "ENVI .pts", read_envi, "write numbers in the order of the comment 'Map (x,y,elev), Image (x,y)'",
+        lambda suffix, start, first: suffix == ".pts" or start.startswith(";"),
+    ),
+    _Format(
+        "ASP .gcp", read_asp,
+        "write id lat lon height and three sigmas, then name column row and two sigmas of each image",
+        lambda suffix, start, first: suffix == ".gcp" or re.match(r"#\s*WKT\s*:", start), (OF_BLOCK,),
+    ),
+    _Format(
+        "CSV/TSV (id,col,row,x,y,h,...)", read_csv,
+        "write one point a line, its numbers under a header such as id,col,row,x,y,h",
+        lambda suffix, start, first: suffix in (".csv", ".tsv") or is_header(first), (OF_BLOCK, OF_GROUND, OF_HEIGHTS),
+    ),
+    _Format(
+        "ODM gcp_list.txt", read_odm, "write x y z column row image [label], under a line with the CRS",
+        lambda suffix, start, first: odm_crs(first) is not None, (OF_BLOCK,),
+    ),
+    _Format(
+        "ArcGIS link table", read_links, "write [id] from-x from-y to-x to-y",
+        lambda suffix, start, first: LINK_TABLE.match(first),
+    ),
+)  # fmt: skip
+_NAMES = ", ".join(one.name for one in _FORMATS)
 
 
 def read_table(
@@ -41,9 +104,9 @@ def read_table(
         For anything that is not a table of finite numbers; names file, line and column.
     """
     text = load_text(path)
-    table = _read(_reader(path, text), path, text)
+    table = _read(_format_of(path, text), path, text)
     if not table.rows:
-        raise InputError("this file holds no points", file=path, remedy=f"give one of: {_FORMATS}")
+        raise InputError("this file holds no points", file=path, remedy=f"give one of: {_NAMES}")
     return _of_image(path, table, image_name, pieces or {})
 
 
@@ -56,54 +119,32 @@ def read_block_table(path: str | os.PathLike[str], expected: Columns = OF_BLOCK)
         As `read_table`; also for a line that does not say which image it is of.
     """
     text = load_text(path)
-    reader = _reader(path, text)
-    if reader is read_csv or reader is read_geojson:
-        table = _read(reader, path, text, expected)
-    elif (reader is read_odm or reader is read_asp) and expected is OF_BLOCK:
-        table = _read(reader, path, text)
-    else:
+    kind = _format_of(path, text)
+    if expected not in kind.of_block:
         raise InputError(
             "points of several images do not stand in this format", file=path,
             remedy="give CSV (id,image,col,row[,x,y,h,...]), GeoJSON with 'ji' by image, ODM gcp_list.txt or ASP .gcp",
         )  # fmt: skip
+    # Only formats whose columns have names can be asked for those of ground alone.
+    table = _read(kind, path, text, *([expected] if OF_GROUND in kind.of_block else []))
     if not table.rows:
         raise InputError("this file holds no points", file=path, remedy="add points to it")
     return table
 
 
-#: What a file of each format has to hold, for errors whose own place knows no better remedy.
-_WANTED: dict[Callable[..., Table], str] = {
-    read_csv: "write one point a line, its numbers under a header such as id,col,row,x,y,h",
-    read_geojson: "write a FeatureCollection of Points [lon, lat, height] with the property 'ji' = [column, row]",
-    read_qgis: "write mapX,mapY,sourceX,sourceY,enable and so on, as the georeferencer of QGIS does",
-    read_odm: "write x y z column row image [label], under a line with the CRS",
-    read_envi: "write numbers in the order of the comment 'Map (x,y,elev), Image (x,y)'",
-    read_asp: "write id lat lon height and three sigmas, then name column row and two sigmas of each image",
-    read_links: "write [id] from-x from-y to-x to-y",
-}
-
-
-def _read(reader: Callable[..., Table], path: str | os.PathLike[str], text: str, *expected: Columns) -> Table:
+def _read(kind: _Format, path: str | os.PathLike[str], text: str, *expected: Columns) -> Table:
     """Read a file; an error without a remedy gets that of the format."""
-    with completed(path, remedy=_WANTED[reader]):
-        return reader(path, text, *expected)
+    with completed(path, remedy=kind.wanted):
+        return kind.reader(path, text, *expected)
 
 
-def _reader(path: str | os.PathLike[str], text: str) -> Callable[[str | os.PathLike[str], str], Table]:
+def _format_of(path: str | os.PathLike[str], text: str) -> _Format:
     suffix, start = Path(path).suffix.lower(), text.lstrip()[:4096]
     lines = [line for line in start.splitlines() if line.strip() and not line.startswith("#")]
     first = lines[0].strip() if lines else ""
-    for reader, known in (
-        (read_geojson, start.startswith(("{", "[")) or suffix in (".geojson", ".json")),
-        (read_qgis, suffix == ".points" or re.match(r"(?i)mapX\s*,", first)),
-        (read_envi, suffix == ".pts" or start.startswith(";")),
-        (read_asp, suffix == ".gcp" or re.match(r"#\s*WKT\s*:", start)),
-        (read_csv, suffix in (".csv", ".tsv") or is_header(first)),
-        (read_odm, odm_crs(first) is not None),
-        (read_links, LINK_TABLE.match(first)),
-    ):
-        if known:
-            return reader
+    for kind in _FORMATS:
+        if kind.known(suffix, start, first):
+            return kind
     if re.search(r"\d", first) and re.fullmatch(r"[-+.,;\deE\s]+", first):
         raise InputError(
             f"numbers without names: it is not said what the columns are; the first line is {short(first)}", file=path,
@@ -113,7 +154,7 @@ def _reader(path: str | os.PathLike[str], text: str) -> Callable[[str | os.PathL
         )  # fmt: skip
     raise InputError(
         f"the format of this point file is not known; its first line is {short(first)}", file=path, field="line 1",
-        remedy=f"give one of: {_FORMATS}",
+        remedy=f"give one of: {_NAMES}",
     )  # fmt: skip
 
 

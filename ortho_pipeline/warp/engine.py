@@ -35,16 +35,15 @@ from ortho_pipeline.warp.lattice import BLOCK, Lattices, OutputBlock, Terrain, b
 
 #: Side of a tile, the piece of work of a thread.
 TILE = 4 * BLOCK
-#: Kernels by the name on the command line.
-RESAMPLING = {
-    "nearest": kernels.NEAREST,
-    "bilinear": kernels.BILINEAR,
-    "cubic": kernels.CUBIC,
-    "lanczos": kernels.LANCZOS,
-    "average": kernels.AVERAGE,
+#: Kernels by the name on the command line, with the source pixels that each reads around the one that holds the point
+#: ('average': plus half of its box).
+_KERNELS = {
+    "nearest": (kernels.NEAREST, 0),
+    "bilinear": (kernels.BILINEAR, 1),
+    "cubic": (kernels.CUBIC, 2),
+    "lanczos": (kernels.LANCZOS, 3),
+    "average": (kernels.AVERAGE, 1),
 }
-#: Source pixels that a kernel reads around the one that holds the point ('average': plus half of its box).
-_REACH = {"nearest": 0, "bilinear": 1, "cubic": 2, "lanczos": 3, "average": 1}
 #: What GDAL's warper takes for each pixel of an ortho whose image points are geolocation arrays: 1.4 GB for 13.7 Mpx.
 _ARRAYS_BYTES = 100
 
@@ -200,9 +199,9 @@ def rectify_gdal(
 
 
 def _check(source: RasterSource, resampling: str, dem_interpolation: str, tolerance: float) -> None:
-    if resampling not in RESAMPLING:
+    if resampling not in _KERNELS:
         raise InputError(
-            f"no kernel is called {resampling!r}", field="resampling", remedy=f"one of {', '.join(RESAMPLING)}"
+            f"no kernel is called {resampling!r}", field="resampling", remedy=f"one of {', '.join(_KERNELS)}"
         )
     if dem_interpolation not in ("bilinear", "cubic"):
         raise InputError(
@@ -271,13 +270,14 @@ class _Job:
         profile: Profile,
     ) -> None:
         self.source, self.surface, self.grid = source, surface, grid
+        kernel, reach = _KERNELS[resampling]
         self.lattices = Lattices(
-            model, surface, grid, (source.width, source.height), tolerance=tolerance, reach=_REACH[resampling],
+            model, surface, grid, (source.width, source.height), tolerance=tolerance, reach=reach,
             averages=resampling == "average",
         )  # fmt: skip
         self.cubic_dem, self.window_bytes = cubic_dem, window_bytes
         self.profile = profile
-        self.resampling = kernels.Resampling(RESAMPLING[resampling], 0, (1.0, 1.0), *_range(source.dtype, profile))
+        self.resampling = kernels.Resampling(kernel, 0, (1.0, 1.0), *_range(source.dtype, profile))
         self.any_band = profile.validity == "nodata" or profile.dtype.kind == "f"
         self._lock = threading.Lock()
         self.valid_pixels = 0
