@@ -46,14 +46,16 @@ class XmlFields:
 
         self.path, self.remedy = path, remedy
         self._midnight: datetime | None = None
-        data = read_bounded(path, limit)
+        data = read_bounded(path, limit, remedy=remedy)
         if len(data) > limit:
             size = f"{limit // 1_000_000} MB"
-            raise InputError(f"this file has more than {size}, which no metadata of a scene has", file=path)
+            raise InputError(
+                f"this file has more than {size}, which no metadata of a scene has", file=path, remedy=remedy
+            )
         try:
             self.root: Element = ElementTree.fromstring(data, forbid_dtd=True)
         except (ElementTree.ParseError, DefusedXmlException, ValueError, LookupError) as error:
-            raise InputError(f"this is not well-formed XML ({error})", file=path) from error
+            raise InputError(f"this is not well-formed XML ({error})", file=path, remedy=remedy) from error
         for element in self.root.iter():
             if isinstance(element.tag, str) and element.tag.startswith("{"):
                 element.tag = element.tag.rpartition("}")[2]

@@ -34,7 +34,7 @@ _PLAIN = (
     "SRTMHGT", "AAIGrid", "GTX", "NTv2", "EHdr", "BMP", "USGSDEM", "SGI", "BYN", "MEM",
 )  # fmt: skip
 #: Drivers whose headers name other files: each is used for a file whose names have been seen.
-_REFERRING = ("VRT", "DIMAP", "ERS", "ISIS3", "PCIDSK")
+_REFERRING = ("VRT", "DIMAP", "ERS", "ISIS3", "PCIDSK", "TIL")
 DRIVERS = _PLAIN + _REFERRING
 #: Raster drivers that send requests; a process of the command line does without them.
 _FETCHING = (

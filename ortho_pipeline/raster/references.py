@@ -1,4 +1,4 @@
-"""Names of other files in rasters that refer to some: VRT, DIMAP, ERS, ISIS3, PCIDSK.
+"""Names of other files in rasters that refer to some: VRT, DIMAP, ERS, ISIS3, PCIDSK, TIL.
 
 They are read without opening what they name.
 """
@@ -188,6 +188,12 @@ def _names_of_pcidsk(path: Any) -> Iterator[Named]:
     yield from ()
 
 
+def _names_of_til(path: Any) -> Iterator[Named]:
+    """Yield the tiles of a product of DigitalGlobe."""
+    for match in re.finditer(r"""filename[ \t]*=[ \t]*("[^"\r\n]*"|[^"\s;]+)""", _header(path), re.IGNORECASE):
+        yield Named(match[1].strip('"'), "filename")
+
+
 def _beginning(path: Any, size: int) -> bytes:
     if isinstance(path, VsiPath):
         return path.read(size)
@@ -197,5 +203,5 @@ def _beginning(path: Any, size: int) -> bytes:
 
 NAMES_OF: dict[str, Any] = {
     "VRT": _names_of_vrt, "DIMAP": _names_of_dimap, "ERS": _names_of_ers, "ISIS3": _names_of_isis3,
-    "PCIDSK": _names_of_pcidsk,
+    "PCIDSK": _names_of_pcidsk, "TIL": _names_of_til,
 }  # fmt: skip

@@ -5,6 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ortho_pipeline.exchange.rpc_files import SCALARS, rpc_metadata
+from ortho_pipeline.models import RPC
 
 
 def flight(times: np.ndarray, *, radius: float = 7.2e6, lon: float = 30.0) -> tuple[np.ndarray, np.ndarray]:
@@ -84,3 +88,92 @@ def spot_text(*, size: tuple[int, int] = (60, 50), every: bool = False, correcte
         f"<Instrument_Look_Angles><BAND_INDEX>1</BAND_INDEX><Look_Angles_List>\n{looks}</Look_Angles_List>"
         "</Instrument_Look_Angles></Instrument_Look_Angles_List></Sensor_Configuration></Data_Strip></Dimap_Document>\n"
     )
+
+
+def utc(seconds: float, day: str = "2021-02-01") -> str:
+    """Return a time so many seconds after noon."""
+    whole = round((12 * 3600 + seconds) * 1e6)
+    clock = f"{whole // 3600000000:02d}:{whole // 60000000 % 60:02d}:{whole // 1000000 % 60:02d}"
+    return f"{day}T{clock}.{whole % 1000000:06d}Z"
+
+
+def view(places: np.ndarray, rates: np.ndarray, *, back_deg: float, left_deg: float) -> np.ndarray:
+    """Return the axes (N, 3, 3) of a camera in ECEF: x to the left of the flight, y forward, z to the ground."""
+    z = -places / np.linalg.norm(places, axis=1)[:, None]
+    x = np.cross(rates, z)
+    x /= np.linalg.norm(x, axis=1)[:, None]
+    turn = Rotation.from_euler("XY", [back_deg, left_deg], degrees=True).as_matrix()
+    return np.stack([x, np.cross(z, x), z], axis=2) @ turn
+
+
+def isd_text(*, size: tuple[int, int] = (60, 50), start: float = 0.0, catalogue: str = "10200100A0000000",
+             tiles: tuple[tuple[str, int, int, int, int], ...] = (), rpc: RPC | None = None, namespace: str = ""
+             ) -> str:  # fmt: skip
+    """Return the ISD XML of an image of 0.8 m pixels, 12 degrees backwards, 9 aside, whose first row is at `start`."""
+    columns, rows = size
+    times = np.arange(-0.3, 0.301, 0.02)
+    places, rates = flight(times)
+    axes = view(places, rates, back_deg=12.0, left_deg=9.0)
+    # The vendor's x is forward, its y along the line the other way.
+    quaternions = Rotation.from_matrix(np.stack([axes[:, :, 1], -axes[:, :, 0], axes[:, :, 2]], axis=2)).as_quat()
+
+    def listed(name: str, values: np.ndarray) -> str:
+        lines = "\n".join(
+            f"<{name}>{k:.15e} {' '.join(f'{v:.15e}' for v in row)}</{name}>" for k, row in enumerate(values, 1)
+        )
+        return f"<{name}List>\n{lines}\n</{name}List>"
+
+    def table(part: str, name: str, values: np.ndarray) -> str:
+        return (
+            f"<{part}><STARTTIME>{utc(times[0])}</STARTTIME><NUMPOINTS>{len(values)}</NUMPOINTS>"
+            f"<TIMEINTERVAL>2.000000000000000e-02</TIMEINTERVAL>{listed(name, values)}</{part}>\n"
+        )
+
+    zeros = np.zeros((len(times), 10))
+    files = "".join(
+        f"<TILE><FILENAME>{name}</FILENAME><ULCOLOFFSET>{left}</ULCOLOFFSET><ULROWOFFSET>{top}</ULROWOFFSET>"
+        f"<LRCOLOFFSET>{left + width - 1}</LRCOLOFFSET><LRROWOFFSET>{top + height - 1}</LRROWOFFSET></TILE>\n"
+        for name, left, top, width, height in tiles
+    )
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?>\n<isd{namespace}><IMD><NUMROWS>{rows}</NUMROWS><NUMCOLUMNS>{columns}'
+        "</NUMCOLUMNS><BANDID>P</BANDID><BITSPERPIXEL>8</BITSPERPIXEL><PRODUCTLEVEL>LV1B</PRODUCTLEVEL><IMAGE><SATID>WV01</SATID>"
+        f"<CATID>{catalogue}</CATID><TLCTIME>{utc(start)}</TLCTIME><FIRSTLINETIME>{utc(start)}</FIRSTLINETIME>"
+        f"<TLCLISTList><TLCLIST>0.0 0.0</TLCLIST><TLCLIST>{rows}.0 {rows * 1e-4:.15e}</TLCLIST></TLCLISTList>"
+        "<MEANSUNEL>4.1e+01</MEANSUNEL><CLOUDCOVER>-9.99e+02</CLOUDCOVER></IMAGE></IMD>\n"
+        f"{table('EPH', 'EPHEMLIST', np.hstack([places, rates, zeros[:, :6]]))}"
+        f"{table('ATT', 'ATTLIST', np.hstack([quaternions, zeros]))}"
+        f"<TIL><NUMTILES>{len(tiles)}</NUMTILES>{files}</TIL><GEO><PRINCIPAL_DISTANCE><PD>8.0e+03</PD></PRINCIPAL_DISTANCE>"
+        "<OPTICAL_DISTORTION><POLYORDER>-1</POLYORDER></OPTICAL_DISTORTION><PERSPECTIVE_CENTER><CX>0.0</CX><CY>0.0</CY>"
+        "<CZ>0.0</CZ></PERSPECTIVE_CENTER><CAMERA_ATTITUDE><QCS1>0.0</QCS1><QCS2>0.0</QCS2><QCS3>0.0</QCS3><QCS4>1.0</QCS4>"
+        "</CAMERA_ATTITUDE><DETECTOR_MOUNTING><BAND_P><BANDID>P</BANDID><DETECTOR_ARRAY><DETORIGINX>0.05</DETORIGINX>"
+        f"<DETORIGINY>{columns * 0.004}</DETORIGINY><DETROTANGLE>0.0</DETROTANGLE><DETPITCH>0.008</DETPITCH>"
+        f"</DETECTOR_ARRAY></BAND_P></DETECTOR_MOUNTING></GEO>{_rpb(rpc)}</isd>\n"
+    )
+
+
+def _rpb(rpc: RPC | None) -> str:
+    if rpc is None:
+        return ""
+    fields = rpc_metadata(rpc)
+    scalars = "".join(
+        f"<{key.replace('_OFF', 'OFFSET').replace('_SCALE', 'SCALE')}>{fields[key]}"
+        f"</{key.replace('_OFF', 'OFFSET').replace('_SCALE', 'SCALE')}>"
+        for key in SCALARS
+    )
+    terms = "".join(
+        f"<{tag}List><{tag}>{fields[key]}</{tag}></{tag}List>\n"
+        for key, tag in (("LINE_NUM_COEFF", "LINENUMCOEF"), ("LINE_DEN_COEFF", "LINEDENCOEF"),
+                         ("SAMP_NUM_COEFF", "SAMPNUMCOEF"), ("SAMP_DEN_COEFF", "SAMPDENCOEF"))
+    )  # fmt: skip
+    return f"<RPB><SPECID>RPC00B</SPECID><IMAGE>{scalars}\n{terms}</IMAGE></RPB>"
+
+
+def til_text(tiles: tuple[tuple[str, int, int, int, int], ...]) -> str:
+    """Return a .TIL file of tiles, as GDAL's driver of that name reads it."""
+    groups = "".join(
+        f'BEGIN_GROUP = TILE_{k}\n\tfilename = "{name}";\n\tULColOffset = {left};\n\tULRowOffset = {top};\n'
+        f"\tLRColOffset = {left + width - 1};\n\tLRRowOffset = {top + height - 1};\nEND_GROUP = TILE_{k}\n"
+        for k, (name, left, top, width, height) in enumerate(tiles, 1)
+    )
+    return f'bandId = "P";\nnumTiles = {len(tiles)};\ntileUnits = "Pixels";\ntileOverlap = 0;\n{groups}END;\n'

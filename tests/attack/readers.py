@@ -18,6 +18,7 @@ import seeds
 from ortho_bilsat.survey import read_survey
 from ortho_cartosat.metadata import read_metadata as read_cartosat
 from ortho_ikonos.metadata import read_header, read_metadata
+from ortho_maxar.isd import Isd, read_isd_pushbroom
 from ortho_orbview3.product import read_product
 from ortho_rpc.dimap import read_dimap_pushbroom
 from ortho_spot.dimap import read_spot
@@ -312,6 +313,16 @@ def _frame_model(folder: Path) -> bytes:
     return (folder / "m").read_bytes()
 
 
+def _maxar_seed(folder: Path) -> bytes:
+    tiles = (("A-P1BS_R1C1-1_P001.TIF", 0, 0, 40, 50), ("A-P1BS_R1C2-1_P001.TIF", 40, 0, 20, 50))
+    return products.isd_text(tiles=tiles, rpc=seeds.rpc()).encode()
+
+
+def _maxar(path: Path) -> Any:
+    isd = Isd(path)
+    return [isd.size, isd.rpc, isd.facts, [vars(tile) for tile in isd.tiles], read_isd_pushbroom(isd)]
+
+
 def _spot(path: Path) -> Any:
     found = read_spot(path)
     return [found.model, found.facts, found.bands_differ]
@@ -357,6 +368,7 @@ READERS = (
     Reader("rpc-tag", "tiff", "one.tif", _tiff(seeds.image), _tagged),
     Reader("dimap-polynomials", "xml", "DIM_X.XML", _text(seeds.dimap_text()), read_dimap_pushbroom),
     Reader("dimap-lists", "xml", "DIM_X.XML", _text(seeds.dimap_text(listed=True)), read_dimap_pushbroom),
+    Reader("maxar-isd", "xml", "one.XML", _maxar_seed, _maxar),
     Reader("spot-metadata", "xml", "METADATA.DIM", _text(products.spot_text()), _spot),
     Reader("spot-detectors", "xml", "METADATA.DIM", _text(products.spot_text(every=True, corrected=True)), _spot),
     Reader("ikonos-metadata", "text", _PO, _sample("ikonos", _PO), read_metadata),

@@ -26,6 +26,7 @@ DEAR = {
     "cartosat-met": 25,
     "dimap-lists": 60,
     "dimap-polynomials": 60,
+    "maxar-isd": 40,
     "spot-metadata": 40,
     "spot-detectors": 40,
     "bilsat-survey": 60,

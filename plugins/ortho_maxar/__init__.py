@@ -1,0 +1,108 @@
+"""Sensor plugin for Maxar (Vantor): WorldView 1 to 4, GeoEye-1, QuickBird, from their ISD XML; tiles and parts too."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from osgeo import gdal
+
+from ortho_maxar.isd import Isd, Tile, read_isd_pushbroom
+from ortho_maxar.layout import metadata_of, parts_beside, tile_of, tiles_beside
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.rpc import has_rpc, rpc_of_dataset
+from ortho_pipeline.files.locations import place
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.models import SensorModel
+from ortho_pipeline.models.pushbroom.scanner import Pushbroom
+from ortho_pipeline.models.rational import RPC
+
+#: From here on (px) the rigorous model and the RPC are worth a word, and from here on they are of two images.
+APART, DISAGREEMENT = 5.0, 100.0
+
+
+@hookimpl
+def ortho_sensors() -> Iterable[Sensor]:
+    """Offer the sensor ``maxar``."""
+    yield Sensor(
+        "maxar",
+        "WorldView 1 to 4, GeoEye-1, QuickBird with ISD XML: image, tile, part of a strip, or .TIL of all tiles",
+        recognises,
+        open_scene,
+        options={"rpc": "which RPC to use: tag, sidecar, or an RPC file; by itself that of the XML"},
+    )
+
+
+def recognises(dataset: gdal.Dataset) -> bool:
+    """Tell whether ISD XML of an image lies beside it."""
+    return metadata_of(dataset.GetDescription()) is not None
+
+
+def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
+    """Open an image with its RPC and with its rigorous model, and the tiles and parts that belong to it."""
+    name, size = dataset.GetDescription(), (dataset.RasterXSize, dataset.RasterYSize)
+    path = metadata_of(name)
+    if path is None:
+        raise InputError("there is no ISD XML beside this image", file=name, remedy="add it from the delivery")
+    isd, image = Isd(path), place(name)
+    tile, warnings = tile_of(isd, image.name), []
+    if tile is not None and (tile.width, tile.height) != size:
+        text = f"the XML calls this tile {tile.width} x {tile.height}, it has {size[0]} x {size[1]} pixels"
+        warnings.append(Notice("maybe-a-crop", text, metadata_size=[tile.width, tile.height]))
+    elif tile is None and isd.size != size:
+        text = "the XML is of {} x {} pixels, the image has {} x {}; its models are of its first corner".format(
+            *isd.size, *size
+        )
+        warnings.append(Notice("maybe-a-crop", text, metadata_size=list(isd.size)))
+    found, source = _rpc(dataset, isd, rpc, tile)
+    models: dict[str, SensorModel] = {} if found is None else {"rpc": found}
+    facts = isd.facts
+    try:
+        first = (0, 0) if tile is None else (tile.left, tile.top)
+        rigorous = read_isd_pushbroom(isd, size=size, first=first)
+        warnings += _compared(rigorous, found)
+        models["pushbroom"] = rigorous
+        facts["rigorous_model"] = path.name
+    except InputError as error:
+        if found is None:
+            raise
+        text = f"{path.name} has a rigorous model that is left out: {error.field or 'model'}: {error.message}"
+        warnings.append(Notice("rigorous-left-out", text, file=path.name))
+    parts, said = parts_beside(isd, image, rigorous=found is None) if tile is None else ([], [])
+    return Scene(
+        "maxar", name, *size, models, source, facts, (*warnings, *said),
+        pieces=(*tiles_beside(isd, image, tile), *parts),
+        sources=(path,) if source != str(path) else (),
+    )  # fmt: skip
+
+
+def _rpc(dataset: gdal.Dataset, isd: Isd, choice: str | None, tile: Tile | None) -> tuple[RPC | None, str]:
+    """Return the RPC of an image in its own pixels, and where it is from."""
+    if choice is not None:
+        return rpc_of_dataset(dataset, choice)
+    if isd.rpc is None:
+        return rpc_of_dataset(dataset) if has_rpc(dataset) else (None, str(isd.path))
+    if tile is None:
+        return isd.rpc, str(isd.path)
+    moved = replace(isd.rpc, col_off=isd.rpc.col_off - tile.left, row_off=isd.rpc.row_off - tile.top)
+    return moved, str(isd.path)
+
+
+def _compared(rigorous: Pushbroom, rpc: RPC | None) -> list[Notice]:
+    """Return a warning where rigorous model and RPC of an image differ; refuse to take both where it is much."""
+    if rpc is None:
+        return []
+    middle = np.array([rigorous.camera.size]) / 2
+    seen = rpc.ground_to_image(rigorous.image_to_ground(middle, rpc.h_off))
+    apart = float(np.linalg.norm(seen - middle))
+    if not apart <= DISAGREEMENT:
+        raise InputError(f"it is {apart:.0f} px off the RPC in the middle of the image", field="pushbroom")
+    if apart <= APART:
+        return []
+    text = (
+        f"the rigorous model and the RPC are {apart:.0f} px apart: programs that rewrite the XML write RPCs of their"
+        " own, without aberration; points tell which is right"
+    )
+    return [Notice("rpc-and-rigorous-differ", text, difference_px=round(apart, 2))]

@@ -1,0 +1,110 @@
+"""The files of a delivery of Maxar (Vantor): which metadata an image has, and the tiles and parts that belong to it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from ortho_maxar.isd import Isd, Tile, read_isd_pushbroom
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import read_bounded
+from ortho_pipeline.files.locations import place
+from ortho_pipeline.hookspecs import Piece
+
+_ISD = re.compile(rb"<(\w{1,20}:)?isd[\s>]")
+#: ``21FEB01005130-P1BS_R1C1-016263048010_01_P001``: time, kind of product, tile, order, part of a strip or of an order.
+_PART = re.compile(
+    r".*-(?P<kind>[A-Z][0-9A-Z]{3})(_R\d+C\d+)?-(?P<order>\w+)_P(?P<part>\d{3})", re.IGNORECASE | re.ASCII
+)
+#: Parts whose rates or columns differ by more are two acquisitions.
+_SAME_RATE = 1e-4
+
+
+def is_isd(path: Path) -> bool:
+    """Tell whether a file is ISD XML, from its first bytes."""
+    try:
+        return bool(_ISD.search(read_bounded(path, 2000)[:2000]))
+    except InputError:
+        return False
+
+
+def metadata_of(name: str) -> Path | None:
+    """Return the ISD XML of an image: of its own name, or the one that lists it among its tiles; None without."""
+    if not name:
+        return None
+    try:
+        image = place(name)
+        beside = [one for one in sorted(image.parent.iterdir()) if one.suffix.lower() == ".xml"]
+    except (OSError, ValueError, InputError):
+        return None
+    own = [one for one in beside if one.stem.lower() == image.stem.lower() and is_isd(one)]
+    if own:
+        return own[0]
+    named = _PART.fullmatch(image.stem)
+    for one in beside:
+        other = _PART.fullmatch(one.stem)
+        # Tiles are named R1C1-, R1C2- ... after their time.
+        if named and other and named["part"] == other["part"] and is_isd(one):
+            try:
+                if any(tile.name.lower() == image.name.lower() for tile in Isd(one).tiles):
+                    return one
+            except InputError:
+                continue
+    return None
+
+
+def tile_of(isd: Isd, image: str) -> Tile | None:
+    """Return the tile of a product that an image is, if the product has several."""
+    if len(isd.tiles) < 2:
+        return None
+    return next((tile for tile in isd.tiles if tile.name.lower() == image.lower()), None)
+
+
+def tiles_beside(isd: Isd, image: Path, own: Tile | None) -> Iterator[Piece]:
+    """Yield the other tiles of a product, in the pixels of this one."""
+    for tile in isd.tiles if own is not None else ():
+        if own is not None and tile != own and (there := _file(image, tile.name)) is not None:
+            yield Piece(there, (tile.left - own.left, tile.top - own.top), (tile.width, tile.height))
+
+
+def parts_beside(isd: Isd, image: Path, rigorous: bool) -> tuple[list[Piece], list[Notice]]:
+    """Return the other parts of the strip, in the pixels of this one, and what is to be said of those not taken.
+
+    Rows of parts follow each other in time; where they overlap, both have the same ground.
+    """
+    pieces, notices = [], []
+    for path in _other_parts(isd.path):
+        try:
+            other = Isd(path)
+            if any(isd.file.said(tag) != other.file.said(tag) for tag in ("IMD/IMAGE/CATID", "IMD/BANDID")):
+                continue
+            (start, period), (its, rate) = isd.rows, other.rows
+            names = [tile.name for tile in other.tiles] or [f"{path.stem}{image.suffix}"]
+            there = _file(image, names[0]) if len(names) == 1 else None
+            if there is None or abs(rate / period - 1) > _SAME_RATE or other.size[0] != isd.size[0]:
+                continue
+            model = read_isd_pushbroom(other) if rigorous else other.rpc
+            if model is not None:
+                pieces.append(Piece(there, (0.0, round((its - start) / period, 3)), other.size, model))
+        except InputError as error:
+            text = f"the part {path.name} is left out: {error.message}"
+            notices.append(Notice("part-left-out", text, file=path.name))
+    return pieces, notices
+
+
+def _other_parts(path: Path) -> Iterator[Path]:
+    """Yield the ISD XML of the other parts of one order, by their names."""
+    own = _PART.fullmatch(path.stem)
+    for one in sorted(path.parent.iterdir()) if own else ():
+        other = _PART.fullmatch(one.stem) if one.suffix.lower() == ".xml" else None
+        if own is None or other is None or other["part"] == own["part"]:
+            continue
+        if all(other[name].lower() == own[name].lower() for name in ("kind", "order")) and is_isd(one):
+            yield one
+
+
+def _file(image: Path, name: str) -> Path | None:
+    """Return the file of this name beside an image, whatever the case of its letters."""
+    return next((one for one in sorted(image.parent.iterdir()) if one.name.lower() == name.lower()), None)

@@ -1,0 +1,234 @@
+"""WorldView and its kin: the rigorous model of the ISD XML against the vendor's RPC; tiles and parts."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ortho_maxar.isd import Isd, read_isd_pushbroom
+from osgeo import gdal
+from products import isd_text, til_text
+from used import pixels, used
+
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.rpc_fit import fit_rpc
+from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
+from ortho_pipeline.models import RPC, Pushbroom
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.models.light import LightPath
+from ortho_pipeline.plugins import open_scene
+from ortho_pipeline.testing import check_sensor_model
+
+ASP = Path("sensors", "asp_plot")
+PARTS = [
+    ASP / "tiled_xmls" / f"WV01_2021020100513{k}_10200100A1865800_21FEB0100513{k}-P1BS-016263048010_01_P00{k + 1}.xml"
+    for k in (0, 1)
+]
+WV03 = ASP / "ba_cams" / "1040010074793300.xml"
+SIZE = (60, 50)
+STEM = "21FEB01120000-P1BS-016263048010_01_P001"
+
+
+# -- against the vendor ----------------------------------------------------------------------------------------------
+
+
+def against_rpc(model: Pushbroom, rpc: RPC, heights: tuple[float, ...] = (-200.0, 0.0, 200.0)) -> Array:
+    """Return by how much (px) the RPC sees elsewhere what the model sees: ``(heights, points, 2)``."""
+    share = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), axis=-1).reshape(-1, 2)
+    image = 0.5 + share * (np.array(model.camera.size) - 1)
+    return np.array([rpc.ground_to_image(model.image_to_ground(image, rpc.h_off + h)) - image for h in heights])
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("part", PARTS, ids=["P001", "P002"])
+def test_rigorous_model_and_the_vendors_rpc(real: Path, part: Path) -> None:
+    isd = Isd(real / part)
+    model = read_isd_pushbroom(isd)
+    apart = against_rpc(model, isd.rpc)
+    assert np.abs(apart.mean(axis=(0, 1))).max() < 0.15
+    assert apart.std(axis=(0, 1)).max() < 0.07
+    # Both effects are seen: without the air the constant is a row and depends on height, without aberration 20 px.
+    by_height = apart.mean(axis=1)
+    assert np.ptp(by_height, axis=0).max() < 0.003
+    airless = against_rpc(replace(model, light=LightPath(aberration=True)), isd.rpc).mean(axis=1)
+    assert np.ptp(airless, axis=0).max() > 0.04
+    assert np.linalg.norm(airless.mean(axis=0)) > 1.0
+    plain = against_rpc(replace(model, light=LightPath()), isd.rpc)
+    assert np.linalg.norm(plain.mean(axis=(0, 1))) > 20
+
+
+@pytest.mark.realdata
+def test_parts_of_a_strip_join(real: Path) -> None:
+    """The second begins 18440 rows after the first, by their times, which are printed to a fortieth of a row."""
+    first, second = (read_isd_pushbroom(real / part) for part in PARTS)
+    image = np.column_stack([np.linspace(0, 35000, 30), np.linspace(18500, 24300, 30)])
+    for height in (3000.0, 3700.0):
+        joined = second.ground_to_image(first.image_to_ground(image, height)) + np.array([0, 18440])
+        assert np.abs(joined - image).max() < 0.05
+
+
+@pytest.mark.realdata
+def test_what_the_rpc_of_a_rewritten_xml_is_made_of(real: Path) -> None:
+    """The WorldView-3 file was rewritten, and its RPC fitted to the camera without aberration: no vendor's.
+
+    Its mean over the image is that camera's, its spread what a rational function leaves of the attitude's swings. The
+    corners, for an image of 42,500 x 38,116 pixels, are the vendor's: with aberration they are within a few metres.
+    """
+    isd = Isd(real / WV03)
+    model = read_isd_pushbroom(isd)
+    plain = against_rpc(replace(model, light=LightPath()), isd.rpc)
+    assert np.abs(plain.mean(axis=(0, 1))).max() < 0.15
+    assert plain.std(axis=(0, 1)).max() < 1.0
+    band = "IMD/BAND_P"
+    corners = np.array([[isd.file.number(f"{band}/{at}{name}") for name in ("LON", "LAT", "HAE")]
+                        for at in ("UL", "UR", "LR", "LL")])  # fmt: skip
+    image = np.array([(0, 0), (42499, 0), (42499, 38115), (0, 38115)]) + 0.5
+
+    def miss(light: LightPath) -> Array:
+        found = replace(model, light=light).image_to_ground(image, corners[:, 2])
+        return np.einsum("nij,nj->ni", enu_from_ecef(found), geocentric(found) - geocentric(corners))[:, :2]
+
+    assert np.linalg.norm(miss(LightPath(aberration=True)), axis=1).max() < 3.0
+    assert np.linalg.norm(miss(LightPath(aberration=True, refraction=True)), axis=1).max() < 4.5
+    assert np.linalg.norm(miss(LightPath()), axis=1).min() > 12.0
+
+
+@pytest.mark.realdata
+def test_it_keeps_the_contract(real: Path) -> None:
+    model = read_isd_pushbroom(real / PARTS[0])
+    centre, half = model.domain
+    check_sensor_model(model, centre + np.random.default_rng(0).uniform(-0.8, 0.8, (20, 3)) * half)
+
+
+# -- simulated -------------------------------------------------------------------------------------------------------
+
+
+def rpc_of(model: Pushbroom) -> RPC:
+    """Return an RPC of a model, for ground from 190 to 220 m: the image is 50 m wide."""
+    low = model.with_heights(190.0, 220.0)
+    centre, half = low.domain
+    box = (centre[0] - half[0], centre[1] - half[1], centre[0] + half[0], centre[1] + half[1])
+    return fit_rpc(low, box, (190.0, 220.0), grid=(7, 7, 4)).rpc
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Pushbroom, RPC]:
+    """The model of the whole simulated image, and its RPC."""
+    path = tmp_path_factory.mktemp("whole") / f"{STEM}.XML"
+    path.write_text(isd_text(size=SIZE))
+    model = read_isd_pushbroom(path)
+    return model, rpc_of(model)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "scene").mkdir()
+    return tmp_path / "scene"
+
+
+@pytest.mark.parametrize("namespace", ["", ' xmlns="http://www.digitalglobe.com/isd"'], ids=["plain", "namespaced"])
+def test_every_command(folder: Path, whole: tuple[Pushbroom, RPC], namespace: str) -> None:
+    model, rpc = whole
+    image = pixels(folder / f"{STEM}.TIF", SIZE)
+    (folder / f"{STEM}.XML").write_text(isd_text(size=SIZE, rpc=rpc, namespace=namespace))
+    if namespace:
+        scene = open_scene(image, "maxar")
+        assert list(scene.models) == ["rpc", "pushbroom"]
+        assert not scene.warnings
+        return
+    info = used(image, model, SIZE, sensor="maxar", height=200.0, correction="model")
+    assert info["models"] == {"rpc": "rpc", "pushbroom": "pushbroom"}
+    assert info["facts"]["rigorous_model"] == f"{STEM}.XML"
+    assert "cloud_cover" not in info["facts"]
+
+
+TILES = tuple(
+    (f"21FEB01120000-P1BS_R1C{k + 1}-016263048010_01_P001.TIF", left, 0, width, 50)
+    for k, (left, width) in enumerate(((0, 40), (40, 20)))
+)
+
+
+def test_tiles_are_one_scene(folder: Path, whole: tuple[Pushbroom, RPC]) -> None:
+    model, rpc = whole
+    (folder / f"{STEM}.XML").write_text(isd_text(size=SIZE, tiles=TILES, rpc=rpc))
+    for name, _, _, width, height in TILES:
+        pixels(folder / name, (width, height))
+    image = np.random.default_rng(0).uniform(0, 20, (10, 2))
+    ground = model.image_to_ground(image + np.array([40, 0]), 200.0)
+    second = open_scene(folder / TILES[1][0])
+    for each in second.models.values():
+        assert np.abs(each.ground_to_image(ground) - image).max() < 0.05
+    assert [(Path(piece.path).name, piece.offset) for piece in second.pieces] == [(TILES[0][0], (-40, 0))]
+    # The .TIL makes one image of them, in GDAL and here.
+    (folder / f"{STEM}.TIL").write_text(til_text(TILES))
+    together = open_scene(folder / f"{STEM}.TIL")
+    assert (together.width, together.height) == SIZE
+    assert np.abs(together.models["pushbroom"].ground_to_image(ground) - image - (40, 0)).max() < 1e-6
+
+
+def test_a_til_leads_nowhere_else(folder: Path) -> None:
+    (folder / f"{STEM}.XML").write_text(isd_text(size=SIZE))
+    pixels(folder.parent / "other.TIF", (40, 50))
+    (folder / f"{STEM}.TIL").write_text(til_text((("../other.TIF", 0, 0, 60, 50),)))
+    with pytest.raises(InputError, match="outside of its own folder"):
+        open_scene(folder / f"{STEM}.TIL")
+
+
+def test_points_of_another_part_adjust_this_one(folder: Path, whole: tuple[Pushbroom, RPC]) -> None:
+    """The second part begins 30 rows after the first; points are measured in it alone, 3 px to the right."""
+    first = pixels(folder / f"{STEM}.TIF", SIZE)
+    other = STEM.replace("120000", "120001").replace("P001", "P002")
+    pixels(folder / f"{other}.TIF", SIZE)
+    (folder / f"{STEM}.XML").write_text(isd_text(size=SIZE, rpc=whole[1]))
+    (folder / f"{other}.XML").write_text(isd_text(size=SIZE, start=30e-4))
+    model = read_isd_pushbroom(folder / f"{other}.XML")
+    (folder / f"{other}.XML").write_text(isd_text(size=SIZE, start=30e-4, rpc=rpc_of(model)))
+    (piece,) = open_scene(first).pieces
+    assert (Path(piece.path).name, piece.offset) == (f"{other}.TIF", (0.0, 30.0))
+    lines = ["id,image,col,row,x,y,h"]
+    for k, (x, y) in enumerate([(10, 30), (50, 35), (30, 48), (20, 25)]):
+        lon, lat, h = model.image_to_ground([[x, y]], 200.0)[0].tolist()
+        lines.append(f"{k},{other}.TIF,{x + 3.0},{y},{lon},{lat},{h}")
+    (folder / "p.csv").write_text("\n".join(lines))
+    result = CliRunner().invoke(cli, ["fit", str(first), "--gcps", str(folder / "p.csv"), "--points-crs", "EPSG:4326",
+                                      "--points-vertical", "ellipsoid", "--correction", "shift", "--json"])  # fmt: skip
+    assert result.exit_code == 0, result.output
+    bias = json.loads(result.stdout)["raw_bias"]
+    assert (bias["col"], bias["row"]) == pytest.approx((3.0, 0.0), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("<POLYORDER>-1", "<POLYORDER>2", "optical distortion"),
+        ("<QCS4>1.0", "<QCS4>0.9", "turned in its platform"),
+        ("<DETROTANGLE>0.0", "<DETROTANGLE>0.1", "turned detectors"),
+        ("<CX>0.0", "<CX>0.5", "away from the middle"),
+        ("<TLCLIST>50.0", "<TLCLIST>25.0 2.4e-3</TLCLIST><TLCLIST>50.0", "any one rate"),
+    ],
+)
+def test_a_camera_of_unknown_conventions_is_left_for_the_rpc(
+    folder: Path, whole: tuple[Pushbroom, RPC], old: str, new: str, said: str
+) -> None:
+    image = pixels(folder / f"{STEM}.TIF", SIZE)
+    (folder / f"{STEM}.XML").write_text(isd_text(size=SIZE, rpc=whole[1]).replace(old, new))
+    scene = open_scene(image)
+    assert list(scene.models) == ["rpc"]
+    (notice,) = scene.notices
+    assert notice.code == "rigorous-left-out"
+    assert said in notice
+
+
+def test_a_crop_is_said_and_a_stranger_left_alone(folder: Path, whole: tuple[Pushbroom, RPC]) -> None:
+    (folder / f"{STEM}.XML").write_text(isd_text(size=SIZE, rpc=whole[1]))
+    crop = open_scene(pixels(folder / f"{STEM}.TIF", (30, 20)))
+    assert [notice.code for notice in crop.notices] == ["maybe-a-crop"]
+    (folder / f"{STEM}.XML").write_text("<isdn/>")
+    from ortho_maxar import recognises
+
+    assert not recognises(gdal.Open(str(folder / f"{STEM}.TIF")))
