@@ -141,8 +141,10 @@ class _Moved(MetaPathFinder, Loader):
         now = f"{__name__}.{_MOVED[spec.name.rpartition('.')[2]]}"
         warnings.warn(f"{spec.name} is {now} now", DeprecationWarning, stacklevel=2)
         # The import system writes into the module it gets; the real one must keep its own name.
-        module = ModuleType(spec.name, importlib.import_module(now).__doc__)
-        module.__dict__.update({k: v for k, v in vars(sys.modules[now]).items() if not k.startswith("__")})
+        real = importlib.import_module(now)
+        module = ModuleType(spec.name, real.__doc__)
+        own = {name: value for name, value in vars(real).items() if not name.startswith("__") or name == "__getattr__"}
+        module.__dict__.update(own)
         return module
 
     def exec_module(self, module: ModuleType) -> None:
