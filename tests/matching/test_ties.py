@@ -18,6 +18,7 @@ from ortho_pipeline.commands.control.ties import names_of
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.imaging import matching
+from ortho_pipeline.imaging.matching.search import refuse_accident
 from ortho_pipeline.imaging.matching.weights import components
 from ortho_pipeline.imaging.ties import Pair, Ties, TieSettings, tie
 from ortho_pipeline.models import ImageCorrection
@@ -184,6 +185,10 @@ def test_scenes_of_different_places_have_no_ties(tmp_path):
     with pytest.raises(InputError, match=r"there are no ties: scene0.tif and scene1.tif: ") as refused:
         tie([*views, other.view(views[0].surface)], TieSettings(search=25.0))
     assert "reference" not in str(refused.value)
+    with pytest.raises(InputError, match=r"the scene and scene0.tif do not agree") as refused:
+        refuse_accident(2, 20, 1.5, 1.0, [matching.OtherScene(views[0].intensity, views[0].model)], 25.0)
+    assert "reference" not in str(refused.value)
+    assert refused.value.field == "images"
 
 
 def test_resolutions_that_are_too_different_are_said_of_both_images(tmp_path):
