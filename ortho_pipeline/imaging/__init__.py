@@ -1,4 +1,4 @@
 """Measurements in pixels: edges, resolution, ellipses, the registration of bands and images.
 
-Imports `raster` and what is below; no sensor model beyond a shift.
+Imports `surface` and what is below.
 """

@@ -124,7 +124,7 @@ def build_report(
     provenance : mapping, optional
         From `commands.inputs.provenance`.
     near : float, optional
-        Distance (m) below which points are neighbours; as `covariance.analyse` chooses it without one.
+        Distance (m) below which points are neighbours; as `spatial_correlation.analyse` chooses it without one.
     warnings : iterable of Notice
         What the reader ought to know; a suspicious difference between control and DEM heights is added to them.
     """
