@@ -49,7 +49,7 @@ demo: setup
 	echo "Report:  $(CURDIR)/out/demo/scene_report.html (any browser opens it)"
 
 # Each worker has one processor: threads of BLAS would only wait for each other.
-PYTEST = OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS)
+PYTEST = OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
 
 test: setup
 	@$(PYTEST) -m "not slow"
