@@ -18,6 +18,7 @@ from scenes import UTM, Case, Setting, View, write_raster
 import ortho_pipeline as op
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.control.matching import search_of
+from ortho_pipeline.display.numbers import px
 from ortho_pipeline.errors import InputError
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
@@ -97,7 +98,7 @@ def test_match_shows_what_it_found(case: Case, written_points: tuple[Path, dict]
     assert 'data-plot="matches"' in page
     assert page.count('aria-label="Scene at m') == page.count('aria-label="Reference at m') >= 24
     worst = max(math.hypot(*one["residual"]) for one in numbers["adjustment"]["points"])
-    assert f"<b>{worst:.2f} px</b>" in page
+    assert f"<b>{px(worst)}</b>" in page
 
 
 def test_the_page_of_matches_is_a_page(case: Case, tmp_path: Path) -> None:
@@ -375,7 +376,7 @@ def test_a_model_that_is_off_by_more_than_the_search_is_refused(tmp_path: Path, 
 
 def test_options_of_matching_without_a_reference_are_refused(case: Case, written: Path) -> None:
     words = (case.scene_file, *heights(case), "-o", written, "--json")
-    for flag, value in (("--search", 5), ("--match-points", 9), ("--dem-sigma", 1), ("--gcps-as", "control")):
+    for flag, value in (("--search", 5), ("--match-points", 9), ("--reference-sigma", 1), ("--gcps-as", "control")):
         assert refused(ortho("rectify", *words, flag, value), written)["field"] == flag
 
 
