@@ -37,6 +37,7 @@ from ortho_pipeline.surface.base import Surface
 
 if TYPE_CHECKING:
     from ortho_pipeline.warp import engine as warp
+    from ortho_pipeline.warp.layers.hiding import Hiding
 
 
 # -- commands --------------------------------------------------------------------------------------------------------
@@ -98,7 +99,8 @@ def rectify(
         exported, complaints = _as_rpc(model)
         source = source_of(opened, image, scene, output)
         budget, notes = layers.budget_of(placed, match, output)
-        warped = _warp(model, exported, source, heights, grid, files["ortho"], output, progress)
+        path = layers.ortho_of(placed, files, output)
+        warped = _warp(model, exported, source, heights, grid, path, output, progress)
         accuracy = layers.write_layers(placed, budget, warped, files, output)
         asked = {"scene": scene, "surface": surface, "output": output, **match_asked(match)}
         record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
@@ -244,7 +246,7 @@ def _warp(
     source: raster.RasterSource,
     surface: Surface,
     grid: raster.Grid,
-    path: Path,
+    path: Path | Hiding,
     output: OutputOptions,
     progress: Callable[[float], None] | None,
 ) -> warp.WarpResult:
@@ -260,6 +262,11 @@ def _warp(
     }
     if output.engine == "ortho":
         return warp.rectify(model, source, surface, grid, path, tolerance=output.tolerance, **common)
+    if not isinstance(path, Path):
+        raise InputError(
+            "GDAL's warper does not look for what terrain hides", field="output.visibility",
+            remedy="leave out `output.visibility` or `output.engine=gdal`",
+        )  # fmt: skip
     if output.engine != "gdal":
         raise InputError(f"no engine is called {output.engine!r}", field="output.engine", remedy="ortho or gdal")
     return warp.rectify_gdal(model, exported, source, surface, grid, path, **common)

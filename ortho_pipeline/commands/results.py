@@ -41,11 +41,16 @@ ENDINGS = {
     "stac": "_stac.json",
     "thumbnail": "_thumbnail.png",
     "overview": "_overview.png",
+    "visibility": "_visibility.tif",
     "accuracy": "_accuracy.tif",
     "accuracy_style": "_accuracy.qml",
 }
 #: Outputs that are only made where an option asks for them: field of `OutputOptions` -> what it asks for.
-_ASKED = {"stac": ("stac", "thumbnail", "overview"), "accuracy_raster": ("accuracy", "accuracy_style")}
+_ASKED = {
+    "stac": ("stac", "thumbnail", "overview"),
+    "accuracy_raster": ("accuracy", "accuracy_style"),
+    "visibility": ("visibility",),
+}
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -129,6 +134,7 @@ class CompareResult:
 def outputs(folder: str | os.PathLike[str], stem: str, asked: OutputOptions) -> dict[str, Path]:
     """Return the paths of the outputs of a scene by what they are, of those that are made if all goes well."""
     idle = {kind for field, kinds in _ASKED.items() if not getattr(asked, field) for kind in kinds}
+    idle |= {"visibility"} if asked.visibility == "nodata" else set()
     return {kind: Path(folder) / f"{stem}{ending}" for kind, ending in ENDINGS.items() if kind not in idle}
 
 

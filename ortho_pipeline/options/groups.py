@@ -348,6 +348,13 @@ class OutputOptions:
             "good the heights are.",
         ),
     ] = False  # fmt: skip
+    visibility: Annotated[
+        str | None,
+        Option(
+            "--visibility", "Look for ground that other terrain hides: write a mask of it, or leave its pixels empty "
+            "(with a surface model a true ortho).", choices=("mask", "nodata"),
+        ),
+    ] = None  # fmt: skip
     layer_step: Annotated[
         int,
         Option(

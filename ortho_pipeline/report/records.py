@@ -328,7 +328,10 @@ class OrthoRecord:
 
 @record
 class WarpRecord:
-    """The exactness of the warp, in pixels of the image; the transformer is GDAL's where its warper made the ortho."""
+    """The exactness of the warp, in pixels of the image; the transformer is GDAL's where its warper made the ortho.
+
+    `hidden_share` is that of the pixels that the image reaches which terrain hides, null where nobody looked.
+    """
 
     max_error_px: float
     tolerance_px: float
@@ -338,6 +341,7 @@ class WarpRecord:
     pixels: Count
     valid_pixels: Count
     transformer: str | None = None
+    hidden_share: float | None = None
 
 
 @record

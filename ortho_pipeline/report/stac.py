@@ -47,6 +47,7 @@ _ASSETS = (
     ("report", "Accuracy report", "application/json", ["metadata"]),
     ("html", "Accuracy report as a page", "text/html", ["metadata"]),
     ("model", "Adjusted sensor model", "application/json", ["metadata"]),
+    ("visibility", "Visible (1), hidden (2), outside (3) and void (4) pixels", _COG, ["metadata"]),
     ("accuracy", "Accuracy of each place", _COG, ["data", "metadata"]),
     ("residuals", "Residuals of the points", "application/geo+json", ["metadata"]),
 )

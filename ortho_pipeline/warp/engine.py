@@ -6,6 +6,7 @@ several threads, each with GDAL handles of its own.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import threading
@@ -32,6 +33,7 @@ from ortho_pipeline.warp import kernels
 from ortho_pipeline.warp.block_kernel import DemWindow, Target, warp_block
 from ortho_pipeline.warp.gdal_engine import warp_with_gdal
 from ortho_pipeline.warp.lattice import BLOCK, Lattices, OutputBlock, Terrain, block_cells
+from ortho_pipeline.warp.layers.hiding import Hiding, Looked
 
 #: Side of a tile, the piece of work of a thread.
 TILE = 4 * BLOCK
@@ -55,7 +57,8 @@ class WarpResult:
     `max_error_px` is a bound on the difference (source pixels) between the geometry used and the exact model at every
     output pixel; `finest_spacing` the smallest lattice spacing that a block needed, 1 where every pixel was projected;
     `valid_pixels` how many output pixels have a value. `transformer` names the one of GDAL's that stood for the model,
-    where GDAL's warper made the pixels: then the error is what was measured through it.
+    where GDAL's warper made the pixels: then the error is what was measured through it. `hidden_share` is that of the
+    pixels that the image reaches which terrain hides, where that was looked for.
     """
 
     max_error_px: float
@@ -67,6 +70,7 @@ class WarpResult:
     valid_pixels: int
     seconds: float
     transformer: str | None = None
+    hidden_share: float | None = None
 
     def notes(self, memory: int) -> list[Notice]:
         """Return a notice if GDAL's geolocation arrays took more memory (bytes) than was allowed, which they may."""
@@ -85,7 +89,7 @@ def rectify(
     source: RasterSource,
     surface: Surface,
     grid: Grid,
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Hiding,
     *,
     resampling: str = "bilinear",
     dem_interpolation: str = "bilinear",
@@ -101,6 +105,8 @@ def rectify(
     ----------
     surface : Surface
         The seam of a global DEM beside the grid (`Surface.around`).
+    path : path or Hiding
+        Where the ortho is written, or that and what is done about pixels that terrain hides.
     profile : Profile, optional
         What the ortho looks like; like its source without.
     tolerance : float
@@ -123,10 +129,18 @@ def rectify(
         model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, memory // (4 * threads),
         profile,
     )  # fmt: skip
-    with RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads) as writer:
+    if isinstance(path, Hiding):
+        job.looked, path = path.begun(model, surface, grid, memory // (4 * threads)), path.ortho
+    with contextlib.ExitStack() as stack:
+        writer = stack.enter_context(
+            RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads)
+        )
+        mask = None if job.looked is None else stack.enter_context(job.looked.writer(threads))
         tiles = list(_tiles(grid, TILE))
-        for done, tile in enumerate(_in_order(threads, job.make, tiles), start=1):
-            writer.write(*tile)
+        for done, (left, top, pixels, valid, classes) in enumerate(_in_order(threads, job.make, tiles), start=1):
+            writer.write(left, top, pixels, valid)
+            if mask is not None:
+                mask.write(left, top, classes[None], None)
             if resources.progress:
                 resources.progress(done / len(tiles))
         refuse_empty(job.valid_pixels, path)
@@ -139,6 +153,7 @@ def rectify(
         pixels=grid.width * grid.height,
         valid_pixels=job.valid_pixels,
         seconds=time.monotonic() - begin,
+        hidden_share=None if job.looked is None else job.looked.hidden_share,
     )
 
 
@@ -281,11 +296,12 @@ class _Job:
         self.any_band = profile.validity == "nodata" or profile.dtype.kind == "f"
         self._lock = threading.Lock()
         self.valid_pixels = 0
+        self.looked: Looked | None = None
 
     # -- a tile ------------------------------------------------------------------------------------------------------
 
-    def make(self, part: tuple[int, int, int, int]) -> tuple[int, int, NDArray[Any], NDArray[np.bool_]]:
-        """Compute one tile (top, left, height, width), as `RasterWriter.write` takes it."""
+    def make(self, part: tuple[int, int, int, int]) -> tuple[int, int, NDArray[Any], NDArray[np.bool_], Any]:
+        """Compute one tile (top, left, height, width): left, top, pixels, which are valid, their classes."""
         top, left, height, width = part
         pixels = np.full((self.source.count, height, width), self.resampling.fill, dtype=self.source.dtype)
         tile = _Tile(top, left, pixels, np.zeros(pixels.shape, dtype=bool))
@@ -298,6 +314,9 @@ class _Job:
         seen = self.lattices.build(blocks, terrain)
         for group, dem, area in terrain.groups(seen):
             self._warp(group, dem, area, tile)
+        classes = (
+            None if self.looked is None else self.looked.look(left, top, tile.pixels, tile.valid, self.resampling.fill)
+        )
         low, _, _, fill = _range(self.profile.dtype, self.profile)
         out = as_written(tile.pixels, tile.valid, self.profile.dtype, fill)
         if self.profile.validity == "nodata":
@@ -306,7 +325,7 @@ class _Job:
         mask = np.asarray((np.any if self.any_band else np.all)(tile.valid, axis=0))
         with self._lock:
             self.valid_pixels += int(np.count_nonzero(mask))
-        return left, top, out, mask
+        return left, top, out, mask, classes
 
     # -- pixels ------------------------------------------------------------------------------------------------------
 

@@ -28,6 +28,7 @@ from ortho_pipeline.surface.dem import DemSurface
 if TYPE_CHECKING:
     from ortho_pipeline.warp.engine import WarpResult
     from ortho_pipeline.warp.layers.accuracy import AccuracyResult, Budget
+    from ortho_pipeline.warp.layers.hiding import Hiding
 
 #: Standard deviation (m) of geoids by the name of the height datum: commission errors over land; of any other, national
 #: ones and grids of one's own. Source: Lemoine et al. 1998 (EGM96), Pavlis et al. 2012 (EGM2008).
@@ -151,6 +152,15 @@ def _assumptions(budget: Budget, surface: Surface) -> list[str]:
     if isinstance(surface.sigma, float | int):
         said.append(f"the heights are as good as {metres(surface.sigma)} everywhere")
     return said
+
+
+def ortho_of(placed: Placement, files: Mapping[str, Path], output: OutputOptions) -> Path | Hiding:
+    """Return where the ortho is written, and what is done about pixels that terrain hides where somebody asks."""
+    if output.visibility is None:
+        return files["ortho"]
+    from ortho_pipeline.warp.layers.hiding import Hiding
+
+    return Hiding(files["ortho"], placed.footprint.heights, files.get("visibility"))
 
 
 def write_layers(

@@ -1,0 +1,96 @@
+"""What is done about hidden pixels while an ortho is made: a mask of them beside it, or no value in it."""
+
+from __future__ import annotations
+
+import os
+import threading
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.raster.ortho import Profile, RasterWriter
+from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.warp.layers.sight import Sight
+from ortho_pipeline.warp.layers.visibility import Visibility
+from ortho_pipeline.warp.layers.visibility_kernel import HIDDEN, VOID
+
+#: Classes of the mask, by their values; 0 stands for nothing.
+NAMES = ("", "visible", "hidden", "outside of the image", "without a height")
+VISIBLE, BEHIND, OUTSIDE, WITHOUT = 1, 2, 3, 4
+
+
+@dataclass(frozen=True)
+class Hiding:
+    """Where an ortho is written, and what is done about pixels that terrain hides.
+
+    Parameters
+    ----------
+    ortho : path
+    heights : (float, float)
+        Lowest and highest ground of the scene, about.
+    mask : path, optional
+        Where the classes of all pixels are written; without it hidden pixels have no value in the ortho.
+    """
+
+    ortho: str | os.PathLike[str]
+    heights: tuple[float, float]
+    mask: str | os.PathLike[str] | None = None
+
+    def begun(self, model: SensorModel, surface: Surface, grid: Grid, window_bytes: int) -> Looked:
+        """Return the work on an ortho, which may hold so many bytes of heights at once."""
+        return Looked(self, grid, Visibility(Sight(model, grid), surface, self.heights, window_bytes))
+
+
+@dataclass
+class Looked:
+    """The work on one ortho, shared by its threads."""
+
+    hiding: Hiding
+    grid: Grid
+    visibility: Visibility
+    _hidden: int = 0
+    _shown: int = 0
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @property
+    def hidden_share(self) -> float:
+        """Share of the pixels that the image reaches which terrain hides."""
+        return self._hidden / max(self._shown, 1)
+
+    def look(self, left: int, top: int, pixels: NDArray[Any], valid: NDArray[np.bool_], fill: Any) -> NDArray[np.uint8]:
+        """Return the classes of a tile ``(h, w)``; without a mask, hidden pixels get the value `fill`, which is none.
+
+        Parameters
+        ----------
+        pixels, valid : (bands, h, w)
+            Of the tile, before they are written.
+        """
+        height, width = pixels.shape[1:]
+        found, shown = self.visibility.look(left, top, width, height), valid.any(axis=0)
+        hidden = (found == HIDDEN) & shown
+        with self._lock:
+            self._hidden += int(np.count_nonzero(hidden))
+            self._shown += int(np.count_nonzero(shown))
+        classes = np.where(shown, VISIBLE, OUTSIDE).astype(np.uint8)
+        classes[hidden] = BEHIND
+        classes[(found == VOID) & ~shown] = WITHOUT
+        if self.hiding.mask is None:
+            pixels[:, hidden], valid[:, hidden] = fill, False
+        return classes
+
+    def writer(self, threads: int) -> Any:
+        """Return the writer of the mask as a context; of nothing where none is wanted."""
+        import contextlib
+
+        if self.hiding.mask is None:
+            return contextlib.nullcontext()
+        profile = Profile(
+            count=1, dtype=np.dtype(np.uint8), validity="nodata", nodata=0.0, descriptions=("visibility",),
+            interpretations=(0,), metadata={f"CLASS_{value}": name for value, name in enumerate(NAMES) if name},
+        )  # fmt: skip
+        options = {"LEVEL": "1", "OVERVIEW_RESAMPLING": "MODE"}
+        return RasterWriter(self.hiding.mask, self.grid, profile, creation_options=options, threads=threads)

@@ -1,0 +1,162 @@
+"""What terrain hides: against the geometry of boxes and cliffs, against brute force, and for any tiling."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pyproj
+import pytest
+from blocks import FLOOR, NORTH, WEST, ZONE, City, Parallel, f1, towards
+from osgeo import gdal
+from scipy.ndimage import gaussian_filter
+
+from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.rays import meet_surface
+from ortho_pipeline.surface.writing import write_dem
+from ortho_pipeline.warp.layers.sight import Sight
+from ortho_pipeline.warp.layers.visibility import Visibility
+from ortho_pipeline.warp.layers.visibility_kernel import CLEAR, HIDDEN, VOID
+
+#: Streets, a tower, a low house beside it, a long block, and a cliff: half of the square lies 35 m higher.
+TOWN = City(((60, 40, 90, 80, 30.0), (120, 100, 128, 110, 60.0), (130, 96, 142, 112, 8.0), (30, 150, 150, 162, 18.0)))
+CLIFF = City(((128, -100, 400, 400, 35.0),))
+
+
+def looked(city: City, path, off_nadir: float, azimuth: float, memory: int = 2**30, step: float = 1.0) -> np.ndarray:
+    east, north = towards(off_nadir, azimuth)
+    grid = city.grid()
+    model = Parallel(east, north, 0.5, city.side)
+    view = Visibility(Sight(model, grid), city.surface(path, step), (FLOOR, FLOOR + 60), memory)
+    return view.look(0, 0, grid.width, grid.height)
+
+
+@pytest.mark.parametrize("city", [TOWN, CLIFF], ids=["town", "cliff"])
+@pytest.mark.parametrize(("off_nadir", "azimuth"), [(0, 0), (10, 75), (25, 253), (45, 128)])
+def test_what_boxes_hide_is_plain_geometry(city, off_nadir, azimuth, tmp_path):
+    found = looked(city, tmp_path / "dsm.tif", off_nadir, azimuth)
+    east, north = towards(off_nadir, azimuth)
+    x, y = city.places(city.grid())
+    wanted = city.hidden(x, y, east, north)
+    assert not (found == VOID).any()
+    # The walls of the DSM lean over one sample: only so near to an edge may it differ (steps of 0.25 m are tried).
+    some = np.flatnonzero(((found == HIDDEN) != wanted).ravel())
+    assert (city.edges(x.ravel()[some], y.ravel()[some], east, north) <= 1.25).all()
+    if off_nadir == 0:
+        assert not (found == HIDDEN).any()
+
+
+@pytest.mark.parametrize(("off_nadir", "azimuth"), [(10, 75), (25, 253), (45, 340)])
+def test_the_finer_the_samples_the_fewer_the_errors(off_nadir, azimuth, tmp_path):
+    found = looked(TOWN, tmp_path / "dsm.tif", off_nadir, azimuth, step=0.25)
+    wanted = TOWN.hidden(*TOWN.places(TOWN.grid()), *towards(off_nadir, azimuth))
+    assert f1(found == HIDDEN, wanted) >= 0.99
+
+
+def rough(path, slope: float, seed: int = 2) -> Surface:
+    """Write terrain of waves whose steepest slope is a tangent."""
+    x, y = np.meshgrid(np.arange(0, 700.0, 5), np.arange(0, 700.0, 5))
+    random, heights = np.random.default_rng(seed), np.zeros(x.shape)
+    for _ in range(24):
+        length, angle, phase = random.uniform(20, 200), random.uniform(0, np.pi), random.uniform(0, 6)
+        heights += length * np.sin(2 * np.pi * (x * np.cos(angle) + y * np.sin(angle)) / length + phase)
+    steepest = max(np.abs(np.diff(heights, axis=0)).max(), np.abs(np.diff(heights, axis=1)).max()) * np.sqrt(2) / 5
+    write_dem(path, FLOOR + heights * slope / steepest, (WEST - 200.37, NORTH + 200.29), 5.0, f"EPSG:{ZONE}")
+    return Surface.open(path, "ellipsoid")
+
+
+def along(surface: Surface, x: np.ndarray, y: np.ndarray, east: float, north: float) -> np.ndarray:
+    """Return how far (m) the terrain rises at most above lines of sight, looked at every 0.05 m upwards."""
+    base = surface.heights(np.stack([x, y], axis=1))
+    rises = np.arange(0.05, surface.height_range[1] - base.min(), 0.05)
+    most = np.full(len(x), -np.inf)
+    for rise in rises:
+        there = surface.heights(np.stack([x + east * rise, y + north * rise], axis=1))
+        most = np.fmax(most, there - base - rise)
+    return most
+
+
+@pytest.mark.parametrize("azimuth", [0, 61, 200])
+def test_rough_terrain_hides_what_a_dense_walk_finds(azimuth, tmp_path):
+    surface = rough(tmp_path / "dem.tif", 5.0)
+    east, north = towards(50, azimuth)
+    grid = City(()).grid(1.0)
+    found = Visibility(Sight(Parallel(east, north, 1.0, 256.0), grid), surface, (40.0, 160.0), 2**30).look(
+        0, 0, 256, 256
+    )
+    rows, columns = np.random.default_rng(1).integers(0, 256, (2, 1500))
+    x, y = grid.xy(columns + 0.5, rows + 0.5)
+    above = along(surface, x, y, east, north)
+    clear = np.abs(above) > 0.02  # the walk steps over what rises by less
+    assert 0.05 < (above > 0.02).mean() < 0.9
+    np.testing.assert_array_equal((found[rows, columns] == HIDDEN)[clear], (above > 0)[clear])
+
+
+def test_nothing_is_hidden_where_no_slope_is_as_steep_as_the_rays(tmp_path):
+    for off_nadir in (10, 30, 45):
+        surface = rough(tmp_path / "dem.tif", 0.999 / np.tan(np.radians(off_nadir)))
+        for azimuth in (0, 45, 130):
+            model = Parallel(*towards(off_nadir, azimuth), 1.0, 256.0)
+            view = Visibility(Sight(model, City(()).grid(1.0)), surface, (0.0, 200.0), 2**30)
+            assert not view.look(0, 0, 256, 256).any()
+
+
+def test_any_window_and_any_memory_give_the_same(tmp_path):
+    surface = rough(tmp_path / "dem.tif", 6.0)
+    grid = City((), side=512.0).grid(1.0)
+    sight = Sight(Parallel(*towards(40, 100), 1.0, 512.0), grid)
+    whole = Visibility(sight, surface, (40.0, 160.0), 2**30).look(0, 0, 512, 512)
+    assert 0.05 < (whole == HIDDEN).mean() < 0.6
+    np.testing.assert_array_equal(Visibility(sight, surface, (40.0, 160.0), 3000).look(0, 0, 512, 512), whole)
+    parts = Visibility(sight, surface, (40.0, 160.0), 2**30)
+    for top in (0, 256):
+        for left in (0, 256):
+            np.testing.assert_array_equal(parts.look(left, top, 256, 256), whole[top : top + 256, left : left + 256])
+
+
+def test_a_void_is_told_and_hides_nothing(tmp_path):
+    path = tmp_path / "dem.tif"
+    rough(path, 5.0)
+    dataset = gdal.Open(str(path), gdal.GA_Update)
+    heights = dataset.ReadAsArray()
+    heights[60:80, 60:80] = -32768.0
+    dataset.WriteArray(heights)
+    dataset = None
+    surface, grid = Surface.open(path, "ellipsoid", fill="mask"), City(()).grid(1.0)
+    sight = Sight(Parallel(*towards(40, 100), 1.0, 256.0), grid)
+    found = Visibility(sight, surface, (40.0, 160.0), 2**30).look(0, 0, 256, 256)
+    columns, rows = np.meshgrid(np.arange(256) + 0.5, np.arange(256) + 0.5)
+    own = surface.heights(np.stack([part.ravel() for part in grid.xy(columns, rows)], axis=1)).reshape(256, 256)
+    np.testing.assert_array_equal(found == VOID, np.isnan(own))
+    assert (found == HIDDEN).any()
+
+
+def test_a_ray_from_the_image_ends_where_the_pixel_is_visible(tiny, tmp_path):
+    """An RPC in longitude and latitude over steep terrain: a pixel is seen if the ray of its image point meets it."""
+    rpc = tiny.model
+    lean = dataclasses.replace(
+        rpc, col_num=rpc.col_num + 0.9 * np.eye(20)[3], row_num=rpc.row_num - 0.5 * np.eye(20)[3]
+    )
+    utm = pyproj.CRS.from_epsg(32634)
+    x, y = pyproj.Transformer.from_crs(4326, utm, always_xy=True).transform(rpc.lon_off, rpc.lat_off)
+    random = np.random.default_rng(5)
+    heights = 500 + 60 * gaussian_filter(random.normal(0, 6, (120, 120)), 1.5)
+    write_dem(tmp_path / "dem.tif", heights, (x - 1200, y + 1200), 20.0, "EPSG:32634")
+    surface, grid = Surface.open(tmp_path / "dem.tif", "ellipsoid"), Grid(utm, x - 512, y + 512, 4.0, 4.0, 256, 256)
+    sight = Sight(lean, grid)
+    found = Visibility(sight, surface, (300.0, 700.0), 2**30).look(0, 0, 256, 256)
+    rows, columns = random.integers(0, 256, (2, 400))
+    xy = np.stack(grid.xy(columns + 0.5, rows + 0.5), axis=1)
+    own = surface.heights(xy)
+    image, above = sight.image(columns + 0.5, rows + 0.5, own), np.full(400, -np.inf)
+    for rise in np.arange(0.1, surface.height_range[1] - own.min(), 0.1):
+        there = lean.image_to_ground(image, own + rise)
+        above = np.fmax(above, surface.heights(there, "EPSG:4979") - own - rise)
+    clear = np.abs(above) > 0.1
+    assert 0.1 < (above > 0.1).mean() < 0.9
+    np.testing.assert_array_equal((found[rows, columns] == HIDDEN)[clear], (above > 0)[clear])
+    met = meet_surface(lean, image, surface)
+    seen = (found[rows, columns] == CLEAR) & clear
+    # That march steps over a crest that is narrower than a sample, and meets what lies behind it.
+    assert (np.abs(met[seen, 2] - own[seen]) < 0.1).mean() > 0.95
