@@ -6,11 +6,15 @@ k(d_{ij} / c)`. With whitened design :math:`A` and cofactors :math:`Q`, the cova
 fit is then :math:`Q A^T \Sigma A Q` (sandwich), not :math:`\sigma_0^2 Q`.
 
 Residuals hide the part that the model absorbs. So the function is estimated by restricted likelihood, which looks only
-at what no value of the parameters can explain. How smooth errors are decides how much of them is long, and few
-residuals tell it: correlations :math:`k` from rough to smooth are tried (exponential, Matern of order 3/2, Gaussian),
-each with ranges from the distance of neighbours to the extent of the points, and with :math:`\sigma_s^2` from
-:math:`\sigma_n^2 / n`, which adds no more to a mean than noise does, to :math:`10^4 \sigma_n^2`. Beforehand families
-count alike, and ranges and ratios by their logarithms, because not even their order of magnitude is known.
+at what no value of the parameters can explain, in the means over cells of a twelfth of the extent: the parameters feel
+what is shared over long distances, and the many pairs of close neighbours, whose errors are rougher or smoother than
+any family (chips that overlap, a DEM between its samples), would outvote it. How smooth errors are decides how much of
+them is long, and few residuals tell it: correlations :math:`k` from rough to smooth are tried (exponential, Matern of
+order 3/2, Gaussian), each with ranges from the distance of neighbours to the extent of the points, and with
+:math:`\sigma_s^2` from :math:`\sigma_n^2 / n`, which adds no more to a mean than noise, to :math:`10^4 \sigma_n^2`.
+Beforehand families count alike, and ranges and ratios by their logarithms, because not even their order of magnitude is
+known; but residuals show a part of the variance :math:`\sigma_n^2 + \sigma_s^2`, and each part from none to all is as
+likely as any other: else smooth functions of enormous variance, of which a fit leaves hardly anything, dominate.
 No single function is taken: :math:`\Sigma` is the mean over all of them, weighted by their likelihood. So the variance
 is right in the mean over scenes of all these kinds; it is not right for each kind alone (docs/accuracy.md). A constant
 part cannot be told from the shift: it is not seen at all.
@@ -45,7 +49,9 @@ _FAMILIES: tuple[Callable[[Array], Array], ...] = (
     lambda x: np.exp(-(x**2)),
 )
 #: Ranges and ratios of variances, shared over noise, that are tried; with the largest, noise is 1 % of what is shared.
-_RANGES, _RATIOS, _LARGEST = 8, 14, 1e4
+_RANGES, _RATIOS, _LARGEST = 16, 20, 1e4
+#: Cells whose means are looked at.
+_CELLS = 144
 
 
 @dataclass(frozen=True)
@@ -124,8 +130,9 @@ class _Scene:
     distance: Array  # (n, n) px
     ranges: Array  # px
     span: Array  # (n, p): an orthonormal basis of the design
-    axes: Array  # (2, 2): rows are the axes
-    left: Array  # (n, 2) residuals along the axes, without what the design explains
+    means: Array  # (m, n): means over cells, times the root of their points, so that noise stays what it is
+    explained: Array  # (m, q): an orthonormal basis of the design in these means
+    left: Array  # (m, 2) residuals along two axes in these means, without what the design explains
     design: Array  # (p, 2, K): the whole design along the axes, in the basis
     weight: float  # points over those that were drawn
 
@@ -140,9 +147,7 @@ class _Scene:
         image, residuals, design = image[order], residuals[order], design[order]
         extent = float(np.ptp(image, axis=0).max())
         columns = np.concatenate([design[:, 0], design[:, 1]], axis=1)
-        scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-        span, singular, _ = np.linalg.svd(columns / scale, full_matrices=False)
-        span = span[:, singular > 1e-9 * singular[0]]
+        span = _basis(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))
         n, p = span.shape
         if n < FEWEST_POINTS or n - p < FEWEST_POINTS / 2 or not extent > 0:
             return None
@@ -150,33 +155,39 @@ class _Scene:
         # Points that lie in heaps, or upon each other, tell of no range within a heap.
         least = np.clip(np.median(np.partition(distance, 1, axis=1)[:, 1]), _HEAP * extent, extent / 2)
         ranges = np.geomspace(least, extent, _RANGES)
-        left = residuals - span @ (span.T @ residuals)
+        means = _cell_means(image)
+        explained = _basis(means @ span)
+        if len(means) - explained.shape[1] < FEWEST_POINTS / 2:
+            means, explained = np.eye(n), span
+        left = means @ residuals
+        left = left - explained @ (explained.T @ left)
         # The axes differ most in what is shared over the middle one of the ranges.
-        near = _FAMILIES[1](distance / ranges[_RANGES // 2])
+        near = means @ _FAMILIES[1](distance / ranges[_RANGES // 2]) @ means.T
         axes = np.linalg.eigh(left.T @ near @ left)[1].T[::-1]
-        turned = np.einsum("ij,njk->nik", axes, design)
-        inside = np.einsum("np,nik->pik", span, turned)
-        return cls(distance, ranges, span, axes, left @ axes.T, inside, given / n)
+        inside = np.einsum("np,nik->pik", span, np.einsum("ij,njk->nik", axes, design))
+        return cls(distance, ranges, span, means, explained, left @ axes.T, inside, given / n)
 
     def middle(self, variance: float) -> tuple[Array, Any]:
         """Return the excess of A^T Sigma A ``(K, K)`` over independent errors of `variance`, and what is likely."""
-        n, p = self.span.shape
-        ratios = np.geomspace(1.0 / n, _LARGEST, _RATIOS)
+        freedom = self.explained.shape[0] - self.explained.shape[1]
+        ratios = np.geomspace(1.0 / len(self.span), _LARGEST, _RATIOS)
         logs, scales, inner = [], [], []
         for family in _FAMILIES:
             for distance in self.ranges:
                 kernel = family(self.distance / distance)
-                half = kernel @ self.span
-                inside = self.span.T @ half
-                # With the design taken out on both sides: p of the values are zero, and say nothing below.
-                cross = (half - self.span @ (inside / 2)) @ self.span.T
-                values, vectors = np.linalg.eigh(kernel - cross - cross.T)
+                inner.append(self.span.T @ kernel @ self.span)
+                seen = self.means @ kernel @ self.means.T
+                half = seen @ self.explained
+                # With the design taken out on both sides: values of its directions are zero, and say nothing below.
+                cross = (half - self.explained @ (self.explained.T @ half / 2)) @ self.explained.T
+                values, vectors = np.linalg.eigh(seen - cross - cross.T)
                 each = 1.0 + ratios[:, None] * np.maximum(values, 0.0)
                 squares = ((vectors.T @ self.left) ** 2).T @ (1.0 / each).T  # (axes, ratios)
-                logs.append(-0.5 * (np.log(each).sum(axis=1) + (n - p) * np.log(squares)))
-                scales.append(squares / (n - p - 2))
-                inner.append(inside)
+                logs.append(-0.5 * (np.log(each).sum(axis=1) + freedom * np.log(squares)))
+                scales.append(squares / (freedom - 2))
         log, scale = np.array(logs), np.array(scales)  # (kernels, axes, ratios)
+        # A uniform part that residuals show of the whole has a logarithm whose density is that part.
+        log = log - np.log(np.maximum(scale * (1.0 + ratios) / variance, 1.0))
         chance = np.exp(log - log.max(axis=(0, 2), keepdims=True))
         chance /= chance.sum(axis=(0, 2), keepdims=True)
         noise = (chance * scale).sum(axis=(0, 2))
@@ -185,7 +196,7 @@ class _Scene:
         excess = np.zeros((size, size))
         for axis in range(2):
             rows = self.design[:, axis]
-            between = np.einsum("k,kij->ij", shared[:, axis], np.array(inner) - np.eye(p))
+            between = np.einsum("k,kij->ij", shared[:, axis], np.array(inner) - np.eye(len(rows)))
             own = noise[axis] + shared[:, axis].sum() - variance
             excess += self.weight * own * rows.T @ rows + self.weight**2 * rows.T @ between @ rows
         share = shared / np.maximum(shared.sum(axis=0), 1e-300)
@@ -193,3 +204,21 @@ class _Scene:
         return excess, tuple(
             (float(pair[0]), float(pair[1])) for pair in (np.sqrt(noise), np.sqrt(shared.sum(axis=0)), mean)
         )
+
+
+def _basis(columns: Array) -> Array:
+    """Return an orthonormal basis of columns ``(n, K)``."""
+    span, singular, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(span[:, singular > 1e-9 * singular[0]])
+
+
+def _cell_means(image: Array) -> Array:
+    """Return the matrix ``(m, n)``, with orthonormal rows, of means over square cells of points ``(n, 2)``."""
+    extent = np.ptp(image, axis=0)
+    side = max(float(np.sqrt(extent.prod() / _CELLS)), float(extent.max()) / _CELLS)
+    counts = np.maximum(1, np.round(extent / side))
+    place = np.minimum(np.floor((image - image.min(axis=0)) / np.maximum(extent, 1e-300) * counts), counts - 1)
+    _, cell = np.unique(place, axis=0, return_inverse=True)
+    means = np.zeros((int(cell.max()) + 1, len(image)))
+    means[cell.ravel(), np.arange(len(image))] = 1.0
+    return np.asarray(means / np.sqrt(means.sum(axis=1, keepdims=True)))
