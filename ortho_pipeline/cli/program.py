@@ -355,7 +355,7 @@ def rectify(
     "formats",
     multiple=True,
     metavar="F[,F...]",
-    help="rpc-txt, rpb, tag, vrt, gcp, gcp-tag, geolocation; may be repeated  [default: the four kinds of RPC]",
+    help="rpc-txt, rpb, tag, vrt, gcp, gcp-tag, geolocation, csm; may be repeated  [default: the four kinds of RPC]",
 )
 @click.option("--force", is_flag=True, help="Accept an RPC that is more than 0.1 px from the model.")
 @point_options

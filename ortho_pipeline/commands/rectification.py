@@ -168,7 +168,7 @@ def export(
     Parameters
     ----------
     formats : sequence of str
-        Some of `exchange.export.FORMATS`: rpc-txt, rpb, vrt, tag, gcp, gcp-tag, geolocation.
+        Some of `exchange.export.FORMATS`: rpc-txt, rpb, vrt, tag, gcp, gcp-tag, geolocation, csm.
     force : bool
         Accept an RPC that stands for the model only to more than 0.1 px.
 

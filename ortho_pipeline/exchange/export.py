@@ -11,6 +11,7 @@ from osgeo import gdal
 
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.csm import write_csm
 from ortho_pipeline.exchange.gcp import Gcps, gcps_of_model, gcps_of_points, write_gcps, write_geolocation
 from ortho_pipeline.exchange.rpc import (
     RpcExport,
@@ -33,6 +34,7 @@ ENDINGS = {
     "gcp": "_gcp.vrt",
     "gcp-tag": "_gcp.tif",
     "geolocation": "_geolocation.vrt",
+    "csm": "_csm.json",
 }
 FORMATS = tuple(ENDINGS)
 
@@ -107,6 +109,7 @@ class Export:
             "gcp": lambda: write_gcps(self.dataset, self._gcps(), path),
             "gcp-tag": lambda: write_gcps(self.dataset, self._gcps(), path),
             "geolocation": lambda: self._geolocation(path),
+            "csm": lambda: self._csm(path),
         }
         writers[name]()
 
@@ -124,6 +127,9 @@ class Export:
         worst = write_geolocation(self.dataset, self.model, self.size, self.surface, path)
         self.document["geolocation"] = {"max_error_px": worst, "heights": f"the model{self._where()}"}
 
+    def _csm(self, path: Path) -> None:
+        self.document["csm"] = {"max_error_px": write_csm(self.model, path, force=self.force)}
+
     def _where(self) -> str:
         surface = self.surface or Surface.constant(self.model.reference_height)
         return f" {surface.describe()}"
@@ -137,6 +143,8 @@ class Export:
         if "gcps" in self.document:
             lines.append("Control points: {n}, {source}".format(**self.document["gcps"]))
             lines += ["Left out: {id} ({reason})".format(**one) for one in self.document["gcps"]["left_out"]]
+        if "csm" in self.document:
+            lines.append("CSM state: at most {max_error_px:.2g} px off".format(**self.document["csm"]))
         if "geolocation" in self.document:
             found = self.document["geolocation"]
             lines.append(f"Geolocation: {found['heights']}, {found['max_error_px']:.2g} px off between its samples")

@@ -13,7 +13,7 @@ from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Piece
 
-_ISD = re.compile(rb"<(\w{1,20}:)?isd[\s>]")
+_ISD = re.compile(rb"<(\w{1,20}:)?isd[\s>].*?<(\w{1,20}:)?IMD>", re.DOTALL)
 #: ``21FEB01005130-P1BS_R1C1-016263048010_01_P001``: time, kind of product, tile, order, part of a strip or of an order.
 _PART = re.compile(
     r".*-(?P<kind>[A-Z][0-9A-Z]{3})(_R\d+C\d+)?-(?P<order>\w+)_P(?P<part>\d{3})", re.IGNORECASE | re.ASCII

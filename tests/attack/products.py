@@ -177,3 +177,40 @@ def til_text(tiles: tuple[tuple[str, int, int, int, int], ...]) -> str:
         for k, (name, left, top, width, height) in enumerate(tiles, 1)
     )
     return f'bandId = "P";\nnumTiles = {len(tiles)};\ntileUnits = "Pixels";\ntileOverlap = 0;\n{groups}END;\n'
+
+
+def tsai_text() -> str:
+    """Return a pinhole camera of Ames Stereo Pipeline, 4 km above 30 east, 40 north, that looks down."""
+    lon, lat = math.radians(30.0), math.radians(40.0)
+    up = np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
+    east = np.array([-math.sin(lon), math.cos(lon), 0.0])
+    turn = np.column_stack([east, -np.cross(up, east), -up])
+    centre = 6.3735e6 * up
+    return (
+        "VERSION_4\nPINHOLE\nfu = 0.05\nfv = 0.05\ncu = 0.00024\ncv = 0.0002\nu_direction = 1 0 0\n"
+        f"v_direction = 0 1 0\nw_direction = 0 0 1\nC = {' '.join(map(repr, centre.tolist()))}\n"
+        f"R = {' '.join(map(repr, turn.ravel().tolist()))}\npitch = 8e-06\nNULL\n"
+    )
+
+
+def aster_text(size: tuple[int, int] = (60, 50), rpc: RPC | None = None) -> str:
+    """Return the lattice of an ASTER camera and an RPC, of another place if none is given."""
+    columns, rows = size
+    at, lines = np.linspace(0.0, columns, 11), np.linspace(-20.0, rows + 20.0, 9)
+    places, rates = flight(2.2e-3 * lines)
+    axes = view(places, rates, back_deg=0.0, left_deg=-3.0)
+    world_from_camera = np.stack([axes[:, :, 1], -axes[:, :, 0], axes[:, :, 2]], axis=2)
+    own = np.column_stack([np.full(11, 4e-4), -(at - columns / 2) * 2.1e-5, np.ones(11)])
+    own /= np.linalg.norm(own, axis=1)[:, None]
+    world = np.einsum("rij,cj->rci", world_from_camera, own).reshape(-1, 3)
+    points = np.stack(np.meshgrid(at, lines), axis=-1).reshape(-1, 2)
+
+    def listed(name: str, values: np.ndarray) -> str:
+        return f"<{name}>\n" + "\n".join(" ".join(map(repr, row)) for row in values.tolist()) + f"\n</{name}>\n"
+
+    one = rpc or RPC(30, 25, 32, 40, 500, 60, 50, 0.1, 0.1, 500, *[np.eye(20)[k] for k in (1, 0, 2, 0)])
+    return (
+        f"<isd>\n{listed('LATTICE_POINT', points)}{listed('SIGHT_VECTOR', np.tile(own, (len(lines), 1)))}"
+        f"{listed('WORLD_SIGHT_VECTOR', world)}{listed('SAT_POS', places)}<IMAGE_COLS>{columns}</IMAGE_COLS>"
+        f"<IMAGE_ROWS>{rows}</IMAGE_ROWS>{_rpb(one)}</isd>\n"
+    )

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import products
 import seeds
+from ortho_asp.cameras import read_adjust, read_aster, read_tsai
 from ortho_bilsat.survey import read_survey
 from ortho_cartosat.metadata import read_metadata as read_cartosat
 from ortho_ikonos.metadata import read_header, read_metadata
@@ -28,6 +29,7 @@ from ortho_pipeline.batch import plan as batch_plan
 from ortho_pipeline.batch.records import FileState, Record
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.commands.inputs import open_scene
+from ortho_pipeline.exchange.csm import csm_text, read_csm
 from ortho_pipeline.exchange.model_file import read_model_file, save_model
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpb
@@ -313,6 +315,20 @@ def _frame_model(folder: Path) -> bytes:
     return (folder / "m").read_bytes()
 
 
+def _tsai(path: Path) -> Any:
+    return read_tsai(path, seeds.SIZE)
+
+
+def _csm_seed(folder: Path) -> bytes:
+    (folder / "METADATA.DIM").write_text(products.spot_text())
+    return csm_text(read_spot(folder / "METADATA.DIM", heights=(0.0, 300.0)).model)[0].encode()
+
+
+def _csm_frame_seed(folder: Path) -> bytes:
+    (folder / "one.tsai").write_text(products.tsai_text())
+    return csm_text(_tsai(folder / "one.tsai").with_heights(0.0, 300.0))[0].encode()
+
+
 def _maxar_seed(folder: Path) -> bytes:
     tiles = (("A-P1BS_R1C1-1_P001.TIF", 0, 0, 40, 50), ("A-P1BS_R1C2-1_P001.TIF", 40, 0, 20, 50))
     return products.isd_text(tiles=tiles, rpc=seeds.rpc()).encode()
@@ -368,6 +384,11 @@ READERS = (
     Reader("rpc-tag", "tiff", "one.tif", _tiff(seeds.image), _tagged),
     Reader("dimap-polynomials", "xml", "DIM_X.XML", _text(seeds.dimap_text()), read_dimap_pushbroom),
     Reader("dimap-lists", "xml", "DIM_X.XML", _text(seeds.dimap_text(listed=True)), read_dimap_pushbroom),
+    Reader("csm-line-scanner", "json", "one.json", _csm_seed, read_csm),
+    Reader("csm-frame", "json", "one.json", _csm_frame_seed, read_csm),
+    Reader("asp-pinhole", "text", "one.tsai", _text(products.tsai_text()), _tsai),
+    Reader("asp-adjust", "text", "one.adjust", _text("0.3 -0.5 0.02\n1.0 -5e-7 -4e-7 -9e-6\n"), read_adjust),
+    Reader("asp-aster", "xml", "one.xml", _text(products.aster_text()), read_aster),
     Reader("maxar-isd", "xml", "one.XML", _maxar_seed, _maxar),
     Reader("spot-metadata", "xml", "METADATA.DIM", _text(products.spot_text()), _spot),
     Reader("spot-detectors", "xml", "METADATA.DIM", _text(products.spot_text(every=True, corrected=True)), _spot),

@@ -27,6 +27,8 @@ DEAR = {
     "dimap-lists": 60,
     "dimap-polynomials": 60,
     "maxar-isd": 40,
+    "csm-line-scanner": 60,
+    "asp-aster": 60,
     "spot-metadata": 40,
     "spot-detectors": 40,
     "bilsat-survey": 60,

@@ -97,13 +97,17 @@ class LineCamera:
         return cls(width, height, -float(u[0]) * focal, line, focal, rest, along_rest)
 
     @classmethod
-    def of_table(cls, width: int, height: int, columns: ArrayLike, across: ArrayLike, along: ArrayLike) -> Self:
+    def of_table(
+        cls, width: int, height: int, columns: ArrayLike, across: ArrayLike, along: ArrayLike, rounding: float = 0.0
+    ) -> Self:
         """Make the camera that follows look directions (u, v, 1) given at columns, one for each detector or fewer.
 
         Parameters
         ----------
         columns, across, along : (n,)
             Columns from the outer corner of the first pixel, and u and v there.
+        rounding : float
+            What the digits of the table leave open (px), and no polynomial should follow.
 
         Raises
         ------
@@ -120,8 +124,8 @@ class LineCamera:
         half = width / 2
         focal = half / float(slope)
         x0, y0 = half - focal * float(start), -focal * float(v.mean())
-        dx = _followed(xi, focal * u - half * (1 + xi) - (focal * start - half))
-        dy = _followed(xi, focal * v + y0)
+        dx = _followed(xi, focal * u - half * (1 + xi) - (focal * start - half), rounding)
+        dy = _followed(xi, focal * v + y0, rounding)
         return cls(width, height, x0, y0, focal, dx, dy)
 
     @property
@@ -183,16 +187,17 @@ class LineCamera:
         return terms if len(terms) else np.zeros(1)
 
 
-def _followed(xi: Array, wanted: Array) -> Array:
+def _followed(xi: Array, wanted: Array, rounding: float) -> Array:
     """Return the shortest polynomial in xi that follows values (px); empty where none is needed."""
-    if np.abs(wanted).max() <= TABLE_MISS / 100:
+    enough = max(rounding, TABLE_MISS / 100)
+    if np.abs(wanted).max() <= enough:
         return np.zeros(0)
     for degree in range(min(TABLE_DEGREE, len(xi) - 1) + 1):
         terms = np.asarray(np.polynomial.polynomial.polyfit(xi, wanted, degree), dtype=np.float64)
         # Rather one degree more than a pattern that could be seen: the terms cost nothing.
-        if (miss := np.abs(polyval(xi, terms) - wanted).max()) <= TABLE_MISS / 100:
+        if (miss := np.abs(polyval(xi, terms) - wanted).max()) <= enough:
             return terms
-    if not miss <= TABLE_MISS:
+    if not miss <= max(rounding, TABLE_MISS):
         raise InputError(
             f"the look angles are up to {miss:.3g} px off any smooth line of detectors", field="across, along"
         )

@@ -1,0 +1,98 @@
+"""Sensor plugin for cameras of Ames Stereo Pipeline and ISIS beside an image: CSM states, .tsai, ASTER; and .adjust."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from osgeo import gdal
+
+from ortho_asp.cameras import adjusted, read_adjust, read_aster, read_tsai
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.csm import has_csm, read_csm
+from ortho_pipeline.exchange.rpc_files import read_rpc_text
+from ortho_pipeline.files import read_bounded
+from ortho_pipeline.files.locations import place
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.models import SensorModel
+from ortho_pipeline.models.frame.camera import FrameCamera
+from ortho_pipeline.models.pushbroom.scanner import Pushbroom
+
+#: What a camera's name ends with after the stem of its image; the first that is there, so adjusted states come first.
+ENDINGS = (".adjusted_state.json", "_csm.json", ".json", ".isd", ".tsai", ".xml")
+
+
+@hookimpl
+def ortho_sensors() -> Iterable[Sensor]:
+    """Offer the sensor ``asp``."""
+    yield Sensor(
+        "asp",
+        "images with a camera of Ames Stereo Pipeline or ISIS: CSM state (.json, .isd), .tsai, ASTER's .xml",
+        recognises,
+        open_scene,
+        options={
+            "camera": "the camera file, where it is not named as the image",
+            "adjust": "an adjustment (.adjust) of a CSM state of a line scanner, applied to it",
+        },
+    )
+
+
+def camera_of(name: str) -> Path | None:
+    """Return the camera file of an image: named as it, whatever the case of its letters; None without."""
+    if not name:
+        return None
+    try:
+        image = place(name)
+        names = {one.name.lower(): one for one in image.parent.iterdir()}
+    except (OSError, ValueError, InputError):
+        return None
+    found = (names.get(f"{image.stem}{ending}".lower()) for ending in ENDINGS)
+    return next((one for one in found if one is not None and one.is_file() and _kind(one)), None)
+
+
+def _kind(path: Path) -> str | None:
+    """Return which kind of camera a file is, from its first bytes."""
+    if has_csm(path):
+        return "csm"
+    try:
+        start = read_bounded(path, 400)[:400]
+    except InputError:
+        return None
+    if path.suffix.lower() == ".tsai" and b"PINHOLE" in start:
+        return "tsai"
+    return "aster" if b"<LATTICE_POINT>" in start else None
+
+
+def recognises(dataset: gdal.Dataset) -> bool:
+    """Tell whether a camera lies beside an image."""
+    return camera_of(dataset.GetDescription()) is not None
+
+
+def open_scene(dataset: gdal.Dataset, *, camera: str | None = None, adjust: str | None = None) -> Scene:
+    """Open an image with its camera."""
+    name, size = dataset.GetDescription(), (dataset.RasterXSize, dataset.RasterYSize)
+    path = place(camera) if camera else camera_of(name)
+    kind = None if path is None else _kind(path)
+    if path is None or kind is None:
+        raise InputError(
+            "there is no camera of this kind" + ("" if path is None else " in this file"), file=path or name,
+            field="camera", remedy="give the CSM state, .tsai or ASTER camera as camera=FILE",
+        )  # fmt: skip
+    model: SensorModel = (
+        read_csm(path) if kind == "csm" else read_tsai(path, size) if kind == "tsai" else read_aster(path)
+    )
+    its = model.camera.size if isinstance(model, Pushbroom) else size
+    if isinstance(model, FrameCamera):
+        its = model.interior.width, model.interior.height
+    if its != size:
+        raise InputError(
+            "the camera is of {} x {} pixels, the image has {} x {}".format(*its, *size), file=path, field="camera",
+            remedy="give the image that the camera was made for, or of a crop its place: `scene.crop_offset=COL,ROW`",
+        )  # fmt: skip
+    sources = []
+    if adjust is not None:
+        model, sources = adjusted(model, *read_adjust(place(adjust))), [place(adjust)]
+    models = {model.kind: model}
+    if kind == "aster":
+        models["rpc"] = read_rpc_text(path)
+    return Scene("asp", name, *size, models, str(path), {"camera": path.name}, sources=tuple(sources))
