@@ -3,6 +3,7 @@
     python benchmarks/warp.py                  the 12000 x 12000 job, three rounds: a table
     python benchmarks/warp.py --scaling        time and memory from 1000² to 24000²
     python benchmarks/warp.py --kernels        by kernel, number of bands and sensor model
+    python benchmarks/warp.py --layers         what layers beside the ortho cost, as shares of the warp alone
     python benchmarks/warp.py --accuracy       every output pixel of a ramp against an independent exact evaluation
     python benchmarks/warp.py --against DIR    the warp alone and the whole job, in pairs with another checkout
                                                (of any time after it got this option), and the first run, which compiles
@@ -32,11 +33,14 @@ import pyproj
 from osgeo import gdal, osr
 
 from ortho_pipeline.exchange.rpc import rpc_metadata
-from ortho_pipeline.models import RPC, SensorModel
+from ortho_pipeline.models import RPC, ImageCorrection, SensorModel
 from ortho_pipeline.models.rpc_box import RPC_TERMS
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp.engine import rectify
+from ortho_pipeline.warp.layers.accuracy import Budget, write_accuracy
+from ortho_pipeline.warp.layers.hiding import Hiding
+from ortho_pipeline.warp.layers.sight import Sight
 
 gdal.UseExceptions()
 
@@ -115,6 +119,27 @@ class Job:
             for band in range(bands):
                 noise = random.normal(0, 20, field.shape)
                 dataset.GetRasterBand(band + 1).WriteArray((field + noise).astype(np.uint16), 0, top)
+
+    def write_dsm(self) -> Path:
+        """Write a surface model of 1 m: the rough terrain, smoothed, with blocks of houses of 6 to 40 m."""
+        path = self.folder / f"dsm_{self.side}.tif"
+        if path.exists():
+            return path
+        xmin, _, xmax, ymax = self.extent
+        count, margin = int(xmax - xmin) + 200, 100.0
+        reference = osr.SpatialReference()
+        reference.ImportFromEPSG(UTM)
+        dataset = gdal.GetDriverByName("GTiff").Create(str(path), count, count, 1, gdal.GDT_Float32, list(TILED))
+        dataset.SetSpatialRef(reference)
+        dataset.SetGeoTransform((xmin - margin, 1.0, 0, ymax + margin, 0, -1.0))
+        houses = np.random.default_rng(3).uniform(6, 40, (count // 40 + 1, count // 40 + 1))
+        x = np.arange(count)
+        for top in range(0, count, 512):
+            y = np.arange(top, min(top + 512, count))[:, None]
+            built = (x % 40 < 24) & (y % 40 < 24)
+            ground = HEIGHT + 60 * np.sin(x / 600) * np.cos(y / 800)
+            dataset.WriteArray((ground + built * houses[y // 40, x // 40]).astype(np.float32), 0, top)
+        return path
 
     def write_dem(self) -> None:
         """Write a rough DEM of ellipsoidal heights."""
@@ -385,6 +410,51 @@ def scaling(folder: Path) -> dict[str, list[Run]]:
     return runs
 
 
+def layers(job: Job, pairs: int) -> dict[str, list[tuple[float, float]]]:
+    """Return CPU seconds of the warp with a layer and without it, alternating; kernels are loaded before."""
+    xmin, ymin, xmax, ymax = job.extent
+    grid = Grid.of_extent(pyproj.CRS.from_epsg(UTM), (xmin, ymin, xmax, ymax), (GSD, GSD))
+    model, source, out = job.model(), RasterSource(job.image), job.folder / "layers.tif"
+    heights, size = (HEIGHT - 270, HEIGHT + 270), (job.side, job.side)
+    budget = Budget(covariance=np.diag([0.2, 1e-5, 1e-5, 0.2, 1e-5, 1e-5]) ** 2, heights=4.0, interpolation_px=0.004)
+    corrected = ImageCorrection.identity(model, "affine", (job.side / 2, job.side / 2))
+
+    def accuracy(surface: Surface) -> None:
+        rectify(model, source, surface, grid, out, driver="GTiff")
+        write_accuracy(budget, Sight(corrected, grid), surface, size, job.folder / "accuracy.tif", heights=heights)
+
+    def plain(surface: Surface) -> None:
+        rectify(model, source, surface, grid, out, driver="GTiff")
+
+    def empty(surface: Surface) -> None:
+        rectify(model, source, surface, grid, Hiding(out, heights), driver="GTiff")
+
+    def mask(surface: Surface) -> None:
+        rectify(model, source, surface, grid, Hiding(out, heights, job.folder / "mask.tif"), driver="GTiff")
+
+    dem, dsm = Surface.open(job.dem, "ellipsoid"), Surface.open(job.write_dsm(), "ellipsoid")
+    todo = {
+        "accuracy, DEM of 30 m": (accuracy, dem), "hidden left empty, DEM of 30 m": (empty, dem),
+        "mask of hidden, DEM of 30 m": (mask, dem), "hidden left empty, DSM of 1 m": (empty, dsm),
+    }  # fmt: skip
+    found: dict[str, list[tuple[float, float]]] = {}
+    for name, (work, surface) in todo.items():
+        found[name] = []
+        for number in range(pairs + 1):
+            seconds = {}
+            for one in (plain, work) if number % 2 else (work, plain):
+                begin = time.process_time()
+                one(surface)
+                seconds[one] = time.process_time() - begin
+            if number:  # the first loads the kernels
+                found[name].append((seconds[work], seconds[plain]))
+        more = sorted(with_it / without - 1 for with_it, without in found[name])
+        base = statistics.median(without for _, without in found[name])
+        print(f"{name:32s} {base:6.2f} s of CPU without; + {100 * statistics.median(more):.1f} % "
+              f"({100 * more[0]:.1f} to {100 * more[-1]:.1f})", flush=True)  # fmt: skip
+    return found
+
+
 class PlainNumPy(SensorModel):
     """The RPC as a plugin author might write it: plain NumPy, nothing overridden."""
 
@@ -481,7 +551,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write all runs there")
     parser.add_argument("--against", type=Path, metavar="DIR", help="another checkout of this project")
     parser.add_argument("--pairs", type=int, default=20, help="of runs, with --against")
-    for option in ("scaling", "kernels", "accuracy"):
+    for option in ("scaling", "kernels", "accuracy", "layers"):
         parser.add_argument(f"--{option}", action="store_true")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="ortho_bench_") as temporary:
@@ -492,6 +562,8 @@ def main() -> None:
             document["scaling"] = {name: [asdict(run) for run in runs] for name, runs in scaling(folder).items()}
         elif arguments.kernels:
             document["kernels"] = {name: [asdict(run) for run in runs] for name, runs in kernels(folder).items()}
+        elif arguments.layers:
+            document["layers"] = layers(Job(folder, arguments.side).make(), min(arguments.pairs, 5))
         elif arguments.against:
             document["against"] = against(Job(folder, arguments.side).make(), arguments.against, arguments.pairs)
         elif arguments.accuracy:

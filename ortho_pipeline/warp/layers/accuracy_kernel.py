@@ -13,18 +13,6 @@ from ortho_pipeline.warp.block_kernel import DemWindow, dem_height_at
 _FIELDS = 10
 
 
-@inlined
-def _between(nodes, j, i, fx, fy, k, f):
-    """Return what lies at (i + fx, j + fy) between nodes; a node without weight may be NaN."""
-    upper = nodes[j, i, k, f] if fx == 0.0 else nodes[j, i, k, f] + (nodes[j, i + 1, k, f] - nodes[j, i, k, f]) * fx
-    if fy == 0.0:
-        return upper
-    lower = nodes[j + 1, i, k, f]
-    if fx > 0.0:
-        lower += (nodes[j + 1, i + 1, k, f] - lower) * fx
-    return upper + (lower - upper) * fy
-
-
 class Nodes(NamedTuple):
     """Nodes of a layer, for compiled code.
 
@@ -66,42 +54,65 @@ def fill(
     nodes, samples, spacing, middle, half = lattice
     dem, sigma, constant, datum = heights
     height, width = covariance.shape[:2]
-    last = radii.size - 1
     value = np.empty(_FIELDS)
+    begin, grow = np.empty((nodes.shape[2], _FIELDS)), np.empty((nodes.shape[2], _FIELDS))
+    place, way = np.empty(samples.shape[2:]), np.empty(samples.shape[2:])
     for row in range(height):
         j, fy = row // spacing, (row % spacing) / spacing
         for column in range(width):
             i, fx = column // spacing, (column % spacing) / spacing
-            u, v = _between(samples, j, i, fx, fy, 0, 0), _between(samples, j, i, fx, fy, 1, 0)
-            h = dem_height_at(dem.heights, u, v, dem.left, dem.top, False)
+            if column % spacing == 0:
+                _along(nodes[j, i], nodes[j, i + 1], nodes[j + 1, i], nodes[j + 1, i + 1], fy, begin, grow)
+                _along(samples[j, i], samples[j, i + 1], samples[j + 1, i], samples[j + 1, i + 1], fy, place, way)
+            bands[:, row, column] = np.nan
+            h = dem_height_at(
+                dem.heights, place[0, 0] + way[0, 0] * fx, place[1, 0] + way[1, 0] * fx, dem.left, dem.top, False
+            )
             t = (h - middle) / half
             for f in range(_FIELDS):
                 value[f] = 0.0
                 for k in range(nodes.shape[2] - 1, -1, -1):
-                    value[f] = value[f] * t + _between(nodes, j, i, fx, fy, k, f)
-            bands[:, row, column] = np.nan
+                    value[f] = value[f] * t + (begin[k, f] + grow[k, f] * fx)
             if not (0.0 <= value[8] <= size[0] and 0.0 <= value[9] <= size[1]):
                 continue
-            totals[7] += 1.0
             deviation = constant
             if constant < 0.0:
-                u, v = _between(samples, j, i, fx, fy, 0, 1), _between(samples, j, i, fx, fy, 1, 1)
+                u, v = place[0, 1] + way[0, 1] * fx, place[1, 1] + way[1, 1] * fx
                 deviation = dem_height_at(sigma.heights, u, v, sigma.left, sigma.top, False)
-            variance = deviation * deviation + datum
-            ee = value[0] + value[3] * value[3] * variance + even + value[5]
-            nn = value[1] + value[4] * value[4] * variance + even + value[6]
-            en = value[2] + value[3] * value[4] * variance + value[7]
-            if not ee + nn + en < np.inf:
-                continue
-            covariance[row, column, 0], covariance[row, column, 1], covariance[row, column, 2] = ee, nn, en
-            _put(ee, nn, en, radii, last, bands, row, column)
-            totals[0] += value[0] + value[1]
-            totals[1] += (value[3] * value[3] + value[4] * value[4]) * variance
-            totals[2] += 2.0 * even
-            totals[3] += value[5] + value[6]
-            totals[4] += ee
-            totals[5] += nn
-            totals[6] += 1.0
+            _count(
+                value, deviation * deviation + datum, even, radii, covariance[row, column], bands, row, column, totals
+            )
+
+
+@inlined
+def _along(northwest, northeast, southwest, southeast, fy, begin, grow):
+    """Fill the values at the west of a cell and how much they grow to its east; a node without weight may be NaN."""
+    for k in range(begin.shape[0]):
+        for f in range(begin.shape[1]):
+            west, east = northwest[k, f], northeast[k, f]
+            if fy > 0.0:
+                west += (southwest[k, f] - west) * fy
+                east += (southeast[k, f] - east) * fy
+            begin[k, f], grow[k, f] = west, east - west
+
+
+@inlined
+def _count(value, variance, even, radii, covariance, bands, row, column, totals):
+    """Put the accuracy of a pixel into the bands and into what they come to together."""
+    totals[7] += 1.0
+    ee = value[0] + value[3] * value[3] * variance + even + value[5]
+    nn = value[1] + value[4] * value[4] * variance + even + value[6]
+    en = value[2] + value[3] * value[4] * variance + value[7]
+    if ee + nn + en < np.inf:
+        covariance[0], covariance[1], covariance[2] = ee, nn, en
+        _put(ee, nn, en, radii, radii.size - 1, bands, row, column)
+        totals[0] += value[0] + value[1]
+        totals[1] += (value[3] * value[3] + value[4] * value[4]) * variance
+        totals[2] += 2.0 * even
+        totals[3] += value[5] + value[6]
+        totals[4] += ee
+        totals[5] += nn
+        totals[6] += 1.0
 
 
 @inlined

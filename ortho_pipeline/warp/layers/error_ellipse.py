@@ -71,7 +71,7 @@ def circular_error_of_all(covariance: Array, share: float = 0.9) -> float:
     larger, smaller = principal(covariance)
     high = float(circular_error(covariance, share).max())
     low = 0.0
-    for _ in range(40):
+    for _ in range(20):
         middle = (low + high) / 2
         if share_beyond(np.array(middle), larger, smaller).mean() > 1.0 - share:
             low = middle

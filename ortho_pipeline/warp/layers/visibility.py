@@ -73,10 +73,10 @@ class Visibility:
         samples = self._samples(near[0].ravel(), near[1].ravel()).reshape(*shape, 2)
         shape = far[0].shape
         columns, rows = far[0].ravel(), far[1].ravel()
-        slopes = [self._slopes(columns, rows, self._middle + self._half * one) for one in levels(_LEVELS)]
-        tangents = np.array([tangent for _, tangent in slopes])
+        count, heights = len(rows), np.repeat(self._middle + self._half * levels(_LEVELS), len(rows))
+        slopes, tangents = self._slopes(np.tile(columns, _LEVELS), np.tile(rows, _LEVELS), heights)
         # Where the model does not project there is no image either.
-        directions = np.nan_to_num(polynomials(np.stack([slope for slope, _ in slopes], axis=1)))
+        directions = np.nan_to_num(polynomials(slopes.reshape(_LEVELS, count, 2).swapaxes(0, 1)))
         square = float(np.nanmax(tangents**2)) if np.isfinite(tangents).any() else 0.0
         return kernel.Rays(
             samples, NEAR, directions.reshape(*shape, _LEVELS, 2), FAR, self._middle, self._half,
@@ -95,9 +95,9 @@ class Visibility:
         x, y = self._sight.grid.xy(columns, rows)
         return self._sampler(np.stack([x, y, np.zeros(len(x))], axis=1))
 
-    def _slopes(self, columns: Array, rows: Array, height: float) -> tuple[Array, Array]:
+    def _slopes(self, columns: Array, rows: Array, heights: Array) -> tuple[Array, Array]:
         """Return samples of the DEM per metre upwards ``(n, 2)``, and metres along the ground per metre upwards."""
-        seen = self._sight.seen(columns, rows, np.full(len(columns), height))
+        seen = self._sight.seen(columns, rows, heights)
         # A line goes against the displacement of what lies higher.
         way = -seen.displacement * [1.0, -1.0] / self._sight.metres(columns, rows)
         there = self._samples(columns + _RISE * way[:, 0], rows + _RISE * way[:, 1])

@@ -3,7 +3,7 @@
 A line of sight is straight: it begins on the terrain, bilinear between samples, and goes on by so many samples per
 metre that it rises. Within a cell of four samples the terrain along it is a quadratic function, so that whether it
 rises above the line is known, not sampled. Terrain can rise above a line only in a cell that is *steep*: where it
-climbs faster than the line does. All other cells are passed unseen, and so are squares of 16 of them whose steep cells
+climbs faster than the line does. All other cells are passed unseen, and so are squares of 8 of them whose steep cells
 all lie below the line.
 """
 
@@ -18,7 +18,7 @@ from ortho_pipeline.files.compiled import compiled, inlined
 #: Classes of `look`.
 CLEAR, HIDDEN, VOID = 0, 1, 2
 #: Cells per side of a square that is passed at once, as a power of two.
-SQUARE_BITS = 4
+SQUARE_BITS = 3
 #: Terrain that rises above a line by less (m) is rounding.
 _ROUNDING = 1e-5
 
@@ -100,37 +100,28 @@ def _rises_above(heights, i, j, x, y, h, across, down, bend, start, end):
 
 
 @inlined
-def _leaves(x, step, first, last):
-    """Return the rise at which a coordinate leaves the cells first to last - 1."""
-    if step > 0.0:
-        return (last - x) / step
-    return (first - x) / step if step < 0.0 else np.inf
-
-
-@compiled
-def is_hidden(relief: Relief, x: float, y: float, h: float, across: float, down: float, bend: float) -> bool:
+def _is_hidden(heights, steep, squares, highest, x, y, h, across, down, bend):
     """Tell whether terrain stands in the way of the line from (x, y) in the window, at the height h.
 
     It goes `across` and `down` samples per metre upwards.
     """
-    heights, steep, squares, highest = relief.heights, relief.steep, relief.squares, relief.highest
     rows, columns = steep.shape
     i, j, rise = min(int(x), columns - 1), min(int(y), rows - 1), 0.0
-    while h + rise < highest:
+    per_column, per_row = 1.0 / across, 1.0 / down
+    hidden, going = False, True
+    while going:
         bi, bj = i >> SQUARE_BITS, j >> SQUARE_BITS
         whole = squares[bj, bi] <= h + rise
-        if whole:
-            first, last = bi << SQUARE_BITS, (bi + 1) << SQUARE_BITS
-            above, below = bj << SQUARE_BITS, (bj + 1) << SQUARE_BITS
-        else:
-            first, last, above, below = i, i + 1, j, j + 1
-        side, end = _leaves(x, across, first, last), _leaves(y, down, above, below)
+        first = bi << SQUARE_BITS if whole else i
+        last = (bi + 1) << SQUARE_BITS if whole else i + 1
+        above = bj << SQUARE_BITS if whole else j
+        below = (bj + 1) << SQUARE_BITS if whole else j + 1
+        side = ((last if across > 0.0 else first) - x) * per_column if across != 0.0 else np.inf
+        end = ((below if down > 0.0 else above) - y) * per_row if down != 0.0 else np.inf
         sideways = side <= end
         stop = side if sideways else end
-        if not whole and steep[j, i] and _rises_above(heights, i, j, x, y, h, across, down, bend, rise, stop):
-            return True
-        if not stop < np.inf:
-            return False
+        if not whole and steep[j, i]:
+            hidden = _rises_above(heights, i, j, x, y, h, across, down, bend, rise, stop)
         if sideways:
             i = last if across > 0.0 else first - 1
             if whole:
@@ -139,10 +130,9 @@ def is_hidden(relief: Relief, x: float, y: float, h: float, across: float, down:
             j = below if down > 0.0 else above - 1
             if whole:
                 i = min(max(int(x + across * stop), first), last - 1)
-        if not (0 <= i < columns and 0 <= j < rows):
-            return False
         rise = max(rise, stop)
-    return False
+        going = not hidden and 0 <= i < columns and 0 <= j < rows and h + rise < highest
+    return hidden
 
 
 @inlined
@@ -165,9 +155,11 @@ def _height(heights, x, y):
 @compiled
 def look(rays: Rays, relief: Relief, first_row: int, first_column: int, out: Any) -> None:
     """Fill `out` ``(h, w)``, which begins with a row and a column of the tile, with `CLEAR`, `HIDDEN` or `VOID`."""
-    near, far, levels = rays.near, rays.far, rays.slopes.shape[2]
+    samples, near, slopes, far, middle, half, bend = rays
+    heights, west, north, steep, squares, highest = relief
     height, width = out.shape
-    begin, grow = np.empty((levels, 2)), np.empty((levels, 2))
+    count = slopes.shape[2]
+    begin, grow = np.empty((count, 2)), np.empty((count, 2))
     for line in range(height):
         row = first_row + line
         ry, ty = row // far, (row % far) / far
@@ -176,28 +168,29 @@ def look(rays: Rays, relief: Relief, first_row: int, first_column: int, out: Any
         while column < first_column + width:
             stop = min((column // near + 1) * near, first_column + width)
             rx, nx = column // far, column // near
-            for k in range(levels):
+            for k in range(count):
                 for axis in range(2):
-                    start, end = rays.slopes[ry, rx, k, axis], rays.slopes[ry, rx + 1, k, axis]
-                    start += (rays.slopes[ry + 1, rx, k, axis] - start) * ty
-                    end += (rays.slopes[ry + 1, rx + 1, k, axis] - end) * ty
+                    start, end = slopes[ry, rx, k, axis], slopes[ry, rx + 1, k, axis]
+                    start += (slopes[ry + 1, rx, k, axis] - start) * ty
+                    end += (slopes[ry + 1, rx + 1, k, axis] - end) * ty
                     begin[k, axis], grow[k, axis] = start, (end - start) / far
-            u0, u1 = rays.samples[ny, nx, 0], rays.samples[ny, nx + 1, 0]
-            v0, v1 = rays.samples[ny, nx, 1], rays.samples[ny, nx + 1, 1]
-            u0, u1 = u0 + (rays.samples[ny + 1, nx, 0] - u0) * fy, u1 + (rays.samples[ny + 1, nx + 1, 0] - u1) * fy
-            v0, v1 = v0 + (rays.samples[ny + 1, nx, 1] - v0) * fy, v1 + (rays.samples[ny + 1, nx + 1, 1] - v1) * fy
+            u0, u1 = samples[ny, nx, 0], samples[ny, nx + 1, 0]
+            v0, v1 = samples[ny, nx, 1], samples[ny, nx + 1, 1]
+            u0, u1 = u0 + (samples[ny + 1, nx, 0] - u0) * fy, u1 + (samples[ny + 1, nx + 1, 0] - u1) * fy
+            v0, v1 = v0 + (samples[ny + 1, nx, 1] - v0) * fy, v1 + (samples[ny + 1, nx + 1, 1] - v1) * fy
             du, dv = (u1 - u0) / near, (v1 - v0) / near
             for c in range(column, stop):
-                x = u0 + du * (c - nx * near) - relief.left
-                y = v0 + dv * (c - nx * near) - relief.top
-                h = _height(relief.heights, x, y)
-                if not h < np.inf:
-                    out[line, c - first_column] = VOID
-                    continue
-                t, at, across, down = (h - rays.middle) / rays.half, c - rx * far, 0.0, 0.0
-                for k in range(levels - 1, -1, -1):
-                    across = across * t + (begin[k, 0] + grow[k, 0] * at)
-                    down = down * t + (begin[k, 1] + grow[k, 1] * at)
-                seen = is_hidden(relief, x, y, h, across, down, rays.bend)
-                out[line, c - first_column] = HIDDEN if seen else CLEAR
+                x, y = u0 + du * (c - nx * near) - west, v0 + dv * (c - nx * near) - north
+                h = _height(heights, x, y)
+                found = VOID
+                if h < highest:
+                    t, at, across, down = (h - middle) / half, c - rx * far, 0.0, 0.0
+                    for k in range(count - 1, -1, -1):
+                        across = across * t + (begin[k, 0] + grow[k, 0] * at)
+                        down = down * t + (begin[k, 1] + grow[k, 1] * at)
+                    hidden = _is_hidden(heights, steep, squares, highest, x, y, h, across, down, bend)
+                    found = HIDDEN if hidden else CLEAR
+                elif h < np.inf:
+                    found = CLEAR
+                out[line, c - first_column] = found
             column = stop
