@@ -58,7 +58,9 @@ def _type(option: Option) -> Any:
     bounds: dict[str, Any] = {"gt": option.above, "lt": option.below}
     bounded: Any = float if option.above is option.below is None else Annotated[float, Field(**bounds)]
     number: Any = Annotated[bounded, pydantic.AfterValidator(_usable)]
-    whole: Any = int if option.above is None else Annotated[int, Field(ge=int(option.above) + 1)]
+    low, high = (None if bound is None else int(bound) for bound in (option.above, option.below))
+    within: dict[str, Any] = {"ge": low if low is None else low + 1, "le": high if high is None else high - 1}
+    whole: Any = int if low is high is None else Annotated[int, Field(**within)]
     return {
         "text": str,
         "file": str,

@@ -110,7 +110,8 @@ def _typed(option: Option) -> dict[str, Any]:
     number: Any = float
     if option.above is not None:
         number = click.FloatRange(option.above, option.below, min_open=True, max_open=option.below is not None)
-    whole = click.IntRange(min=None if option.above is None else int(option.above) + 1)
+    low, high = (None if bound is None else int(bound) for bound in (option.above, option.below))
+    whole = click.IntRange(min=low if low is None else low + 1, max=high if high is None else high - 1)
     return {
         "file": {"type": click.Path(dir_okay=False)},
         "number": {"type": number},

@@ -16,7 +16,7 @@ from typing import Any
 import pyproj
 
 from ortho_pipeline import plugins
-from ortho_pipeline.errors import InputError, OrthoError, of_option
+from ortho_pipeline.errors import InputError, OrthoError, completed, of_option
 from ortho_pipeline.exchange import crop
 from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.exchange.rpc import files_of
@@ -37,6 +37,8 @@ SIDE_CARS = ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", "_metadata.txt", ".IMD")
 ATTACHED = (".aux.xml", ".ovr", ".msk")
 #: In place of a file of points: the ground control points that the image itself holds.
 OWN_POINTS = "own"
+#: No height is less certain (m) than that: the Earth has none of that size.
+_LARGEST_SIGMA = 10_000.0
 #: Name of the "sensor" of an image that has no model of its own.
 POINTS_ONLY = "points only"
 
@@ -163,16 +165,19 @@ def open_sigma(
     Raises
     ------
     InputError
-        For a number that is not positive, and a raster that cannot be read.
+        For a number that is not positive or larger than mountains, and a raster that cannot be read.
     """
     if options.sigma is None:
         return None
-    number = math.nan if isinstance(options.sigma, os.PathLike) else number_of(options.sigma)
-    if number > 0:
+    try:
+        # What reads as a number is one: nan and 1e999 are no files.
+        number = number_of(float(options.sigma))  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        with completed(field="surface.sigma"):
+            path = os.fspath(options.sigma)  # type: ignore[arg-type]
+            return Surface.open(path, "ellipsoid", override=True, fill="mask", memory=memory, **scene.access)
+    if 0 < number <= _LARGEST_SIGMA:
         return number
-    if not isinstance(options.sigma, float | int) and math.isnan(number):
-        with of_option("surface.sigma"):
-            return Surface.open(options.sigma, "ellipsoid", override=True, fill="mask", memory=memory, **scene.access)
     raise InputError(
         f"{options.sigma} is no standard deviation", field="surface.sigma",
         remedy="give metres, or a raster of them such as Copernicus' height error mask",

@@ -81,6 +81,8 @@ class PointTable(Protocol):
     def source(self) -> str: ...
 
 
+#: Chips are held in memory, and more matches say no more of a model.
+_MOST_MATCHES = 100_000
 _VERTICAL_FORMS = "ellipsoid, egm96, egm2008, EPSG:n or a grid file"
 _PIXEL_ORIGIN = Option(
     "--pixel-origin",
@@ -388,7 +390,15 @@ class MatchOptions:
         ),
     ] = None  # fmt: skip
     points: Annotated[
-        int, Option("--match-points", "About how many matches are wanted.", "N", kind="integer", above=0)
+        int,
+        Option(
+            "--match-points",
+            "About how many matches are wanted.",
+            "N",
+            kind="integer",
+            above=0,
+            below=_MOST_MATCHES + 1,
+        ),
     ] = 500
     reference_sigma: Annotated[
         float | None,

@@ -165,7 +165,7 @@ def read_image_errors(
             f"a covariance without {missing}", file=path, field=where[there.index(True)],
             remedy=f"give {', '.join(CSV_ERRORS[:3])}, or sigma_image alone",
         )  # fmt: skip
-    column, row = (sigma_of(values[k], path, where[k], zero=False) for k in range(2))
+    column, row = (sigma_of(values[k], path, where[k], zero=False, what="variance") for k in range(2))
     both = number(values[2], path, where[2])
     matrix = np.array([[[column, both], [both, row]]])
     if not _is_positive_definite(matrix)[0]:

@@ -222,10 +222,12 @@ def role_of(text: Any, path: str | os.PathLike[str], where: str) -> str:
     return role
 
 
-def sigma_of(text: Any, path: str | os.PathLike[str], where: str, *, zero: bool) -> float:
+def sigma_of(
+    text: Any, path: str | os.PathLike[str], where: str, *, zero: bool, what: str = "standard deviation"
+) -> float:
     value = number(text, path, where)
     if value < 0 or (value == 0 and not zero) or value > MAX_SIGMA:
-        raise InputError(f"{short(text)} is not a standard deviation", file=path, field=where)
+        raise InputError(f"{short(text)} is not a {what}", file=path, field=where)
     return value
 
 

@@ -117,7 +117,8 @@ def _opened(
         if in_local_archive(name) and not place.exists():
             raise InputError("there is no such file in an archive", file=name, remedy=_in_archive(name))
     elif not Path(name).is_file() and not (Path(name).is_dir()):
-        raise InputError("there is no such file", file=name, remedy="check the path")
+        what = "this is a pipe or a device" if Path(name).exists() else "there is no such file"
+        raise InputError(what, file=name, remedy="check the path")
     elif Path(name).suffix.lower() in (".zip", ".tar", ".tgz"):
         raise InputError("this is an archive, not an image", file=name, remedy=_in_archive(name))
     elif Path(name).suffix.lower() != ".vrt":

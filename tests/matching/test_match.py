@@ -13,7 +13,7 @@ from scenes import Case, Setting, View, write_raster
 from scipy import ndimage
 from trials import Outcome, good_texture, grounds, matches, refusals, run, tried
 
-from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.errors import CrsError, OrthoError
 from ortho_pipeline.imaging import matching
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
@@ -168,6 +168,15 @@ def test_a_reference_without_a_crs_is_refused(tmp_path):
     found = tried(case, [bare])
     assert "coordinate system" in found.refused
     assert "bare.tif" in found.refused
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4978", 'LOCAL_CS["of a site",UNIT["metre",1]]'], ids=["geocentric", "local"])
+def test_a_reference_whose_crs_leads_nowhere_is_refused_by_its_name(tmp_path, crs):
+    path = tmp_path / "bad.tif"
+    write_raster(path, [np.ones((9, 9))], "uint16", place=(0.0, 1.0, 0.0, 0.0, 0.0, -1.0), crs=crs)
+    with pytest.raises(CrsError) as caught:
+        matching.open_references([path])
+    assert (caught.value.file, caught.value.field, bool(caught.value.remedy)) == (str(path), "CRS", True)
 
 
 def test_a_reference_of_far_away_is_refused(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -364,6 +365,18 @@ def test_references_of_nothing_and_none_are_refused(case: Case, tmp_path: Path, 
         words = (case.scene_file, "--reference", name, *heights(case), "-o", written / "p.csv", "--json")
         error = refused(ortho("match", *words), written)
         assert (error["file"], error["field"]) == (str(name), "--reference")
+
+
+def test_what_is_endless_is_refused(case: Case, tmp_path: Path, written: Path) -> None:
+    pipe = tmp_path / "pipe.tif"
+    os.mkfifo(pipe)
+    words = (case.scene_file, *heights(case), "-o", written / "p.csv", "--json")
+    for name in (pipe, "/dev/zero"):
+        error = refused(ortho("match", *words, "--reference", name), written)
+        assert (error["file"], error["field"]) == (str(name), "--reference")
+        assert "a pipe or a device" in error["message"]
+    many = ortho("match", *words, "--reference", case.reference_file, "--match-points", 10**9)
+    assert refused(many, written)["field"] == "--match-points"
 
 
 def test_a_model_that_is_off_by_more_than_the_search_is_refused(tmp_path: Path, written: Path) -> None:

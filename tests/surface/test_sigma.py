@@ -52,10 +52,10 @@ def test_a_raster_is_read_where_it_lies_and_its_voids_are_unknown(tiny, quality)
     assert read[quality] == "DEM accuracy"
 
 
-@pytest.mark.parametrize("sigma", [0.0, -3, "0", "nan", "no_such_file.tif"])
+@pytest.mark.parametrize("sigma", [0.0, -3, "0", "nan", "inf", "1e308", "1e12", 1e12, 1e-200, "no_such_file.tif"])
 def test_what_is_no_standard_deviation_is_refused(tiny, sigma):
     with pytest.raises(InputError) as caught:
         open_surface(SurfaceOptions(dem=tiny.dem, vertical="ellipsoid", sigma=sigma))
-    assert caught.value.remedy
+    assert (caught.value.field, bool(caught.value.remedy)) == ("surface.sigma", True)
     with pytest.raises(InputError, match="there is none"):
         has_surface(SurfaceOptions(sigma=sigma))

@@ -12,7 +12,7 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import CrsError, InputError
+from ortho_pipeline.errors import CrsError, InputError, completed
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.intensity import Intensity
@@ -142,7 +142,11 @@ class Reference:
             )  # fmt: skip
         inverse = np.linalg.inv(forward)
         offset = -inverse @ np.array([transform[0], transform[3]])
-        return cls(Intensity(source), horizontal(parse_crs(text)), np.column_stack([inverse, offset]))
+        with completed(source.path):
+            crs = horizontal(parse_crs(text))
+            # A system of no known datum is refused here, by the name of its file.
+            ground_transform("EPSG:4979", crs)
+        return cls(Intensity(source), crs, np.column_stack([inverse, offset]))
 
     @property
     def path(self) -> str:
