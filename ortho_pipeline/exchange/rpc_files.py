@@ -259,12 +259,13 @@ def _fields_of_xml(text: str, path: str | PathLike[str]) -> tuple[dict[str, str]
     for element in root.iter():
         tag = element.tag.rpartition("}")[2] if isinstance(element.tag, str) else ""
         parts.setdefault(tag, []).append(element)
-    if "RFM_Validity" in parts or "Inverse_Model" in parts:
+    if "RFM_Validity" in parts or "Inverse_Model" in parts or "GroundtoImage_Values" in parts:
         profile = _first_text(parts, "METADATA_PROFILE")
         # Pleiades Neo counts pixels from 0, its predecessors and SPOT from 1.
         origin = 0.0 if "PNEO" in profile.upper() else 1.0
         fields: dict[str, str] = {}
-        for tag in ("RFM_Validity", "Inverse_Model"):
+        # Version 3, of Pleiades Neo, has another name for the model from ground to image.
+        for tag in ("RFM_Validity", "Inverse_Model", "GroundtoImage_Values"):
             for child in parts.get(tag, [[]])[0]:
                 key = str(child.tag).rpartition("}")[2]
                 if _is_rpc_key(key):

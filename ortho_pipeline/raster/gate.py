@@ -122,6 +122,9 @@ class _Gate:
         if there.is_dir():
             self._see_folder(there)
             allowed = ["DIMAP"]
+            if (product := self._product_in(there)) is not None:
+                name = os.fspath(product)
+                self._see_named(product, "DIMAP", frozenset())
         else:
             kind = _identified(name, drivers)
             if kind in _REFERRING:
@@ -175,6 +178,17 @@ class _Gate:
             if re.fullmatch(r"metadata\.dim|vol_.*\.xml", name.lower()):
                 self._must_be_inside(folder / name, folder, name)
                 self._see_named(folder / name, "DIMAP", frozenset())
+
+    def _product_in(self, folder: Any) -> Any:
+        """Return the DIMAP 2 metadata in a folder, which GDAL does not look for; None where it finds its own."""
+        names = [name for name in self._names(folder) if re.fullmatch(r"(dim_|vol_|metadata\.dim).*", name.lower())]
+        found = [name for name in names if re.fullmatch(r"dim_.*\.xml", name.lower())]
+        if len(found) > 1:
+            raise InputError(
+                f"this folder has several products: {', '.join(sorted(found)[:6])}", file=folder,
+                remedy="name the DIM_*.XML of one of them, or an image",
+            )  # fmt: skip
+        return folder / found[0] if found == names and found else None
 
     def _see_side_cars(self, path: Any) -> None:
         """See to what GDAL takes up as overviews and masks because of its name."""

@@ -7,6 +7,7 @@ same image lie beside it, the scene has the model ``pushbroom`` as well.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from osgeo import gdal
@@ -17,7 +18,7 @@ from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.models.rational import RPC
-from ortho_rpc.rigorous import Rigorous, rigorous_beside
+from ortho_rpc.rigorous import Rigorous, rigorous_beside, rpc_of_dimap, tiles_beside
 
 # What GDAL's readers of vendor metadata agree on, and what it is called here.
 IMAGERY = {"SATELLITEID": "satellite", "ACQUISITIONDATETIME": "acquired", "CLOUDCOVER": "cloud_cover_percent"}
@@ -29,15 +30,27 @@ def ortho_sensors() -> Iterable[Sensor]:
     yield Sensor(
         "rpc",
         "any image with an RPC (tag, .RPB, _RPC.TXT, DIMAP, NITF, VRT)",
-        has_rpc,
+        recognises,
         open_scene,
         options={"rpc": "which RPC to use: tag, sidecar, or an RPC file"},
         fallback=True,
     )
 
 
+def recognises(dataset: gdal.Dataset) -> bool:
+    """Tell whether an image has an RPC, or is DIMAP metadata that have one beside them."""
+    return has_rpc(dataset) or _of_dimap(dataset) is not None
+
+
+def _of_dimap(dataset: gdal.Dataset) -> Path | None:
+    name = dataset.GetDescription()
+    return rpc_of_dimap(place(name)) if name.upper().endswith(".XML") else None
+
+
 def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
     """Open an image with its RPC, or with the one given."""
+    if rpc is None and not has_rpc(dataset) and (beside := _of_dimap(dataset)) is not None:
+        rpc = str(beside)
     model, source = rpc_of_dataset(dataset, rpc)
     width, height = dataset.RasterXSize, dataset.RasterYSize
     rigorous = rigorous_beside(place(dataset.GetDescription()), (width, height), model)
@@ -54,6 +67,7 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
         facts=_facts(dataset, model) | _facts_of(rigorous),
         warnings=(*_warnings(dataset, model), *rigorous.warnings),
         sources=() if rigorous.path is None else (rigorous.path,),
+        pieces=tiles_beside(place(dataset.GetDescription())),
     )
 
 

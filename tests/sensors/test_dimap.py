@@ -15,11 +15,14 @@ import pytest
 from click.testing import CliRunner
 from ortho_rpc.dimap import has_dimap_pushbroom, read_dimap_pushbroom
 from osgeo import gdal
+from products import dimap_product
 from seeds import dimap_text
 
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
+from ortho_pipeline.exchange.rpc_files import read_rpc_text
+from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
 from ortho_pipeline.models import RPC, Pushbroom
 from ortho_pipeline.models.base import Array
@@ -424,3 +427,64 @@ def test_three_thousand_mutations_of_the_real_file(pleiades: Path, tmp_path: Pat
             continue
         assert np.isfinite(np.concatenate([model.path.coefficients, model.attitude.coefficients])).all()
     assert 300 < refused < 2900
+
+
+# -- tiles, folders, Pleiades Neo ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def tiled(tmp_path: Path) -> tuple[Path, Path, Pushbroom]:
+    """Two tiles of a scene with its metadata and RPC, and its model."""
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    dimap_product(folder)
+    model = read_dimap_pushbroom(folder / "DIM_A.XML").with_heights(190.0, 220.0)
+    centre, half = model.domain
+    box = (centre[0] - half[0], centre[1] - half[1], centre[0] + half[0], centre[1] + half[1])
+    return *dimap_product(folder, fit_rpc(model, box, (190.0, 220.0), grid=(7, 7, 4)).rpc), model
+
+
+def test_tiles_count_as_one_image(tiled: tuple[Path, Path, Pushbroom]) -> None:
+    first, second, model = tiled
+    scene = open_scene(second)
+    assert [(Path(piece.path).name, piece.offset, piece.size) for piece in scene.pieces] == [
+        (first.name, (-200, 0), (200, 400))
+    ]
+    image = np.array([[10.0, 20.0], [90.0, 390.0]])
+    ground = model.image_to_ground(image + np.array([200.0, 0.0]), 205.0)
+    for each in scene.models.values():
+        assert np.abs(each.ground_to_image(ground) - image).max() < 1e-3
+
+
+@pytest.mark.parametrize("given", ["DIM_A.XML", ""], ids=["metadata", "folder"])
+def test_metadata_or_folder_in_place_of_an_image(tiled: tuple[Path, Path, Pushbroom], given: str) -> None:
+    """All tiles are one image then, by GDAL's driver of DIMAP."""
+    first, _, model = tiled
+    scene = open_scene(first.parent / given)
+    assert (scene.width, scene.height) == (300, 400)
+    assert list(scene.models) == ["rpc", "pushbroom"]
+    ground = model.image_to_ground([[250.0, 100.0]], 205.0)
+    assert np.abs(scene.model.ground_to_image(ground) - [250.0, 100.0]).max() < 1e-3
+
+
+def test_a_folder_of_two_products_names_them(tiled: tuple[Path, Path, Pushbroom]) -> None:
+    folder = tiled[0].parent
+    shutil.copy(folder / "DIM_A.XML", folder / "DIM_B.XML")
+    with pytest.raises(InputError, match=r"several products: DIM_A.XML, DIM_B.XML"):
+        open_scene(folder)
+
+
+@pytest.mark.realdata
+def test_rpc_of_pleiades_neo_and_its_vertices(real: Path) -> None:
+    """Version 3 of the file; it counts from 0 where the vertices, with heights, count centres from 1.
+
+    Below, their corners are 0.15 px apart: as far as one of the vendor's models follows the other.
+    """
+    folder = real / "sensors" / "asp_plot" / "pleiades"
+    rpc = read_rpc_text(folder / "RPC_PNEO3_202111071029126_PAN_trimmed.XML")
+    root = ElementTree.parse(folder / "DIM_PNEO3_202111071029126_PAN_trimmed.XML").getroot()
+    names = ("LON", "LAT", "H", "COL", "ROW")
+    corners = np.array([[float(v.findtext(n)) for n in names] for v in root.iter("Vertex")])
+    apart = rpc.ground_to_image(corners[:, :3]) - (corners[:, 3:] - 0.5)
+    assert np.abs(apart[:2]).max() < 0.002
+    assert np.abs(apart[2:]).max() < 0.16
