@@ -32,6 +32,7 @@ from ortho_pipeline.imaging.matching.targets import (
     View,
     chip_factor,
     metres_per_pixel,
+    near,
     shown_by,
     spread_over,
 )
@@ -142,12 +143,14 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     InputError
         If there is no overlap, no place stands out, or what was found could be an accident; with the reason.
     """
+    reach = settings.search / metres_per_pixel(view)
+    targets = near(view, targets, reach)
     # Left alone, GDAL keeps blocks in a share of the machine's memory; chips lie beside each other and need few.
     seen = [view.intensity, *(target.intensity for target in targets)]
     threads = limit_cache(settings.memory, settings.threads, *(one.source.block for one in seen))
     shown = _shown(view, targets)
     base = chip_factor(view, targets, shown)
-    reach = max(settings.search / metres_per_pixel(view), 2.0 * base)
+    reach = max(reach, 2.0 * base)
     region = _region(view, shown)
     correction, levels = place(view, targets, reach, base, region)
     extent = region[2] - region[0], region[3] - region[1]

@@ -195,6 +195,28 @@ def spread_over(view: View) -> Array:
     return np.column_stack([columns.ravel(), rows.ravel()])
 
 
+def near(view: View, targets: Sequence[Target], reach: float) -> Sequence[Target]:
+    """Return the targets that may show something of a scene whose model is off by `reach` px; all, if none may.
+
+    Of a country's many orthoimages a scene needs few, and each of the others would be asked for every chip.
+    """
+    image = spread_over(view)
+    ground = view.model.image_to_ground(image, view.model.reference_height)
+    # A quarter of the scene besides, for relief and the curves of the projection.
+    share = 0.25 + reach / min(view.size)
+    found = []
+    for target in targets:
+        places = target.project(ground, view.model.crs)
+        places = places[np.isfinite(places).all(axis=1)]
+        if len(places):
+            low, high = places.min(axis=0), places.max(axis=0)
+            margin, size = share * (high - low).max(), (target.intensity.width, target.intensity.height)
+            if ((low - margin > size) | (high + margin < 0)).any():
+                continue
+        found.append(target)
+    return found or targets
+
+
 def shown_by(targets: Sequence[Target], ground: Array, crs: str) -> NDArray[np.bool_]:
     """Tell which ground ``(n, 3)`` lies in one of the targets at least."""
     found = np.zeros(len(ground), dtype=bool)
