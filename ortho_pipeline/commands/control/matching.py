@@ -259,7 +259,8 @@ def search_of(scene: Scene, options: MatchOptions, pixel: float) -> Search:
         Size (m) of a pixel on the ground.
     """
     if options.search is not None:
-        return Search(options.search, "as asked for")
+        least = 2.0 * pixel  # as far as chips are moved in any case
+        return Search(options.search, "as asked for") if options.search >= least else Search(least, "two pixels")
     stated = _stated(scene, pixel)
     if stated is not None:
         sigma, source = stated
