@@ -128,13 +128,13 @@ def _typed(option: Option) -> dict[str, Any]:
     }.get(option.kind, {})
 
 
-def _pair(_: click.Context, __: click.Parameter, text: str | None) -> tuple[float, float] | None:
+def _pair(_: click.Context, option: click.Parameter, text: str | None) -> tuple[float, float] | None:
     if text is None:
         return None
     try:
         column, row = (float(part) for part in text.split(","))
     except ValueError:
-        raise click.BadParameter(f"{text!r} is not COL,ROW") from None
+        raise click.BadParameter(f"{text!r} is not {option.metavar}") from None
     return column, row
 
 

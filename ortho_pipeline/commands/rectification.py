@@ -12,6 +12,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.points import match_asked
 from ortho_pipeline.commands.inputs import has_surface, open_surface
 from ortho_pipeline.commands.layers import budget as layers
+from ortho_pipeline.commands.layers.angles import sun_of, write_angles
 from ortho_pipeline.commands.placement import place_scene, source_of
 from ortho_pipeline.commands.results import ENDINGS, Result, outputs, outputs_together, write_report
 from ortho_pipeline.commands.scene_fit import adjust, open_adjustable
@@ -89,7 +90,7 @@ def rectify(
     limit_cache(output.memory, 1)
     opened = open_adjustable(image, scene, points, match)
     heights = open_surface(surface, scene, output.memory)
-    acquired = _acquired(opened.facts, output)
+    acquired, sun = _acquired(opened.facts, output), sun_of(opened.facts, output)
     read = inputs.files_read(image, scene, points, surface, match, opened)
     begun = states(read) | begun
     with inputs.hashed_beside(read, digest) as hashing:
@@ -102,6 +103,7 @@ def rectify(
         path = layers.ortho_of(placed, files, output)
         warped = _warp(model, exported, source, heights, grid, path, output, progress)
         accuracy = layers.write_layers(placed, budget, warped, files, output)
+        angles = write_angles(placed, sun, files, output)
         asked = {"scene": scene, "surface": surface, "output": output, **match_asked(match)}
         record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
     whole = raster.open_dataset(image, **scene.access)
@@ -112,7 +114,7 @@ def rectify(
         warnings=[*adjusted.warnings(heights), *found.notes(), *placed.sparse(warped.valid_pixels), *complaints,
                   *notes, *warped.notes(output.memory)],
     )  # fmt: skip
-    made = report.with_layers(made, accuracy=accuracy)
+    made = report.with_layers(made, accuracy=accuracy, angles=angles)
     write_report(made, adjusted.fit, files, adjusted.matched)
     if acquired is not None:
         stac_items.write_item(files["stac"], made, files, acquired, name or stem)
@@ -145,6 +147,7 @@ def check(
     inputs.require_heights(surface)
     opened = open_adjustable(image, scene, points, match)
     _acquired(opened.facts, output)
+    sun_of(opened.facts, output)
     placed = place_scene(opened, points, scene, open_surface(surface, scene, output.memory), output, match)
     Profile.of(source_of(placed.scene, image, scene, output), output.dtype, output.nodata)
     layers.budget_of(placed, match, output)

@@ -42,6 +42,8 @@ ENDINGS = {
     "thumbnail": "_thumbnail.png",
     "overview": "_overview.png",
     "visibility": "_visibility.tif",
+    "angles": "_angles.tif",
+    "shadow": "_shadow.tif",
     "accuracy": "_accuracy.tif",
     "accuracy_style": "_accuracy.qml",
 }
@@ -50,6 +52,7 @@ _ASKED = {
     "stac": ("stac", "thumbnail", "overview"),
     "accuracy_raster": ("accuracy", "accuracy_style"),
     "visibility": ("visibility",),
+    "angles": ("angles", "shadow"),
 }
 
 _P = ParamSpec("_P")

@@ -357,10 +357,24 @@ class OutputOptions:
             "(with a surface model a true ortho).", choices=("mask", "nodata"),
         ),
     ] = None  # fmt: skip
+    angles: Annotated[
+        bool,
+        Option(
+            "--angles", "Write angles of view at each place and, where the sun is known, of the sun, and which pixels "
+            "lie in shadow.",
+        ),
+    ] = False  # fmt: skip
+    sun: Annotated[
+        Sequence[float] | None,
+        Option(
+            "--sun", "Azimuth and elevation of the sun, degrees, for `output.angles`.", "AZ,EL", kind="pair",
+            unset="that of the metadata",
+        ),
+    ] = None  # fmt: skip
     layer_step: Annotated[
         int,
         Option(
-            "--layer-step", "Pixels of the ortho to one of `output.accuracy_raster`, per side.", "N", kind="integer",
+            "--layer-step", "Pixels of the ortho to one of the layers of accuracy and angles.", "N", kind="integer",
             above=0,
         ),
     ] = 16  # fmt: skip

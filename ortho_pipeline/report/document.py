@@ -36,6 +36,7 @@ from ortho_pipeline.report.delivered import accuracy_before
 from ortho_pipeline.report.gallery.chips import gallery
 from ortho_pipeline.report.gallery.plots import residuals_by_axis
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
+from ortho_pipeline.report.layers.angles import AnglesLayer
 from ortho_pipeline.report.map_scale import map_scale
 from ortho_pipeline.report.matching import matching_record
 from ortho_pipeline.report.plots import plots
@@ -261,8 +262,11 @@ def _warped(warp: WarpResult) -> WarpRecord:
     return record_of(WarpRecord, {name: value for name, value in asdict(warp).items() if name != "seconds"})
 
 
-def with_layers(report: SceneReport, *, accuracy: AccuracyLayer | None) -> SceneReport:
+def with_layers(
+    report: SceneReport, *, accuracy: AccuracyLayer | None, angles: AnglesLayer | None = None
+) -> SceneReport:
     """Return the report with what layers beside the ortho say; the headline gives the accuracy over the scene."""
+    report = replace(report, angles=angles)
     if accuracy is None:
         return report
     head = report.headline

@@ -19,6 +19,7 @@ from ortho_pipeline.report.adjustment_records import (
     RmsesOnGround,
 )
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
+from ortho_pipeline.report.layers.angles import AnglesLayer
 from ortho_pipeline.report.matching import MatchingRecord
 
 Size = tuple[Annotated[int, Shape(minimum=1)], Annotated[int, Shape(minimum=1)]]
@@ -365,6 +366,7 @@ class SceneReport:
     ortho: OrthoRecord | None
     warp: WarpRecord | None
     accuracy: AccuracyLayer | None = None
+    angles: AnglesLayer | None = None
     provenance: Provenance
     warnings: tuple[str, ...]
     notices: tuple[NoticeDocument, ...] = ()

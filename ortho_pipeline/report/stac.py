@@ -48,6 +48,8 @@ _ASSETS = (
     ("html", "Accuracy report as a page", "text/html", ["metadata"]),
     ("model", "Adjusted sensor model", "application/json", ["metadata"]),
     ("visibility", "Visible (1), hidden (2), outside (3) and void (4) pixels", _COG, ["metadata"]),
+    ("angles", "Angles of view and of the sun at each place", _COG, ["data", "metadata"]),
+    ("shadow", "Pixels in the sun (1), in shadow (2), void (4)", _COG, ["metadata"]),
     ("accuracy", "Accuracy of each place", _COG, ["data", "metadata"]),
     ("residuals", "Residuals of the points", "application/geo+json", ["metadata"]),
 )

@@ -242,12 +242,13 @@ def write_accuracy(
     # Little is gained by more effort, and half of the time of the layer would be spent on it.
     options = {"LEVEL": "1", "OVERVIEW_RESAMPLING": "AVERAGE"}
     with RasterWriter(path, grid, profile, creation_options=options, threads=resources.threads or 1) as writer:
-        for left, top, width, height in _tiles(grid, _TILE):
+        for left, top, width, height in tiles(grid, _TILE):
             writer.write(left, top, layer.make(left, top, width, height), None)
     return layer.result()
 
 
-def _tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
+def tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
+    """Yield left, top, width and height of the tiles of a grid, row by row."""
     for top in range(0, grid.height, side):
         for left in range(0, grid.width, side):
             yield left, top, min(side, grid.width - left), min(side, grid.height - top)

@@ -92,5 +92,5 @@ class Looked:
             count=1, dtype=np.dtype(np.uint8), validity="nodata", nodata=0.0, descriptions=("visibility",),
             interpretations=(0,), metadata={f"CLASS_{value}": name for value, name in enumerate(NAMES) if name},
         )  # fmt: skip
-        options = {"LEVEL": "1", "OVERVIEW_RESAMPLING": "MODE"}
+        options = {"LEVEL": "1", "OVERVIEW_RESAMPLING": "NEAREST"}
         return RasterWriter(self.hiding.mask, self.grid, profile, creation_options=options, threads=threads)

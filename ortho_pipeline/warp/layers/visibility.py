@@ -11,6 +11,7 @@ With cubic interpolation of the heights of an ortho, the surface looked over is 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -47,10 +48,22 @@ class Visibility:
         Lowest and highest ground of the scene, about.
     window_bytes : int
         Of heights that may be held at once.
+    way : callable, optional
+        From output positions and heights to metres east and north on the map ``(n, 2)`` per metre upwards, where lines
+        do not go to the sensor.
     """
 
-    def __init__(self, sight: Sight, surface: Surface, heights: tuple[float, float], window_bytes: int) -> None:
+    def __init__(
+        self,
+        sight: Sight,
+        surface: Surface,
+        heights: tuple[float, float],
+        window_bytes: int,
+        *,
+        way: Callable[[Array, Array, Array], Array] | None = None,
+    ) -> None:
         self._sight, self._surface, self._bytes = sight, surface, window_bytes
+        self._way = way or self._to_sensor
         low, high = heights
         self._middle, self._half = (low + high) / 2, max((high - low) / 2, 1.0)
         self._sampler = surface.sampler(sight.grid.crs)
@@ -97,11 +110,14 @@ class Visibility:
 
     def _slopes(self, columns: Array, rows: Array, heights: Array) -> tuple[Array, Array]:
         """Return samples of the DEM per metre upwards ``(n, 2)``, and metres along the ground per metre upwards."""
-        seen = self._sight.seen(columns, rows, heights)
+        way = self._way(columns, rows, heights)
+        step = _RISE * way * [1.0, -1.0] / self._sight.metres(columns, rows)
+        there = self._samples(columns + step[:, 0], rows + step[:, 1])
+        return (there - self._samples(columns, rows)) / _RISE, np.hypot(*way.T)
+
+    def _to_sensor(self, columns: Array, rows: Array, heights: Array) -> Array:
         # A line goes against the displacement of what lies higher.
-        way = -seen.displacement * [1.0, -1.0] / self._sight.metres(columns, rows)
-        there = self._samples(columns + _RISE * way[:, 0], rows + _RISE * way[:, 1])
-        return (there - self._samples(columns, rows)) / _RISE, np.hypot(*seen.displacement.T)
+        return -self._sight.seen(columns, rows, heights).displacement
 
     # -- pieces ------------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,70 @@
+"""Angles of view and of the sun beside an ortho."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ortho_pipeline.commands.placement import Placement
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.process_limits import Resources
+from ortho_pipeline.options import OutputOptions
+from ortho_pipeline.report.layers.angles import AnglesLayer
+
+if TYPE_CHECKING:
+    from ortho_pipeline.warp.layers.angles import Sun
+
+
+def sun_of(facts: Mapping[str, Any], output: OutputOptions) -> Sun | None:
+    """Return where the sun stands: as the user says, or the metadata; None where nobody says, or it is not asked.
+
+    Raises
+    ------
+    InputError
+        If the user gives a sun that does not stand over the horizon, or one that nobody asks for.
+    """
+    if not output.angles:
+        if output.sun is not None:
+            raise InputError("only the angles depend on the sun", field="output.sun",
+                             remedy="give `output.angles` too, or leave it out")  # fmt: skip
+        return None
+    from ortho_pipeline.warp.layers.angles import Sun
+
+    if output.sun is not None:
+        return Sun(float(output.sun[0]), float(output.sun[1]))
+    azimuth, elevation = facts.get("sun_azimuth_deg"), facts.get("sun_elevation_deg")
+    if isinstance(azimuth, int | float) and isinstance(elevation, int | float):
+        # Metadata of a night are no mistake of the user.
+        with contextlib.suppress(InputError):
+            return Sun(float(azimuth), float(elevation))
+    return None
+
+
+def write_angles(
+    placed: Placement, sun: Sun | None, files: dict[str, Path], output: OutputOptions
+) -> AnglesLayer | None:
+    """Write the layers of angles and of shadows, if they were asked for, and return what the report says of them.
+
+    Without a sun there are no shadows, and they are taken out of `files`.
+    """
+    if not output.angles:
+        return None
+    from ortho_pipeline.warp.layers import angles
+    from ortho_pipeline.warp.layers.sight import Sight
+
+    sight, heights = Sight(placed.model, placed.grid), placed.footprint.heights
+    resources = Resources(output.memory, output.threads)
+    size = placed.scene.width, placed.scene.height
+    found = angles.write_angles(
+        sight, placed.surface, size, files["angles"], heights=heights, step=output.layer_step, sun=sun,
+        resources=resources,
+    )  # fmt: skip
+    if sun is None:
+        del files["shadow"]
+        return AnglesLayer(view_zenith_deg=found.view_zenith_deg, sun_deg=None, shadow_share=None)
+    share = angles.write_shadows(sight, placed.surface, sun, files["shadow"], heights=heights, resources=resources)
+    return AnglesLayer(
+        view_zenith_deg=found.view_zenith_deg, sun_deg=(sun.azimuth_deg, sun.elevation_deg), shadow_share=share
+    )

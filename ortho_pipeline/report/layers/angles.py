@@ -1,0 +1,28 @@
+"""The layers of angles in the report."""
+
+from __future__ import annotations
+
+from ortho_pipeline.display.numbers import share
+from ortho_pipeline.files.documents import record
+
+
+@record
+class AnglesLayer:
+    """Least and greatest zenith angle of view; azimuth and elevation of the sun, and the share of the ortho in shadow.
+
+    The last two are null where nobody knows where the sun stood.
+    """
+
+    view_zenith_deg: tuple[float, float]
+    sun_deg: tuple[float, float] | None
+    shadow_share: float | None
+
+    @property
+    def statement(self) -> str:
+        """Return the angles in words."""
+        low, high = self.view_zenith_deg
+        said = f"seen {low:.2f}° to {high:.2f}° off the vertical"
+        if self.sun_deg is None or self.shadow_share is None:
+            return f"{said}; where the sun stood is not known"
+        azimuth, elevation = self.sun_deg
+        return f"{said}; the sun at {azimuth:.1f}°, {elevation:.1f}° high, {share(self.shadow_share)} in shadow"

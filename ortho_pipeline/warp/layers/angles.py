@@ -1,0 +1,258 @@
+"""Angles of view and of the sun at each place of an ortho, and what lies in shadow.
+
+Azimuths are clockwise from true north, towards sensor and sun; zenith angles are from the ellipsoid's normal, and the
+sun's incidence is from the normal of the terrain over a pixel of the layer. The sun stands at one place for the whole
+scene. Refraction is left out.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.process_limits import Resources
+from ortho_pipeline.geodesy.crs import GroundTransform
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.raster.ortho import Profile, RasterWriter
+from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.rays import levels, polynomials
+from ortho_pipeline.warp.layers.accuracy import layer_grid, tiles
+from ortho_pipeline.warp.layers.sight import Sight
+from ortho_pipeline.warp.layers.visibility import Visibility
+from ortho_pipeline.warp.layers.visibility_kernel import HIDDEN, VOID
+
+#: Classes of the mask of shadows, by their values; 0 stands for nothing.
+LIT, SHADED, WITHOUT = 1, 2, 4
+#: Side of a tile, of the layer and of the mask, and pixels of the layer between nodes.
+_TILE, _MASK_TILE, _SPACING = 256, 1024, 16
+_LEVELS = 3
+#: Degrees of latitude over which north is looked for.
+_NORTH = 1e-4
+
+
+@dataclass(frozen=True)
+class Sun:
+    """Where the sun stands, degrees: azimuth from true north, elevation over the horizon.
+
+    Raises
+    ------
+    InputError
+        If it does not stand over the horizon.
+    """
+
+    azimuth_deg: float
+    elevation_deg: float
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.elevation_deg <= 90.0 and abs(self.azimuth_deg) <= 360.0):
+            raise InputError(
+                f"the sun does not stand at an azimuth of {self.azimuth_deg:g} and {self.elevation_deg:g} degrees over "
+                "the horizon", field="output.sun", remedy="give degrees from north and over the horizon, above 0",
+            )  # fmt: skip
+
+    def way(self, grid: Grid) -> Callable[[Array, Array, Array], Array]:
+        """Return the function from output positions to metres east, north on the map ``(n, 2)`` per metre upwards."""
+        tangent, north = 1.0 / math.tan(math.radians(self.elevation_deg)), true_north(grid)
+
+        def found(columns: Array, rows: Array, heights: Array) -> Array:
+            bearing = math.radians(self.azimuth_deg) + north(columns, rows)
+            return tangent * np.stack([np.sin(bearing), np.cos(bearing)], axis=1)
+
+        return found
+
+
+@dataclass(frozen=True)
+class AnglesResult:
+    """Least and greatest zenith angle of view (degrees) where the image reaches; NaN where it does not."""
+
+    view_zenith_deg: tuple[float, float]
+
+
+def true_north(grid: Grid) -> Callable[[Array, Array], Array]:
+    """Return the function from output positions to the bearing (radians) of true north on the map ``(n,)``."""
+    there, back = GroundTransform(grid.crs, "EPSG:4979"), GroundTransform("EPSG:4979", grid.crs)
+
+    def found(columns: Array, rows: Array) -> Array:
+        x, y = grid.xy(columns, rows)
+        if grid.crs.is_geographic:
+            return np.zeros(len(x))
+        lonlat = there(np.stack([x, y, np.zeros(len(x))], axis=1))
+        step = np.array([0.0, _NORTH, 0.0])
+        ends = back(np.concatenate([lonlat - step, lonlat + step]))
+        way = ends[len(x) :] - ends[: len(x)]
+        return np.asarray(np.arctan2(way[:, 0], way[:, 1]))
+
+    return found
+
+
+# -- angles ----------------------------------------------------------------------------------------------------------
+
+
+def write_angles(
+    sight: Sight,
+    surface: Surface,
+    size: tuple[int, int],
+    path: str | os.PathLike[str],
+    *,
+    heights: tuple[float, float],
+    step: int,
+    sun: Sun | None = None,
+    resources: Resources | None = None,
+) -> AnglesResult:
+    """Write zenith and azimuth of view, and the sun's incidence, of the ortho on the grid of `sight` as a COG.
+
+    Bands: view_zenith, view_azimuth and with a sun sun_incidence, degrees; NaN where the image does not reach.
+
+    Parameters
+    ----------
+    size : (int, int)
+        Columns and rows of the image.
+    heights : (float, float)
+        Lowest and highest ground of the scene, about.
+    step : int
+        Pixels of the ortho to one of the layer, per side.
+    """
+    grid = layer_grid(sight.grid, step)
+    own, names = Sight(sight.model, grid), ["view_zenith", "view_azimuth", *(["sun_incidence"] if sun else [])]
+    profile = Profile(
+        count=len(names), dtype=np.dtype(np.float32), validity="nodata", nodata=math.nan, descriptions=tuple(names),
+        interpretations=(0,) * len(names), scales=((1.0, 0.0, "degree"),) * len(names), metadata=_metadata(sun),
+    )  # fmt: skip
+    low, high = math.inf, -math.inf
+    options = {"LEVEL": "1", "OVERVIEW_RESAMPLING": "NEAREST"}
+    threads = (resources or Resources()).threads or 1
+    with RasterWriter(path, grid, profile, creation_options=options, threads=threads) as writer:
+        for left, top, width, height in tiles(grid, _TILE):
+            bands = _angles(own, surface, size, heights, (left, top, width, height), sun)
+            if np.isfinite(bands[0]).any():
+                low, high = min(low, float(np.nanmin(bands[0]))), max(high, float(np.nanmax(bands[0])))
+            writer.write(left, top, bands.astype(np.float32), None)
+    return AnglesResult((low, high) if low <= high else (math.nan, math.nan))
+
+
+def _metadata(sun: Sun | None) -> Mapping[str, str]:
+    if sun is None:
+        return {}
+    return {"SUN_AZIMUTH": f"{sun.azimuth_deg:.10g}", "SUN_ELEVATION": f"{sun.elevation_deg:.10g}"}
+
+
+def _angles(
+    sight: Sight, surface: Surface, size: tuple[int, int], heights: tuple[float, float],
+    window: tuple[int, int, int, int], sun: Sun | None,
+) -> Array:  # fmt: skip
+    """Return the bands ``(n, height, width)`` of a window (left, top, width, height) of a layer."""
+    left, top, width, height = window
+    columns, rows = np.meshgrid(left + 0.5 + np.arange(width), top + 0.5 + np.arange(height))
+    flat = columns.ravel(), rows.ravel()
+    middle, half = sum(heights) / 2, max((heights[1] - heights[0]) / 2, 1.0)
+    ground = surface.heights(np.stack(sight.grid.xy(*flat), axis=1), sight.grid.crs)
+    fields = _between(sight, window, middle, half)
+    t = ((ground - middle) / half).reshape(height, width, 1)
+    image = (fields[..., 0, :2] + t * (fields[..., 1, :2] + t * fields[..., 2, :2])).reshape(-1, 2)
+    lean = (fields[..., 0, 2:] + t * (fields[..., 1, 2:] + t * fields[..., 2, 2:])).reshape(-1, 2)
+    north = true_north(sight.grid)(*flat)
+    zenith = np.arctan(np.hypot(*lean.T))
+    # A ray goes against the displacement; straight down it comes from nowhere in particular.
+    azimuth = np.degrees(np.arctan2(-lean[:, 0], -lean[:, 1]) - north) % 360.0
+    found = [np.degrees(zenith), azimuth]
+    if sun is not None:
+        found.append(_incidence(sight, surface, flat, sun.way(sight.grid)(*flat, ground)))
+    bands = np.stack(found)
+    with np.errstate(invalid="ignore"):
+        bands[:, ~((image >= 0) & (image <= size)).all(axis=1)] = math.nan
+    return bands.reshape(len(found), height, width)
+
+
+def _between(sight: Sight, window: tuple[int, int, int, int], middle: float, half: float) -> Array:
+    """Return image points and displacements ``(height, width, levels, 4)`` as polynomials in the normalised height."""
+    left, top, width, height = window
+    across, down = (np.arange(-(-side // _SPACING) + 1) * _SPACING for side in (width, height))
+    nodes = _nodes(sight, left + 0.5 + across, top + 0.5 + down, middle, half)
+    if not np.isfinite(nodes).all():
+        # Where the model ends between nodes, every pixel is one.
+        return _nodes(sight, left + 0.5 + np.arange(width), top + 0.5 + np.arange(height), middle, half)
+    by_row, by_column = (_weights(side) for side in (height, width))
+    return np.asarray(np.einsum("rj,jikf,ci->rckf", by_row, nodes, by_column, optimize=True))
+
+
+def _nodes(sight: Sight, across: NDArray[Any], down: NDArray[Any], middle: float, half: float) -> Array:
+    """Return what `_between` does at nodes ``(rows, columns, levels, 4)``."""
+    columns, rows = np.meshgrid(across, down)
+    count = columns.size
+    at = np.repeat(middle + half * levels(_LEVELS), count)
+    seen = sight.seen(np.tile(columns.ravel(), _LEVELS), np.tile(rows.ravel(), _LEVELS), at)
+    values = np.concatenate([seen.image, seen.displacement], axis=1).reshape(_LEVELS, count, 4).swapaxes(0, 1)
+    return polynomials(values).reshape(len(down), len(across), _LEVELS, 4)
+
+
+def _weights(count: int) -> Array:
+    """Return the weights ``(count, nodes)`` of nodes in linear interpolation."""
+    place = np.arange(count) / _SPACING
+    nodes = np.arange(-(-count // _SPACING) + 1)
+    return np.maximum(0.0, 1.0 - np.abs(place[:, None] - nodes))
+
+
+def _incidence(sight: Sight, surface: Surface, flat: tuple[Array, Array], way: Array) -> Array:
+    """Return the angle (degrees) between the sun and the normal of the terrain over a pixel."""
+    columns, rows = flat
+    metres = sight.metres(columns, rows)
+
+    def at(column: float, row: float) -> Array:
+        return surface.heights(np.stack(sight.grid.xy(columns + column, rows + row), axis=1), sight.grid.crs)
+
+    east = (at(0.5, 0.0) - at(-0.5, 0.0)) / metres[:, 0]
+    north = (at(0.0, -0.5) - at(0.0, 0.5)) / metres[:, 1]
+    cosine = (1.0 - east * way[:, 0] - north * way[:, 1]) / np.sqrt(
+        (1.0 + east**2 + north**2) * (1.0 + (way**2).sum(axis=1))
+    )
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+# -- shadows ---------------------------------------------------------------------------------------------------------
+
+
+def write_shadows(
+    sight: Sight,
+    surface: Surface,
+    sun: Sun,
+    path: str | os.PathLike[str],
+    *,
+    heights: tuple[float, float],
+    resources: Resources | None = None,
+) -> float:
+    """Write which pixels of the ortho lie in shadow, their own or that of other terrain; return the share of shadow.
+
+    Byte: 1 in the sun, 2 in shadow, 4 without a height. A line from the pixel to the sun is followed over the surface,
+    exactly as lines of sight are (`visibility`).
+    """
+    resources = resources or Resources()
+    grid = sight.grid
+    looking = Visibility(sight, surface, heights, resources.memory // 4, way=sun.way(grid))
+    profile = Profile(
+        count=1, dtype=np.dtype(np.uint8), validity="nodata", nodata=0.0, descriptions=("shadow",),
+        interpretations=(0,),
+        metadata={f"CLASS_{LIT}": "in the sun", f"CLASS_{SHADED}": "in shadow", f"CLASS_{WITHOUT}": "without a height",
+                  **_metadata(sun)},
+    )  # fmt: skip
+    options = {"LEVEL": "1", "OVERVIEW_RESAMPLING": "NEAREST"}
+    counts = np.zeros(5, dtype=np.int64)
+    with RasterWriter(path, grid, profile, creation_options=options, threads=resources.threads or 1) as writer:
+        for left, top, width, height in tiles(grid, _MASK_TILE):
+            classes = _classes(looking.look(left, top, width, height))
+            counts += np.bincount(classes.ravel(), minlength=5)
+            writer.write(left, top, classes[None], None)
+    return float(counts[SHADED] / max(counts[LIT] + counts[SHADED], 1))
+
+
+def _classes(found: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    classes = np.full(found.shape, LIT, dtype=np.uint8)
+    classes[found == HIDDEN], classes[found == VOID] = SHADED, WITHOUT
+    return classes

@@ -1,0 +1,129 @@
+"""Angles of view against the geometry of rays, of the sun against a rendered scene."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyproj
+import pytest
+from blocks import FLOOR, NORTH, WEST, City, Parallel, f1, towards
+from osgeo import gdal
+
+from ortho_pipeline import commands
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
+from ortho_pipeline.options import OutputOptions, SurfaceOptions
+from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.report.document import read_report
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.warp import engine
+from ortho_pipeline.warp.layers.angles import Sun, write_angles, write_shadows
+from ortho_pipeline.warp.layers.hiding import Hiding
+from ortho_pipeline.warp.layers.sight import Sight
+
+TOWN = City(((60, 40, 90, 80, 30.0), (120, 100, 128, 110, 60.0), (30, 150, 150, 162, 18.0), (180, 60, 220, 66, 25.0)))
+SUN = Sun(142.0, 40.0)
+
+
+def read(path):
+    return gdal.Open(str(path)).ReadAsArray()
+
+
+def test_angles_of_view_are_those_of_the_rays_in_space(tiny, tmp_path):
+    """Two points of a pixel's ray, 200 m apart in height, in ECEF: their direction, in the axes of the place."""
+    utm = pyproj.CRS.from_epsg(32634)
+    x, y = pyproj.Transformer.from_crs(4326, utm, always_xy=True).transform(tiny.model.lon_off, tiny.model.lat_off)
+    grid = Grid(utm, x - 960, y + 720, 4.8, 4.8, 400, 300)
+    dem = Surface.open(tiny.dem, "ellipsoid")
+    write_angles(Sight(tiny.model, grid), dem, (400, 300), tmp_path / "a.tif", heights=(480.0, 520.0), step=8)
+    zenith, azimuth = read(tmp_path / "a.tif")
+    columns, rows = (part.ravel() for part in np.meshgrid(np.arange(20, 30) * 8 + 4.0, np.arange(10, 20) * 8 + 4.0))
+    heights = dem.heights(np.stack(grid.xy(columns, rows), axis=1), utm)
+    image = Sight(tiny.model, grid).image(columns, rows, heights)
+    low, high = (tiny.model.image_to_ground(image, heights + rise) for rise in (-100.0, 100.0))
+    ray = np.einsum("nij,nj->ni", enu_from_ecef(low), geocentric(high) - geocentric(low))
+    found = (rows // 8).astype(int), (columns // 8).astype(int)
+    np.testing.assert_allclose(
+        zenith[found], np.degrees(np.arctan2(np.hypot(ray[:, 0], ray[:, 1]), ray[:, 2])), atol=0.05
+    )
+    np.testing.assert_allclose(azimuth[found], np.degrees(np.arctan2(ray[:, 0], ray[:, 1])) % 360, atol=0.3)
+
+
+def test_the_sun_falls_on_a_slope_as_the_normal_has_it(tmp_path):
+    from ortho_pipeline.surface.writing import write_dem
+
+    x = np.arange(0, 400.0, 4)
+    heights = FLOOR + 0.3 * np.broadcast_to(x, (100, 100))  # rises to the east
+    write_dem(tmp_path / "dem.tif", heights, (WEST - 70, NORTH + 70), 4.0, "EPSG:32636")
+    surface, grid = Surface.open(tmp_path / "dem.tif", "ellipsoid"), City(()).grid(1.0)
+    sight = Sight(Parallel(0.0, 0.0, 1.0, 256.0), grid)
+    write_angles(sight, surface, (256, 256), tmp_path / "a.tif", heights=(100.0, 220.0), step=8, sun=SUN)
+    zenith, _, incidence = read(tmp_path / "a.tif")[:, 10, 10]
+    normal, sun = np.array([-0.3, 0.0, 1.0]), np.array([*towards(50.0, 142.0), 1.0])
+    cosine = normal @ sun / np.linalg.norm(normal) / np.linalg.norm(sun)
+    # The map's north is a third of a degree from the true one here.
+    assert incidence == pytest.approx(np.degrees(np.arccos(cosine)), abs=0.4)
+    assert zenith == pytest.approx(0.0, abs=1e-6)
+
+
+def rendered(off_nadir: float, azimuth: float) -> np.ndarray:
+    """Return an image of the town: each pixel's ray is walked down to the first box, roof or ground; shade is 40."""
+    east, north = towards(off_nadir, azimuth)
+    count = int(TOWN.side / 0.5)
+    columns, rows = np.meshgrid(np.arange(count) + 0.5, np.arange(count) + 0.5)
+    x, y = 0.5 * columns, TOWN.side - 0.5 * rows
+    height = np.zeros(x.shape)
+    for level in np.arange(60.0, 0.0, -0.125):
+        inside = TOWN.heights(x + east * level, y + north * level) >= level
+        height = np.where((height == 0) & inside, level, height)
+    place = x + east * height, y + north * height
+    # A wall is dark: what the sun does there is no matter of an ortho.
+    roof = TOWN.heights(*place)
+    shade = TOWN.hidden(*place, *towards(90 - SUN.elevation_deg, SUN.azimuth_deg)) | (np.abs(roof - height) > 0.2)
+    return np.where(shade, 40, 200).astype(np.uint8)
+
+
+def test_shadows_of_a_rendered_scene_are_where_the_mask_has_them(tmp_path):
+    east, north = towards(15, 300)
+    model, grid, surface = Parallel(east, north, 0.5, TOWN.side), TOWN.grid(), TOWN.surface(tmp_path / "dsm.tif", 0.25)
+    image = rendered(15, 300)
+    made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "image.tif"), *image.shape[::-1], 1, gdal.GDT_Byte)
+    made.WriteArray(image)
+    made = None
+    heights = (FLOOR, FLOOR + 60)
+    hiding = Hiding(tmp_path / "ortho.tif", heights, tmp_path / "mask.tif")
+    engine.rectify(model, RasterSource(tmp_path / "image.tif"), surface, grid, hiding, resampling="nearest")
+    # The map's north, not the true one, is the renderer's.
+    bearing = Sun(SUN.azimuth_deg - np.degrees(_convergence(grid)), SUN.elevation_deg)
+    share = write_shadows(Sight(model, grid), surface, bearing, tmp_path / "shadow.tif", heights=heights)
+    shadow, visible = read(tmp_path / "shadow.tif"), read(tmp_path / "mask.tif") == 1
+    dark = read(tmp_path / "ortho.tif") == 40
+    assert f1((shadow == 2) & visible, dark & visible) >= 0.98
+    assert share == pytest.approx((shadow == 2).mean())
+    assert 0.02 < share < 0.3
+
+
+def _convergence(grid: Grid) -> float:
+    from ortho_pipeline.warp.layers.angles import true_north
+
+    return float(true_north(grid)(np.array([grid.width / 2]), np.array([grid.height / 2]))[0])
+
+
+def test_rectify_writes_angles_and_shadows_with_the_ortho(tiny, tmp_path):
+    output = OutputOptions(resolution=10.0, crs="EPSG:32634", angles=True, sun=(60.0, 3.0), layer_step=4)
+    surface = SurfaceOptions(dem=tiny.dem, vertical="ellipsoid")
+    result = commands.rectify(tiny.image, tmp_path / "out", surface=surface, output=output)
+    bands = gdal.Open(str(result.files["angles"]))
+    names = [bands.GetRasterBand(k + 1).GetDescription() for k in range(bands.RasterCount)]
+    assert names == ["view_zenith", "view_azimuth", "sun_incidence"]
+    report = read_report(result.files["report"])
+    assert report.angles.sun_deg == (60.0, 3.0)
+    # Waves of 20 m over 300 m throw shadows where the sun is so low.
+    assert 0.05 < report.angles.shadow_share < 0.9
+    assert "in shadow" in report.angles.statement
+    night = OutputOptions(resolution=10.0, crs="EPSG:32634", angles=True)
+    without = commands.rectify(tiny.image, tmp_path / "out", surface=surface, output=night)
+    assert "shadow" not in without.files
+    assert not result.files["shadow"].exists()
+    for wrong in (OutputOptions(sun=(60.0, 3.0)), OutputOptions(angles=True, sun=(60.0, -3.0))):
+        with pytest.raises(InputError):
+            commands.check(tiny.image, surface=surface, output=wrong)
