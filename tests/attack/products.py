@@ -243,3 +243,33 @@ def dimap_product(folder: Path, rpc: RPC | None = None) -> tuple[Path, Path]:
     if rpc is not None:
         (folder / "RPC_A.XML").write_text(rpc_xml(rpc))
     return folder / names[0], folder / names[1]
+
+
+def enmap_text(size: tuple[int, int], rpcs: tuple[RPC, ...]) -> str:
+    """Return METADATA.XML of EnMAP level 1B: three visible bands and two infrared ones, each with its RPC."""
+
+    def listed(number: int, rpc: RPC) -> str:
+        fields = rpc_metadata(rpc)
+        names = {key: key.replace("LINE_", "ROW_").replace("SAMP_", "COL_") for key in SCALARS}
+        terms = {"LINE_NUM": "ROW_NUM", "LINE_DEN": "ROW_DEN", "SAMP_NUM": "COL_NUM", "SAMP_DEN": "COL_DEN"}
+        parts = [f"<{name}>{fields[key]}</{name}>" for key, name in names.items()]
+        for key, name in terms.items():
+            values = fields[f"{key}_COEFF"].split()
+            parts += [f"<{name}_{k:02d}>{value}</{name}_{k:02d}>" for k, value in enumerate(values, 1)]
+        return f'<bandID number="{number}">{"".join(parts)}</bandID>\n'
+
+    bands = "".join(listed(k, rpc) for k, rpc in enumerate(rpcs, 1))
+    dimension = f"<dimension><columns>{size[0]}</columns><rows>{size[1]}</rows></dimension>"
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<level_X><base><level>L1B</level></base><specific><datatakeStart>'
+        "2022-06-09T08:12:25.038918Z</datatakeStart></specific><product><image>"
+        f"<vnir><channels>3</channels>{dimension}</vnir><swir><channels>2</channels>{dimension}</swir></image>"
+        f"<navigation><RPC>\n{bands}</RPC></navigation></product></level_X>\n"
+    )
+
+
+PLANET = (
+    '{"id": "20200101_081500_12_2401", "type": "Feature", "properties": {"acquired": "2020-01-01T08:15:00.12Z",\n'
+    ' "cloud_cover": 0.01, "gsd": 3.7, "instrument": "PSB.SD", "item_type": "PSScene", "satellite_id": "2401",\n'
+    ' "strip_id": "3000001", "sun_azimuth": 140.1, "sun_elevation": 41.5, "view_angle": 2.1}}\n'
+)

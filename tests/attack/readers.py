@@ -18,9 +18,11 @@ import seeds
 from ortho_asp.cameras import read_adjust, read_aster, read_tsai
 from ortho_bilsat.survey import read_survey
 from ortho_cartosat.metadata import read_metadata as read_cartosat
+from ortho_enmap import read_enmap
 from ortho_ikonos.metadata import read_header, read_metadata
 from ortho_maxar.isd import Isd, read_isd_pushbroom
 from ortho_orbview3.product import read_product
+from ortho_planet import read_item
 from ortho_rpc.dimap import read_dimap_pushbroom
 from ortho_spot.dimap import read_spot
 
@@ -329,6 +331,15 @@ def _csm_frame_seed(folder: Path) -> bytes:
     return csm_text(_tsai(folder / "one.tsai").with_heights(0.0, 300.0))[0].encode()
 
 
+def _enmap_seed(folder: Path) -> bytes:
+    return products.enmap_text(seeds.SIZE, (seeds.rpc(),) * 5).encode()
+
+
+def _enmap(path: Path) -> Any:
+    rpcs, facts = read_enmap(path)
+    return [*rpcs, facts]
+
+
 def _maxar_seed(folder: Path) -> bytes:
     tiles = (("A-P1BS_R1C1-1_P001.TIF", 0, 0, 40, 50), ("A-P1BS_R1C2-1_P001.TIF", 40, 0, 20, 50))
     return products.isd_text(tiles=tiles, rpc=seeds.rpc()).encode()
@@ -389,6 +400,8 @@ READERS = (
     Reader("asp-pinhole", "text", "one.tsai", _text(products.tsai_text()), _tsai),
     Reader("asp-adjust", "text", "one.adjust", _text("0.3 -0.5 0.02\n1.0 -5e-7 -4e-7 -9e-6\n"), read_adjust),
     Reader("asp-aster", "xml", "one.xml", _text(products.aster_text()), read_aster),
+    Reader("enmap-metadata", "xml", "one-METADATA.XML", _enmap_seed, _enmap),
+    Reader("planet-item", "json", "one_metadata.json", _text(products.PLANET), read_item),
     Reader("maxar-isd", "xml", "one.XML", _maxar_seed, _maxar),
     Reader("spot-metadata", "xml", "METADATA.DIM", _text(products.spot_text()), _spot),
     Reader("spot-detectors", "xml", "METADATA.DIM", _text(products.spot_text(every=True, corrected=True)), _spot),

@@ -27,6 +27,7 @@ DEAR = {
     "dimap-lists": 60,
     "dimap-polynomials": 60,
     "maxar-isd": 40,
+    "enmap-metadata": 60,
     "csm-line-scanner": 60,
     "asp-aster": 60,
     "spot-metadata": 40,

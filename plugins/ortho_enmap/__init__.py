@@ -1,0 +1,177 @@
+"""Sensor plugin for EnMAP level 1B: the spectral image of a detector with the RPCs of its bands from METADATA.XML.
+
+Every band has an RPC, because the detectors look at a place one after the other: the short-wave infrared sees it 20
+rows from the visible, and not by the same amount at every height. One band's RPC is that of the image.
+
+Rows and columns of these RPCs count from 0 at the first centre: with the file's corners, whose heights are not said,
+the rows of the first and the last line are 0.0 and 1023.0 of 1024.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from osgeo import gdal
+
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.exchange.rpc_files import rpc_of_fields
+from ortho_pipeline.files import read_bounded
+from ortho_pipeline.files.locations import place
+from ortho_pipeline.files.xml_fields import XmlFields
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.models.rational import RPC
+
+MAX_SIZE = 20_000_000
+MOST_BANDS = 300
+_DETECTORS = ("VNIR", "SWIR")
+_SCALARS = {
+    "ROW_OFF": "LINE_OFF", "COL_OFF": "SAMP_OFF", "LAT_OFF": "LAT_OFF", "LONG_OFF": "LONG_OFF",
+    "HEIGHT_OFF": "HEIGHT_OFF", "ROW_SCALE": "LINE_SCALE", "COL_SCALE": "SAMP_SCALE", "LAT_SCALE": "LAT_SCALE",
+    "LONG_SCALE": "LONG_SCALE", "HEIGHT_SCALE": "HEIGHT_SCALE",
+}  # fmt: skip
+_TERMS = {
+    "ROW_NUM": "LINE_NUM_COEFF",
+    "ROW_DEN": "LINE_DEN_COEFF",
+    "COL_NUM": "SAMP_NUM_COEFF",
+    "COL_DEN": "SAMP_DEN_COEFF",
+}
+#: Bands of one image that lie further (px) from the chosen one are worth a word.
+_SAME = 0.1
+_REMEDY = "copy the metadata again from the delivery"
+
+
+@hookimpl
+def ortho_sensors() -> Iterable[Sensor]:
+    """Offer the sensor ``enmap``."""
+    yield Sensor(
+        "enmap",
+        "EnMAP level 1B: ...SPECTRAL_IMAGE_VNIR.TIF or _SWIR.TIF with ...METADATA.XML",
+        recognises,
+        open_scene,
+        options={"band": "the band whose RPC is taken, counted from 1 in this image; by itself the middle one"},
+    )
+
+
+def metadata_of(name: str) -> tuple[Path, str] | None:
+    """Return the metadata of an image and its detector, by their names; None for others."""
+    if not name:
+        return None
+    image = place(name)
+    start, sign, end = image.stem.upper().partition("-SPECTRAL_IMAGE")
+    detector = next((one for one in _DETECTORS if end.strip("_") in (one, f"{one}_COG")), None)
+    if not sign or detector is None or not start.startswith("ENMAP"):
+        return None
+    try:
+        wanted = f"{start}-METADATA.XML"
+        found = next((one for one in image.parent.iterdir() if one.name.upper() == wanted), None)
+    except (OSError, ValueError, InputError):
+        return None
+    return None if found is None else (found, detector)
+
+
+def recognises(dataset: gdal.Dataset) -> bool:
+    """Tell whether an image is one of a detector of EnMAP with its metadata beside it."""
+    found = metadata_of(dataset.GetDescription())
+    try:
+        return found is not None and b"level_X" in read_bounded(found[0], 1000)
+    except InputError:
+        return False
+
+
+def open_scene(dataset: gdal.Dataset, *, band: str | None = None) -> Scene:
+    """Open the image of a detector with the RPC of one of its bands."""
+    name, size = dataset.GetDescription(), (dataset.RasterXSize, dataset.RasterYSize)
+    found = metadata_of(name)
+    if found is None:
+        raise InputError("there is no METADATA.XML beside this image", file=name, remedy="add it from the delivery")
+    path, detector = found
+    rpcs, facts = read_enmap(path)
+    its = _of_detector(rpcs, facts, detector, dataset.RasterCount, path)
+    number = _chosen(band, len(its))
+    model = its[number - 1]
+    if facts["size"] != list(size):
+        raise InputError(
+            "the metadata are of {} x {} pixels, the image has {} x {}".format(*facts["size"], *size), file=path,
+            field="dimension", remedy="give the whole image, or of a crop its place with `scene.crop_offset=COL,ROW`",
+        )  # fmt: skip
+    warnings = []
+    apart = max(apart_of(one, model) for one in its)
+    if apart > _SAME:
+        text = f"bands of this image lie up to {apart:.2f} px from band {number}, whose RPC is taken for all"
+        warnings.append(Notice("bands-differ", text, difference_px=round(apart, 3)))
+    other = rpcs[facts["bands_vnir"] + facts["bands_swir"] // 2 if detector == "VNIR" else facts["bands_vnir"] // 2]
+    facts |= {"detector": detector, "band": number, "parallax_to_other_detector_px_per_km": parallax(model, other)}
+    return Scene("enmap", name, *size, {"rpc": model}, str(path), facts, tuple(warnings))
+
+
+@reads(_REMEDY)
+def read_enmap(path: Path) -> tuple[tuple[RPC, ...], dict[str, Any]]:
+    """Read the RPCs of all bands, visible ones first, and what is worth showing.
+
+    Raises
+    ------
+    InputError
+        If it is no metadata of level 1B, or an RPC is damaged.
+    """
+    file = XmlFields(path, remedy=_REMEDY, limit=MAX_SIZE)
+    level = file.said("base/level") or "none"
+    if level != "L1B":
+        raise file.error(f"a product of level {level[:10]} has no RPCs", "base/level", "take level 1B")
+    entries = file.all("product/navigation/RPC/bandID", MOST_BANDS) or file.all(".//RPC/bandID", MOST_BANDS)
+    if not entries:
+        raise file.error("there are no RPCs", "RPC")
+    rpcs = []
+    for entry in entries:
+        fields = {gdals: file.text(name, entry) for name, gdals in _SCALARS.items()}
+        for name, gdals in _TERMS.items():
+            fields |= {f"{gdals}_{k}": file.text(f"{name}_{k:02d}", entry) for k in range(1, 21)}
+        rpcs.append(rpc_of_fields(fields, path))
+    columns, rows = (file.integer(f"product/image/vnir/dimension/{name}") for name in ("columns", "rows"))
+    facts: dict[str, Any] = {"size": [columns, rows], "acquired": file.said("specific/datatakeStart")}
+    for detector in _DETECTORS:
+        facts[f"bands_{detector.lower()}"] = file.integer(f"product/image/{detector.lower()}/channels")
+    return tuple(rpcs), facts
+
+
+def apart_of(one: RPC, other: RPC) -> float:
+    """Return how far (px) two bands are apart in the middle of the other, at its own height."""
+    middle = np.array([[other.lon_off, other.lat_off, other.h_off]])
+    return float(np.linalg.norm(one.ground_to_image(middle) - other.ground_to_image(middle)))
+
+
+def parallax(one: RPC, other: RPC) -> list[float]:
+    """Return by how many pixels (column, row) the place of `other` beside `one` grows with a kilometre of height."""
+    ground = one.lon_off, one.lat_off
+    low, high = (np.array([[*ground, one.h_off + h]]) for h in (-500.0, 500.0))
+    apart = [other.ground_to_image(at) - one.ground_to_image(at) for at in (low, high)]
+    return [round(float(value), 5) for value in (apart[1] - apart[0])[0]]
+
+
+def _of_detector(
+    rpcs: tuple[RPC, ...], facts: dict[str, Any], detector: str, bands: int, path: Path
+) -> tuple[RPC, ...]:
+    """Return the RPCs of the bands of a detector, which the image has to have all."""
+    visible, infrared = facts["bands_vnir"], facts["bands_swir"]
+    if visible + infrared != len(rpcs):
+        raise InputError(
+            f"{len(rpcs)} RPCs are not those of {visible} and {infrared} bands", file=path, field="RPC", remedy=_REMEDY
+        )
+    its = rpcs[:visible] if detector == "VNIR" else rpcs[visible:]
+    if bands != len(its):
+        raise InputError(
+            f"the image has {bands} bands, the metadata {len(its)} of {detector}", file=path, field="channels",
+            remedy="give the image with all its bands",
+        )  # fmt: skip
+    return its
+
+
+def _chosen(band: str | None, count: int) -> int:
+    if band is None:
+        return (count + 1) // 2
+    if not band.isascii() or not band.isdigit() or not 1 <= int(band[:9]) <= count:
+        raise InputError(f"there is no band {band[:20]!r}", field="band", remedy=f"give a number from 1 to {count}")
+    return int(band)

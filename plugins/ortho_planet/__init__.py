@@ -1,0 +1,110 @@
+"""Sensor plugin for Planet's basic products: PlanetScope level 1B and SkySat level 1A/1B, by their RPC.
+
+The metadata of an item (``<id>_metadata.json``) lie beside its assets, whose names begin with the item's. Frames of one
+strip are images of their own: `ortho adjust` takes them together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from osgeo import gdal
+
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.exchange.rpc import has_rpc, rpc_of_dataset
+from ortho_pipeline.files import read_bounded, read_json
+from ortho_pipeline.files.locations import place
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+
+MAX_SIZE = 5_000_000
+_REMEDY = "download the item's metadata again"
+#: What of an item is worth showing, and what it is called here.
+_TEXTS = {"acquired": "acquired", "satellite_id": "satellite", "instrument": "instrument", "item_type": "item_type",
+          "strip_id": "strip"}  # fmt: skip
+_NUMBERS = {
+    "sun_azimuth": "sun_azimuth_deg", "sun_elevation": "sun_elevation_deg", "view_angle": "view_angle_deg",
+    "cloud_cover": "cloud_cover", "gsd": "stated_gsd_m",
+}  # fmt: skip
+
+
+@hookimpl
+def ortho_sensors() -> Iterable[Sensor]:
+    """Offer the sensor ``planet``."""
+    yield Sensor(
+        "planet",
+        "PlanetScope level 1B and SkySat level 1A/1B with <id>_metadata.json and an RPC",
+        recognises,
+        open_scene,
+        options={"rpc": "which RPC to use: tag, sidecar, or an RPC file"},
+    )
+
+
+def metadata_of(name: str) -> Path | None:
+    """Return the metadata of the item that an image is an asset of; None without."""
+    if not name:
+        return None
+    try:
+        image = place(name)
+        found = [one for one in sorted(image.parent.iterdir()) if one.name.lower().endswith("_metadata.json")]
+    except (OSError, ValueError, InputError):
+        return None
+    its = [one for one in found if image.stem.lower().startswith(one.name[: -len("_metadata.json")].lower())]
+    # The longest name is of the item itself, where one item's name begins with another's.
+    return max(its, key=lambda one: len(one.name), default=None)
+
+
+def recognises(dataset: gdal.Dataset) -> bool:
+    """Tell whether metadata of an item of Planet lie beside an image."""
+    path = metadata_of(dataset.GetDescription())
+    try:
+        return path is not None and b'"item_type"' in read_bounded(path, MAX_SIZE)
+    except InputError:
+        return False
+
+
+def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
+    """Open an asset with its RPC."""
+    name = dataset.GetDescription()
+    path = metadata_of(name)
+    if path is None:
+        raise InputError("there is no <id>_metadata.json beside this image", file=name, remedy="download it")
+    facts = read_item(path)
+    if rpc is None and not has_rpc(dataset):
+        raise InputError(
+            "there is no RPC: orthorectified assets have none, and are orthoimages already", file=name,
+            remedy="take the basic product (level 1B, or SkySat's 1A) with its RPC",
+        )  # fmt: skip
+    model, source = rpc_of_dataset(dataset, rpc)
+    warnings = []
+    if not str(facts.get("item_type", "PS")).startswith(("PS", "SkySat")):
+        text = f"items of the type {facts['item_type']} were not at hand to check this reader with"
+        warnings.append(Notice("unchecked-product", text))
+    return Scene(
+        "planet", name, dataset.RasterXSize, dataset.RasterYSize, {"rpc": model}, source, facts, tuple(warnings),
+        sources=(path,),
+    )  # fmt: skip
+
+
+@reads(_REMEDY)
+def read_item(path: Path) -> dict[str, Any]:
+    """Read what is worth showing of an item's metadata.
+
+    Raises
+    ------
+    InputError
+        If it is no JSON of an item.
+    """
+    document = read_json(path, MAX_SIZE, _REMEDY)
+    properties = document.get("properties") if isinstance(document, dict) else None
+    if not isinstance(properties, dict):
+        raise InputError("this is not the metadata of an item", file=path, field="properties", remedy=_REMEDY)
+    texts = {ours: properties.get(theirs) for theirs, ours in _TEXTS.items()}
+    facts: dict[str, Any] = {name: text[:200] for name, text in texts.items() if isinstance(text, str)}
+    for theirs, ours in _NUMBERS.items():
+        value = properties.get(theirs)
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9:
+            facts[ours] = value
+    return facts
