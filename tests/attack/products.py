@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from seeds import dimap_text, rpc_xml
 
 from ortho_pipeline.exchange.rpc_files import SCALARS, rpc_metadata
+from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
 from ortho_pipeline.models import RPC
 
 
@@ -273,3 +275,25 @@ PLANET = (
     ' "cloud_cover": 0.01, "gsd": 3.7, "instrument": "PSB.SD", "item_type": "PSScene", "satellite_id": "2401",\n'
     ' "strip_id": "3000001", "sun_azimuth": 140.1, "sun_elevation": 41.5, "view_angle": 2.1}}\n'
 )
+
+
+def capella_text() -> str:
+    """Return extended metadata of a geocoded image at 15 east, 40 north, seen 35 degrees from the vertical."""
+    ground = np.array([[15.0015, 40.0, 120.0]])
+    target = geocentric(ground)[0]
+    east, north, up = enu_from_ecef(ground)[0]
+    incidence = math.radians(35.0)
+    satellite = target + 620e3 * (math.sin(incidence) * east + math.cos(incidence) * up)
+    vectors = [
+        {"time": f"2021-01-01T00:00:{k:02d}Z", "position": (satellite + 7600.0 * (k - 2) * north).tolist(),
+         "velocity": (7600.0 * north).tolist()}
+        for k in range(5)
+    ]  # fmt: skip
+    document = {
+        "product_type": "GEO",
+        "collect": {
+            "platform": "capella-2", "start_timestamp": "2021-01-01T00:00:00Z", "state": {"state_vectors": vectors},
+            "image": {"center_pixel": {"target_position": target.tolist()}},
+        },
+    }  # fmt: skip
+    return json.dumps(document, indent=1)

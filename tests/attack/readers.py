@@ -24,6 +24,7 @@ from ortho_maxar.isd import Isd, read_isd_pushbroom
 from ortho_orbview3.product import read_product
 from ortho_planet import read_item
 from ortho_rpc.dimap import read_dimap_pushbroom
+from ortho_sar import read_extended
 from ortho_spot.dimap import read_spot
 
 from ortho_pipeline import commands
@@ -402,6 +403,7 @@ READERS = (
     Reader("asp-aster", "xml", "one.xml", _text(products.aster_text()), read_aster),
     Reader("enmap-metadata", "xml", "one-METADATA.XML", _enmap_seed, _enmap),
     Reader("planet-item", "json", "one_metadata.json", _text(products.PLANET), read_item),
+    Reader("sar-extended", "json", "one_extended.json", _text(products.capella_text()), read_extended),
     Reader("maxar-isd", "xml", "one.XML", _maxar_seed, _maxar),
     Reader("spot-metadata", "xml", "METADATA.DIM", _text(products.spot_text()), _spot),
     Reader("spot-detectors", "xml", "METADATA.DIM", _text(products.spot_text(every=True, corrected=True)), _spot),

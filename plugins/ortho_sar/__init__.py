@@ -1,0 +1,193 @@
+r"""Sensor plugin for radar images that were geocoded on a plane (GEC), not on terrain: Capella, Umbra, ICEYE, others.
+
+A radar measures range: a point above the plane lies nearer to the antenna than the point of the plane below it, and is
+drawn *towards* the radar, by :math:`1 / \tan\theta` of its height at the incidence angle :math:`\theta`. In direction
+and sign a camera on the other side would see so at the elevation :math:`\theta`; the model is `MapPlane`.
+
+No product was at hand to check the fields with that are read of Capella's ``_extended.json`` (places of satellite and
+scene centre, from which both angles follow); of others the angles are given as options. A notice says so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+from osgeo import gdal
+
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.files import read_bounded, read_json
+from ortho_pipeline.files.locations import place
+from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geodetic
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.models.map_plane import MapPlane
+
+MAX_SIZE = 20_000_000
+_REMEDY = "download the metadata again, or give incidence=DEG and azimuth=DEG"
+#: Ground (m) above and below the plane that the model is meant for.
+HALF_RANGE = 1000.0
+#: Incidence angles of radars (degrees).
+_STEEPEST, _FLATTEST = 10.0, 80.0
+_PLANE = "give a product in map geometry on a plane (GEC, GEO), not SLC or GRD"
+
+
+@hookimpl
+def ortho_sensors() -> Iterable[Sensor]:
+    """Offer the sensor ``sar``."""
+    yield Sensor(
+        "sar",
+        "radar images geocoded on a plane (GEC): Capella with _extended.json, others with the options",
+        recognises,
+        open_scene,
+        options={
+            "incidence": "incidence angle at the scene's centre, degrees from the vertical",
+            "azimuth": "direction from the scene to the radar, degrees from north, clockwise",
+            "plane": "ellipsoidal height (m) of the plane; by itself that of the scene's centre in the metadata",
+        },
+    )
+
+
+def metadata_of(name: str) -> Path | None:
+    """Return the extended metadata of an image of Capella; None without."""
+    if not name:
+        return None
+    try:
+        image = place(name)
+        found = image.with_name(f"{image.stem}_extended.json")
+        return found if found.is_file() else None
+    except (OSError, ValueError, InputError):
+        return None
+
+
+def recognises(dataset: gdal.Dataset) -> bool:
+    """Tell whether extended metadata of Capella lie beside an image."""
+    path = metadata_of(dataset.GetDescription())
+    try:
+        return path is not None and b'"center_pixel"' in read_bounded(path, MAX_SIZE)
+    except InputError:
+        return False
+
+
+def open_scene(
+    dataset: gdal.Dataset, *, incidence: str | None = None, azimuth: str | None = None, plane: str | None = None
+) -> Scene:
+    """Open an image on a plane; refuse one in slant range."""
+    name, size = dataset.GetDescription(), (dataset.RasterXSize, dataset.RasterYSize)
+    path = metadata_of(name)
+    facts = {} if path is None else read_extended(path)
+    product = facts.get("product", "GEC")
+    if product not in ("GEC", "GEO"):
+        raise InputError(f"a product {product} is in slant or ground range", file=name, remedy=_PLANE)
+    crs, corner, pixel = _map_of(dataset)
+    given = {"incidence_deg": incidence, "azimuth_deg": azimuth, "plane_m": plane}
+    facts |= {fact: _number(text, fact) for fact, text in given.items() if text is not None}
+    missing = [fact for fact in given if not isinstance(facts.get(fact), float)]
+    if missing:
+        options = ", ".join(fact.rpartition("_")[0] for fact in missing)
+        raise InputError(
+            f"nothing says the {options} of this image", file=name, field=options, remedy=f"give {options}"
+        )
+    if not _STEEPEST <= facts["incidence_deg"] <= _FLATTEST:
+        raise InputError(
+            f"{facts['incidence_deg']:g} degrees are not the incidence of a radar", field="incidence",
+            remedy=f"it is from {_STEEPEST:g} to {_FLATTEST:g} degrees from the vertical",
+        )  # fmt: skip
+    height = facts["plane_m"]
+    model = MapPlane.from_view(
+        crs, corner, pixel, size, height, math.radians(facts["azimuth_deg"]) + math.pi,
+        math.radians(facts["incidence_deg"]), (height - HALF_RANGE, height + HALF_RANGE),
+    )  # fmt: skip
+    facts["relief_px_per_100_m"] = round(100 * math.hypot(*model.relief) / pixel[0], 2)
+    return Scene("sar", name, *size, {"geo": model}, str(path or name), facts, _warnings(path is not None))
+
+
+@reads(_REMEDY)
+def read_extended(path: Path) -> dict[str, Any]:
+    """Read the angles and the plane of Capella's extended metadata: of the satellite over the scene's centre.
+
+    Raises
+    ------
+    InputError
+        If it is no such JSON, or its places are not those of a satellite and a scene.
+    """
+    document = read_json(path, MAX_SIZE, _REMEDY)
+
+    def at(*names: str) -> Any:
+        found = document
+        for name in names:
+            found = found.get(name) if isinstance(found, dict) else None
+        return found
+
+    product = at("product_type")
+    facts: dict[str, Any] = {"product": product[:10] if isinstance(product, str) else "unknown"}
+    for fact, text in (("satellite", at("collect", "platform")), ("acquired", at("collect", "start_timestamp"))):
+        if isinstance(text, str):
+            facts[fact] = text[:60]
+    vectors = at("collect", "state", "state_vectors")
+    if not isinstance(vectors, list) or not vectors:
+        raise InputError("there are no places of the satellite", file=path, field="collect.state.state_vectors")
+    target = _place(at("collect", "image", "center_pixel", "target_position"), path, "center_pixel.target_position")
+    places = np.array([_place(one.get("position") if isinstance(one, dict) else None, path, "state_vectors.position")
+                       for one in vectors])  # fmt: skip
+    # The middle of the aperture is where the radar is nearest, within what the vectors' distance leaves open.
+    line = places[int(np.argmin(np.linalg.norm(places - target, axis=1)))] - target
+    ground = geodetic(target[None])
+    east, north, up = enu_from_ecef(ground)[0] @ (line / np.linalg.norm(line))
+    if not (up > 0.1 and abs(ground[0, 2]) < 10_000):
+        raise InputError("these are not a satellite and a scene below it", file=path, field="state_vectors, target")
+    facts["incidence_deg"] = round(math.degrees(math.acos(min(1.0, up))), 4)
+    facts["azimuth_deg"] = round(math.degrees(math.atan2(east, north)) % 360.0, 4)
+    return facts | {"plane_m": round(float(ground[0, 2]), 3)}
+
+
+def _place(value: Any, path: Path, field: str) -> NDArray[np.float64]:
+    good = isinstance(value, list) and len(value) == 3
+    if not good or not all(isinstance(one, int | float) and not isinstance(one, bool) for one in value):
+        raise InputError("three numbers belong here", file=path, field=field, remedy=_REMEDY)
+    found = np.array(value, dtype=np.float64)
+    if not 6.2e6 < np.linalg.norm(found) < 5e7:
+        raise InputError("this is not a place on Earth or around it", file=path, field=field, remedy=_REMEDY)
+    return found
+
+
+def _map_of(dataset: gdal.Dataset) -> tuple[str, tuple[float, float], tuple[float, float]]:
+    """Return CRS, corner and pixel of an image in map geometry."""
+    name, steps = dataset.GetDescription(), dataset.GetGeoTransform(can_return_null=True)
+    text = dataset.GetProjection()
+    if steps is None or not text:
+        raise InputError("this image has no map geometry: it is in slant or ground range", file=name, remedy=_PLANE)
+    crs = pyproj.CRS(text)
+    if not crs.is_projected or steps[2] or steps[4] or not (steps[1] > 0 > steps[5]):
+        raise InputError(
+            f"an image in {crs.name} is not read, only in a map projection with north on top", file=name,
+            remedy="project it to UTM (gdalwarp -t_srs EPSG:326zz), which leaves the plane a plane",
+        )  # fmt: skip
+    return crs.to_string(), (steps[0], steps[3]), (steps[1], -steps[5])
+
+
+def _number(text: str, fact: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) < 1e5:
+        raise InputError(f"{text[:20]!r} is not a number", field=fact.rpartition("_")[0], remedy="give a number")
+    return value
+
+
+def _warnings(from_file: bool) -> tuple[Notice, ...]:
+    text = (
+        "this is a radar image: what rises leans towards the radar, slopes steeper than the incidence lie over each"
+        " other and others in shadow, and no ground was seen there"
+    )
+    found = [Notice("radar-on-a-plane", text)]
+    if from_file:
+        text = "no product of this kind was at hand to check how its metadata are read: compare with control points"
+        found.append(Notice("unchecked-product", text))
+    return tuple(found)
