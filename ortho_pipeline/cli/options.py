@@ -182,6 +182,7 @@ adjustment_options = click_options("points", BlockOptions, "ties", "correction",
 surface_options = _grouped("surface", SurfaceOptions)
 match_options = _grouped("match", MatchOptions)
 matching_options = _grouped("match", MatchOptions, "reference", "search", "points", "reference_sigma")
+reference_options = _grouped("match", MatchOptions, "reference", "search")
 tie_options = _grouped("match", MatchOptions, "search", "points")
 dem_datum_options = _grouped("surface", SurfaceOptions, "vertical", "override_vertical")
 network_option = _grouped("scene", SceneOptions, "allow_network")

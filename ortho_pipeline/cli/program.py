@@ -17,6 +17,7 @@ import click
 from ortho_pipeline.cli.batch import run
 from ortho_pipeline.cli.block import adjust, intersect
 from ortho_pipeline.cli.matching import match, ties
+from ortho_pipeline.cli.measuring import measure
 from ortho_pipeline.cli.options import (
     click_options,
     dem_datum_options,
@@ -173,6 +174,7 @@ cli.add_command(adjust)
 cli.add_command(intersect)
 cli.add_command(match)
 cli.add_command(ties)
+cli.add_command(measure)
 
 # -- commands --------------------------------------------------------------------------------------------------------
 

@@ -29,7 +29,7 @@ from ortho_pipeline.surface.base import Surface
 
 if TYPE_CHECKING:
     # What matches takes a while to load, and few commands match.
-    from ortho_pipeline.imaging.matching import Matches, Reference
+    from ortho_pipeline.imaging.matching import Matches, Reference, View
 
 #: How far a model may be off (m) of which nothing is known, and at most this part of the scene's shorter side.
 DEFAULT_SEARCH, _PART = 100.0, 0.25
@@ -202,8 +202,36 @@ def match_scene(
     InputError
         For references that are none, a scene without model or heights, and what matching refuses.
     """
-    from ortho_pipeline.imaging.matching import MatchSettings, View, match, open_references
+    from ortho_pipeline.imaging.matching import MatchSettings, match
     from ortho_pipeline.imaging.matching.targets import metres_per_pixel
+
+    view, references = open_reference_views(scene, options, surface, opened)
+    pixel = metres_per_pixel(view)
+    search = search_of(scene, options, pixel)
+    settings = MatchSettings(
+        search=search.distance, points=options.points, dem_sigma=typical_sigma(view.surface) or 0.0,
+        reference_sigma=options.reference_sigma or 0.0, threads=threads or os.cpu_count() or 1, memory=memory,
+    )  # fmt: skip
+    with _of_references():
+        matches = match(view, references, settings)
+    paths = tuple(one.path for one in references)
+    notices = [*_default_search(search), *_made_of_scene(scene, references, matches)]
+    return Matched(
+        matches, paths, options, search, (scene.width, scene.height), pixel, tuple(notices), typical_sigma(view.surface)
+    )
+
+
+def open_reference_views(
+    scene: Scene, options: MatchOptions, surface: Surface | None, opened: SceneOptions = SceneOptions()
+) -> tuple[View, tuple[Reference, ...]]:
+    """Open a scene and its references as a matcher sees them.
+
+    Raises
+    ------
+    InputError
+        For references that are none, and a scene without model or heights.
+    """
+    from ortho_pipeline.imaging.matching import View, open_references
 
     if surface is None:
         raise InputError(
@@ -220,20 +248,7 @@ def match_scene(
     for one in references:
         _refuse_scene(scene, one)
     rasters = scene.rasters or (scene.path,)
-    view = View(Intensity(RasterSource(*rasters, **opened.access)), scene.model, surface)
-    pixel = metres_per_pixel(view)
-    search = search_of(scene, options, pixel)
-    settings = MatchSettings(
-        search=search.distance, points=options.points, dem_sigma=typical_sigma(surface) or 0.0,
-        reference_sigma=options.reference_sigma or 0.0, threads=threads or os.cpu_count() or 1, memory=memory,
-    )  # fmt: skip
-    with _of_references():
-        matches = match(view, references, settings)
-    paths = tuple(one.path for one in references)
-    notices = [*_default_search(search), *_made_of_scene(scene, references, matches)]
-    return Matched(
-        matches, paths, options, search, (scene.width, scene.height), pixel, tuple(notices), typical_sigma(surface)
-    )
+    return View(Intensity(RasterSource(*rasters, **opened.access)), scene.model, surface), references
 
 
 @contextmanager

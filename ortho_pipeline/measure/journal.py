@@ -1,0 +1,157 @@
+"""The journal: every action on its own line, on disk before it is shown, so that nothing that was seen is lost.
+
+A line is a JSON object with a checksum of itself. What a killed process or a power cut leaves of the last line is cut
+off when the journal is opened again; a line that is wrong anywhere else is an error, because what follows rests on it.
+One process holds the lock and writes; another one reads.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import allowed, parse_json
+
+#: Beyond this many bytes it is no journal of hands.
+MAX_BYTES = 256_000_000
+_REMEDY = "move it away to begin anew, or restore it from a copy"
+
+
+class Journal:
+    """A journal that is open.
+
+    Parameters
+    ----------
+    path : Path
+
+    Attributes
+    ----------
+    actions : list of dict
+        Those that it holds, in their order.
+    read_only : bool
+        Whether another process holds it.
+    healed : int
+        Bytes of an unfinished last line that were cut off.
+
+    Raises
+    ------
+    InputError
+        If it cannot be opened, or is damaged before its end.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = allowed(path)
+        try:
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+            self.read_only = not _locked(self._file)
+            data = _whole(self._file, path)
+        except OSError as error:
+            raise _unwritable(path, error) from error
+        sound, self.actions = _lines(data, path)
+        self.healed = len(data) - sound
+        if not self.read_only:
+            if self.healed:
+                os.ftruncate(self._file, sound)
+                os.fsync(self._file)
+            _sync_folder(path.parent)
+
+    def append(self, action: Mapping[str, Any]) -> None:
+        """Write an action and wait until it is on disk; where that fails nothing of it is left.
+
+        Raises
+        ------
+        InputError
+            If another process holds the journal, or it cannot be written.
+        """
+        if self.read_only:
+            raise InputError("another process measures these points: this one only shows them", file=self.path,
+                             remedy="close the other one, and start again")  # fmt: skip
+        data = _line(action)
+        size = os.fstat(self._file).st_size
+        try:
+            os.lseek(self._file, size, os.SEEK_SET)
+            left = data
+            while left:
+                left = left[os.write(self._file, left) :]
+            os.fsync(self._file)
+        except OSError as error:
+            os.ftruncate(self._file, size)
+            raise _unwritable(self.path, error) from error
+        self.actions.append(dict(action))
+
+    def close(self) -> None:
+        """Let go of the file and of its lock."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+
+def _line(action: Mapping[str, Any]) -> bytes:
+    text = json.dumps(action, allow_nan=False, separators=(",", ":"))
+    return f'{{"crc":"{zlib.crc32(text.encode()):08x}","action":{text}}}\n'.encode()
+
+
+def _locked(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _whole(descriptor: int, path: Path) -> bytes:
+    if os.fstat(descriptor).st_size > MAX_BYTES:
+        raise InputError("this is no journal of measured points: it is too large", file=path, remedy=_REMEDY)
+    parts = []
+    while part := os.read(descriptor, 1 << 20):
+        parts.append(part)
+    return b"".join(parts)
+
+
+def _lines(data: bytes, path: Path) -> tuple[int, list[dict[str, Any]]]:
+    """Return how many bytes are sound, and the actions in them."""
+    found: list[dict[str, Any]] = []
+    start = 0
+    while start < len(data):
+        end = data.find(b"\n", start)
+        if end < 0:
+            return start, found
+        action = _action(data[start:end])
+        if action is None:
+            if end + 1 == len(data):
+                # A power cut can leave the length of a line without its bytes.
+                return start, found
+            raise InputError("this journal is damaged, and what follows rests on it", file=path,
+                             field=f"line {len(found) + 1}", remedy=_REMEDY)  # fmt: skip
+        found.append(action)
+        start = end + 1
+    return start, found
+
+
+def _action(line: bytes) -> dict[str, Any] | None:
+    """Return the action of a line, None where it is not what was written."""
+    try:
+        document = parse_json(line, "journal", _REMEDY)
+    except InputError:
+        return None
+    action = document.get("action") if isinstance(document, dict) else None
+    return action if isinstance(action, dict) and _line(action) == line + b"\n" else None
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _unwritable(path: Path, error: OSError) -> InputError:
+    return InputError(f"the journal cannot be written ({error.strerror or error})", file=path,
+                      remedy="choose an output in a folder that you may write to and that has room")  # fmt: skip

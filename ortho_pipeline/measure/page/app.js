@@ -1,0 +1,359 @@
+// The page: what is being measured, requests, keys. The server computes; what is shown here was written down before.
+import { Table } from './table.js';
+import { Views } from './views.js';
+
+const $ = (id) => document.getElementById(id);
+const windowName = crypto.randomUUID();
+let facts, state, views, table;
+let selected = null;
+let pending = null; // {image, ground, shown, ...}: the point under way
+let skipped = 0; // places that were offered and passed over
+let turn = 0; // answers to requests that something newer overtook are not shown
+const look = { scene: { bands: [0], limits: null }, reference: { bands: [0], limits: null } };
+const compared = { flicker: false, difference: false, swipe: 0 };
+
+async function ask(what, given = {}) {
+  const response = await fetch(`api/${what}`, { method: 'POST', headers: { 'content-type': 'application/json' }, body: JSON.stringify({ window: windowName, ...given }) });
+  const answer = await response.json().catch(() => ({ error: { message: `the server answers ${response.status}` } }));
+  if (response.ok) return answer;
+  const { message, remedy, field } = answer.error;
+  throw new Error(`${field ? `${field}: ` : ''}${message}${remedy ? ` (${remedy})` : ''}`);
+}
+
+function say(text, bad = false) {
+  $('said').textContent = text;
+  $('said').className = bad ? 'bad' : '';
+}
+
+/** Run what may fail, and say so where it does. */
+const safely = (work) => async (...given) => {
+  try { return await work(...given); } catch (error) {
+    say(error instanceof TypeError ? 'The server does not answer: nothing that was accepted is lost. Start ortho measure again.' : error.message, true);
+    return undefined;
+  }
+};
+
+const nextPlace = () => state.next[skipped % Math.max(state.next.length, 1)];
+
+const shownMarks = () => state.marks.map((mark) => ({ ...mark, ...(state.points[mark.id] ?? {}) }));
+const markOf = (id) => state.marks.find((mark) => mark.id === id);
+const number = (value, digits) => (value === null || value === undefined ? '–' : value.toFixed(digits));
+
+async function showTiles(panes = ['scene', 'reference']) {
+  await Promise.all(panes.map(async (pane) => {
+    const { bands } = look[pane];
+    look[pane].limits ??= (await ask('stretch', { pane, bands, version: state.version })).limits;
+    views.tiles[pane].show({ version: state.version, bands, limits: look[pane].limits });
+  }));
+}
+
+function draw() {
+  const marks = shownMarks();
+  views.draw(marks, selected, pending, nextPlace());
+  table.draw(marks, selected);
+}
+
+function show(next) {
+  const rendered = state && state.version !== next.version;
+  state = next;
+  const { headline } = state;
+  $('figure').textContent = headline.px === null ? 'Not tested' : `${headline.px.toFixed(3)} px${headline.m === null ? '' : `, ${headline.m.toFixed(3)} m`}`;
+  $('what').textContent = state.error ? `${headline.what}: ${state.error}` : headline.what;
+  $('undo').disabled = !state.undo || !facts.writes;
+  $('redo').disabled = !state.redo || !facts.writes;
+  $('correction').value = state.correction ?? '';
+  skipped = 0;
+  tellNext();
+  const items = state.notices.map((text) => { const item = document.createElement('li'); item.textContent = text; return item; });
+  $('notices').replaceChildren(...items);
+  $('doubts-title').textContent = `Notices (${items.length})`;
+  draw();
+  if (rendered) safely(showTiles)(['reference']);
+}
+
+function tellNext() {
+  const place = nextPlace();
+  if (!place) { $('gain').textContent = ''; return; }
+  const [column, row] = place.image.map((value) => value.toFixed(0));
+  const gain = place.sigma === null ? '' : `: predicted to ±${place.sigma.toFixed(3)} px there; a point would make the worst place ±${place.then.toFixed(3)} px (now ±${place.largest.toFixed(3)})`;
+  $('gain').textContent = `Measure next at column ${column}, row ${row}${gain}.`;
+}
+
+function fill() {
+  const mark = pending ?? {};
+  $('name').value = mark.id ?? '';
+  $('role').value = mark.role ?? 'control';
+  $('sigma').value = mark.sigma_image ?? '';
+  $('sigma').placeholder = mark.covariance ? Math.sqrt((mark.covariance[0] + mark.covariance[1]) / 2).toFixed(3) : '0.5';
+  $('note').value = mark.note ?? '';
+  $('sigma-xy').value = mark.sigma_xy || '';
+  $('sigma-h').value = mark.sigma_h || '';
+  const writes = facts.writes;
+  $('accept').disabled = !writes || !pending?.image || !pending?.ground;
+  $('cancel').disabled = !pending;
+  $('off').disabled = $('remove').disabled = !writes || !selected;
+  $('next').disabled = !state.next.length;
+}
+
+function freeName() {
+  let count = state.marks.length + 1;
+  while (markOf(`P${count}`)) count += 1;
+  return `P${count}`;
+}
+
+function begin() {
+  pending ??= { id: freeName(), role: $('role').value || 'control', how: 'manual', ground_from: null, sigma_xy: 0, sigma_h: 0, note: '' };
+}
+
+function cancel() {
+  turn += 1;
+  pending = null;
+  selected = null;
+  say('Click a feature, or go to the next place (n) and press m.');
+  fill();
+  draw();
+}
+
+/** Take a match into the point under way, or say why it is none. */
+function take(found, wanted) {
+  if (found.reason) {
+    pending.score = null;
+    pending.covariance = null;
+    const other = pending.image && pending.ground ? 'Accept it as measured by hand, or nudge it.' : `Click the same feature in the ${wanted}.`;
+    say(`No match: ${found.reason}. ${other}`, true);
+    return;
+  }
+  Object.assign(pending, { image: found.image, ground: found.ground, score: found.score, covariance: found.covariance, how: 'matched', sigma_image: null });
+  pending.ground_from ??= 'reference';
+  const sigma = Math.sqrt((found.covariance[0] + found.covariance[1]) / 2);
+  say(`Matched: score ${found.score.toFixed(3)}, ±${sigma.toFixed(3)} px${found.scattered ? ` by the scatter of ${found.scattered} neighbours` : ' (no neighbours to tell)'}. Enter accepts.`);
+}
+
+const measure = safely(async (pane, place) => {
+  begin();
+  const mine = (turn += 1);
+  say('Matching …');
+  if (pane === 'scene') {
+    const known = pending.ground && (pending.by_hand || pending.ground_from !== 'reference') ? pending.ground : null;
+    Object.assign(pending, { image: place, how: 'manual', covariance: null, score: null, clicked: true });
+    const found = await ask('propose', { image: place, ground: known });
+    if (mine !== turn) return;
+    if (found.reason && !known) { pending.ground = null; pending.ground_from = null; }
+    take(found, 'reference');
+  } else {
+    const there = await ask('predict', { shown: place, version: state.version });
+    if (mine !== turn) return;
+    if (!there.ground) { say('The reference shows no ground here.', true); return; }
+    Object.assign(pending, { ground: there.ground, ground_from: 'reference', by_hand: true });
+    const image = pending.clicked ? pending.image : there.scene;
+    const found = image ? await ask('propose', { image, ground: there.ground }) : { reason: 'the model leads outside of the scene' };
+    if (mine !== turn) return;
+    take(found, 'scene');
+  }
+  await locate(mine);
+});
+
+/** Ask where the ground of the point under way is shown, and draw it. */
+async function locate(mine) {
+  const there = pending.ground ? await ask('predict', { ground: pending.ground, version: state.version })
+    : await ask('predict', { scene: pending.image, version: state.version });
+  if (mine !== turn || !pending) return;
+  pending.shown = there.shown;
+  fill();
+  draw();
+}
+
+const nudge = safely(async (column, row) => {
+  if (!pending?.image) return;
+  const mine = (turn += 1);
+  pending.image = [pending.image[0] + column, pending.image[1] + row];
+  Object.assign(pending, { how: 'manual', covariance: null, score: null, clicked: true });
+  say(`By hand: column ${pending.image[0].toFixed(2)}, row ${pending.image[1].toFixed(2)}. Enter accepts.`);
+  fill();
+  draw();
+  if (!pending.shown) await locate(mine);
+});
+
+const decimal = (id) => {
+  const text = $(id).value.trim().replace(',', '.');
+  if (!text) return null;
+  const value = Number(text);
+  if (!Number.isFinite(value)) throw new Error(`${$(id).parentElement.firstChild.textContent.trim()}: not a number`);
+  return value;
+};
+
+/** The members of a mark that the server knows. */
+const plain = (mark) => Object.fromEntries(['id', 'image', 'ground', 'role', 'off', 'sigma_image', 'covariance', 'sigma_xy', 'sigma_h', 'group', 'how', 'ground_from', 'score', 'note']
+  .filter((key) => mark[key] !== undefined).map((key) => [key, mark[key]]));
+
+const act = safely(async (action) => { const next = await ask('act', { action }); show(next); return next; });
+
+const accept = safely(async () => {
+  if (!pending?.image || !pending?.ground) { say('A point has a place in the scene and one on the ground.', true); return; }
+  const sigma = decimal('sigma');
+  const mark = plain({ ...pending, id: $('name').value.trim() || freeName(), role: $('role').value, note: $('note').value,
+    sigma_xy: decimal('sigma-xy') ?? 0, sigma_h: decimal('sigma-h') ?? 0,
+    ...(sigma === null ? {} : { sigma_image: sigma, covariance: null }) });
+  const done = await act({ do: 'put', mark, ...(pending.was ? { was: pending.was } : {}) });
+  if (!done) return;
+  pending = null;
+  selected = null;
+  say(`${mark.id} accepted.`);
+  fill();
+  draw();
+});
+
+function choose(id) {
+  const mark = markOf(id);
+  if (!mark) return;
+  turn += 1;
+  selected = id;
+  pending = { ...mark, was: id, by_hand: true, clicked: true };
+  say(`${id}: ${mark.role}, ${mark.how}${mark.off ? ', off' : ''}. Nudge it, click it anew, or change what stands here; Enter accepts.`);
+  if (mark.image) views.goTo(mark.image, 1);
+  fill();
+  draw();
+}
+
+const toggleOff = () => { const mark = selected && markOf(selected); if (mark) act({ do: 'put', mark: plain({ ...mark, off: !mark.off }), was: mark.id }).then(() => choose(mark.id)); };
+const remove = () => { if (selected) { const id = selected; cancel(); act({ do: 'remove', id }); } };
+/** Go to the place that tells most; from there to the second best, and so on. */
+function goNext() {
+  if (!state.next.length) return;
+  const place = nextPlace();
+  const [column, row] = views.middle();
+  if (Math.hypot(place.image[0] - column, place.image[1] - row) < 1) skipped += 1;
+  cancel();
+  views.goTo(nextPlace().image, 1);
+  tellNext();
+  say('The next place: press m at the feature in the middle, or click one. Press n again for another place.');
+}
+
+const dragged = safely(async (pane, id, place) => {
+  const mark = markOf(id);
+  if (!mark || !facts.writes) { draw(); return; }
+  const changed = { ...mark, how: 'manual', covariance: null, score: null };
+  if (pane === 'scene') changed.image = place;
+  else {
+    const there = await ask('predict', { shown: place, version: state.version });
+    if (!there.ground) { draw(); return; }
+    Object.assign(changed, { ground: there.ground, ground_from: 'reference' });
+  }
+  await act({ do: 'put', mark: plain(changed), was: id });
+});
+
+function compare(change) {
+  Object.assign(compared, change);
+  views.compare(compared);
+  for (const name of ['flicker', 'difference']) $(name).setAttribute('aria-pressed', String(compared[name]));
+}
+
+const stretch = safely(async () => {
+  for (const pane of ['scene', 'reference']) look[pane].limits = (await ask('stretch', { pane, bands: look[pane].bands, version: state.version, box: views.box() })).limits;
+  await showTiles();
+});
+
+function cells(values, kind) { return values.map((value) => { const cell = document.createElement(kind); cell.textContent = value; return cell; }); }
+
+const models = safely(async () => {
+  say('Comparing models …');
+  const { rows, recommendation } = await ask('compare');
+  const total = (rmse, which) => number(rmse?.[which]?.total, 3);
+  const head = document.createElement('tr');
+  head.append(...cells(['Model', 'Parameters', 'Control, px', 'Check, px', 'Left out, px'], 'th'));
+  $('models').tHead.replaceChildren(head);
+  $('models').tBodies[0].replaceChildren(...rows.map((one) => {
+    const row = document.createElement('tr');
+    row.append(...cells(one.error ? [one.model, one.parameters, 'not fitted', '', ''] : [one.model, one.parameters, total(one.rmse, 'control'), total(one.rmse, 'check'), total(one.rmse, 'loo')], 'td'));
+    if (one.error) row.title = one.error;
+    return row;
+  }));
+  $('recommended').textContent = recommendation.model ? `Recommended: ${recommendation.model}. ${recommendation.reason}.` : recommendation.reason;
+  say('');
+  $('compared').showModal();
+});
+
+const typed = safely(async () => {
+  begin();
+  const mine = (turn += 1);
+  const { ground } = await ask('typed', { values: [decimal('x'), decimal('y'), decimal('h')], crs: $('crs').value, vertical: $('vertical').value });
+  Object.assign(pending, { ground, ground_from: 'typed', by_hand: true });
+  const there = await ask('predict', { ground, version: state.version });
+  if (mine !== turn) return;
+  pending.shown = there.shown;
+  if (there.scene) views.goTo(there.scene, 1);
+  say('Ground taken. Now click it in the scene: where it is expected is in the middle.');
+  fill();
+  draw();
+});
+
+function pressed(event) {
+  const { target, key } = event;
+  if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector('dialog[open]')) return;
+  const typing = target.matches('input:not([type="range"]), select, textarea');
+  if (key === 'Escape') { cancel(); return; }
+  if (typing) { if (key === 'Enter' && target.closest('#point')) { event.preventDefault(); accept(); } return; }
+  const inMap = target.classList.contains('map');
+  const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[key];
+  if (arrow && inMap && pending?.image) {
+    event.preventDefault();
+    event.stopPropagation(); // the view does not pan
+    const step = event.shiftKey ? 1 : 0.1;
+    nudge(arrow[0] * step, arrow[1] * step);
+    return;
+  }
+  const along = (step) => { const { order } = table; if (order.length) choose(order[(order.indexOf(selected) + step + order.length) % order.length] ?? order[0]); };
+  const keys = {
+    m: () => measure(target.id === 'reference' ? 'reference' : 'scene', views.middle()),
+    n: goNext, j: () => along(1), k: () => along(-1), o: toggleOff, Delete: remove, c: models, s: stretch,
+    r: () => { const roles = ['control', 'check', 'tie']; $('role').value = roles[(roles.indexOf($('role').value) + 1) % 3]; if (pending) pending.role = $('role').value; say(`Role: ${$('role').value}.`); },
+    f: () => compare({ flicker: !compared.flicker, difference: false }), d: () => compare({ difference: !compared.difference, flicker: false }),
+    z: () => act({ do: 'undo' }), Z: () => act({ do: 'redo' }), '?': () => $('keys').showModal(),
+  };
+  if (key === 'Enter' && (inMap || target === document.body)) { event.preventDefault(); accept(); } else if (keys[key]) { event.preventDefault(); keys[key](); }
+}
+
+function bandChoices(pane) {
+  const select = $(`${pane}-bands`);
+  const count = facts.bands[pane];
+  const choices = [[[0], count > 1 ? 'mean' : '1'], ...(count >= 3 ? [[[1, 2, 3], '1, 2, 3'], [[3, 2, 1], '3, 2, 1']] : []),
+    ...(count > 1 ? Array.from({ length: count }, (_, index) => [[index + 1], String(index + 1)]) : [])];
+  select.replaceChildren(...choices.map(([, name]) => new Option(name)));
+  select.addEventListener('change', () => { look[pane] = { bands: choices[select.selectedIndex][0], limits: null }; safely(showTiles)([pane]); });
+}
+
+function banner() {
+  const text = facts.locked ? 'Read only: another process measures these points. This one shows them as they were when it was opened.'
+    : facts.writes ? (facts.healed ? 'The last action had not been written as a whole, and was left out.' : '') : 'Read only: another window measures these points.';
+  $('banner-text').textContent = text;
+  $('banner').hidden = !text;
+  $('take').hidden = facts.locked || facts.writes;
+}
+
+async function start(given = {}) {
+  facts = await ask('begin', given);
+  document.title = `${facts.scene} – ortho measure`;
+  $('title').textContent = `${facts.scene} → ${facts.output}`;
+  banner();
+  if (!views) {
+    views = new Views(facts, (pane, place, hit) => (hit && !pending ? choose(hit) : measure(pane, place)), dragged);
+    table = new Table($('table'), choose);
+    for (const pane of ['scene', 'reference']) bandChoices(pane);
+    $('correction').replaceChildren(new Option('shift (default)', ''), ...facts.corrections.map((name) => new Option(name)));
+  }
+  show(facts.state);
+  fill();
+  await showTiles();
+}
+
+for (const [id, work] of Object.entries({
+  undo: () => act({ do: 'undo' }), redo: () => act({ do: 'redo' }), compare: models, help: () => $('keys').showModal(), accept, cancel, off: toggleOff, remove, next: goNext, typed,
+  flicker: () => compare({ flicker: !compared.flicker, difference: false }), difference: () => compare({ difference: !compared.difference, flicker: false }), stretch,
+  take: () => safely(start)({ take: true }),
+})) $(id).addEventListener('click', work);
+$('swipe').addEventListener('input', () => compare({ swipe: Number($('swipe').value), flicker: false, difference: false }));
+$('correction').addEventListener('change', () => act({ do: 'correct', correction: $('correction').value || null }));
+for (const [id, key] of [['name', 'id'], ['role', 'role'], ['note', 'note']]) $(id).addEventListener('change', () => { if (pending) pending[key] = $(id).value; });
+document.addEventListener('keydown', pressed, true);
+addEventListener('pagehide', () => navigator.sendBeacon('api/leave', JSON.stringify({ window: windowName })));
+safely(start)();

@@ -1,0 +1,97 @@
+"""Places: where ground lies in the image and image on the ground, by the model as it is adjusted now."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, parse_crs
+from ortho_pipeline.imaging.matching import Reference, View
+from ortho_pipeline.measure.marks import GROUND_CRS
+from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.rays import meet_surface
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """A scene and its references as one geometry.
+
+    Parameters
+    ----------
+    view : View
+        The scene by the model that the reference is rendered with.
+    references : tuple of Reference
+    """
+
+    view: View
+    references: tuple[Reference, ...]
+
+    @property
+    def model(self) -> SensorModel:
+        """The model that puts ground into the image."""
+        return self.view.model
+
+    @property
+    def surface(self) -> Surface:
+        """The heights."""
+        return self.view.surface
+
+    def by(self, model: SensorModel) -> Places:
+        """Return the same by another model."""
+        return replace(self, view=replace(self.view, model=model))
+
+    def image_of(self, ground: ArrayLike) -> Array:
+        """Return the image ``(N, 2)`` of ground ``(N, 3)`` in `GROUND_CRS`; NaN where there is none."""
+        given = np.asarray(ground, dtype=float).reshape(-1, 3)
+        return self.model.ground_to_image(ground_transform(GROUND_CRS, self.model.crs)(given))
+
+    def ground_of(self, image: ArrayLike) -> Array:
+        """Return the ground ``(N, 3)`` in `GROUND_CRS` that image points ``(N, 2)`` see; NaN where they see none."""
+        met = meet_surface(self.model, np.asarray(image, dtype=float).reshape(-1, 2), self.surface)
+        found = np.full(met.shape, np.nan)
+        good = np.isfinite(met).all(axis=1)
+        found[good] = ground_transform(self.model.crs, GROUND_CRS)(met[good])
+        return found
+
+    def moved(self, shift: ArrayLike) -> Places:
+        """Return the same where the model puts everything `shift` (column, row; px) farther."""
+        step = np.zeros(6)
+        step[[0, 3]] = np.asarray(shift, dtype=float)
+        return self.by(ImageCorrection(self.model, "shift", (0.0, 0.0), step))
+
+
+def ground_typed(values: Sequence[float | None], crs: str, vertical: str | None, surface: Surface) -> Array:
+    """Return typed coordinates x, y and height as ground ``(3,)`` in `GROUND_CRS`; a height of None is the surface's.
+
+    Parameters
+    ----------
+    crs : str
+        Of x and y.
+    vertical : str, optional
+        What the height is measured above; the ellipsoid without one.
+
+    Raises
+    ------
+    InputError, CrsError, DatumError
+        If a value is missing, or what it is in is not known.
+    """
+    if len(values) != 3 or values[0] is None or values[1] is None:
+        raise InputError("ground has x and y, and a height or none", field="ground")
+    plane = horizontal(parse_crs(crs))
+    plan = np.array([[values[0], values[1]]], dtype=float)
+    lonlat = ground_transform(plane, "EPSG:4326")(np.column_stack([plan, [0.0]]))[0, :2]
+    if values[2] is None:
+        height = float(surface.heights(plan, plane)[0])
+        if not np.isfinite(height):
+            raise InputError("the DEM has no height here", field="ground", remedy="type the height")
+    else:
+        datum = Vertical.parse(vertical or "ellipsoid")
+        undulation = 0.0 if datum.is_ellipsoid else float(datum.undulation(lonlat[:1], lonlat[1:])[0])
+        height = values[2] + undulation
+    return np.array([lonlat[0], lonlat[1], height])

@@ -1,0 +1,303 @@
+"""The server of the page: starlette behind the guard, on this machine alone.
+
+What the page may load is a fixed table, read when the server begins: no path of a request is ever opened.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import os
+import secrets
+import socket
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+from ortho_pipeline.commands.fitting import compare
+from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.files import parse_json
+from ortho_pipeline.measure.guard import App, Guard
+from ortho_pipeline.measure.session import Session
+from ortho_pipeline.measure.tiles import MOST, PANES, SIDE, Tiles
+from ortho_pipeline.options import CORRECTIONS, OutputOptions, SceneOptions
+from ortho_pipeline.raster.block_cache import limit_cache
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+    from starlette.responses import Response
+
+#: What the page is made of: name -> media type.
+PAGE = {
+    "index.html": "text/html; charset=utf-8",
+    "style.css": "text/css; charset=utf-8",
+    "app.js": "text/javascript; charset=utf-8",
+    "views.js": "text/javascript; charset=utf-8",
+    "table.js": "text/javascript; charset=utf-8",
+    "ol.js": "text/javascript; charset=utf-8",
+    "ol.css": "text/css; charset=utf-8",
+    "ol-LICENSE.md": "text/plain; charset=utf-8",
+}
+_LOOPBACK = "127.0.0.1"
+_REMEDY = "load the page anew"
+
+
+class Windows:
+    """Which window of the browser writes: the first one, until another takes over."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._writer: str | None = None
+
+    def claim(self, window: str, *, take: bool = False) -> bool:
+        """Return whether a window writes now; `take` makes it so."""
+        with self._lock:
+            if self._writer is None or take:
+                self._writer = window
+            return self._writer == window
+
+    def leave(self, window: str) -> None:
+        """Let the next window write, if it was this one."""
+        with self._lock:
+            if self._writer == window:
+                self._writer = None
+
+
+class _Answers:
+    """What is answered to each request; methods of the same names as paths."""
+
+    def __init__(self, session: Session, tiles: Tiles) -> None:
+        self._session, self._tiles, self._windows = session, tiles, Windows()
+
+    def begin(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Say what does not change: sizes, names, bands."""
+        session = self._session
+        writes = not session.journal.read_only and self._windows.claim(_window(given), take=bool(given.get("take")))
+        return {
+            "scene": os.path.basename(session.scene.path), "output": os.path.basename(session.output),
+            "references": [os.path.basename(one.path) for one in session.places.references],
+            "size": [session.scene.width, session.scene.height], "tile": SIDE, "bands": self._tiles.bands,
+            "corrections": list(CORRECTIONS), "writes": writes, "locked": session.journal.read_only,
+            "healed": session.journal.healed, "state": session.state(),
+        }  # fmt: skip
+
+    def leave(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Take note that a window is closed."""
+        self._windows.leave(_window(given))
+        return {}
+
+    def act(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Do an action; a window that does not write is refused."""
+        if not self._windows.claim(_window(given)):
+            raise InputError("another window measures these points: this one only shows them", field="window",
+                             remedy="take over")  # fmt: skip
+        action = given.get("action")
+        if not isinstance(action, dict):
+            raise InputError("there is no action", field="action")
+        return self._session.act(action)
+
+    def state(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Return all that changes."""
+        return self._session.state()
+
+    def predict(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Say where a place lies in both views."""
+        places = {name: _numbers(given.get(name), 2) for name in ("scene", "shown") if given.get(name) is not None}
+        if given.get("ground") is not None:
+            places["ground"] = _numbers(given["ground"], 3)
+        if len(places) != 1:
+            raise InputError("one place is predicted: scene, shown or ground")
+        return self._session.predict(_whole(given.get("version", 0)), **places)
+
+    def propose(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Match a click."""
+        ground = given.get("ground")
+        return self._session.proposal(
+            _numbers(given.get("image"), 2), None if ground is None else _numbers(ground, 3)
+        )  # fmt: skip
+
+    def typed(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Understand typed coordinates."""
+        values = given.get("values")
+        if not isinstance(values, list) or len(values) != 3:
+            raise InputError("ground has x, y and a height or none", field="values")
+        numbers = [None if value is None else _numbers([value], 1)[0] for value in values]
+        vertical = given.get("vertical")
+        return {
+            "ground": self._session.typed(numbers, str(given.get("crs") or ""), str(vertical) if vertical else None)
+        }
+
+    def stretch(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Return what is black and white, for each band."""
+        pane, box = str(given.get("pane")), given.get("box")
+        if pane not in PANES:
+            raise InputError("there is no such view", field="pane")
+        where = None if box is None else _numbers(box, 4)
+        bands, version = _bands(given.get("bands")), _whole(given.get("version", 0))
+        return {"limits": [self._tiles.limits(pane, version, where, self._band(pane, band)) for band in bands]}
+
+    def compare(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Compare the models that the points could be fitted with."""
+        return self._session.compared(compare)
+
+    def save(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Write the points."""
+        self._session.save()
+        return {}
+
+    def _band(self, pane: str, band: int) -> int:
+        if not 0 <= band <= self._tiles.bands[pane]:
+            raise InputError("there is no such band", field="bands")
+        return band
+
+
+def application(session: Session, token: str, hosts: set[str], opened: SceneOptions = SceneOptions()) -> App:
+    """Return the ASGI application of a session."""
+    from starlette.applications import Starlette
+    from starlette.responses import JSONResponse, Response
+    from starlette.routing import Route
+
+    tiles = Tiles(session, opened)
+    answers = _Answers(session, tiles)
+    files = {name: resources.files("ortho_pipeline.measure").joinpath("page", name).read_bytes() for name in PAGE}
+    workers = ThreadPoolExecutor(max(2, os.cpu_count() or 1), thread_name_prefix="measure")
+
+    async def run(work: Callable[..., Any], *given: Any) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(workers, work, *given)
+
+    async def page(request: Request) -> Response:
+        name = request.path_params.get("name", "index.html")
+        if name not in files:
+            return Response("refused\n", 404)
+        return Response(files[name], media_type=PAGE[name], headers={"cache-control": "no-cache"})
+
+    async def tile(request: Request) -> Response:
+        try:
+            given = _tile(request)
+            made = await run(lambda: tiles.png(*given))
+        except OrthoError as error:
+            return JSONResponse(_told(error), 400)
+        # The address names all that the pixels depend on.
+        return Response(made, media_type="image/png", headers={"cache-control": "private, max-age=86400, immutable"})
+
+    async def answer(request: Request) -> Response:
+        work = getattr(answers, request.path_params["what"]) if request.path_params["what"] in _ASKED else None
+        if work is None:
+            return Response("refused\n", 404)
+        try:
+            given = parse_json(await request.body() or b"{}", "request", _REMEDY)
+            if not isinstance(given, dict):
+                raise InputError("a request is a JSON object", remedy=_REMEDY)
+            done = await run(work, given)
+        except OrthoError as error:
+            return JSONResponse(_told(error), 409 if error.field == "window" else 400)
+        if request.path_params["what"] == "act":
+            workers.submit(session.save)
+        return JSONResponse(done, headers={"cache-control": "no-store"})
+
+    routes = [
+        Route("/", page),
+        Route("/api/{what}", answer, methods=["POST"]),
+        Route("/tiles/{pane}/{version:int}/{factor:int}/{column:int}/{row:int}", tile),
+        Route("/{name}", page),
+    ]
+    return Guard(Starlette(routes=routes), hosts, token)
+
+
+_ASKED = ("begin", "leave", "act", "state", "predict", "propose", "typed", "stretch", "compare", "save")
+
+
+def serve(session: Session, opened: SceneOptions, ready: Callable[[str], None], port: int = 0) -> None:
+    """Serve the page of a session until the process is asked to end.
+
+    Parameters
+    ----------
+    ready : callable
+        Gets the address once it is answered there.
+    port : int
+        0 is any that is free.
+    """
+    import uvicorn
+
+    token = secrets.token_urlsafe(24)
+    listening = socket.create_server((_LOOPBACK, port))
+    number = listening.getsockname()[1]
+    hosts = {f"{_LOOPBACK}:{number}", f"localhost:{number}"}
+    limit_cache(OutputOptions.memory, os.cpu_count() or 1)
+    app = application(session, token, hosts, opened)
+    config = uvicorn.Config(
+        app, log_level="warning", access_log=False, server_header=False, date_header=False, ws="none", lifespan="off",
+        timeout_graceful_shutdown=3,
+    )  # fmt: skip
+    try:
+        ready(f"http://{_LOOPBACK}:{number}/{token}/")
+        # Ctrl-C is how this command ends.
+        with contextlib.suppress(KeyboardInterrupt):
+            uvicorn.Server(config).run([listening])
+    finally:
+        listening.close()
+        session.close()
+
+
+# -- what requests say -----------------------------------------------------------------------------------------------
+
+
+def _tile(request: Request) -> tuple[Any, ...]:
+    given = request.path_params
+    query = request.query_params
+    bands = _bands([int(text) if text.isascii() and text.isdigit() else -1 for text in query.get("b", "0").split(",")])
+    values = query.get("l", "").split(",")
+    if len(values) != 2 * len(bands):
+        raise InputError("there is no such tile", field="tile")
+    try:
+        limits = _numbers([float(text) for text in values], len(values))
+    except ValueError:
+        raise InputError("there is no such tile", field="tile") from None
+    pairs = list(zip(limits[::2], limits[1::2], strict=True))
+    factor, column, row = given["factor"], given["column"], given["row"]
+    if factor > MOST or max(column, row) > 1 << 20:
+        raise InputError("there is no such tile", field="tile")
+    return given["pane"], given["version"], factor, column, row, bands, pairs
+
+
+def _bands(values: Any) -> list[int]:
+    found = [_whole(value) for value in values] if isinstance(values, list) else []
+    if len(found) not in (1, 3):
+        raise InputError("one band is shown in grey, or three in colours", field="bands")
+    return found
+
+
+def _whole(value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 31:
+        raise InputError("this is no whole number", field="request", remedy=_REMEDY)
+    return value
+
+
+def _numbers(values: Any, count: int) -> list[float]:
+    """Return so many finite numbers of a request."""
+    if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
+        raise InputError(f"{count} numbers are wanted", field="request", remedy=_REMEDY)
+    for value in values:
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not math.isfinite(value)
+            or abs(value) > 1e12
+        ):
+            raise InputError("this is no number", field="request", remedy=_REMEDY)
+    return [float(value) for value in values]
+
+
+def _window(given: dict[str, Any]) -> str:
+    name = given.get("window")
+    if not isinstance(name, str) or not 8 <= len(name) <= 64:
+        raise InputError("a window has a name", field="request", remedy=_REMEDY)
+    return name
+
+
+def _told(error: OrthoError) -> dict[str, Any]:
+    """Return what the page shows of an error: no path of this machine is in it."""
+    return {"error": {"message": error.message, "field": error.field, "remedy": error.remedy}}

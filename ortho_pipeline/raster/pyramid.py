@@ -1,0 +1,85 @@
+"""A raster as it is looked at: intensities at any reduction, where what is coarse is read once and kept.
+
+Up to `intensity.EXACT` a window is read and averaged. Beyond, the whole raster is brought to one coarse copy in memory,
+from its overviews or, where it has none, by single pixels of every few rows; that serves to look and never to measure.
+"""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+from numpy.typing import NDArray
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.raster.intensity import EXACT, Intensity
+from ortho_pipeline.raster.source import RasterSource, first_line
+
+#: The coarse copy has a pixel for so many by so many, at least; and no more pixels than that in all.
+_COARSE, _MOST_PIXELS = 2 * EXACT, 16_000_000
+
+
+class Pyramid(Intensity):
+    """Intensities of a raster for a viewer: as `Intensity`, with a coarse copy in memory for large reductions."""
+
+    def __init__(self, source: RasterSource) -> None:
+        super().__init__(source)
+        self._lock = threading.Lock()
+        self._copy: NDArray[np.float32] | None = None
+        self._step = _COARSE
+        while (self.width / self._step) * (self.height / self._step) > _MOST_PIXELS:
+            self._step *= 2
+
+    @property
+    def coarse(self) -> NDArray[np.float32]:
+        """The whole raster ``(rows, columns)``, made when it is first asked for; NaN where not valid."""
+        with self._lock:
+            if self._copy is None:
+                self._copy = self._decimated()
+            return self._copy
+
+    def stretch(self, percent: tuple[float, float] = (1.0, 99.0)) -> tuple[float, float]:
+        """Return the intensities that are shown as black and as white: percentiles of all valid pixels."""
+        seen = self.coarse[np.isfinite(self.coarse)]
+        if not len(seen):
+            return 0.0, 1.0
+        low, high = (float(value) for value in np.percentile(seen, percent))
+        return low, max(high, low + 1e-6 * max(abs(low), 1.0))
+
+    def _reduced(self, left: int, top: int, rows: int, columns: int, factor: int) -> NDArray[np.float32]:
+        copy = self.coarse
+        row = ((top + (np.arange(rows) + 0.5) * factor) / self._step).astype(int)
+        column = ((left + (np.arange(columns) + 0.5) * factor) / self._step).astype(int)
+        if factor <= self._step:
+            return copy[np.minimum(row, copy.shape[0] - 1)][:, np.minimum(column, copy.shape[1] - 1)]
+        many = factor // self._step
+        first = np.minimum(top // self._step + np.arange(rows * many), copy.shape[0] - 1)
+        second = np.minimum(left // self._step + np.arange(columns * many), copy.shape[1] - 1)
+        part = copy[first][:, second].reshape(rows, many, columns, many)
+        valid = np.isfinite(part)
+        count = valid.sum(axis=(1, 3))
+        total = np.where(valid, part, 0.0).sum(axis=(1, 3))
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
+
+    def _decimated(self) -> NDArray[np.float32]:
+        rows, columns = max(1, self.height // self._step), max(1, self.width // self._step)
+        window = 0, 0, columns * self._step, rows * self._step
+        if columns * self._step > self.width or rows * self._step > self.height:
+            window = 0, 0, self.width, self.height
+        size = {"buf_xsize": columns, "buf_ysize": rows}
+        found, valid = np.zeros((rows, columns), np.float32), np.ones((rows, columns), dtype=bool)
+        try:
+            for number in self._bands:
+                band = self.source.bands[number]
+                way = gdal.GRIORA_Average if band.GetOverviewCount() else gdal.GRIORA_NearestNeighbour
+                found += band.ReadAsArray(*window, **size, buf_type=gdal.GDT_Float32, resample_alg=way)
+                valid &= band.GetMaskBand().ReadAsArray(*window, **size) != 0
+        except RuntimeError as error:
+            raise InputError(
+                f"the pixels cannot be read ({first_line(error)})", file=self.source.path,
+                remedy="the file is cut off or damaged: copy it again",
+            ) from error  # fmt: skip
+        found /= len(self._bands)
+        found[~valid] = np.nan
+        return found

@@ -1,0 +1,98 @@
+"""An orthoimage of the sample scene's place, of its known landscape and with no other error, and the scene's truth."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from osgeo import gdal, osr
+
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.simulation.scanner import LineScanner
+from ortho_pipeline.simulation.terrain import Landscape, Terrain
+
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
+_PIXEL, _SIDE = 2.5, 1360
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The camera of the sample, its terrain and landscape."""
+
+    camera: LineScanner
+    terrain: Terrain
+
+    def image_of(self, ground: np.ndarray) -> np.ndarray:
+        """Return where the camera has ground ``(N, 3)`` in longitude, latitude and ellipsoidal height."""
+        return self.camera.ground_to_image(ground_transform("EPSG:4979", self.camera.crs)(np.asarray(ground)))
+
+    def ground_at(self, image: np.ndarray) -> np.ndarray:
+        """Return the true ground ``(N, 3)`` of image points, lon, lat, h."""
+        height = np.full(len(image), 850.0)
+        for _ in range(40):
+            ground = ground_transform(self.camera.crs, "EPSG:4979")(self.camera.image_to_ground(image, height))
+            height = self.terrain(ground[:, 0], ground[:, 1])
+        return np.column_stack([ground[:, :2], height])
+
+
+@pytest.fixture(scope="session")
+def truth() -> Truth:
+    document = json.loads((SAMPLE / "truth.json").read_text())
+    camera = {key: tuple(value) if isinstance(value, list) else value for key, value in document["camera"].items()}
+    camera.pop("kind")
+    return Truth(LineScanner(**camera), Terrain(**document["terrain"]))
+
+
+#: Places of the scene (px) with structure; about them the quick reference has pixels.
+FEATURES = np.array([(200, 200), (800, 220), (500, 500), (240, 800), (780, 790), (150, 500)], dtype=float)
+_PATCH = 120
+
+
+@pytest.fixture(scope="session")
+def features() -> np.ndarray:
+    return FEATURES
+
+
+@pytest.fixture(scope="session")
+def reference(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An ortho of the landscape itself about `FEATURES`: no camera and no DEM had a part in it."""
+    path = tmp_path_factory.mktemp("reference") / "reference.tif"
+    write_reference(truth, path, FEATURES)
+    return path
+
+
+@pytest.fixture(scope="session")
+def whole_reference(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same of the whole scene, which takes a while."""
+    path = tmp_path_factory.mktemp("reference") / "whole.tif"
+    write_reference(truth, path)
+    return path
+
+
+def write_reference(truth: Truth, path: Path, about: np.ndarray | None = None) -> None:
+    """Write the landscape as an ortho, about some image points only if they are given."""
+    terrain = truth.terrain
+    left, top = terrain.x0 - _SIDE * _PIXEL / 2, terrain.y0 + _SIDE * _PIXEL / 2
+    landscape = Landscape(terrain, _PIXEL, seed=7)
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), _SIDE, _SIDE, 1, gdal.GDT_Byte, ["TILED=YES"])
+    system = osr.SpatialReference()
+    system.ImportFromEPSG(32636)
+    dataset.SetProjection(system.ExportToWkt())
+    dataset.SetGeoTransform((left, _PIXEL, 0, top, 0, -_PIXEL))
+    band = dataset.GetRasterBand(1)
+    band.SetNoDataValue(0)
+    windows = [(0, first, _SIDE, 80) for first in range(0, _SIDE, 80)]
+    if about is not None:
+        xy = terrain.xy(*truth.ground_at(about)[:, :2].T)
+        middle = np.round((xy - (left, top)) / (_PIXEL, -_PIXEL)).astype(int)
+        windows = [(column - _PATCH, row - _PATCH, 2 * _PATCH, 2 * _PATCH) for column, row in middle.tolist()]
+    for column, row, width, height in windows:
+        x = left + (column + np.arange(width) + 0.5) * _PIXEL
+        y = top - (row + np.arange(height) + 0.5) * _PIXEL
+        x, y = np.meshgrid(x, y)
+        values = landscape(np.column_stack([x.ravel(), y.ravel()])).reshape(x.shape)
+        band.WriteArray(np.round(1 + values * 250).astype(np.uint8), column, row)
+    dataset = None

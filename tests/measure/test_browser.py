@@ -1,0 +1,180 @@
+"""The page in Chromium: a person clicks, presses keys, and looks."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytest.importorskip("uvicorn", reason="the extra 'measure' is not installed")
+
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
+_FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--disable-background-networking"]
+_SLOW_MACHINE = 60_000
+
+
+class Served:
+    """`ortho measure` as a process of its own, and a browser page on it."""
+
+    def __init__(self, page, folder: Path, reference: Path) -> None:
+        self.output = folder / "p.geojson"
+        code = "from ortho_pipeline.cli.program import main; main()"
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", code, "measure", str(SAMPLE / "scene.tif"), "--reference", str(reference), "--dem",
+             str(SAMPLE / "dem.tif"), "-o", str(self.output), "--no-browser"],
+            stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert self.process.stdout is not None
+        self.address = self.process.stdout.readline().split()[-1]
+        self.page, self.hosts, self.faults = page, set(), []
+        page.set_default_timeout(_SLOW_MACHINE)
+        page.on("request", lambda request: self.hosts.add(request.url.split("/")[2]))
+        page.on("console", lambda told: self.faults.append(told.text) if told.type == "error" else None)
+        page.on("pageerror", lambda error: self.faults.append(str(error)))
+        page.goto(self.address)
+        self.says("#what", "not tested")
+
+    def says(self, where: str, text: str) -> None:
+        playwright.expect(self.page.locator(where)).to_have_text(re.compile(text), timeout=_SLOW_MACHINE)
+
+    def click(self, pane: str, place: np.ndarray) -> None:
+        """Click a pixel of the scene as the page shows it at first: the whole of it, 2 px in one of the screen."""
+        box = self.page.locator(f"#{pane}").bounding_box()
+        assert box is not None
+        middle = np.array([box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
+        self.page.mouse.click(*(middle + (place - 500) / 2).tolist())
+
+    def accept(self, name: str) -> None:
+        self.says("#said", f"Matched|{name}")
+        self.page.keyboard.press("Enter")
+        self.says("#said", f"{name} accepted")
+
+    def end(self) -> list[dict]:
+        """End the server as Ctrl-C does, and return the points that it wrote."""
+        self.process.send_signal(signal.SIGINT)
+        assert self.process.wait(30) == 0
+        return json.loads(self.output.read_text())["features"]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[object]:
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=_FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def serve(browser, tmp_path: Path):
+    running = []
+
+    def serving(reference: Path, **context: object) -> Served:
+        page = browser.new_page(**{"viewport": {"width": 1400, "height": 860}, **context})
+        running.append(Served(page, tmp_path, reference))
+        return running[-1]
+
+    yield serving
+    for served in running:
+        served.page.close()
+        served.process.kill()
+        served.process.wait()
+
+
+def missed(points: list[dict], truth) -> np.ndarray:
+    """Return how far (px) points of a file are from the truth."""
+    image = np.array([one["properties"]["ji"] for one in points]) + 0.5
+    return np.hypot(*(image - truth.image_of([one["geometry"]["coordinates"] for one in points])).T)
+
+
+def test_a_person_clicks_two_points(serve, reference: Path, truth, features: np.ndarray) -> None:
+    served = serve(reference)
+    for number, feature in enumerate(features[[2, 3]]):
+        served.click("scene", feature + np.array([2, -2]))
+        served.accept(f"P{number + 1}")
+    served.says("#what", "left out in turn, relative to the reference")
+    assert served.page.locator("#table tbody tr").count() == 2
+    points = served.end()
+    assert missed(points, truth).max() < 0.1
+    assert [one["properties"]["measured"] for one in points] == ["matched", "matched"]
+    assert served.hosts == {served.address.split("/")[2]}, "a request left the page's own server"
+    assert not served.faults
+
+
+@pytest.mark.slow
+def test_a_person_clicks_six_points_in_either_view(serve, reference: Path, truth, features: np.ndarray) -> None:
+    served = serve(reference)
+    for number, feature in enumerate(features):
+        served.click("scene" if number < 2 or number % 2 else "reference", feature + np.array([-2, 2]))
+        served.accept(f"P{number + 1}")
+    # Undo, redo, a blunder made by the arrow keys, and its name.
+    served.page.keyboard.press("z")
+    playwright.expect(served.page.locator("#table tbody tr")).to_have_count(5)
+    served.page.keyboard.press("Shift+Z")
+    playwright.expect(served.page.locator("#table tbody tr")).to_have_count(6)
+    points = served.end()
+    assert missed(points, truth).max() < 0.1
+    assert not served.faults
+
+
+@pytest.mark.slow
+def test_six_points_by_keyboard_alone(serve, whole_reference: Path, truth) -> None:
+    served = serve(whole_reference)
+    page = served.page
+    page.keyboard.press("?")
+    playwright.expect(page.locator("#keys")).to_be_visible()
+    page.keyboard.press("Escape")
+    for _ in range(12):
+        page.keyboard.press("Tab")
+        if page.evaluate("() => document.activeElement.id") == "scene":
+            break
+    assert page.evaluate("() => document.activeElement.id") == "scene"
+    accepted = 0
+    for _ in range(12):
+        page.keyboard.press("n")
+        page.keyboard.press("m")
+        served.says("#said", "Matched|No match")
+        if "No match" in page.inner_text("#said"):
+            continue
+        accepted += 1
+        page.keyboard.press("Enter")
+        served.says("#said", f"P{accepted} accepted")
+        if accepted == 6:
+            break
+    page.keyboard.press("j")
+    served.says("#said", "P1: control")
+    before = page.inner_text("#table tbody")
+    page.keyboard.press("ArrowRight")
+    served.says("#said", "By hand")
+    page.keyboard.press("Escape")
+    assert page.inner_text("#table tbody") == before
+    points = served.end()
+    assert len(points) == 6
+    assert missed(points, truth).max() < 0.1
+    assert not served.faults
+
+
+@pytest.mark.slow
+def test_a_killed_server_loses_nothing_and_the_page_says_so(serve, reference: Path, features: np.ndarray) -> None:
+    served = serve(reference)
+    served.click("scene", features[2])
+    served.accept("P1")
+    served.process.kill()
+    served.process.wait()
+    served.page.keyboard.press("z")
+    served.says("#said", "nothing that was accepted is lost")
+    again = serve(reference)
+    playwright.expect(again.page.locator("#table tbody tr")).to_have_count(1)
+    assert len(again.end()) == 1

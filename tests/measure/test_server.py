@@ -1,0 +1,127 @@
+"""The server: what is refused, and that nothing of this machine is opened by what a request says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ortho_pipeline.measure.session import open_session
+from ortho_pipeline.options import MatchOptions, SurfaceOptions
+
+pytest.importorskip("starlette", reason="the extra 'measure' is not installed")
+from starlette.testclient import TestClient
+
+from ortho_pipeline.measure.guard import MAX_BODY
+from ortho_pipeline.measure.server import PAGE, application
+
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
+TOKEN, HOST, WINDOW = "a-token-of-tests", "127.0.0.1:4321", "window-one"
+
+
+@pytest.fixture(scope="module")
+def client(reference: Path, tmp_path_factory: pytest.TempPathFactory):
+    session = open_session(
+        SAMPLE / "scene.tif", tmp_path_factory.mktemp("measure") / "p.geojson",
+        surface=SurfaceOptions(dem=SAMPLE / "dem.tif"), match=MatchOptions(reference=(str(reference),)),
+    )  # fmt: skip
+    with TestClient(application(session, TOKEN, {HOST}), base_url=f"http://{HOST}") as found:
+        yield found
+    session.close()
+
+
+def test_the_page_and_its_parts_are_given_with_a_strict_policy(client: TestClient) -> None:
+    for name in ("", *PAGE):
+        answer = client.get(f"/{TOKEN}/{name}")
+        assert answer.status_code == 200
+        policy = answer.headers["content-security-policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy
+        assert answer.headers["referrer-policy"] == "no-referrer"
+        assert "access-control-allow-origin" not in answer.headers
+    assert "http" not in client.get(f"/{TOKEN}/").text.replace("http-equiv", "")
+
+
+@pytest.mark.parametrize("path", ["/", "/wrong/", "/wrong/api/state", f"/{TOKEN}", f"/{TOKEN}x/", f"//{TOKEN}/"])
+def test_nothing_is_answered_without_the_token(client: TestClient, path: str) -> None:
+    assert client.get(path).status_code == 404
+    assert client.post(path, json={}).status_code == 404
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "127.0.0.1:80", f"{HOST}.evil.example", ""])
+def test_a_foreign_host_is_refused(client: TestClient, host: str) -> None:
+    assert client.get(f"/{TOKEN}/", headers={"host": host}).status_code == 421
+
+
+def test_another_origin_is_refused(client: TestClient) -> None:
+    given = {"window": WINDOW}
+    for origin in ("http://evil.example", "null", "https://127.0.0.1:4321"):
+        assert client.post(f"/{TOKEN}/api/state", json=given, headers={"origin": origin}).status_code == 403
+    assert client.post(f"/{TOKEN}/api/state", json=given, headers={"origin": f"http://{HOST}"}).status_code == 200
+
+
+def test_a_long_body_is_refused_however_it_comes(client: TestClient) -> None:
+    assert client.post(f"/{TOKEN}/api/state", content=b" " * (MAX_BODY + 1)).status_code == 413
+    parts = (b" " * 1000 for _ in range(MAX_BODY // 1000 + 2))
+    assert client.post(f"/{TOKEN}/api/state", content=parts).status_code == 413
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["../session.py", "..%2fsession.py", "%2e%2e/%2e%2e/etc/passwd", "page/../session.py", "/etc/passwd",
+     "api/__class__", "api/_band", "api/../begin", "tiles/..%2f..%2fscene/0/1/0/0?l=0,1", "index.html%00"],
+)  # fmt: skip
+def test_no_path_of_a_request_is_opened(client: TestClient, path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = []
+    monkeypatch.setattr("io.open", lambda *given, **_: opened.append(given))
+    monkeypatch.setattr("builtins.open", lambda *given, **_: opened.append(given))
+    for answer in (client.get(f"/{TOKEN}/{path}"), client.post(f"/{TOKEN}/{path}", json={"window": WINDOW})):
+        assert answer.status_code in (400, 404, 405)
+    assert not opened
+
+
+@pytest.mark.parametrize(
+    ("what", "given"),
+    [
+        ("begin", {}), ("act", {"window": WINDOW, "action": {"do": "begin", "marks": []}}),
+        ("act", {"window": WINDOW, "action": {"do": "put", "mark": {"id": "A", "image": [1e400, 0]}}}),
+        ("act", {"window": WINDOW}), ("propose", {"image": [1]}), ("propose", {"image": ["1", 2]}),
+        ("predict", {}), ("predict", {"scene": [1, 2], "version": -1}), ("predict", {"scene": [1, 2], "version": 99}),
+        ("typed", {"values": [1, 2]}), ("typed", {"values": [1, 2, 3], "crs": "file:///etc/passwd"}),
+        ("stretch", {"pane": "../x", "bands": [0]}), ("stretch", {"pane": "scene", "bands": [5]}), ("act", []),
+    ],
+)  # fmt: skip
+def test_what_makes_no_sense_is_one_line_and_changes_nothing(client: TestClient, what: str, given: object) -> None:
+    import json
+
+    before = client.post(f"/{TOKEN}/api/state", json={"window": WINDOW}).json()
+    answer = client.post(f"/{TOKEN}/api/{what}", content=json.dumps(given))
+    assert answer.status_code == 400
+    assert answer.json()["error"]["message"]
+    assert str(SAMPLE) not in answer.text
+    assert client.post(f"/{TOKEN}/api/state", json={"window": WINDOW}).json() == before
+
+
+def test_the_second_window_reads_until_it_takes_over(client: TestClient) -> None:
+    def ask(what: str, window: str, **given: object):
+        return client.post(f"/{TOKEN}/api/{what}", json={"window": window, **given})
+
+    action = {"do": "put", "mark": {"id": "A", "image": [1.0, 2.0]}}
+    assert ask("begin", WINDOW).json()["writes"]
+    assert not ask("begin", "window-two").json()["writes"]
+    assert ask("act", "window-two", action=action).status_code == 409
+    assert ask("begin", "window-two", take=True).json()["writes"]
+    assert ask("act", "window-two", action=action).status_code == 200
+    assert ask("act", WINDOW, action=action).status_code == 409
+    ask("leave", "window-two")
+    assert ask("begin", WINDOW).json()["writes"]
+    assert ask("act", WINDOW, action={"do": "undo"}).status_code == 200
+
+
+def test_a_tile_is_a_picture_and_nonsense_is_none(client: TestClient) -> None:
+    answer = client.get(f"/{TOKEN}/tiles/scene/0/2/0/1?b=0&l=0,2000")
+    assert answer.headers["content-type"] == "image/png"
+    assert answer.content[:4] == b"\x89PNG"
+    for wrong in ("scene/0/3/0/0?l=0,1", "scene/0/1/0/0?l=0,nan", "scene/0/1/0/0?l=0", "scene/0/1/0/0?b=1,2&l=0,1,2,3",
+                  "scene/0/131072/0/0?l=0,1", "scene/0/1/9999999/0?l=0,1"):  # fmt: skip
+        assert client.get(f"/{TOKEN}/tiles/{wrong}").status_code == 400
