@@ -137,8 +137,10 @@ class MosaicSettings(_Strict):
     """One raster of all scenes."""
 
     format: Literal["VRT", "COG"] = "VRT"
-    order: Literal["best-view", "first-on-top"] = Field(
-        default="best-view", description="What lies on top: the scene that looks down most steeply, or the first."
+    order: Literal["best-view", "first-on-top", "most-accurate"] = Field(
+        default="best-view",
+        description="What lies on top: the scene that looks down most steeply, or the first; or at each pixel "
+        "the scene that is most accurate there, as their output.accuracy_raster says.",
     )
     seams: bool = Field(default=True, description="Measure how well the scenes agree where they overlap.")
 

@@ -368,6 +368,10 @@ class _Run:
         append_line(self.log_path, json.dumps(line, allow_nan=False, default=str))
 
 
+def _path_of(name: str | None) -> Path | None:
+    return None if name is None else Path(name)
+
+
 class _Mosaic:
     """The mosaic of a run, made again only when an ortho or the settings have changed."""
 
@@ -378,16 +382,19 @@ class _Mosaic:
         self.report = planned.output / RUN_FILES["seams"]
         self.record = planned.output / STATE / "mosaic" / "record.json"
         self.orthos = [
-            mosaic.Ortho(job.name, Path(outcomes[job.name].files["ortho"]), outcomes[job.name].facts["lean_m_per_m"])
+            mosaic.Ortho(
+                job.name, Path(outcomes[job.name].files["ortho"]), outcomes[job.name].facts["lean_m_per_m"],
+                _path_of(outcomes[job.name].files.get("accuracy")),
+            )
             for job in jobs
-        ]
+        ]  # fmt: skip
         # What the records know of the orthos need not be taken again.
         known = [Record.read(job.record) for job in jobs]
         self.inputs = tuple(
             replace(state, role=job.name, path=str(job.folder / state.path))
             for job, record in zip(jobs, known, strict=True)
             for state in (record.outputs if record else ())
-            if state.role == "ortho"
+            if state.role in ("ortho", "accuracy")
         )
         order = {ortho.name: ortho.relief_displacement for ortho in self.orthos}
         self.key = key_of(self.inputs, {**self.settings.model_dump(), "order": list(order.items())}, versions())

@@ -41,11 +41,15 @@ _MARGIN = 18
 
 @dataclass(frozen=True)
 class Ortho:
-    """An orthoimage of a mosaic; `relief_displacement` is that of a metre of height (m), None where it is not known."""
+    """An orthoimage of a mosaic; `relief_displacement` is that of a metre of height (m), None where it is not known.
+
+    `accuracy` is the raster that `layers.accuracy` wrote of it.
+    """
 
     name: str
     path: Path
     relief_displacement: float | None = None
+    accuracy: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -60,10 +64,11 @@ class Layer:
 
 @dataclass(frozen=True)
 class Mosaic:
-    """Orthos placed on one grid: layers, the topmost first."""
+    """Orthos placed on one grid: layers, the topmost first, or the most accurate first at each pixel."""
 
     grid: Grid
     layers: tuple[Layer, ...]
+    by_pixel: bool = False
 
 
 def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
@@ -71,17 +76,24 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
 
     Parameters
     ----------
-    order : {'best-view', 'first-on-top'}
-        What lies on top: the steepest view, in which errors of the DEM move pixels least, or the first.
+    order : {'best-view', 'first-on-top', 'most-accurate'}
+        What lies on top: the steepest view, in which errors of the DEM move pixels least, or the first; or at each
+        pixel the ortho with the smallest ce90 there (the steepest view of equal ones).
 
     Raises
     ------
     InputError
-        If they do not share a grid, or differ in bands, type or nodata.
+        If they do not share a grid, or differ in bands, type or nodata; if one has no accuracy that would decide.
     """
     if not orthos:
         raise InputError("a mosaic needs an ortho", field="mosaic")
-    if order == "best-view":
+    without = [ortho for ortho in orthos if ortho.accuracy is None]
+    if order == "most-accurate" and without:
+        raise InputError(
+            f"nobody says how accurate {without[0].name} is at each place", file=without[0].path, field="mosaic.order",
+            remedy="give all scenes `output.accuracy_raster`, or order them by best-view",
+        )  # fmt: skip
+    if order != "first-on-top":
         orthos = sorted(
             orthos, key=lambda ortho: math.inf if ortho.relief_displacement is None else ortho.relief_displacement
         )
@@ -99,7 +111,7 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
         Layer(ortho, grid, round((grid.left - left) / first.dx), round((top - grid.top) / first.dy))
         for ortho, grid in zip(orthos, grids, strict=True)
     ]
-    return Mosaic(whole, tuple(layers))
+    return Mosaic(whole, tuple(layers), order == "most-accurate")
 
 
 def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
@@ -140,6 +152,8 @@ def write_vrt(placed: Mosaic, path: Path) -> None:
     InputError
         If GDAL leaves an ortho out.
     """
+    if placed.by_pixel:
+        raise InputError("a VRT does not choose pixel by pixel", file=path, field="mosaic.format", remedy="make a COG")
     names = [str(layer.ortho.path) for layer in reversed(placed.layers)]
     with raster_output(path) as temporary:
         made = gdal.BuildVRT(
@@ -166,25 +180,56 @@ def write_cog(placed: Mosaic, path: Path, *, memory: int = 512_000_000, threads:
                 size = min(_WINDOW, grid.width - left), min(_WINDOW, grid.height - top)
                 pixels = np.full((profile.count, size[1], size[0]), fill, dtype=profile.dtype)
                 valid = np.zeros(pixels.shape, dtype=bool)
+                best = np.full(size[::-1], np.inf, dtype=np.float32) if placed.by_pixel else None
                 for layer, source in zip(placed.layers, sources, strict=True):
-                    _put_below(layer, source, left, top, pixels, valid)
+                    _put(layer, source, left, top, pixels, valid, best)
                 writer.write(left, top, pixels, np.all(valid, axis=0))
 
 
-def _put_below(
-    layer: Layer, source: RasterSource, left: int, top: int, pixels: NDArray[Any], valid: NDArray[np.bool_]
+def _put(
+    layer: Layer,
+    source: RasterSource,
+    left: int,
+    top: int,
+    pixels: NDArray[Any],
+    valid: NDArray[np.bool_],
+    best: NDArray[np.float32] | None,
 ) -> None:
-    """Fill what has no value yet from an ortho."""
+    """Fill what has no value yet from an ortho, or where `best` is given what is more accurate in it."""
     box = _intersection((left, top, left + pixels.shape[2], top + pixels.shape[1]), _box(layer))
-    if box is None or valid[:, box[1] - top : box[3] - top, box[0] - left : box[2] - left].all():
+    if box is None:
         return
     place = (slice(None), slice(box[1] - top, box[3] - top), slice(box[0] - left, box[2] - left))
+    if best is None and valid[place].all():
+        return
     there = box[0] - layer.left, box[1] - layer.top
     values = source.read(*there, box[2] - box[0], box[3] - box[1])
     good = source.read_valid(*there, values)
-    new = ~valid[place] if good is None else ~valid[place] & good
+    good = np.ones(values.shape, dtype=bool) if good is None else np.broadcast_to(good, values.shape)
+    if best is None:
+        new = ~valid[place] & good
+    else:
+        own = _ce90(layer, *there, box[2] - box[0], box[3] - box[1])
+        better = good.all(axis=0) & (own < best[place[1:]])
+        best[place[1:]] = np.where(better, own, best[place[1:]])
+        new = np.broadcast_to(better, values.shape)
     pixels[place] = np.where(new, values, pixels[place])
     valid[place] |= new
+
+
+def _ce90(layer: Layer, left: int, top: int, width: int, height: int) -> NDArray[np.float32]:
+    """Return the circular error (m) in a window of an ortho, of the nearest pixel of its raster of accuracy.
+
+    Where nothing is known it is larger than any that is.
+    """
+    assert layer.ortho.accuracy is not None
+    source = RasterSource(layer.ortho.accuracy)
+    own = grid_of(layer.ortho.accuracy)
+    steps = [round(size / pixel) for size, pixel in zip((own.dx, own.dy), (layer.grid.dx, layer.grid.dy), strict=True)]
+    columns, rows = (np.arange(left, left + width) // steps[0], np.arange(top, top + height) // steps[1])
+    part = source.read(int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1))
+    found = part[-1][np.ix_(rows - rows[0], columns - columns[0])]
+    return np.where(np.isfinite(found), found, np.finfo(np.float32).max).astype(np.float32)
 
 
 def _box(layer: Layer) -> tuple[int, int, int, int]:

@@ -116,8 +116,8 @@ def test_heights_of_unknown_quality_have_no_accuracy_and_void_ones_neither(tiny,
     assert 0.9 < made.known < 1.0
     assert one.known == 1.0
     middle = ratio.shape[1] // 2
-    np.testing.assert_allclose(ratio[:, middle + 5 :][np.isfinite(ratio[:, middle + 5 :])], 3.0, rtol=1e-5)
-    np.testing.assert_allclose(np.nanmin(ratio), 1.0, rtol=1e-5)
+    np.testing.assert_allclose(ratio[:, middle + 5 :][np.isfinite(ratio[:, middle + 5 :])], 3.0, rtol=1e-3)
+    np.testing.assert_allclose(np.nanmin(ratio), 1.0, rtol=1e-3)
     void = np.isnan(ce90) & np.isfinite(even)
     assert void.any()
 

@@ -240,3 +240,29 @@ def test_a_mosaic_says_what_is_missing_and_parts_make_none(block):
         with pytest.raises(InputError, match="share a grid") as caught:
             batch.run(block / "p.yaml", executor="sequential")
         assert caught.value.field == f"defaults.output.{field}"
+
+
+def test_the_most_accurate_ortho_has_each_pixel(tmp_path, landscape):
+    """Two orthos over each other, each twice as accurate as the other in one half; unknown is worst."""
+    made = []
+    for name, ramp in (("a", (1.0, 4.0)), ("b", (2.0, 2.0))):
+        ortho = cut(tmp_path, name, landscape + 3000 * (name == "b"), 40, 30, 300, 260, relief_displacement=0.1)
+        path = ortho.path.with_name(f"{name}_accuracy.tif")
+        grid = Grid(UTM, 500080, 4e6 - 60, 2.0 * 16, 2.0 * 16, 19, 17)
+        with RasterWriter(path, grid, Profile(4, np.dtype("float32"), "nodata", math.nan)) as writer:
+            ce90 = np.where(np.arange(19) < 10, *ramp) * np.ones((17, 1))
+            ce90[0] = np.nan if name == "b" else ce90[0]
+            writer.write(0, 0, np.stack([ce90] * 4).astype(np.float32), None)
+        made.append(dataclasses.replace(ortho, accuracy=path))
+    write_cog(lay_out(made, "most-accurate"), tmp_path / "m.tif")
+    values, valid = read(tmp_path / "m.tif")
+    one, both = (read(ortho.path) for ortho in made)
+    np.testing.assert_array_equal(valid, one[1] | both[1])
+    west = np.arange(300) < 160
+    np.testing.assert_array_equal(values[16:, west][valid[16:, west]], one[0][16:, west][valid[16:, west]])
+    np.testing.assert_array_equal(values[16:, ~west][valid[16:, ~west]], both[0][16:, ~west][valid[16:, ~west]])
+    np.testing.assert_array_equal(values[:16][valid[:16]], one[0][:16][valid[:16]])
+    with pytest.raises(InputError, match="pixel by pixel"):
+        write_vrt(lay_out(made, "most-accurate"), tmp_path / "m.vrt")
+    with pytest.raises(InputError, match="how accurate"):
+        lay_out([made[0], dataclasses.replace(made[1], accuracy=None)], "most-accurate")

@@ -46,7 +46,7 @@ BANDS = ("sigma_e", "sigma_n", "rho", "ce90")
 #: Output pixels per pixel of the layer, per side.
 STEP = 16
 #: Side of a tile of the layer, and spacings of its nodes, tried one after the other (pixels of the layer).
-_TILE, _SPACINGS = 256, (16, 8, 4, 2)
+_TILE, _SPACINGS = 256, (64, 16, 4)
 #: A standard deviation is interpolated to this part of itself, at so many places that are tried.
 _TOLERANCE, _PROBES = 0.005, 200
 #: Heights at which a node is exact.
@@ -240,7 +240,7 @@ def write_accuracy(
         scales=tuple((1.0, 0.0, unit) for unit in ("m", "m", "", "m")),
     )  # fmt: skip
     # Little is gained by more effort, and half of the time of the layer would be spent on it.
-    options = {"LEVEL": "1", "OVERVIEW_RESAMPLING": "AVERAGE"}
+    options = {"LEVEL": "1", "PREDICTOR": "NO", "OVERVIEW_RESAMPLING": "NEAREST"}
     with RasterWriter(path, grid, profile, creation_options=options, threads=resources.threads or 1) as writer:
         for left, top, width, height in tiles(grid, _TILE):
             writer.write(left, top, layer.make(left, top, width, height), None)
@@ -353,7 +353,7 @@ class _Layer:
                 bands[(slice(None), *here)], self.totals,
             )  # fmt: skip
         self._count(left, top, bands, covariance)
-        return bands
+        return _rounded(bands)
 
     def _pieces(self, samples: Array, height: int, width: int, spacing: int) -> Iterator[tuple[int, int, int, int]]:
         """Yield the pieces (row, column, rows, columns) of a tile whose windows of heights fit into the memory."""
@@ -406,6 +406,14 @@ class _Layer:
             cell=self.cell,
             known=float(count / totals[7]) if totals[7] else 0.0,
         )
+
+
+def _rounded(bands: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return bands to one part in 2000, which is more than anybody knows of an accuracy and packs in half the time."""
+    bits = bands.view(np.uint32)
+    known = np.isfinite(bands)
+    bits[known] = (bits[known] + np.uint32(1 << 12)) & np.uint32(0xFFFFE000)
+    return bands
 
 
 def _window(surface: Surface, samples: Array) -> DemWindow:

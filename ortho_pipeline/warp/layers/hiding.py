@@ -61,8 +61,10 @@ class Looked:
         """Share of the pixels that the image reaches which terrain hides."""
         return self._hidden / max(self._shown, 1)
 
-    def look(self, left: int, top: int, pixels: NDArray[Any], valid: NDArray[np.bool_], fill: Any) -> NDArray[np.uint8]:
-        """Return the classes of a tile ``(h, w)``; without a mask, hidden pixels get the value `fill`, which is none.
+    def look(
+        self, left: int, top: int, pixels: NDArray[Any], valid: NDArray[np.bool_], fill: Any
+    ) -> NDArray[np.uint8] | None:
+        """Return the classes of a tile ``(h, w)``; without a mask none, and hidden pixels get `fill`, no value.
 
         Parameters
         ----------
@@ -70,17 +72,19 @@ class Looked:
             Of the tile, before they are written.
         """
         height, width = pixels.shape[1:]
-        found, shown = self.visibility.look(left, top, width, height), valid.any(axis=0)
-        hidden = (found == HIDDEN) & shown
+        found = self.visibility.look(left, top, width, height)
+        shown: NDArray[np.bool_] = valid[0] if len(valid) == 1 else np.asarray(valid.any(axis=0))
+        count = int(np.count_nonzero(shown))
+        # Most tiles of most terrain have nothing hidden: every look at all of their pixels is worth saving.
+        hidden = np.asarray((found == HIDDEN) & shown) if found.any() else None
         with self._lock:
-            self._hidden += int(np.count_nonzero(hidden))
-            self._shown += int(np.count_nonzero(shown))
-        classes = np.where(shown, VISIBLE, OUTSIDE).astype(np.uint8)
-        classes[hidden] = BEHIND
-        classes[(found == VOID) & ~shown] = WITHOUT
-        if self.hiding.mask is None:
+            self._shown += count
+            self._hidden += 0 if hidden is None else int(np.count_nonzero(hidden))
+        if self.hiding.mask is not None:
+            return _classes(found, shown, hidden)
+        if hidden is not None:
             pixels[:, hidden], valid[:, hidden] = fill, False
-        return classes
+        return None
 
     def writer(self, threads: int) -> Any:
         """Return the writer of the mask as a context; of nothing where none is wanted."""
@@ -94,3 +98,12 @@ class Looked:
         )  # fmt: skip
         options = {"LEVEL": "1", "OVERVIEW_RESAMPLING": "NEAREST"}
         return RasterWriter(self.hiding.mask, self.grid, profile, creation_options=options, threads=threads)
+
+
+def _classes(found: NDArray[np.uint8], shown: NDArray[np.bool_], hidden: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+    classes = np.full(shown.shape, OUTSIDE, dtype=np.uint8)
+    classes[shown] = VISIBLE
+    if hidden is not None:
+        classes[hidden] = BEHIND
+        classes[(found == VOID) & ~shown] = WITHOUT
+    return classes
