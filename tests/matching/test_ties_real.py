@@ -11,17 +11,21 @@ import numpy as np
 import pyproj
 import pytest
 from osgeo import gdal
+from scipy.spatial import cKDTree
 
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.points import BlockPoints, shape_of
 from ortho_pipeline.exchange.rpc import read_rpc, rpc_of_dataset
-from ortho_pipeline.imaging.matching import View
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.imaging.matching import MatchSettings, View, match, open_references
 from ortho_pipeline.imaging.ties import Ties, TieSettings, tie
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.points.image_errors import sigma_of_covariance
 from ortho_pipeline.raster.intensity import Intensity
-from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.rays import meet_surface
+from ortho_pipeline.warp.engine import rectify
 
 pytestmark = pytest.mark.realdata
 
@@ -87,3 +91,30 @@ def test_ties_of_pleiades_images_meet(real, name, dem_sigma):
     # The issue asks for 0.34 px, what the triplet's own authors reach.
     assert np.nanmedian(apart) <= 0.1
     assert len(after.rejected) < 0.02 * len(ties.track)
+
+
+@pytest.mark.slow
+def test_matches_with_an_ortho_of_the_other_image_are_the_ties(real, tmp_path):
+    """One crop of Gizeh, rectified, is the reference of the other: both say what lies where."""
+    images, models, surface = pleiades(real, "gizeh")
+    one, other = images
+    source, path = RasterSource(images[other]), tmp_path / "ortho.tif"
+    corners = np.array([[0.0, 0.0], [source.width, 0.0], [0.0, source.height], [source.width, source.height]])
+    ground = meet_surface(models[other], corners, surface)
+    x, y = ground_transform("EPSG:4979", "EPSG:32636")(ground)[:, :2].T
+    grid = Grid.of_extent(pyproj.CRS(32636), (x.min(), y.min(), x.max(), y.max()), (0.5, 0.5))
+    rectify(models[other], source, surface, grid, path, resampling="cubic", driver="GTiff")
+    view = View(Intensity(RasterSource(images[one])), models[one], surface)
+    matches = match(view, open_references([path]), MatchSettings(30.0, 700, 15.0)).points
+    there = models[other].ground_to_image(matches.to_crs("EPSG:4979").ground)
+    ties = tied(images, models, surface, 15.0)
+    tracks = ties.of_pair(0, 1)
+    left, right = (ties.measured[(ties.image == k) & np.isin(ties.track, tracks)] for k in (0, 1))
+    apart, nearest = cKDTree(matches.image).query(left)
+    same = apart < 1
+    assert same.sum() >= 100
+    # What little the places differ is the same in both images.
+    difference = (there - matches.image)[nearest[same]] - (right - left)[same]
+    # The issue asks for 0.2 px; an ortho of cubic convolution beside its image moves edges by a fiftieth.
+    assert np.sqrt((difference**2).mean(axis=0)).max() <= 0.05
+    assert np.abs(difference).max() <= 0.2
