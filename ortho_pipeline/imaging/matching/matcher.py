@@ -50,6 +50,8 @@ _RADIUS = 4
 _NEAR = 2.5
 #: Rounds of rendering and measuring; the last is the one whose correction moves by less than this (px).
 _ROUNDS, _STANDS = 3, 0.02
+#: Where fewer than this part of the chips agree, and scatter (chip px) by more than this, nothing is found.
+_MOSTLY, _VAGUE = 0.5, 0.5
 #: Rounds of judging.
 _JUDGED = 6
 #: Why a match was not kept, in words.
@@ -330,8 +332,24 @@ class _Tried:
             distance = squared_distances(residuals, total)
             bad = distance > SIGMAS**2
             if not bad.any():
-                return
+                break
             self.reason[good[bad]] = "contradicts"
+        self._refuse_vague(residuals[~bad])
+
+    def _refuse_vague(self, residuals: Array) -> None:
+        """Raise an error where ground that looks alike elsewhere (furrows, rows of trees) explains all that was found.
+
+        Wrong heights scatter matches of the right place, and clouds make them few; they do not do both.
+        """
+        seen = int((self.reason != "hidden").sum())
+        scatter = float(np.sqrt((residuals**2).mean()))
+        if len(residuals) < _MOSTLY * seen and scatter > _VAGUE * self.factor:
+            raise InputError(
+                f"the scene and the reference do not agree: {len(residuals)} of {counted(seen, 'chip')} fit together, "
+                f"and those only within {scatter:.1f} px", file=self.targets[0].path, field=self.targets[0].field,
+                remedy="check that the reference shows this place, search farther (`match.search`) if the model may be "
+                "off by more, or give better heights",
+            )  # fmt: skip
 
     def _too_few(self) -> InputError:
         counts = {name: int((self.reason == name).sum()) for name in REASONS}
