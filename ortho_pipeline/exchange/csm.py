@@ -49,7 +49,10 @@ class State:
             raise self.error(f"{count or 'a list of'} numbers belong here", field)
         if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in value):
             raise self.error("this is not a list of numbers", field)
-        return np.array(value, dtype=np.float64)
+        found = np.array(value, dtype=np.float64)
+        if not (np.abs(found) < 1e15).all():
+            raise self.error("a number is too large", field)
+        return found
 
     def number(self, field: str, default: float | None = None) -> float:
         """Return a number."""

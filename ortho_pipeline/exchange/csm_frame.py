@@ -39,6 +39,8 @@ def read_frame(state: State) -> FrameCamera:
     values = state.numbers("m_currentParameterValue", 7)
     if not 0.99 < np.linalg.norm(values[3:]) < 1.01:
         raise state.error("the quaternion is not of length one", "m_currentParameterValue")
+    if not 6e6 < np.linalg.norm(values[:3]) < 1e9:
+        raise state.error("this is not a place above the Earth", "m_currentParameterValue")
     focal = state.number("m_focalLength")
     sample, line = state.numbers("m_iTransS", 3), state.numbers("m_iTransL", 3)
     if sample[2] or line[1] or not (sample[1] > 0 and line[2] > 0 and focal > 0):

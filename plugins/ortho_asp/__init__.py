@@ -8,6 +8,7 @@ from pathlib import Path
 from osgeo import gdal
 
 from ortho_asp.cameras import adjusted, read_adjust, read_aster, read_tsai
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.csm import has_csm, read_csm
 from ortho_pipeline.exchange.rpc_files import read_rpc_text
@@ -84,15 +85,14 @@ def open_scene(dataset: gdal.Dataset, *, camera: str | None = None, adjust: str 
     its = model.camera.size if isinstance(model, Pushbroom) else size
     if isinstance(model, FrameCamera):
         its = model.interior.width, model.interior.height
+    sources, warnings = [], []
     if its != size:
-        raise InputError(
-            "the camera is of {} x {} pixels, the image has {} x {}".format(*its, *size), file=path, field="camera",
-            remedy="give the image that the camera was made for, or of a crop its place: `scene.crop_offset=COL,ROW`",
-        )  # fmt: skip
-    sources = []
+        text = "the camera is of {} x {} pixels, this image has {} x {}: is it a crop?".format(*its, *size)
+        warnings.append(Notice("maybe-a-crop", text, metadata_size=list(its)))
     if adjust is not None:
         model, sources = adjusted(model, *read_adjust(place(adjust))), [place(adjust)]
     models = {model.kind: model}
     if kind == "aster":
         models["rpc"] = read_rpc_text(path)
-    return Scene("asp", name, *size, models, str(path), {"camera": path.name}, sources=tuple(sources))
+    facts = {"camera": path.name}
+    return Scene("asp", name, *size, models, str(path), facts, tuple(warnings), sources=tuple(sources))

@@ -66,13 +66,16 @@ def read_tsai(path: PathLike[str], size: tuple[int, int]) -> FrameCamera:
     turn = numbers("R", 9).reshape(3, 3)
     if not are_rotations(turn[None]) or not (fu > 0 and fv > 0 and pitch > 0):
         raise InputError("this is not a rotation, or not a camera", file=path, field="R, fu, fv, pitch")
+    centre = numbers("C", 3)
+    if not 6e6 < np.linalg.norm(centre) < 1e9:
+        raise InputError("this is not a place above the Earth", file=path, field="C")
     # Different focal lengths of the axes are different pitches here; from the first centre to its outer corner.
     pitch_y, (width, height) = pitch * fu / fv, size
     interior = Interior(
         width, height, fu, pitch, pitch_y,
         x0=(cu / pitch + 0.5 - width / 2) * pitch, y0=(height / 2 - cv / pitch - 0.5) * pitch_y,
     )  # fmt: skip
-    model = FrameCamera.from_geocentric(interior, numbers("C", 3), np.diag([1.0, -1.0, -1.0]) @ turn.T, heights=HEIGHTS)
+    model = FrameCamera.from_geocentric(interior, centre, np.diag([1.0, -1.0, -1.0]) @ turn.T, heights=HEIGHTS)
     require_view(model)
     return model
 

@@ -93,12 +93,12 @@ def open_scene(dataset: gdal.Dataset, *, band: str | None = None) -> Scene:
     its = _of_detector(rpcs, facts, detector, dataset.RasterCount, path)
     number = _chosen(band, len(its))
     model = its[number - 1]
-    if facts["size"] != list(size):
-        raise InputError(
-            "the metadata are of {} x {} pixels, the image has {} x {}".format(*facts["size"], *size), file=path,
-            field="dimension", remedy="give the whole image, or of a crop its place with `scene.crop_offset=COL,ROW`",
-        )  # fmt: skip
     warnings = []
+    if facts["size"] != list(size):
+        text = "the metadata are for {} x {} pixels, this image has {} x {}: is it a crop?".format(
+            *facts["size"], *size
+        )
+        warnings.append(Notice("maybe-a-crop", text, metadata_size=facts["size"]))
     apart = max(apart_of(one, model) for one in its)
     if apart > _SAME:
         text = f"bands of this image lie up to {apart:.2f} px from band {number}, whose RPC is taken for all"

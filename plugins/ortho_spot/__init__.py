@@ -71,14 +71,10 @@ def open_scene(dataset: gdal.Dataset, *, attitude: str = "vendor") -> Scene:
         raise InputError("there is no such choice", field="attitude", remedy="give vendor or speeds")
     spot = read_spot(path, attitude=attitude)
     size, its = (dataset.RasterXSize, dataset.RasterYSize), spot.model.camera.size
-    if size != its:
-        raise InputError(
-            "the metadata are for {} x {} pixels, the image has {} x {}".format(*its, *size),
-            file=path,
-            field="Raster_Dimensions",
-            remedy="give the whole scene as delivered, or of a crop its place with `scene.crop_offset=COL,ROW`",
-        )
     warnings = []
+    if size != its:
+        text = "the metadata are for {} x {} pixels, this image has {} x {}: is it a crop?".format(*its, *size)
+        warnings.append(Notice("maybe-a-crop", text, metadata_size=list(its)))
     if spot.bands_differ > 0.5:
         text = f"the look angles of its bands differ by up to {spot.bands_differ:.1f} px; those of the first are used"
         warnings.append(Notice("bands-differ", text, difference_px=round(spot.bands_differ, 3)))

@@ -114,7 +114,10 @@ def test_aster_beside_an_image(folder: Path) -> None:
     assert scene.model.camera.size == SIZE
 
 
-def test_the_image_of_another_camera_is_refused(folder: Path, model: Pushbroom) -> None:
+def test_an_image_of_another_size_may_be_a_crop(folder: Path, model: Pushbroom) -> None:
     write_csm(model, folder / "one.json")
-    with pytest.raises(InputError, match="60 x 50 pixels, the image has 61 x 50"):
-        open_scene(pixels(folder / "one.tif", (61, 50)))
+    image = pixels(folder / "one.tif", (30, 20))
+    (notice,) = open_scene(image).notices
+    assert notice.code == "maybe-a-crop"
+    ground = model.image_to_ground([[22.0, 31.0]], 200.0)
+    assert np.abs(open_scene(image, crop_offset=(10, 20)).model.ground_to_image(ground) - (12.0, 11.0)).max() < 0.1

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+import pyproj
 import pytest
 from ortho_spot import recognises
 from ortho_spot.dimap import read_spot
 from osgeo import gdal
 from products import spot_text
+from scipy.ndimage import gaussian_filter, map_coordinates
 from used import pixels, used
 
+from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric, meet_height
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.testing import check_sensor_model
 
@@ -161,6 +167,17 @@ def test_every_command_takes_the_folder(scene: Path) -> None:
     assert info["facts"]["acquired"] == "1998-07-12T12:00:00"
 
 
+def test_a_crop_has_its_place(scene: Path) -> None:
+    whole = open_scene(scene / "IMAGERY.TIF").model
+    image = pixels(scene / "IMAGERY.TIF", (30, 20))
+    # GDAL deletes the metadata of an image that it writes anew.
+    (scene / "METADATA.DIM").write_text(spot_text(size=SIZE))
+    assert [notice.code for notice in open_scene(image).notices] == ["maybe-a-crop"]
+    crop = open_scene(image, crop_offset=(20, 10)).model
+    ground = whole.image_to_ground([[33.0, 15.0]], 200.0)
+    assert np.abs(crop.ground_to_image(ground) - (13.0, 5.0)).max() < 1e-6
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
@@ -186,3 +203,84 @@ def test_strangers_are_left_alone(tmp_path: Path) -> None:
         "<Dimap_Document><METADATA_PROFILE>OTHER</METADATA_PROFILE></Dimap_Document>"
     )
     assert not recognises(gdal.Open(str(image)))
+
+
+def window(text: str, left: int, top: int, side: int) -> str:
+    """Return the metadata of a window of a scene with two look angles: its detectors, its rows, its size."""
+    found = re.findall(r"<PSI_([XY])>(.*?)</PSI_", text)
+    ends = np.array([[float(value) for axis, value in found if axis == name] for name in "XY"])
+    whole = int(re.search(r"<NCOLS>(\d+)", text)[1])
+    inner = ends[:, :1] + np.diff(ends) * (left + np.array([0, side - 1])) / (whole - 1)
+    looks = "".join(
+        f"<Look_Angles><DETECTOR_ID>{d}</DETECTOR_ID><PSI_X>{x!r}</PSI_X><PSI_Y>{y!r}</PSI_Y></Look_Angles>"
+        for d, (x, y) in zip((1, side), inner.T.tolist(), strict=True)
+    )
+    text = re.sub(r"(?s)(<Look_Angles_List>).*?(</Look_Angles_List>)", rf"\g<1>{looks}\g<2>", text)
+    text = re.sub(r"(<N(?:COLS|ROWS)>)\d+", rf"\g<1>{side}", text)
+    centre = int(re.search(r"<SCENE_CENTER_LINE>(\d+)", text)[1])
+    return re.sub(r"(<SCENE_CENTER_LINE>)\d+", rf"\g<1>{centre - top}", text)
+
+
+@pytest.mark.slow
+@pytest.mark.realdata
+def test_automatic_control_of_a_real_scenes_geometry(real: Path, tmp_path: Path) -> None:
+    """SPOT 1's geometry, 300 m off, over hills: 40 matches with an orthoimage leave half a pixel or less."""
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    side = 700
+    text = window((real / "sensors" / "cosicorr3d" / "SPOT1.DIM").read_text(), 2600, 2600, side)
+    (folder / "METADATA.DIM").write_text(text)
+    model = read_spot(folder / "METADATA.DIM").model
+    names = ("roll_offset", "pitch_offset", "yaw_offset")
+    # 300 m from 960 km, and an angle that nobody measured about the vertical.
+    values = dict(zip(names, (2.2e-4, -1.6e-4, 1e-4), strict=True))
+    truth = model.with_params([values.get(name, 0.0) for name in model.param_names])
+    utm, random = "EPSG:32636", np.random.default_rng(3)
+    onto = ground_transform("EPSG:4979", utm)
+    middle = onto(model.image_to_ground([[side / 2, side / 2]], 0.0))[0, :2].round(-1)
+    cells, step = 2048, 10.0
+    tone = sum(gaussian_filter(random.normal(0, 1, (cells, cells)), s, mode="wrap") * s for s in (1.5, 4.0, 12.0))
+    corner = middle + np.array([-1, 1]) * cells * step / 2
+
+    def height(x: Array, y: Array) -> Array:
+        return 300.0 + 120.0 * np.sin((x - middle[0]) / 1500.0) * np.cos((y - middle[1]) / 1900.0)
+
+    def shade(x: Array, y: Array) -> Array:
+        return map_coordinates(tone, [(corner[1] - y) / step - 0.5, (x - corner[0]) / step - 0.5], order=1, mode="wrap")
+
+    def written(path: Path, values: Array, place: tuple[float, ...] | None) -> Path:
+        kind = gdal.GDT_Float32 if place and path.name == "dem.tif" else gdal.GDT_Byte
+        dataset = gdal.GetDriverByName("GTiff").Create(str(path), values.shape[1], values.shape[0], 1, kind)
+        if place:
+            dataset.SetGeoTransform(place)
+            dataset.SetProjection(pyproj.CRS(utm).to_wkt())
+        dataset.WriteArray(values)
+        dataset = None
+        return path
+
+    def grey(x: Array, y: Array) -> Array:
+        return np.clip(120 + 45 * shade(x, y) / tone.std(), 1, 255).astype(np.uint8)
+
+    columns, rows = np.meshgrid(np.arange(side) + 0.5, np.arange(side) + 0.5)
+    image = np.column_stack([columns.ravel(), rows.ravel()])
+    level = np.full(len(image), 300.0)
+    for _ in range(12):
+        place = onto(truth.image_to_ground(image, level))
+        level = height(place[:, 0], place[:, 1])
+    scene = written(folder / "IMAGERY.TIF", grey(place[:, 0], place[:, 1]).reshape(side, side), None)
+    (folder / "METADATA.DIM").write_text(text)  # GDAL deletes the metadata of an image that it writes anew
+    x, y = np.meshgrid(corner[0] + step * (np.arange(cells) + 0.5), corner[1] - step * (np.arange(cells) + 0.5))
+    grid = (corner[0], step, 0.0, corner[1], 0.0, -step)
+    written(tmp_path / "dem.tif", height(x, y).astype(np.float32), grid)
+    written(tmp_path / "reference.tif", grey(x, y), grid)
+    fitted = commands.fit(
+        scene, PointOptions(correction="model"), SceneOptions(),
+        SurfaceOptions(dem=tmp_path / "dem.tif", vertical="ellipsoid"),
+        MatchOptions(reference=(tmp_path / "reference.tif",), points=40, search=1000.0),
+    )  # fmt: skip
+    check = random.uniform(50, side - 50, (200, 2))
+    ground = truth.image_to_ground(check, 350.0)
+    before = np.linalg.norm(onto(model.image_to_ground(check, 350.0)) - onto(ground), axis=1)
+    assert before.min() > 250
+    left = np.linalg.norm(fitted.fit.model.ground_to_image(ground) - check, axis=1)
+    assert np.sqrt((left**2).mean()) < 0.5
