@@ -19,7 +19,7 @@ from ortho_pipeline.surface.rays import meet_surface
 #: Places per side at which it is asked how certain the image is.
 _SIDE = 12
 #: Uncertainties within this part of the largest are alike: the place farthest from all points is taken then.
-_ALIKE = 0.02
+_ALIKE = 0.1
 #: Places that are offered, the best first.
 _OFFERED = 6
 
@@ -55,6 +55,13 @@ class Grid:
         origins, _ = candidates(places.view, (0, 0, width, height), (_SIDE, _SIDE), SIDE, factor, cells)
         image, on_ground = _shown(places, np.asarray(origins + SIDE * factor / 2, dtype=np.float64))
         return cls(image, on_ground, ground) if len(image) else cls(regular, ground, ground)
+
+    def without(self, taken: Array) -> Grid:
+        """Return the places at which there is no point: a second one of the same pixels tells nothing new."""
+        near = np.zeros(len(self.image), dtype=bool)
+        for place in taken:
+            near |= np.abs(self.image - place).max(axis=1) < SIDE / 2
+        return Grid(self.image[~near], self.ground[~near], self.everywhere)
 
 
 def _shown(places: Places, image: Array) -> tuple[Array, Array]:
@@ -92,6 +99,7 @@ def measure_next(grid: Grid, fit: Fit | None, taken: Array) -> list[Next]:
     A measurement of variance s^2 makes C into ``C - C J^T (J C J^T + s^2 I)^-1 J C``.
     Source: sequential least squares (Koch 1999, section 3.2.8).
     """
+    grid = grid.without(taken)
     if fit is None or not len(fit.param_names):
         return [Next(_pair(grid.image[k])) for k in _apart(grid.image, taken)]
     partials, everywhere = fit.model.param_partials(grid.ground), fit.model.param_partials(grid.everywhere)

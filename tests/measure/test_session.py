@@ -96,6 +96,18 @@ def test_the_next_point_gains_what_was_promised(opens: Opens) -> None:
     assert np.hypot(*np.subtract(after["image"], before["image"])) > 100
 
 
+def test_no_place_is_offered_twice(opens: Opens) -> None:
+    """Where the model is least certain there may be a point already: at a corner, for a drift."""
+    session = opens(correction="shift-drift")
+    state, places = session.state(), []
+    for number in range(8):
+        places.append(state["next"][0]["image"])
+        ground = session.predict(state["version"], scene=places[-1])["ground"]
+        state = session.act({"do": "put", "mark": {"id": f"P{number}", "image": places[-1], "ground": ground}})
+    apart = [np.abs(np.subtract(one, other)).max() for k, one in enumerate(places) for other in places[:k]]
+    assert min(apart) >= 20
+
+
 def test_a_blunder_is_named_at_once_and_switched_off(opens: Opens) -> None:
     session = opens(gcps=SAMPLE / "gcps.geojson")
     mark = next(one for one in session.state()["marks"] if one["role"] == "control")

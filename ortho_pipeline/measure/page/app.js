@@ -337,6 +337,9 @@ async function start(given = {}) {
   banner();
   if (!views) {
     views = new Views(facts, (pane, place, hit) => (hit && !pending ? choose(hit) : measure(pane, place)), dragged);
+    views.whole(facts.size);
+    // Vectors of residuals are as long on the screen at every zoom.
+    views.view.on('change:resolution', () => { if (state) draw(); });
     table = new Table($('table'), choose);
     for (const pane of ['scene', 'reference']) bandChoices(pane);
     $('correction').replaceChildren(new Option('shift (default)', ''), ...facts.corrections.map((name) => new Option(name)));

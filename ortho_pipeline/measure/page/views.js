@@ -47,8 +47,8 @@ export class Views {
     const [width, height] = facts.size;
     const projection = new ol.proj.Projection({ code: 'image', units: 'pixels', extent: [0, -height, width, 0] });
     this.tiles = { scene: tiled('scene', facts.size, facts.tile, projection), reference: tiled('reference', facts.size, facts.tile, projection) };
-    this.view = new ol.View({ projection, center: [width / 2, -height / 2], resolution: Math.max(width, height) / 500, minResolution: 1 / 32,
-      maxResolution: Math.max(width, height) / 100, enableRotation: false, smoothExtentConstraint: false });
+    this.view = new ol.View({ projection, center: [width / 2, -height / 2], minResolution: 1 / 32,
+      maxResolution: Math.max(width, height) / 250, resolution: 1, enableRotation: false, smoothExtentConstraint: false });
     this.marks = { scene: new ol.source.Vector(), reference: new ol.source.Vector() };
     this.maps = {};
     this.over = new ol.layer.Tile({ source: this.tiles.reference.source, visible: false });
@@ -136,6 +136,9 @@ export class Views {
     this.view.setCenter(at(place));
     if (resolution && this.view.getResolution() > resolution) this.view.setResolution(resolution);
   }
+
+  /** Show the whole scene. */
+  whole(size) { this.view.fit([0, -size[1], size[0], 0], { size: this.maps.scene.getSize() }); }
 
   /** What is seen of the scene: left, top, right, bottom. */
   box() {
