@@ -8,7 +8,7 @@
 #   make fuzz     read damaged files with every reader (N=100000 of each, READER=name for one, KEEP=folder for results)
 #   make bench    speed and memory against gdalwarp, speed of adjustments and of many scenes
 #   make docs     the documentation as a site in out/site, links checked
-#   make images   draw the pictures of README.md again
+#   make images   draw the pictures of README.md and of docs/measure.md again (Chromium)
 #   make clean    remove .venv, caches and out/
 #
 # PYTHON=python3.12     the interpreter that .venv is made from (3.11 or newer)
@@ -76,6 +76,7 @@ bench: setup
 	$(BIN)/python benchmarks/adjust.py
 	$(BIN)/python benchmarks/batch.py
 	$(BIN)/python benchmarks/answers.py
+	$(BIN)/python benchmarks/measure.py
 
 docs: setup
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
@@ -83,6 +84,7 @@ docs: setup
 
 images: setup
 	@$(BIN)/python docs/make_images.py
+	$(BIN)/python docs/make_measure_images.py
 
 clean:
 	rm -rf $(VENV) out build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache

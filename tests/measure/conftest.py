@@ -40,6 +40,11 @@ class Truth:
 
 @pytest.fixture(scope="session")
 def truth() -> Truth:
+    return truth_of_sample()
+
+
+def truth_of_sample() -> Truth:
+    """Return the truth that the sample data came from."""
     document = json.loads((SAMPLE / "truth.json").read_text())
     camera = {key: tuple(value) if isinstance(value, list) else value for key, value in document["camera"].items()}
     camera.pop("kind")

@@ -10,7 +10,7 @@ const COLUMNS = [
   ['m', (mark) => length(mark.residual_m), (mark) => number(length(mark.residual_m))],
   ['Left out', (mark) => length(mark.loo), (mark) => number(length(mark.loo))],
   ['w', (mark) => mark.w ?? null, (mark) => number(mark.w, 1)],
-  ['By', (mark) => mark.how, (mark) => mark.how],
+  ['By', (mark) => mark.how, (mark) => ({ matched: 'match', manual: 'hand' }[mark.how] ?? mark.how)],
 ];
 
 export class Table {

@@ -51,13 +51,14 @@ export class Views {
       maxResolution: Math.max(width, height) / 250, resolution: 1, enableRotation: false, smoothExtentConstraint: false });
     this.marks = { scene: new ol.source.Vector(), reference: new ol.source.Vector() };
     this.maps = {};
-    this.over = new ol.layer.Tile({ source: this.tiles.reference.source, visible: false });
+    const extent = projection.getExtent(); // tiles reach beyond the scene, where the reference goes on
+    this.over = new ol.layer.Tile({ source: this.tiles.reference.source, visible: false, extent });
     this.swipe = 0;
     this.difference = false;
     this.over.on('prerender', (event) => this.#clip(event));
     this.over.on('postrender', (event) => { event.context.restore(); });
     for (const pane of ['scene', 'reference']) {
-      const layers = [new ol.layer.Tile({ source: this.tiles[pane].source })];
+      const layers = [new ol.layer.Tile({ source: this.tiles[pane].source, extent })];
       if (pane === 'scene') layers.push(this.over);
       layers.push(new ol.layer.Vector({ source: this.marks[pane], updateWhileAnimating: true, updateWhileInteracting: true }));
       const map = new ol.Map({ target: pane, view: this.view, controls: [], layers });
@@ -75,7 +76,7 @@ export class Views {
     for (const pane of ['scene', 'reference']) {
       const view = new ol.View({ projection, center: at([width / 2, height / 2]), resolution: 1 / 6, enableRotation: false });
       this.loupes[pane] = new ol.Map({ target: `loupe-${pane}`, view, controls: [], interactions: [],
-        layers: [new ol.layer.Tile({ source: this.tiles[pane].source })] });
+        layers: [new ol.layer.Tile({ source: this.tiles[pane].source, extent })] });
     }
   }
 

@@ -1,0 +1,126 @@
+"""How fluid `ortho measure` is: tiles of a large scene, the rendered reference, the live solution, the first answer.
+
+python benchmarks/measure.py [SIDE]     a scene of 12000 pixels a side unless another is given; prints milliseconds
+
+Each figure is the 95th percentile of what a person waits for, beside what issue 18 asks for. Tiles are asked for once
+before ("warm": files and kernels), and then at places that were not asked for.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyproj
+from osgeo import gdal, osr
+
+from ortho_pipeline.exchange.rpc import write_rpc_txt
+from ortho_pipeline.exchange.rpc_fit import fit_rpc
+from ortho_pipeline.measure.session import open_session
+from ortho_pipeline.measure.tiles import Tiles
+from ortho_pipeline.options import MatchOptions, SurfaceOptions
+from ortho_pipeline.simulation.scanner import LineScanner
+from ortho_pipeline.surface.writing import write_dem
+
+gdal.UseExceptions()
+LON, LAT, CRS, GSD = 33.35, 37.25, "EPSG:32636", 1.0
+
+
+def write(folder: Path, side: int) -> None:
+    """Write a scene of noise with its RPC, a rough DEM of 30 m, and a reference of noise."""
+    camera = LineScanner.over(
+        LON, LAT, 850.0, image_width=side, image_height=side, gsd=GSD, off_nadir_deg=15.0, heights=(600.0, 1400.0)
+    )
+    centre, half = camera.domain
+    west, south, east, north = *(centre - 1.05 * half)[:2], *(centre + 1.05 * half)[:2]
+    write_rpc_txt(fit_rpc(camera, (west, south, east, north), (600.0, 1400.0)).rpc, folder / "scene_RPC.TXT")
+    random = np.random.default_rng(1)
+    noise = random.integers(100, 2000, (1024, 1024), dtype=np.uint16)
+    x, y = pyproj.Transformer.from_crs("EPSG:4326", CRS, always_xy=True).transform(LON, LAT)
+    reach = 0.62 * side * GSD + 2000
+    for name, pixels in (("scene.tif", side), ("reference.tif", int(2 * reach / GSD))):
+        made = gdal.GetDriverByName("GTiff").Create(
+            str(folder / name), pixels, pixels, 1, gdal.GDT_UInt16, ["TILED=YES", "BIGTIFF=IF_SAFER"]
+        )
+        if name == "reference.tif":
+            system = osr.SpatialReference()
+            system.ImportFromEPSG(32636)
+            made.SetProjection(system.ExportToWkt())
+            made.SetGeoTransform((x - reach, GSD, 0, y + reach, 0, -GSD))
+        for top in range(0, pixels, 1024):
+            for left in range(0, pixels, 1024):
+                part = noise[: min(1024, pixels - top), : min(1024, pixels - left)]
+                made.GetRasterBand(1).WriteArray(part, left, top)
+    side_of_dem = int(2 * (reach + 1000) / 30)
+    heights = 900 + np.cumsum(random.normal(0, 1, (side_of_dem, side_of_dem)), axis=1)
+    write_dem(
+        folder / "dem.tif", np.clip(heights, 650, 1350), (x - reach - 1000, y + reach + 1000), 30.0, f"{CRS}+5773"
+    )
+
+
+def worked(job: Callable[[], object], count: int) -> float:
+    """Return the median CPU time (ms) of a job: other processes add to the wall clock."""
+    taken = []
+    for _ in range(count):
+        begin = time.process_time()
+        job()
+        taken.append(time.process_time() - begin)
+    return float(np.median(taken)) * 1e3
+
+
+def waited(job: Callable[[int], object], count: int) -> float:
+    """Return the 95th percentile (ms) of waiting for a job."""
+    taken = []
+    for number in range(count):
+        begin = time.perf_counter()
+        job(number)
+        taken.append(time.perf_counter() - begin)
+    return float(np.percentile(taken, 95)) * 1e3
+
+
+def main(side: int) -> None:
+    """Measure and print."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        write(folder, side)
+        begin = time.perf_counter()
+        session = open_session(
+            folder / "scene.tif", folder / "p.geojson", surface=SurfaceOptions(dem=folder / "dem.tif"),
+            match=MatchOptions(reference=(str(folder / "reference.tif"),)),
+        )  # fmt: skip
+        tiles = Tiles(session)
+        limits = [tiles.limits("scene", 0, None, 0)]
+        print(f"open, with the contrast of the scene         {time.perf_counter() - begin:8.2f} s")
+        random = np.random.default_rng(2)
+        for pane, bound in (("scene", 100), ("reference", 150)):
+            for factor in (1, 4, 16):
+                most = max(1, side // (256 * factor))
+                places = random.integers(0, most, (60, 2)).tolist()
+
+                def show(number: int, pane: str = pane, factor: int = factor, places: list = places) -> object:
+                    column, row = places[number]
+                    return tiles.png(pane, 0, factor, column, row, [0], limits)
+
+                show(0)
+                print(
+                    f"tile of the {pane:<9} 1 : {factor:<2} ({side}^2)    {waited(show, 60):8.0f} ms (asked: {bound})"
+                )
+        image = random.uniform(0, side, (100, 2))
+        ground = session.places.ground_of(image)
+        for number, (at, on_ground) in enumerate(zip(image.tolist(), ground.tolist(), strict=True)):
+            noisy = [at[0] + random.normal(0, 0.3), at[1] + random.normal(0, 0.3)]
+            mark = {"id": f"P{number}", "image": noisy, "ground": on_ground, "ground_from": "typed"}
+            session.act({"do": "put", "mark": mark})
+        print(
+            f"solution of 100 points                       {waited(lambda _: session._solve(), 20):8.0f} ms (asked: 50)"
+        )
+        print(f"all that is shown of them                    {waited(lambda _: session.state(), 20):8.0f} ms")
+        session.close()
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 12000)
