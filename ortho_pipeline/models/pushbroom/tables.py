@@ -26,6 +26,8 @@ _NEIGHBOURS = 8
 #: A cubic polynomial follows an orbit for so long (seconds) to a micrometre.
 _PATH_PIECE = 2.5
 _CUBIC = SplineForm(3)
+#: Positions (m) beyond this are damaged.
+_FARTHEST = 1e9
 
 
 def pushbroom_of_tables(
@@ -73,6 +75,8 @@ def pushbroom_of_tables(
     degree, last = splines.degree, camera.height * line_period
     slack = max(line_period, 1e-3 * last)
     times, positions = _table(orbit, (3,), (first_time, last, slack), degree, "orbit")
+    if not (np.abs(positions) < _FARTHEST).all():
+        raise InputError("a position of this table is no place of a satellite (ECEF metres)", field="orbit")
     turn_times, turns = _table(attitude, (3, 3), (first_time, last, slack), degree, "attitude")
     if not are_rotations(turns):
         raise InputError("a matrix of this table is not a rotation", field="attitude")
