@@ -72,13 +72,13 @@ def rendered(off_nadir: float, azimuth: float) -> np.ndarray:
     columns, rows = np.meshgrid(np.arange(count) + 0.5, np.arange(count) + 0.5)
     x, y = 0.5 * columns, TOWN.side - 0.5 * rows
     height = np.zeros(x.shape)
-    for level in np.arange(60.0, 0.0, -0.125):
+    for level in np.arange(60.0, 0.0, -0.25):
         inside = TOWN.heights(x + east * level, y + north * level) >= level
         height = np.where((height == 0) & inside, level, height)
     place = x + east * height, y + north * height
     # A wall is dark: what the sun does there is no matter of an ortho.
     roof = TOWN.heights(*place)
-    shade = TOWN.hidden(*place, *towards(90 - SUN.elevation_deg, SUN.azimuth_deg)) | (np.abs(roof - height) > 0.2)
+    shade = TOWN.hidden(*place, *towards(90 - SUN.elevation_deg, SUN.azimuth_deg)) | (np.abs(roof - height) > 0.3)
     return np.where(shade, 40, 200).astype(np.uint8)
 
 

@@ -34,11 +34,11 @@ def seen(off_nadir: float, azimuth: float) -> np.ndarray:
     count = int(BLOCK.side / 0.5)
     columns, rows = np.meshgrid(np.arange(count) + 0.5, np.arange(count) + 0.5)
     x, y, height = 0.5 * columns, BLOCK.side - 0.5 * rows, np.zeros((count, count))
-    for level in np.arange(22.0, 0.0, -0.125):
+    for level in np.arange(22.0, 0.0, -0.25):
         inside = BLOCK.heights(x + east * level, y + north * level) >= level
         height = np.where((height == 0) & inside, level, height)
     place = x + east * height, y + north * height
-    return np.where(np.abs(BLOCK.heights(*place) - height) > 0.1, 1, painted(*place)).astype(np.uint8)
+    return np.where(np.abs(BLOCK.heights(*place) - height) > 0.3, 1, painted(*place)).astype(np.uint8)
 
 
 def made(tmp_path, name: str, azimuth: float, surface, *, hide: bool):
