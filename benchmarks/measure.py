@@ -115,10 +115,10 @@ def main(side: int) -> None:
             noisy = [at[0] + random.normal(0, 0.3), at[1] + random.normal(0, 0.3)]
             mark = {"id": f"P{number}", "image": noisy, "ground": on_ground, "ground_from": "typed"}
             session.act({"do": "put", "mark": mark})
-        print(
-            f"solution of 100 points                       {waited(lambda _: session._solve(), 20):8.0f} ms (asked: 50)"
-        )
-        print(f"all that is shown of them                    {waited(lambda _: session.state(), 20):8.0f} ms")
+        jobs = ("solution of 100 points", session._solve, 50), ("all that is shown of them", session.state, 0)
+        for what, job, asked in jobs:
+            wall = waited(lambda _, job=job: job(), 20)
+            print(f"{what:<44} {wall:8.0f} ms, CPU {worked(job, 20):.0f} ms{f' (asked: {asked})' if asked else ''}")
         session.close()
 
 

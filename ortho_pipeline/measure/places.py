@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -16,6 +17,9 @@ from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import meet_surface
+
+#: What a person may type for a CRS or a height datum: names and codes.
+_NAMED = r"[a-z]{2,12}:[0-9]{1,9}(\+[0-9]{1,9})?|ellipsoid|egm96|egm2008"
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +85,11 @@ def ground_typed(values: Sequence[float | None], crs: str, vertical: str | None,
     InputError, CrsError, DatumError
         If a value is missing, or what it is in is not known.
     """
+    for field, text in (("crs", crs), ("vertical", vertical or "ellipsoid")):
+        # What else PROJ understands may name files, and a page opens none.
+        if not re.fullmatch(_NAMED, text.strip(), re.ASCII | re.IGNORECASE):
+            raise InputError("this is not known by that name", field=field,
+                             remedy="give EPSG:n, for heights also ellipsoid, egm96 or egm2008")  # fmt: skip
     if len(values) != 3 or values[0] is None or values[1] is None:
         raise InputError("ground has x and y, and a height or none", field="ground")
     plane = horizontal(parse_crs(crs))

@@ -63,6 +63,9 @@ def solve(
         done = adjust(scene, asked, opened, surface)
     except OrthoError as error:
         return Solution(scene.model, None, error.message)
+    except np.linalg.LinAlgError as error:
+        # What is in the journal has to open again, whatever it is.
+        return Solution(scene.model, None, f"the points cannot be adjusted ({error})")
     return Solution(done.model, done)
 
 

@@ -88,6 +88,8 @@ def test_no_path_of_a_request_is_opened(client: TestClient, path: str, monkeypat
         ("act", {"window": WINDOW}), ("propose", {"image": [1]}), ("propose", {"image": ["1", 2]}),
         ("predict", {}), ("predict", {"scene": [1, 2], "version": -1}), ("predict", {"scene": [1, 2], "version": 99}),
         ("typed", {"values": [1, 2]}), ("typed", {"values": [1, 2, 3], "crs": "file:///etc/passwd"}),
+        ("typed", {"values": [1, 2, 3], "vertical": "/etc/geoid.gtx"}),
+        ("typed", {"values": [1, 2, 3], "crs": "+proj=longlat +nadgrids=/etc/passwd"}),
         ("stretch", {"pane": "../x", "bands": [0]}), ("stretch", {"pane": "scene", "bands": [5]}), ("act", []),
     ],
 )  # fmt: skip
@@ -116,6 +118,17 @@ def test_the_second_window_reads_until_it_takes_over(client: TestClient) -> None
     ask("leave", "window-two")
     assert ask("begin", WINDOW).json()["writes"]
     assert ask("act", WINDOW, action={"do": "undo"}).status_code == 200
+
+
+def test_no_file_is_looked_for_that_a_request_names(client: TestClient, tmp_path: Path) -> None:
+    """A geoid grid that is there is as unknown to the page as one that is not."""
+    (tmp_path / "real.gtx").write_bytes(b"x" * 100)
+    answers = [
+        client.post(f"/{TOKEN}/api/typed", json={"values": [1, 2, 3], "vertical": str(path)}).text
+        for path in (tmp_path / "real.gtx", tmp_path / "none.gtx")
+    ]
+    assert answers[0] == answers[1]
+    assert "not known by that name" in answers[0]
 
 
 def test_a_tile_is_a_picture_and_nonsense_is_none(client: TestClient) -> None:
