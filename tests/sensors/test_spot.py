@@ -233,7 +233,7 @@ def test_automatic_control_of_a_real_scenes_geometry(real: Path, tmp_path: Path)
     model = read_spot(folder / "METADATA.DIM").model
     names = ("roll_offset", "pitch_offset", "yaw_offset")
     # 300 m from 960 km, and an angle that nobody measured about the vertical.
-    values = dict(zip(names, (2.2e-4, -1.6e-4, 1e-4), strict=True))
+    values = dict(zip(names, (2.7e-4, -2e-4, 1e-4), strict=True))
     truth = model.with_params([values.get(name, 0.0) for name in model.param_names])
     utm, random = "EPSG:32636", np.random.default_rng(3)
     onto = ground_transform("EPSG:4979", utm)
@@ -259,7 +259,8 @@ def test_automatic_control_of_a_real_scenes_geometry(real: Path, tmp_path: Path)
         return path
 
     def grey(x: Array, y: Array) -> Array:
-        return np.clip(120 + 45 * shade(x, y) / tone.std(), 1, 255).astype(np.uint8)
+        noise = random.normal(0, 5, np.shape(x))
+        return np.clip(120 + 45 * shade(x, y) / tone.std() + noise, 1, 255).astype(np.uint8)
 
     columns, rows = np.meshgrid(np.arange(side) + 0.5, np.arange(side) + 0.5)
     image = np.column_stack([columns.ravel(), rows.ravel()])
@@ -281,6 +282,6 @@ def test_automatic_control_of_a_real_scenes_geometry(real: Path, tmp_path: Path)
     check = random.uniform(50, side - 50, (200, 2))
     ground = truth.image_to_ground(check, 350.0)
     before = np.linalg.norm(onto(model.image_to_ground(check, 350.0)) - onto(ground), axis=1)
-    assert before.min() > 250
+    assert before.min() > 300
     left = np.linalg.norm(fitted.fit.model.ground_to_image(ground) - check, axis=1)
     assert np.sqrt((left**2).mean()) < 0.5
