@@ -21,6 +21,8 @@ from ortho_pipeline.surface.base import Surface
 
 #: Points per side of a scene at which it is asked what targets show of it.
 SAMPLES = 32
+#: Pixels of a chip are smaller by this than those of a coarser target.
+_FINER = 1.5
 #: Resolutions of scene and target differ by at most this factor.
 _RATIO = 8.0
 
@@ -228,7 +230,7 @@ def shown_by(targets: Sequence[Target], ground: Array, crs: str) -> NDArray[np.b
 
 
 def chip_factor(view: View, targets: Sequence[Target], shown: Array) -> int:
-    """Return how many pixels of a scene are as large as one of the targets at points ``(n, 2)``, at least 1.
+    """Return how many pixels of a scene make one of a chip, where targets show points ``(n, 2)`` of it; at least 1.
 
     Raises
     ------
@@ -243,7 +245,8 @@ def chip_factor(view: View, targets: Sequence[Target], shown: Array) -> int:
             file=first.path, field=first.field,
             remedy=f"match images whose resolutions differ by at most {_RATIO:.0f} times",
         )  # fmt: skip
-    return max(1, round(1 / ratio))
+    # Averaged to the pixels of a target half as fine, a real scene was found half a pixel off; in its own, a twentieth.
+    return max(1, round(1 / ratio / _FINER))
 
 
 def _resolution_ratio(view: View, target: Target, image: Array) -> Array:
