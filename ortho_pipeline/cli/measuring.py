@@ -10,12 +10,14 @@ import click
 
 from ortho_pipeline.cli.options import (
     image_argument,
+    json_option,
     point_options,
     reference_options,
     scene_options,
     surface_options,
 )
 from ortho_pipeline.cli.parsing import Command
+from ortho_pipeline.cli.printing import print_json
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 
@@ -32,9 +34,10 @@ from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, Sur
 @click.option("--no-browser", is_flag=True, help="Print the address, and open nothing.")
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="On this machine.  [default: any that is free]")
 @scene_options
+@json_option
 def measure(
     image: str, match: MatchOptions, points: PointOptions, surface: SurfaceOptions, output: str | None,
-    no_browser: bool, port: int, scene: SceneOptions,
+    no_browser: bool, port: int, scene: SceneOptions, as_json: bool,
 ) -> None:  # fmt: skip
     """Measure points of IMAGE in the browser, beside its reference in the geometry of the image.
 
@@ -58,8 +61,11 @@ def measure(
     )  # fmt: skip
 
     def ready(address: str) -> None:
-        click.echo(f"Measuring at {address}")
-        click.echo(f"Points: {session.output}. Ctrl-C ends.")
+        if as_json:
+            print_json({"address": address, "points": str(session.output)})
+        else:
+            click.echo(f"Measuring at {address}")
+            click.echo(f"Points: {session.output}. Ctrl-C ends.")
         if not no_browser:
             webbrowser.open(address)
 

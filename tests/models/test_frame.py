@@ -262,7 +262,7 @@ def test_covariance_is_honest():
     for number in range(1000):
         noisy = exact.image + random.normal(0, 0.7, exact.image.shape)
         # What `fit` does, without its leave-one-out residuals and warnings, which are most of its time.
-        solution = replace(problem, image=noisy).solve(everything)
+        solution = replace(problem, points=replace(problem.points, image=noisy)).solve(everything)
         sigmas = solution.sigma0 * np.sqrt(np.diag(solution.cofactors))
         pulls.append((solution.model.params - truth.params) / sigmas)
         if number == 0:
