@@ -117,7 +117,7 @@ def drawn(rpc: RPC, kind: str, count: int, repeats: int) -> np.ndarray:
     return np.array(found)
 
 
-@pytest.mark.parametrize("kind", ["shift", "affine"])
+@pytest.mark.parametrize("kind", ["shift", pytest.param("affine", marks=pytest.mark.slow)])
 def test_sigmas_cover_the_mean_over_all_correlations(rpc: RPC, kind: str) -> None:
     """The mean square of (estimate - truth) / sigma is 1 where nothing is known of how errors are shared.
 

@@ -131,6 +131,7 @@ def test_a_void_is_told_and_hides_nothing(tmp_path):
     assert (found == HIDDEN).any()
 
 
+@pytest.mark.slow
 def test_a_ray_from_the_image_ends_where_the_pixel_is_visible(tiny, tmp_path):
     """An RPC in longitude and latitude over steep terrain: the ray of a pixel's image point is walked upwards."""
     rpc = tiny.model
