@@ -103,6 +103,7 @@ __all__ = sorted(_HOMES)  # noqa: PLE0605
 #: Modules that plugins and scripts imported before there were rooms -> where they are now.
 _MOVED = {
     "bands": "commands.bands",
+    "contract": "plugins.contract",
     "crs": "geodesy.crs",
     "dem": "surface.dem",
     "geometry": "geodesy.ellipsoid",

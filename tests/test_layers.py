@@ -33,7 +33,6 @@ points
 models
 estimation
 hookspecs
-contract
 raster
 surface
 exchange
@@ -74,7 +73,7 @@ GDAL_MODULES |= {
 }
 NUMBA_MODULES = {"files.compiled"}
 MATPLOTLIB_MODULES = {"display.drawing"}
-MAX_ENTRIES, MAX_MODULES, MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_PARAMETERS = 27, 12, 500, 250, 50, 12
+MAX_ENTRIES, MAX_MODULES, MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_PARAMETERS = 26, 12, 500, 250, 50, 12
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 PLUGIN_FILES = sorted((ROOT / "plugins").rglob("*.py"))

@@ -11,11 +11,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ortho_pipeline.contract import described, scene_faults
 from ortho_pipeline.errors import InputError, OrthoError, PluginError, Terminated, completed
 from ortho_pipeline.exchange.crop import placed
 from ortho_pipeline.hookspecs import Scene, Sensor, Study
 from ortho_pipeline.models import KINDS
+from ortho_pipeline.plugins.contract import described, scene_faults
 from ortho_pipeline.plugins.registry import Broken, Provenance, Registry
 from ortho_pipeline.raster.source import open_dataset
 

@@ -18,10 +18,10 @@ from typing import Any
 import pluggy
 
 from ortho_pipeline import hookspecs
-from ortho_pipeline.contract import described, sensor_faults
 from ortho_pipeline.errors import PluginError, Terminated
 from ortho_pipeline.hookspecs import PROJECT_NAME, Sensor, Study
 from ortho_pipeline.models import KINDS, SensorModel
+from ortho_pipeline.plugins.contract import described, sensor_faults
 
 BUNDLED = "ortho-pipeline"
 HOOKS = ("ortho_sensors", "ortho_models", "ortho_studies")
