@@ -57,7 +57,6 @@ GDAL_MODULES = {
     "raster.block_cache",
     "raster.source",
     "raster.intensity",
-    "raster.pyramid",
     "raster.output",
     "raster.ortho",
     "surface.dem_file",

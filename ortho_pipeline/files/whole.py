@@ -193,7 +193,7 @@ class Outputs:
                 os.replace(temporary, final)
             for path in obsolete:
                 path.unlink(missing_ok=True)
-            _sync_folder(self.folder)
+            sync_folder(self.folder)
             self.journal.unlink(missing_ok=True)
         except OSError as error:
             raise _unwritable(self.folder, error) from error
@@ -415,8 +415,8 @@ def _sync(path: Path) -> None:
         os.fsync(written.fileno())
 
 
-def _sync_folder(folder: Path) -> None:
-    # Without this a power cut after the rename can lose the new name.
+def sync_folder(folder: Path) -> None:
+    """Bring the names in a folder to disk: a power cut after a file was made or renamed could lose its name."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import allowed, parse_json
+from ortho_pipeline.files import allowed, parse_json, sync_folder
 
 #: Beyond this many bytes it is no journal of hands.
 MAX_BYTES = 256_000_000
@@ -59,7 +59,7 @@ class Journal:
             if self.healed:
                 os.ftruncate(self._file, sound)
                 os.fsync(self._file)
-            _sync_folder(path.parent)
+            sync_folder(path.parent)
 
     def append(self, action: Mapping[str, Any]) -> None:
         """Write an action and wait until it is on disk; where that fails nothing of it is left.
@@ -142,14 +142,6 @@ def _action(line: bytes) -> dict[str, Any] | None:
         return None
     action = document.get("action") if isinstance(document, dict) else None
     return action if isinstance(action, dict) and _line(action) == line + b"\n" else None
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _unwritable(path: Path, error: OSError) -> InputError:

@@ -17,7 +17,6 @@ from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-from ortho_pipeline.commands.fitting import compare
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import parse_json
 from ortho_pipeline.measure.guard import App, Guard
@@ -141,7 +140,7 @@ class _Answers:
 
     def compare(self, given: dict[str, Any]) -> dict[str, Any]:
         """Compare the models that the points could be fitted with."""
-        return self._session.compared(compare)
+        return self._session.compared()
 
     def save(self, given: dict[str, Any]) -> dict[str, Any]:
         """Write the points."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import os
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.matching import open_reference_views, search_of
 from ortho_pipeline.commands.control.points import read_control, with_heights
-from ortho_pipeline.commands.results import CompareResult
+from ortho_pipeline.commands.fitting import compare
 from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import sha256, write_json
@@ -257,7 +257,7 @@ class Session:
             "covariance": json_position([column, row, both]), "scattered": found.scattered, "reason": reason,
         })  # fmt: skip
 
-    def compared(self, compare: Callable[..., CompareResult]) -> dict[str, Any]:
+    def compared(self) -> dict[str, Any]:
         """Return the document of `ortho compare` for the points as they are now."""
         asked = PointOptions(gcps=self.marks.points(self._called), significance=self._options.significance)
         return compare(self.scene, asked).to_json()

@@ -15,7 +15,7 @@ from ortho_pipeline.imaging.matching.chips import Renderer
 from ortho_pipeline.measure.session import Session
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.raster.output import png_bytes
-from ortho_pipeline.raster.pyramid import Pyramid
+from ortho_pipeline.raster.pyramid import Pyramid, stretch
 from ortho_pipeline.raster.source import RasterSource
 
 #: Side of a tile (px).
@@ -38,16 +38,16 @@ class Tiles:
 
     def __init__(self, session: Session, opened: SceneOptions = SceneOptions(), memory: int = 256_000_000) -> None:
         self._session, self._access = session, opened.access
-        self._scene = tuple(session.scene.rasters or (session.scene.path,))
         self._references = session.places.references
+        self._sources = {
+            "scene": [session.places.view.intensity.source],
+            "reference": [one.intensity.source for one in self._references],
+        }
         self._lock = threading.Lock()
         self._open: dict[tuple[str, int], list[Pyramid]] = {}
         self._kept: OrderedDict[Hashable, Pixels] = OrderedDict()
         self._most = max(1, memory // (4 * SIDE * SIDE))
-        self.bands = {
-            "scene": RasterSource(*self._scene, **self._access).count,
-            "reference": self._references[0].intensity.source.count,
-        }
+        self.bands = {pane: sources[0].count for pane, sources in self._sources.items()}
 
     def png(
         self, pane: str, version: int, factor: int, column: int, row: int, bands: Sequence[int],
@@ -89,12 +89,7 @@ class Tiles:
             factor *= 2
         plane = self.pixels(pane, version, factor, left, top, band)
         rows, columns = (max(1, extent // factor) for extent in (bottom - top, right - left))
-        seen = plane[:rows, :columns]
-        seen = seen[np.isfinite(seen)]
-        if not len(seen):
-            return self._pyramids(pane, band)[0].stretch()
-        low, high = (float(value) for value in np.percentile(seen, (1.0, 99.0)))
-        return low, max(high, low + 1e-6 * max(abs(low), 1.0))
+        return stretch(plane[:rows, :columns]) or self._pyramids(pane, band)[0].stretch()
 
     def pixels(self, pane: str, version: int, factor: int, left: int, top: int, band: int) -> Pixels:
         """Return the intensities ``(SIDE, SIDE)`` of a square of the scene's pixels; NaN where nothing is shown."""
@@ -133,11 +128,9 @@ class Tiles:
         with self._lock:
             found = self._open.get((pane, band))
             if found is None:
-                rasters = [self._scene] if pane == "scene" else [(one.path,) for one in self._references]
-                sources = [RasterSource(*paths, **self._access) for paths in rasters]
                 found = [
-                    Pyramid(RasterSource(*one.paths, bands=[band], **self._access) if 0 < band <= one.count else one)
-                    for one in sources
+                    Pyramid(RasterSource(*one.paths, bands=[band] if 0 < band <= one.count else None, **self._access))
+                    for one in self._sources[pane]
                 ]
                 self._open[pane, band] = found
             return found

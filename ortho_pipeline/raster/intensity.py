@@ -75,16 +75,26 @@ class Intensity:
         return mean.reshape(rows, factor, columns, factor).mean(axis=(1, 3), dtype=np.float32)
 
     def _reduced(self, left: int, top: int, rows: int, columns: int, factor: int) -> NDArray[np.float32]:
-        window = left, top, columns * factor, rows * factor
+        return self._resampled((left, top, columns * factor, rows * factor), rows, columns)
+
+    def _resampled(
+        self, window: tuple[int, int, int, int], rows: int, columns: int, *, single: bool = False
+    ) -> NDArray[np.float32]:
+        """Return a window (left, top, width, height) as GDAL reduces it to ``(rows, columns)``.
+
+        Parameters
+        ----------
+        single : bool
+            Where there are no overviews, take single pixels for all that they stand for.
+        """
         size = {"buf_xsize": columns, "buf_ysize": rows}
         found = np.zeros((rows, columns), dtype=np.float32)
         valid = np.ones((rows, columns), dtype=bool)
         try:
             for number in self._bands:
                 band = self.source.bands[number]
-                found += band.ReadAsArray(
-                    *window, **size, buf_type=gdal.GDT_Float32, resample_alg=gdal.GRIORA_Average
-                )  # fmt: skip
+                way = gdal.GRIORA_NearestNeighbour if single and not band.GetOverviewCount() else gdal.GRIORA_Average
+                found += band.ReadAsArray(*window, **size, buf_type=gdal.GDT_Float32, resample_alg=way)
                 valid &= band.GetMaskBand().ReadAsArray(*window, **size) != 0
         except RuntimeError as error:
             raise InputError(

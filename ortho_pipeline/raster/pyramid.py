@@ -10,14 +10,21 @@ import threading
 
 import numpy as np
 from numpy.typing import NDArray
-from osgeo import gdal
 
-from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.intensity import EXACT, Intensity
-from ortho_pipeline.raster.source import RasterSource, first_line
+from ortho_pipeline.raster.source import RasterSource
 
 #: The coarse copy has a pixel for so many by so many, at least; and no more pixels than that in all.
 _COARSE, _MOST_PIXELS = 2 * EXACT, 16_000_000
+
+
+def stretch(values: NDArray[np.float32]) -> tuple[float, float] | None:
+    """Return what is shown as black and as white of intensities: percentiles 1 and 99; None where none is valid."""
+    seen = values[np.isfinite(values)]
+    if not len(seen):
+        return None
+    low, high = (float(value) for value in np.percentile(seen, (1.0, 99.0)))
+    return low, max(high, low + 1e-6 * max(abs(low), 1.0))
 
 
 class Pyramid(Intensity):
@@ -39,13 +46,9 @@ class Pyramid(Intensity):
                 self._copy = self._decimated()
             return self._copy
 
-    def stretch(self, percent: tuple[float, float] = (1.0, 99.0)) -> tuple[float, float]:
+    def stretch(self) -> tuple[float, float]:
         """Return the intensities that are shown as black and as white: percentiles of all valid pixels."""
-        seen = self.coarse[np.isfinite(self.coarse)]
-        if not len(seen):
-            return 0.0, 1.0
-        low, high = (float(value) for value in np.percentile(seen, percent))
-        return low, max(high, low + 1e-6 * max(abs(low), 1.0))
+        return stretch(self.coarse) or (0.0, 1.0)
 
     def _reduced(self, left: int, top: int, rows: int, columns: int, factor: int) -> NDArray[np.float32]:
         copy = self.coarse
@@ -67,19 +70,4 @@ class Pyramid(Intensity):
         window = 0, 0, columns * self._step, rows * self._step
         if columns * self._step > self.width or rows * self._step > self.height:
             window = 0, 0, self.width, self.height
-        size = {"buf_xsize": columns, "buf_ysize": rows}
-        found, valid = np.zeros((rows, columns), np.float32), np.ones((rows, columns), dtype=bool)
-        try:
-            for number in self._bands:
-                band = self.source.bands[number]
-                way = gdal.GRIORA_Average if band.GetOverviewCount() else gdal.GRIORA_NearestNeighbour
-                found += band.ReadAsArray(*window, **size, buf_type=gdal.GDT_Float32, resample_alg=way)
-                valid &= band.GetMaskBand().ReadAsArray(*window, **size) != 0
-        except RuntimeError as error:
-            raise InputError(
-                f"the pixels cannot be read ({first_line(error)})", file=self.source.path,
-                remedy="the file is cut off or damaged: copy it again",
-            ) from error  # fmt: skip
-        found /= len(self._bands)
-        found[~valid] = np.nan
-        return found
+        return self._resampled(window, rows, columns, single=True)
