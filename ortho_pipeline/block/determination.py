@@ -12,7 +12,7 @@ from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints, TooFewPoints, counted
-from ortho_pipeline.estimation.fit import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING
+from ortho_pipeline.estimation.determinacy import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 
 

@@ -17,7 +17,7 @@ from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.estimation import comparison as comparing
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import viewing
-from ortho_pipeline.estimation.spatial_correlation import analyse_fit
+from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import staged, together, write_text
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.hookspecs import Scene

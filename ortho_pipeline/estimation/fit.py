@@ -17,6 +17,13 @@ from ortho_pipeline.display.notebook import fit_html
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import DegeneratePoints, InputError, counted
 from ortho_pipeline.estimation.blunders import REJECTED_LIMIT, Outlying, find_blunders, outlying
+from ortho_pipeline.estimation.determinacy import (
+    EXTRAPOLATION_WARNING,
+    UNSTABLE,
+    corner_ratio_of,
+    uncertain_edge,
+    unstable,
+)
 from ortho_pipeline.estimation.problem import Prior, Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors, shared_errors
@@ -27,17 +34,8 @@ from ortho_pipeline.points import Points
 
 __all__ = ["Fit", "Prior", "fit", "root_mean_square"]
 
-#: Refuse where some corner of the image (of the model's domain without one) would be predicted so many times worse than
-#: a point is measured ...
-EXTRAPOLATION_LIMIT = 100.0
-#: ... and say so from here on.
-EXTRAPOLATION_WARNING = 10.0
-#: Beyond this condition without its regularisation a model is called unstable.
-_UNSTABLE = 1e4
 #: Chance of calling a parameter justified that is zero.
 SIGNIFICANCE = 0.05
-#: Two parameters correlated beyond this are listed as 1.000: they cannot be told apart.
-_INSEPARABLE = 0.9995
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -82,7 +80,7 @@ class Fit:
     def reservations(self) -> tuple[str, ...]:
         """Why the model is not to be relied on, whatever its residuals: ``unstable``, ``uncertain at a corner``."""
         found = []
-        if len(self.param_names) > 1 and self.condition > _UNSTABLE:
+        if len(self.param_names) > 1 and self.condition > UNSTABLE:
             found.append("unstable")
         if not self.corner_ratio <= EXTRAPOLATION_WARNING:
             found.append("uncertain at a corner")
@@ -281,8 +279,8 @@ def fit(
     if rejected:
         # A start that gross errors had a part in took those of the ground to move in directions of their making.
         solution = problem.started(solution.model).solve(keep)
-    ratio = _corner_ratio(solution, points.source, strength)
-    warnings += _uncertain_edge(ratio) + _unstable(solution, strength)
+    ratio = corner_ratio_of(solution, points.source, strength)
+    warnings += uncertain_edge(ratio) + unstable(solution, strength)
     used = np.zeros(len(points), dtype=bool)
     used[problem.rows[keep]] = True
     found = _result(solution, points, used, raw, {**known_bad, **rejected}, warnings, name, strength, problem.priors)
@@ -428,65 +426,3 @@ def _refuse_many(points: Points, rejected: dict[int, str], count: int) -> None:
             file=points.source,
             remedy="measure these points again, or remove the wrong ones",
         )
-
-
-def _corner_ratio(solution: Solution, source: str, strength: float | None) -> float:
-    """Return how many times less certain a model is at a corner of its image than a measured point.
-
-    One that is much less certain is refused, but never a regularised one: what the points leave open, the user has
-    decided.
-    """
-    if not len(solution.model.params) or not len(solution.residuals):
-        return 0.0
-    partials = solution.model.param_partials(solution.model.corners)
-    spread = np.sqrt(((partials @ solution.cofactors) * partials).sum(axis=2))
-    factor = float(np.nanmax(spread, initial=0.0) / np.median(solution.errors.sigma))
-    if np.isnan(spread).all() and strength is None:
-        raise DegeneratePoints(
-            "how certain the model is cannot be said: no corner of the ground that it is meant for has an image",
-            file=source,
-            field="domain",
-            remedy="check the metadata of the scene; of a plugin, that domain is (centre, half-size) in units of crs",
-        )
-    if np.isnan(spread).all():
-        factor = math.inf
-    if factor > EXTRAPOLATION_LIMIT and strength is None:
-        raise DegeneratePoints(
-            f"the control points do not determine the whole scene: at a corner the model is {factor:.0f} times less "
-            "certain than a measured point",
-            file=source,
-            remedy="spread the points over the image (and over height, for 3D models), or take a simpler model",
-        )
-    return factor
-
-
-def _uncertain_edge(factor: float) -> list[Notice]:
-    if factor <= EXTRAPOLATION_WARNING:
-        return []
-    text = f"uncertain at the edge: at a corner of the scene {factor:.0f} times less certain than a measured point"
-    return [Notice("uncertain-at-edge", text, factor=factor)]
-
-
-def _unstable(solution: Solution, strength: float | None) -> list[Notice]:
-    names = solution.model.param_names
-    if strength is not None:
-        if solution.condition <= _UNSTABLE:
-            return []
-        text = (
-            f"unstable: the points determine {solution.effective:.1f} of {counted(len(names), 'parameter')} (condition "
-            f"{solution.condition:.0e}); regularisation ({strength:.1e}) decides the others: trust check points only"
-        )
-        return [Notice("unstable", text, condition=solution.condition)]
-    if solution.condition <= _UNSTABLE or len(names) < 2:
-        pairs = np.abs(np.triu(correlation_of(solution.cofactors), 1))
-        if not (pairs > _INSEPARABLE).any():
-            return []
-        first, second = np.unravel_index(int(np.argmax(pairs)), pairs.shape)
-        text = (
-            f"{counted(int((pairs > _INSEPARABLE).sum()), 'pair of parameters is', 'pairs of parameters are')} "
-            f"correlated beyond {_INSEPARABLE} "
-            f"({names[first]} and {names[second]} the most): they cannot be told apart"
-        )
-        return [Notice("inseparable-parameters", text, parameters=[names[first], names[second]])]
-    text = f"unstable: the condition of the adjustment is {solution.condition:.0e}: a simpler model is safer"
-    return [Notice("unstable", text, condition=solution.condition)]

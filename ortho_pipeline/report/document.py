@@ -25,7 +25,7 @@ from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.estimation.fit import Fit, root_mean_square
 from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rmse_metres, viewing
-from ortho_pipeline.estimation.spatial_correlation import analyse_fit
+from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
 from ortho_pipeline.files.documents import DocumentError, json_position, json_value, record_of
 from ortho_pipeline.geodesy.crs import Vertical, crs_text, ground_transform

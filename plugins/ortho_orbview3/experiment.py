@@ -32,7 +32,7 @@ from ortho_orbview3.statements import (
 from ortho_pipeline.estimation.family_fit import fit_family, prune
 from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.estimation.ground_residuals import in_metres
-from ortho_pipeline.estimation.spatial_correlation import analyse
+from ortho_pipeline.estimation.spatial.correlation import analyse
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.rational import RPC, Rational

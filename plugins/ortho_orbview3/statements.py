@@ -11,7 +11,7 @@ import numpy as np
 
 from ortho_orbview3 import rendering
 from ortho_orbview3 import truth as simulated
-from ortho_pipeline.estimation.spatial_correlation import CovarianceAnalysis
+from ortho_pipeline.estimation.spatial.correlation import CovarianceAnalysis
 from ortho_pipeline.imaging.edge import analyse_edge
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.simulation.tables import Statement

@@ -15,7 +15,7 @@ from scipy.stats import binom
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.estimation.ground_residuals import viewing
-from ortho_pipeline.estimation.spatial_correlation import CovarianceAnalysis, analyse, analyse_fit
+from ortho_pipeline.estimation.spatial.correlation import CovarianceAnalysis, analyse, analyse_fit
 from ortho_pipeline.files.documents import json_value, record_of
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection

@@ -19,7 +19,7 @@ from ortho_pipeline import commands
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import fit
-from ortho_pipeline.estimation.spatial_correlation import in_metres
+from ortho_pipeline.estimation.spatial.correlation import in_metres
 from ortho_pipeline.exchange.rpc import export_rpc, rpc_metadata
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.options import PointOptions
