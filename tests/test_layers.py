@@ -59,6 +59,7 @@ GDAL_MODULES = {
     "raster.intensity",
     "raster.output",
     "raster.ortho",
+    "raster.regridded",
     "surface.dem_file",
 }
 GDAL_MODULES |= {

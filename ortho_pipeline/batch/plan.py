@@ -213,7 +213,7 @@ class _Planner:
             name=self._checked_name(name, image, where), image=image, output=self.output,
             scene=self._scene(settings, image, where), points=self._points(settings, image, where),
             surface=self._surface(settings, image, where), match=self._match(settings, image, where),
-            ortho=self._ortho(settings), versions=versions(),
+            ortho=self._ortho(settings, image, where), versions=versions(),
         )  # fmt: skip
 
     def _scene(self, settings: Settings, image: Path, where: str) -> SceneOptions:
@@ -253,8 +253,9 @@ class _Planner:
         values["reference"] = tuple(self._file(name, image, field) for name in _listed(values["reference"]))
         return MatchOptions(**values)
 
-    def _ortho(self, settings: Settings) -> OutputOptions:
+    def _ortho(self, settings: Settings, image: Path, where: str) -> OutputOptions:
         values: dict[str, Any] = dict(settings.output)
+        values["fill_from"] = self._file(values["fill_from"], image, f"{where}.output.fill_from")
         values["creation_options"] = {key: str(value) for key, value in values["creation_options"].items()}
         return OutputOptions(**values)
 

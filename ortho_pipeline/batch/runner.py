@@ -118,7 +118,10 @@ def _still_good(record: Record | None, job: Job, listing: str, verify: bool) -> 
     if not verify:
         _digests.learn(record.inputs)
     known = {one.path: one.role for one in record.inputs if os.path.isfile(one.path)}
-    found = inputs.hashed(inputs.files_read(job.image, job.scene, job.points, job.surface, job.match), _digests)
+    found = inputs.hashed(
+        inputs.files_read(job.image, job.scene, job.points, job.surface, job.match, fill_from=job.ortho.fill_from),
+        _digests,
+    )
     read = _states(job, {**{one["path"]: one["role"] for one in found}, **known})
     if record.key != key_of(read, job.configuration, job.versions) or not record.intact(job.folder, verify):
         return None
@@ -145,7 +148,7 @@ def _as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
 def _folders(job: Job) -> list[str | os.PathLike[str]]:
     """Return the files in whose folders a new name could change the scene."""
     return [path for path in (job.image, inputs.point_file(job.points), job.surface.dem, *job.match.reference,
-                          *job.scene.files.values())
+                          job.ortho.fill_from, *job.scene.files.values())
             if path is not None and os.path.isabs(path)]  # fmt: skip
 
 

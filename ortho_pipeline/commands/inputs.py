@@ -262,6 +262,8 @@ def check_paths(
     surface: SurfaceOptions,
     match: MatchOptions = MatchOptions(),
     overwrite: bool = False,
+    *,
+    fill_from: str | os.PathLike[str] | None = None,
 ) -> None:
     """Refuse to write what is read, and outputs that change the model of the source or of the ortho.
 
@@ -275,7 +277,7 @@ def check_paths(
     InputError
         With the path that is in the way.
     """
-    inputs = {Path(path).resolve() for path in given_files(image, scene, points, surface, match)}
+    inputs = {Path(path).resolve() for path in given_files(image, scene, points, surface, match, fill_from)}
     removed = old_side_cars(files["ortho"]) if overwrite and "ortho" in files else []
     for path in (*files.values(), *removed):
         if path.resolve() in inputs:
@@ -305,9 +307,11 @@ def given_files(
     points: PointOptions = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
     match: MatchOptions = MatchOptions(),
+    fill_from: str | os.PathLike[str] | None = None,
 ) -> list[str | os.PathLike[str]]:
     """Return the files that the user gave."""
-    given = (image, *scene.files.values(), point_file(points), surface.dem, sigma_file(surface), *match.reference)
+    given = (image, *scene.files.values(), point_file(points), surface.dem, sigma_file(surface), *match.reference,
+             fill_from)  # fmt: skip
     return [path for path in given if path is not None]
 
 
@@ -346,6 +350,7 @@ def files_read(
     surface: SurfaceOptions = SurfaceOptions(),
     match: MatchOptions = MatchOptions(),
     opened: Scene | None = None,
+    fill_from: str | os.PathLike[str] | None = None,
 ) -> dict[Path, str]:
     """Return every file that is read and its role, side-cars and sources of a VRT included.
 
@@ -375,6 +380,8 @@ def files_read(
     add("DEM accuracy", [sigma_file(surface)])
     for reference in match.reference:
         add("reference", [reference, *_files_of(reference, scene)])
+    if fill_from is not None:
+        add("other ortho", [fill_from, *_files_of(fill_from, scene)])
     return read
 
 

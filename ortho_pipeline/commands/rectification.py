@@ -13,6 +13,7 @@ from ortho_pipeline.commands.control.points import match_asked
 from ortho_pipeline.commands.inputs import has_surface, open_surface
 from ortho_pipeline.commands.layers import budget as layers
 from ortho_pipeline.commands.layers.angles import sun_of, write_angles
+from ortho_pipeline.commands.layers.filling import other_of
 from ortho_pipeline.commands.placement import place_scene, source_of
 from ortho_pipeline.commands.results import ENDINGS, Result, outputs, outputs_together, write_report
 from ortho_pipeline.commands.scene_fit import adjust, open_adjustable
@@ -83,15 +84,15 @@ def rectify(
     stem = Path(image).stem
     files = outputs(folder, stem, output)
     points = inputs.point_options(points)
-    inputs.check_paths(files, image, scene, points, surface, match, overwrite)
+    inputs.check_paths(files, image, scene, points, surface, match, overwrite, fill_from=output.fill_from)
     inputs.require_heights(surface)
-    begun = states(inputs.given_files(image, scene, points, surface, match))
+    begun = states(inputs.given_files(image, scene, points, surface, match, output.fill_from))
     # Before the DEM is read: left alone, GDAL keeps blocks in a share of the machine's memory.
     limit_cache(output.memory, 1)
     opened = open_adjustable(image, scene, points, match)
     heights = open_surface(surface, scene, output.memory)
     acquired, sun = _acquired(opened.facts, output), sun_of(opened.facts, output)
-    read = inputs.files_read(image, scene, points, surface, match, opened)
+    read = inputs.files_read(image, scene, points, surface, match, opened, output.fill_from)
     begun = states(read) | begun
     with inputs.hashed_beside(read, digest) as hashing:
         placed = place_scene(opened, points, scene, heights, output, match)
@@ -100,7 +101,7 @@ def rectify(
         exported, complaints = _as_rpc(model)
         source = source_of(opened, image, scene, output)
         budget, notes = layers.budget_of(placed, match, output)
-        path = layers.ortho_of(placed, files, output)
+        path = layers.ortho_of(placed, files, output, other_of(placed, source, scene, output))
         warped = _warp(model, exported, source, heights, grid, path, output, progress)
         accuracy = layers.write_layers(placed, budget, warped, files, output)
         angles = write_angles(placed, sun, files, output)
@@ -149,7 +150,7 @@ def check(
     _acquired(opened.facts, output)
     sun_of(opened.facts, output)
     placed = place_scene(opened, points, scene, open_surface(surface, scene, output.memory), output, match)
-    Profile.of(source_of(placed.scene, image, scene, output), output.dtype, output.nodata)
+    other_of(placed, source_of(placed.scene, image, scene, output), scene, output)
     layers.budget_of(placed, match, output)
     return placed.to_json()
 

@@ -357,6 +357,13 @@ class OutputOptions:
             "(with a surface model a true ortho).", choices=("mask", "nodata"),
         ),
     ] = None  # fmt: skip
+    fill_from: Annotated[
+        PathLike | None,
+        Option(
+            "--fill-from", "Fill what `output.visibility` leaves empty from this ortho, on any grid.",
+            "ORTHO", kind="file",
+        ),
+    ] = None  # fmt: skip
     angles: Annotated[
         bool,
         Option(

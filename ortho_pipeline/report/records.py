@@ -331,7 +331,8 @@ class OrthoRecord:
 class WarpRecord:
     """The exactness of the warp, in pixels of the image; the transformer is GDAL's where its warper made the ortho.
 
-    `hidden_share` is that of the pixels that the image reaches which terrain hides, null where nobody looked.
+    `hidden_share` is that of the pixels that the image reaches which terrain hides, null where nobody looked;
+    `filled_share` that of those which another ortho filled (`output.fill_from`), null where none was given.
     """
 
     max_error_px: float
@@ -343,6 +344,7 @@ class WarpRecord:
     valid_pixels: Count
     transformer: str | None = None
     hidden_share: float | None = None
+    filled_share: float | None = None
 
 
 @record

@@ -119,6 +119,7 @@ def write_item(
         raise InputError("no pixel of the ortho is valid: it has no place", file=files["ortho"])
     geometry, box = to_geojson(outline, grid.crs)
     properties = {**_projection(grid, outline), **_view(report.scene.view), **_accuracy(report)}
+    properties |= _filled(report)
     prefixes = {"file", "raster", *(name.partition(":")[0] for name in properties)}
     facts = report.scene.facts
     if isinstance(facts.get("satellite"), str):
@@ -204,6 +205,18 @@ def _view(view: View | None) -> dict[str, Any]:
     if view.sensor_azimuth_deg is not None:
         angles["view:azimuth"] = round((view.sensor_azimuth_deg + 180) % 360, 4)
     return angles
+
+
+def _filled(report: SceneReport) -> dict[str, Any]:
+    """Return which share of what the image reaches is hidden, and which is another ortho's."""
+    warp = report.warp
+    if warp is None or warp.hidden_share is None:
+        return {}
+    found: dict[str, Any] = {"ortho:hidden_share": round(warp.hidden_share, 6)}
+    if warp.filled_share is not None:
+        other = (report.provenance.options or {}).get("output", {}).get("fill_from")
+        found |= {"ortho:filled_share": round(warp.filled_share, 6), "ortho:filled_from": Path(str(other)).name}
+    return found
 
 
 def _accuracy(report: SceneReport) -> dict[str, Any]:

@@ -157,7 +157,8 @@ def summary_text(report: SceneReport) -> str:
         by = f" (GDAL's {warp.transformer} transformer)" if warp.transformer else ""
         rows.append(("warp", f"{px(warp.max_error_px)} at worst from the exact model{by}"))
         if warp.hidden_share is not None:
-            rows.append(("visible", f"{share(1.0 - warp.hidden_share)} of what the image reaches"))
+            filled = "" if warp.filled_share is None else f"; {share(warp.filled_share)} from another ortho"
+            rows.append(("visible", f"{share(1.0 - warp.hidden_share)} of what the image reaches{filled}"))
     # The headline and the rows above have said these already.
     said = ("left-out", "no-redundancy", "few-check-points")
     rows += [("warning", text) for text in texts_but(report.warnings, report.notices, *said)]

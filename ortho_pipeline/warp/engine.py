@@ -58,7 +58,8 @@ class WarpResult:
     output pixel; `finest_spacing` the smallest lattice spacing that a block needed, 1 where every pixel was projected;
     `valid_pixels` how many output pixels have a value. `transformer` names the one of GDAL's that stood for the model,
     where GDAL's warper made the pixels: then the error is what was measured through it. `hidden_share` is that of the
-    pixels that the image reaches which terrain hides, where that was looked for.
+    pixels that the image reaches which terrain hides, where that was looked for, `filled_share` that of those which
+    another ortho filled, where one was given.
     """
 
     max_error_px: float
@@ -71,6 +72,7 @@ class WarpResult:
     seconds: float
     transformer: str | None = None
     hidden_share: float | None = None
+    filled_share: float | None = None
 
     def notes(self, memory: int) -> list[Notice]:
         """Return a notice if GDAL's geolocation arrays took more memory (bytes) than was allowed, which they may."""
@@ -123,7 +125,8 @@ def rectify(
     _check(source, resampling, dem_interpolation, tolerance)
     resources = resources or Resources()
     memory = resources.memory
-    threads = limit_cache(memory, _threads(resources), source.block, surface.block)
+    other = path.other.block if isinstance(path, Hiding) and path.other is not None else 0
+    threads = limit_cache(memory, _threads(resources), source.block, surface.block, other)
     profile = profile or Profile.of(source)
     job = _Job(
         model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, memory // (4 * threads),
@@ -154,6 +157,7 @@ def rectify(
         valid_pixels=job.valid_pixels,
         seconds=time.monotonic() - begin,
         hidden_share=None if job.looked is None else job.looked.hidden_share,
+        filled_share=None if job.looked is None else job.looked.filled_share,
     )
 
 
@@ -314,11 +318,13 @@ class _Job:
         seen = self.lattices.build(blocks, terrain)
         for group, dem, area in terrain.groups(seen):
             self._warp(group, dem, area, tile)
-        classes = (
-            None if self.looked is None else self.looked.look(left, top, tile.pixels, tile.valid, self.resampling.fill)
-        )
+        classes, hidden = None, None
+        if self.looked is not None:
+            classes, hidden = self.looked.look(left, top, tile.pixels, tile.valid, self.resampling.fill)
         low, _, _, fill = _range(self.profile.dtype, self.profile)
         out = as_written(tile.pixels, tile.valid, self.profile.dtype, fill)
+        if self.looked is not None:
+            self.looked.fill(left, top, hidden, out, tile.valid)
         if self.profile.validity == "nodata":
             _keep_off_nodata(out, tile.valid, fill, low)
         # NaN says for itself which band has no value; an integer cannot, so there a pixel needs all of its bands.

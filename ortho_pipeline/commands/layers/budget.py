@@ -26,6 +26,7 @@ from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
 
 if TYPE_CHECKING:
+    from ortho_pipeline.raster.regridded import Regridded
     from ortho_pipeline.warp.engine import WarpResult
     from ortho_pipeline.warp.layers.accuracy import AccuracyResult, Budget
     from ortho_pipeline.warp.layers.hiding import Hiding
@@ -72,7 +73,12 @@ def budget_of(placed: Placement, match: MatchOptions, output: OutputOptions) -> 
             field="output.accuracy_raster",
             remedy="give `surface.sigma`, or control points with `points.gcps`, or leave it out",
         )  # fmt: skip
-    known = Known(budget, tuple(unknown), tuple(_assumptions(budget, surface)), covariance is not None)
+    assumed = _assumptions(budget, surface)
+    if output.fill_from is not None:
+        assumed.append(
+            f"pixels from {Path(output.fill_from).name} are as accurate as that is: the layer is of the others"
+        )
+    known = Known(budget, tuple(unknown), tuple(assumed), covariance is not None)
     if not unknown:
         return known, []
     names = {"model": "the model", "heights": "the heights (`surface.sigma`)",
@@ -154,13 +160,15 @@ def _assumptions(budget: Budget, surface: Surface) -> list[str]:
     return said
 
 
-def ortho_of(placed: Placement, files: Mapping[str, Path], output: OutputOptions) -> Path | Hiding:
+def ortho_of(
+    placed: Placement, files: Mapping[str, Path], output: OutputOptions, other: Regridded | None = None
+) -> Path | Hiding:
     """Return where the ortho is written, and what is done about pixels that terrain hides where somebody asks."""
     if output.visibility is None:
         return files["ortho"]
     from ortho_pipeline.warp.layers.hiding import Hiding
 
-    return Hiding(files["ortho"], placed.footprint.heights, files.get("visibility"))
+    return Hiding(files["ortho"], placed.footprint.heights, files.get("visibility"), other)
 
 
 def write_layers(

@@ -1,4 +1,4 @@
-"""What is done about hidden pixels while an ortho is made: a mask of them beside it, or no value in it."""
+"""What is done about hidden pixels while an ortho is made: a mask of them beside it, no value in it, or another's."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
+from ortho_pipeline.raster.regridded import Regridded
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp.layers.sight import Sight
@@ -34,11 +35,14 @@ class Hiding:
         Lowest and highest ground of the scene, about.
     mask : path, optional
         Where the classes of all pixels are written; without it hidden pixels have no value in the ortho.
+    other : Regridded, optional
+        The ortho whose pixels they have, where it shows them.
     """
 
     ortho: str | os.PathLike[str]
     heights: tuple[float, float]
     mask: str | os.PathLike[str] | None = None
+    other: Regridded | None = None
 
     def begun(self, model: SensorModel, surface: Surface, grid: Grid, window_bytes: int) -> Looked:
         """Return the work on an ortho, which may hold so many bytes of heights at once."""
@@ -54,6 +58,7 @@ class Looked:
     visibility: Visibility
     _hidden: int = 0
     _shown: int = 0
+    _filled: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     @property
@@ -61,10 +66,17 @@ class Looked:
         """Share of the pixels that the image reaches which terrain hides."""
         return self._hidden / max(self._shown, 1)
 
+    @property
+    def filled_share(self) -> float | None:
+        """Share of the same pixels that are those of another ortho; None where none is given."""
+        return None if self.hiding.other is None else self._filled / max(self._shown, 1)
+
     def look(
         self, left: int, top: int, pixels: NDArray[Any], valid: NDArray[np.bool_], fill: Any
-    ) -> NDArray[np.uint8] | None:
-        """Return the classes of a tile ``(h, w)``; without a mask none, and hidden pixels get `fill`, no value.
+    ) -> tuple[NDArray[np.uint8] | None, NDArray[np.bool_] | None]:
+        """Return the classes of a tile ``(h, w)``, and which of its pixels are hidden; None where none is.
+
+        Without a mask there are no classes, and hidden pixels get `fill`, no value.
 
         Parameters
         ----------
@@ -81,10 +93,33 @@ class Looked:
             self._shown += count
             self._hidden += 0 if hidden is None else int(np.count_nonzero(hidden))
         if self.hiding.mask is not None:
-            return _classes(found, shown, hidden)
+            return _classes(found, shown, hidden), hidden
         if hidden is not None:
             pixels[:, hidden], valid[:, hidden] = fill, False
-        return None
+        return None, hidden
+
+    def fill(
+        self, left: int, top: int, hidden: NDArray[np.bool_] | None, pixels: NDArray[Any], valid: NDArray[np.bool_]
+    ) -> None:
+        """Give the hidden pixels ``(h, w)`` of a tile the values of the other ortho, where it has any.
+
+        Parameters
+        ----------
+        pixels, valid : (bands, h, w)
+            Of the tile, as they are written.
+        """
+        if self.hiding.other is None or hidden is None or not hidden.any():
+            return
+        rows, columns = (np.flatnonzero(hidden.any(axis=axis)) for axis in (1, 0))
+        part = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+        size = int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)
+        values, good = self.hiding.other.read(left + int(columns[0]), top + int(rows[0]), *size)
+        new = hidden[part] & good
+        for band in range(len(pixels)):
+            pixels[band][part][new[band]] = values[band][new[band]]
+            valid[band][part] |= new[band]
+        with self._lock:
+            self._filled += int(np.count_nonzero(new.any(axis=0)))
 
     def writer(self, threads: int) -> Any:
         """Return the writer of the mask as a context; of nothing where none is wanted."""

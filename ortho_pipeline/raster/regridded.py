@@ -1,0 +1,160 @@
+"""Pixels of an ortho on the grid of another one.
+
+It may lie on another grid, in another CRS. On the same grid its pixels are taken over as they are;
+otherwise GDAL's warper brings them there with its exact transformer, in blocks at fixed places and with a fixed size of
+its kernels, so that the result does not depend on tiles, memory or threads.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from typing import Any
+
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.geodesy.crs import crs_text
+from ortho_pipeline.raster.ortho import Profile
+from ortho_pipeline.raster.source import MEMORY, Grid, RasterSource, first_line
+from ortho_pipeline.raster.valid_area import grid_of
+
+#: Part of a pixel by which grids may differ: rounding of coordinates, no more.
+_SAME = 1e-3
+#: GDAL gives alpha 0 to 255 as the share of a pixel's footprint that has values: of a pixel at least half.
+_ENOUGH = 128
+
+
+class Regridded:
+    """An ortho on the grid of another one; safe to use from several threads.
+
+    Parameters
+    ----------
+    grid : Grid
+        On which its pixels are wanted.
+    resampling : str
+        Between pixels of another grid, by GDAL's name.
+
+    Raises
+    ------
+    InputError
+        If it is no ortho, or lies elsewhere.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], grid: Grid, *, resampling: str = "bilinear", memory: int = MEMORY,
+        **access: Any,
+    ) -> None:  # fmt: skip
+        self.path, self._grid, self._resampling = path, grid, resampling
+        self._memory, self._local = memory, threading.local()
+        self._source = RasterSource(path, memory=memory, **access)
+        self._own = grid_of(path)
+        self._check_overlap()
+        self._offset = _offset(grid, self._own)
+
+    @property
+    def is_resampled(self) -> bool:
+        """Whether its pixels lie on another grid."""
+        return self._offset is None
+
+    @property
+    def block(self) -> int:
+        """Bytes of the blocks that are held to read a pixel."""
+        return self._source.block
+
+    def require(self, profile: Profile) -> None:
+        """Raise an `InputError` unless it has the bands and the type of an ortho of this profile."""
+        own = f"{counted(self._source.count, 'band')} of {self._source.dtype}"
+        wanted = f"{counted(profile.count, 'band')} of {profile.dtype}"
+        if own != wanted:
+            raise InputError(
+                f"this ortho has {own}, where {wanted} would be filled", file=self.path,
+                remedy="make it of the same bands and type (`output.bands`, `output.dtype`)",
+            )  # fmt: skip
+
+    def read(self, left: int, top: int, width: int, height: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """Return pixels and which are valid ``(bands, height, width)`` of a window of the grid."""
+        if self._offset is None:
+            return self._resampled(left, top, width, height)
+        count, source = self._source.count, self._source
+        pixels = np.zeros((count, height, width), dtype=source.dtype)
+        valid = np.zeros(pixels.shape, dtype=bool)
+        west, north = left - self._offset[0], top - self._offset[1]
+        first, last = max(west, 0), min(west + width, source.width)
+        upper, lower = max(north, 0), min(north + height, source.height)
+        if first < last and upper < lower:
+            part = (slice(None), slice(upper - north, lower - north), slice(first - west, last - west))
+            pixels[part] = values = source.read(first, upper, last - first, lower - upper)
+            good = source.read_valid(first, upper, values)
+            valid[part] = True if good is None else good
+        return pixels, valid
+
+    def _resampled(self, left: int, top: int, width: int, height: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        count = self._source.count
+        try:
+            found = self._warped.ReadAsArray(left, top, width, height)
+        except RuntimeError as error:
+            raise InputError(
+                f"GDAL cannot resample this ortho ({first_line(error)})", file=self.path, remedy="make it again"
+            ) from error  # fmt: skip
+        pixels = found[:count]
+        valid = np.broadcast_to(found[-1] >= _ENOUGH, pixels.shape).copy()
+        if pixels.dtype.kind == "f":
+            valid &= ~np.isnan(pixels)
+        return pixels, valid
+
+    @property
+    def _warped(self) -> gdal.Dataset:
+        """The ortho on the grid, with alpha as its last band; of the calling thread."""
+        if not hasattr(self._local, "warped"):
+            # The kernels of each block as wide as at the middle: GDAL would take what it finds in the block.
+            scales = self._scales()
+            self._local.warped = gdal.Warp(
+                "", self._source.dataset, format="VRT", dstSRS=self._grid.crs.to_wkt(),
+                srcSRS=self._own.crs.to_wkt(), outputBounds=self._grid.extent, width=self._grid.width,
+                height=self._grid.height, resampleAlg=self._resampling, errorThreshold=0.0, dstAlpha=True,
+                warpMemoryLimit=self._memory // 8,
+                warpOptions=[f"XSCALE={scales[0]!r}", f"YSCALE={scales[1]!r}"],
+            )  # fmt: skip
+        return self._local.warped
+
+    def _scales(self) -> tuple[float, float]:
+        """Return how many pixels of the grid make one of this ortho, at most 1, per axis."""
+        grid = self._grid
+        columns = grid.width / 2 + np.array([-0.5, 0.5, 0.0, 0.0])
+        rows = grid.height / 2 + np.array([0.0, 0.0, -0.5, 0.5])
+        to_own = pyproj.Transformer.from_crs(grid.crs, self._own.crs, always_xy=True)
+        x, y = (np.asarray(part) for part in to_own.transform(*grid.xy(columns, rows)))
+        across = (np.abs(x[1] - x[0]) + np.abs(x[3] - x[2])) / self._own.dx
+        down = (np.abs(y[1] - y[0]) + np.abs(y[3] - y[2])) / self._own.dy
+        return min(1.0, 1.0 / float(across)), min(1.0, 1.0 / float(down))
+
+    def _check_overlap(self) -> None:
+        own, grid = self._own, self._grid
+        try:
+            to_own = pyproj.Transformer.from_crs(grid.crs, own.crs, always_xy=True)
+            box = to_own.transform_bounds(*grid.extent, densify_pts=21)
+        except pyproj.exceptions.ProjError:
+            box = (math.inf,) * 4
+        xmin, ymin, xmax, ymax = own.extent
+        if not (box[0] < xmax and box[2] > xmin and box[1] < ymax and box[3] > ymin):
+            raise InputError(
+                f"this ortho ({crs_text(own.crs)}) lies elsewhere", file=self.path,
+                remedy="give an ortho of this place, or leave it out",
+            )  # fmt: skip
+
+
+def _offset(grid: Grid, own: Grid) -> tuple[int, int] | None:
+    """Return column and row in one grid at which another begins; None where their pixels are not the same."""
+    if grid.crs != own.crs or not all(
+        math.isclose(one, other, rel_tol=1e-9) for one, other in ((grid.dx, own.dx), (grid.dy, own.dy))
+    ):
+        return None
+    columns, rows = (own.left - grid.left) / grid.dx, (grid.top - own.top) / grid.dy
+    if max(abs(columns - round(columns)), abs(rows - round(rows))) > _SAME:
+        return None
+    return round(columns), round(rows)
