@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.points import control_of, has_control, match_asked
-from ortho_pipeline.commands.inputs import has_surface, open_surface
+from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
 from ortho_pipeline.commands.results import ENDINGS, CompareResult, FitResult, outputs_together, write_report
 from ortho_pipeline.commands.scene_fit import (
     Adjusted,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -16,20 +15,19 @@ from typing import Any
 import pyproj
 
 from ortho_pipeline import plugins
-from ortho_pipeline.errors import InputError, OrthoError, completed, of_option
+from ortho_pipeline.commands.heights.surfaces import sigma_file
+from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange import crop
 from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.exchange.rpc import files_of
 from ortho_pipeline.files import sha256, states
 from ortho_pipeline.files.locations import archive_of, located
 from ortho_pipeline.files.process_limits import startable_threads
-from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions, number_of
+from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.surface.dem import DemSurface
 
 #: Side-cars that GDAL would attach to an image of this stem, whatever the image itself says.
 SIDE_CARS = ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", "_metadata.txt", ".IMD")
@@ -37,8 +35,6 @@ SIDE_CARS = ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", "_metadata.txt", ".IMD")
 ATTACHED = (".aux.xml", ".ovr", ".msk")
 #: In place of a file of points: the ground control points that the image itself holds.
 OWN_POINTS = "own"
-#: No height is less certain (m) than that: the Earth has none of that size.
-_LARGEST_SIGMA = 10_000.0
 #: Name of the "sensor" of an image that has no model of its own.
 POINTS_ONLY = "points only"
 
@@ -127,115 +123,10 @@ def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_mo
     return open_scene(image, options)
 
 
-def open_surface(
-    options: SurfaceOptions, scene: SceneOptions = SceneOptions(), memory: int = OutputOptions.memory
-) -> Surface:
-    """Open the DEM, or take the ground to be flat.
-
-    Parameters
-    ----------
-    memory : int
-        Bytes of the whole job.
-
-    Raises
-    ------
-    InputError
-        If both or neither are given, or a rule is unknown.
-    """
-    if options.dem is not None and options.height is not None:
-        raise InputError(
-            "`surface.dem` and `surface.height` exclude each other", field="surface.height", remedy="give one of them"
-        )
-    if options.dem is None and options.height is None:
-        raise InputError(
-            "there are no heights", field="surface.dem", remedy="give `surface.dem=FILE` or `surface.height=METRES`"
-        )
-    sigma = open_sigma(options, scene, memory)
-    if options.height is not None:
-        return Surface.constant(options.height).with_sigma(sigma)
-    assert options.dem is not None
-    return open_dem(options.dem, options, scene, memory).with_sigma(sigma)
-
-
-def open_sigma(
-    options: SurfaceOptions, scene: SceneOptions = SceneOptions(), memory: int = OutputOptions.memory
-) -> float | Surface | None:
-    """Return the standard deviation of heights: a number (m), a raster of such, or None where nobody says.
-
-    Raises
-    ------
-    InputError
-        For a number that is not positive or larger than mountains, and a raster that cannot be read.
-    """
-    if options.sigma is None:
-        return None
-    try:
-        # What reads as a number is one: nan and 1e999 are no files.
-        number = number_of(float(options.sigma))  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        with completed(field="surface.sigma"):
-            path = os.fspath(options.sigma)  # type: ignore[arg-type]
-            return Surface.open(path, "ellipsoid", override=True, fill="mask", memory=memory, **scene.access)
-    if 0 < number <= _LARGEST_SIGMA:
-        return number
-    raise InputError(
-        f"{options.sigma} is no standard deviation", field="surface.sigma",
-        remedy="give metres, or a raster of them such as Copernicus' height error mask",
-    )  # fmt: skip
-
-
-def open_dem(
-    path: str | os.PathLike[str], options: SurfaceOptions, scene: SceneOptions, memory: int = OutputOptions.memory
-) -> DemSurface:
-    """Open a DEM; of the options it is those that say how its heights are to be understood."""
-    with of_option("surface.vertical"):
-        vertical = None if options.vertical is None else Vertical.parse(options.vertical)
-    return Surface.open(
-        path, vertical, override=options.override_vertical, fill=options.fill, memory=memory, **scene.access
-    )
-
-
-def require_heights(options: SurfaceOptions) -> None:
-    """Raise an `InputError` if there are no heights."""
-    if not has_surface(options):
-        raise InputError(
-            "an orthoimage needs heights", field="surface.dem",
-            remedy="give `surface.dem=FILE`, or `surface.height=METRES` above the ellipsoid for flat ground",
-        )  # fmt: skip
-
-
 def _perhaps_elsewhere(value: Any, allow_network: bool) -> Any:
     """Return a file of an archive or of the network as one that can be read; any other value as it is."""
     text = str(value)
     return located(text, allow_network=allow_network) if text.startswith("/vsi") or "://" in text else value
-
-
-def has_surface(options: SurfaceOptions) -> bool:
-    """Tell whether heights are given.
-
-    Raises
-    ------
-    InputError
-        If something is said of a DEM that is not given.
-    """
-    idle = {
-        "surface.vertical": options.vertical is not None,
-        "surface.override_vertical": options.override_vertical,
-        "surface.fill": options.fill != SurfaceOptions.fill,
-        "surface.sigma": options.sigma is not None and options.height is None,
-    }
-    for field in (field for field, given in idle.items() if given and options.dem is None):
-        raise InputError("this is said of a DEM, and there is none", field=field,
-                         remedy="leave it out, or give `surface.dem`")  # fmt: skip
-    return options.dem is not None or options.height is not None
-
-
-def sigma_file(options: SurfaceOptions) -> str | os.PathLike[str] | None:
-    """Return the raster of standard deviations of heights, None where there is none."""
-    given = options.sigma
-    if given is None or isinstance(given, float | int):
-        return None
-    return given if isinstance(given, os.PathLike) or math.isnan(number_of(given)) else None
 
 
 # -- points ----------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.points import match_asked
-from ortho_pipeline.commands.inputs import has_surface, open_surface
+from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface, require_heights
 from ortho_pipeline.commands.layers import budget as layers
 from ortho_pipeline.commands.layers.angles import sun_of, write_angles
 from ortho_pipeline.commands.layers.filling import other_of
@@ -85,7 +85,7 @@ def rectify(
     files = outputs(folder, stem, output)
     points = inputs.point_options(points)
     inputs.check_paths(files, image, scene, points, surface, match, overwrite, fill_from=output.fill_from)
-    inputs.require_heights(surface)
+    require_heights(surface)
     begun = states(inputs.given_files(image, scene, points, surface, match, output.fill_from))
     # Before the DEM is read: left alone, GDAL keeps blocks in a share of the machine's memory.
     limit_cache(output.memory, 1)
@@ -145,7 +145,7 @@ def check(
     InputError
         As `rectify`.
     """
-    inputs.require_heights(surface)
+    require_heights(surface)
     opened = open_adjustable(image, scene, points, match)
     _acquired(opened.facts, output)
     sun_of(opened.facts, output)

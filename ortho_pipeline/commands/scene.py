@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline import plugins
-from ortho_pipeline.commands.inputs import open_dem, open_scene
+from ortho_pipeline.commands.heights.surfaces import open_dem
+from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION, Result, outputs_together
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError, completed, counted

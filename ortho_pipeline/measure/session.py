@@ -16,6 +16,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.matching import open_reference_views, search_of
 from ortho_pipeline.commands.control.points import read_control, with_heights
 from ortho_pipeline.commands.fitting import compare
+from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
 from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import sha256, write_json
@@ -299,9 +300,9 @@ def open_session(
     if points.fit_model is not None:
         raise InputError("the reference is shown by the scene's own model", field="points.fit_model",
                          remedy="leave it out, and fit the model to the saved points")  # fmt: skip
-    inputs.require_heights(surface)
+    require_heights(surface)
     opened = inputs.open_scene(image, scene)
-    heights: Surface = inputs.open_surface(surface, scene)
+    heights: Surface = open_surface(surface, scene)
     opened = on_surface(opened, heights)
     view, references = open_reference_views(opened, match, heights, scene)
     inputs.check_paths({"points": path}, image, scene, PointOptions(), surface, match)

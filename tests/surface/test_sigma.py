@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from osgeo import gdal
 
-from ortho_pipeline.commands.inputs import files_read, has_surface, open_surface
+from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
+from ortho_pipeline.commands.inputs import files_read
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import SurfaceOptions
 from ortho_pipeline.surface.accuracy import typical_sigma

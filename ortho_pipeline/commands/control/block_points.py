@@ -15,6 +15,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import points_of_images
 from ortho_pipeline.commands.control.matching import match_scene
 from ortho_pipeline.commands.control.ties import tie_scenes
+from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
 from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
@@ -68,7 +69,7 @@ def gather(
         tables.append(table)
         notices += notes
     if matched:
-        heights = inputs.open_surface(surface, scenes[0])
+        heights = open_surface(surface, scenes[0])
         opened = {
             label: on_surface(inputs.open_scene(image, scene), heights)
             for label, image, scene in zip(labels, images, scenes, strict=True)
@@ -110,7 +111,7 @@ def _refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: 
                     "this is said of matching, and nothing is matched", field=f"match.{name}",
                     remedy="leave it out, or give `points.ties=auto`",
                 )  # fmt: skip
-        if inputs.has_surface(surface):
+        if has_surface(surface):
             raise InputError(
                 "heights serve matching, and nothing is matched",
                 field="surface.dem" if surface.dem is not None else "surface.height",

@@ -9,6 +9,7 @@ from typing import Any
 
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.matching import match_scene
+from ortho_pipeline.commands.heights.surfaces import open_surface
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust, on_surface
 from ortho_pipeline.display.notices import to_document
@@ -59,7 +60,7 @@ def match(
     files |= _page(report)
     inputs.check_paths(files, image, scene, PointOptions(), surface, match)
     opened = inputs.open_scene(image, scene)
-    heights = inputs.open_surface(surface, scene)
+    heights = open_surface(surface, scene)
     adjusted = None if report is None else adjust(opened, PointOptions(), scene, heights, match)
     matched = None if adjusted is None else adjusted.matched
     if matched is None:

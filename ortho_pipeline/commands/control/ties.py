@@ -17,6 +17,7 @@ from ortho_pipeline.block.points import BlockPoints, shape_of
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of
 from ortho_pipeline.commands.control.matching import search_of
+from ortho_pipeline.commands.heights.surfaces import open_surface
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.display.notices import Notice, to_document
@@ -204,7 +205,7 @@ def ties(
         raise InputError("ties are not written in this format", file=output, field="output", remedy="give a .csv file")
     for image in images:
         inputs.check_paths(files, image, scene, PointOptions(), surface)
-    heights = inputs.open_surface(surface, scene)
+    heights = open_surface(surface, scene)
     scenes = {name: inputs.open_scene(image, scene) for name, image in zip(names, images, strict=True)}
     tied = tie_scenes(scenes, match, heights, scene)
     write_text(output, _csv(tied.points))
