@@ -23,6 +23,7 @@ from ortho_pipeline.commands.inputs import OWN_POINTS
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster import source as raster
+from ortho_pipeline.surface.mosaic import matching_files
 
 #: Folder of records and locks within the output folder.
 STATE = ".run"
@@ -240,6 +241,8 @@ class _Planner:
     def _surface(self, settings: Settings, image: Path, where: str) -> SurfaceOptions:
         values: dict[str, Any] = dict(settings.surface)
         values["dem"] = self._file(values["dem"], image, f"{where}.surface.dem")
+        for cell in () if values["dem"] is None else matching_files(values["dem"]) or ():
+            self._inside(cell, f"{where}.surface.dem")
         values["fill"] = str(values["fill"])
         if isinstance(values["sigma"], str):
             values["sigma"] = self._perhaps_file(values["sigma"], image, f"{where}.surface.sigma")

@@ -15,7 +15,7 @@ from typing import Any
 import pyproj
 
 from ortho_pipeline import plugins
-from ortho_pipeline.commands.heights.surfaces import sigma_file
+from ortho_pipeline.commands.heights.surfaces import dem_files, sigma_file
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange import crop
 from ortho_pipeline.exchange.model_file import read_model_file
@@ -201,8 +201,8 @@ def given_files(
     fill_from: str | os.PathLike[str] | None = None,
 ) -> list[str | os.PathLike[str]]:
     """Return the files that the user gave."""
-    given = (image, *scene.files.values(), point_file(points), surface.dem, sigma_file(surface), *match.reference,
-             fill_from)  # fmt: skip
+    given = (image, *scene.files.values(), point_file(points), *dem_files(surface), sigma_file(surface),
+             *match.reference, fill_from)  # fmt: skip
     return [path for path in given if path is not None]
 
 
@@ -264,8 +264,8 @@ def files_read(
         add("image", _files_of(opened.path, scene) if opened.path != Path(image) else ())
         add("metadata", [*opened.sources, opened.model_source])
     add("points", [point_file(points)])
-    if surface.dem is not None:
-        add("DEM", [surface.dem, *_files_of(surface.dem, scene)])
+    for dem in dem_files(surface):
+        add("DEM", [dem, *_files_of(dem, scene)])
     if surface.vertical is not None:
         add("geoid", [surface.vertical])
     add("DEM accuracy", [sigma_file(surface)])

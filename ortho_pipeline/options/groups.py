@@ -236,7 +236,10 @@ class BlockOptions:
 class SurfaceOptions:
     """Where heights come from: a DEM, or one ellipsoidal height in metres."""
 
-    dem: Annotated[PathLike | None, Option("--dem", "Digital elevation model.", "FILE")] = None
+    dem: Annotated[
+        PathLike | None,
+        Option("--dem", "Digital elevation model: a file, or a pattern of the files that make one.", "FILE"),
+    ] = None
     vertical: Annotated[
         str | None, Option("--dem-vertical", f"Height datum of the DEM: {_VERTICAL_FORMS}.", "DATUM")
     ] = None

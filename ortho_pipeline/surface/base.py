@@ -78,6 +78,8 @@ class Surface(abc.ABC):
 
         Parameters
         ----------
+        path : path
+            A file, or a pattern such as ``folder/*.tif`` of the files that make one DEM (see `surface.mosaic`).
         vertical : Vertical or str, optional
             What the heights are measured above; needed where the DEM does not say it.
         override : bool
@@ -107,6 +109,11 @@ class Surface(abc.ABC):
     @abc.abstractmethod
     def block(self) -> int:
         """Bytes that GDAL decodes at once to read a sample; 0 where nothing is read."""
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files that heights are read from."""
+        return ()
 
     @property
     @abc.abstractmethod

@@ -24,6 +24,7 @@ from ortho_pipeline.geodesy.datum import dem_unit, dem_vertical, dem_vertical_re
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
 from ortho_pipeline.surface.base import Array, Excerpt, Surface, Window, parse_fill, positions
 from ortho_pipeline.surface.dem_file import Affine, DemFile, SampleGrid
+from ortho_pipeline.surface.mosaic import Samples, matching_files, open_mosaic
 from ortho_pipeline.surface.voids import nearest_heights
 
 #: ``fill='nearest'`` looks so far for a valid height: samples, and metres after which real terrain is another one.
@@ -50,7 +51,16 @@ def open_dem(
     memory: int,
 ) -> DemSurface:
     """Open a DEM: see `Surface.open`."""
-    file = DemFile(path, access)
+    files = matching_files(path)
+    file: Samples = DemFile(path, access) if files is None else open_mosaic(path, files, access)
+    return dem_of(file, vertical, override, fill, memory)
+
+
+def dem_of(
+    file: Samples, vertical: Vertical | str | None, override: bool, fill: str | float, memory: int
+) -> DemSurface:
+    """Return samples, of a file or of many, as a surface: see `Surface.open`."""
+    path = file.path
     crs, grid = file.place()
     declared = declared_vertical(crs)
     option = None if vertical is None else Vertical.parse(vertical)
@@ -122,7 +132,7 @@ class DemSurface(Surface):
 
     Parameters
     ----------
-    file : DemFile
+    file : Samples
     grid : SampleGrid
         Where the samples lie; in a DEM that goes round the world, with its seam.
     vertical : Vertical
@@ -137,7 +147,7 @@ class DemSurface(Surface):
     sigma : float, Surface or None
     """
 
-    file: DemFile
+    file: Samples
     grid: SampleGrid
     vertical: Vertical
     metres_per_unit: float
@@ -180,6 +190,11 @@ class DemSurface(Surface):
     def block(self) -> int:
         """Bytes that GDAL decodes at once to read a sample."""
         return self.file.block
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files that heights are read from."""
+        return self.file.files
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -339,7 +354,7 @@ class DemSurface(Surface):
         samples = self.sampler(crs)(ground)
         samples = samples[np.isfinite(samples).all(axis=1)]
         if not len(samples):
-            raise self._no_height()
+            raise _no_height(self.file.path)
         low, high = samples.min(axis=0), samples.max(axis=0)
         wider = margin * (high - low) + 1 if margin else 0.0
         size = self.shape[::-1]
@@ -358,14 +373,14 @@ class DemSurface(Surface):
                 if not np.isnan(heights).all():
                     low, high = min(low, float(np.nanmin(heights))), max(high, float(np.nanmax(heights)))
         if low > high:
-            raise self._no_height()
+            raise _no_height(self.file.path)
         return low, high
 
-    def _no_height(self) -> CoverageError:
-        return CoverageError(
-            "this DEM holds no valid height here", file=self.file.path,
-            remedy="check its nodata value, unit and extent",
-        )  # fmt: skip
+
+def _no_height(path: str) -> CoverageError:
+    return CoverageError(
+        "this DEM holds no valid height here", file=path, remedy="check its nodata value, unit and extent"
+    )
 
 
 def _on_ellipsoid(plan: Array) -> Array:

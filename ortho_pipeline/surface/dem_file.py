@@ -139,6 +139,15 @@ class DemFile:
         """The unit of the heights, as the file calls it."""
         return self.dataset.GetRasterBand(1).GetUnitType()
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The file."""
+        return (self.path,)
+
+    def close(self) -> None:
+        """Let go of the handle of this thread; it is opened again when it is needed."""
+        vars(self._local).clear()
+
     def place(self) -> tuple[pyproj.CRS, SampleGrid]:
         """Return the full CRS of the file and the grid of its samples.
 

@@ -10,6 +10,7 @@ from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions, number_of
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
+from ortho_pipeline.surface.mosaic import matching_files
 
 #: No height is less certain (m) than that: the Earth has none of that size.
 _LARGEST_SIGMA = 10_000.0
@@ -81,6 +82,13 @@ def open_dem(
     return Surface.open(
         path, vertical, override=options.override_vertical, fill=options.fill, memory=memory, **scene.access
     )
+
+
+def dem_files(options: SurfaceOptions) -> list[str]:
+    """Return the files of the DEM that the user gave: one, those of a pattern, or none."""
+    if options.dem is None:
+        return []
+    return [*(matching_files(options.dem) or [os.fspath(options.dem)])]
 
 
 def require_heights(options: SurfaceOptions) -> None:

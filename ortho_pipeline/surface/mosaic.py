@@ -1,0 +1,342 @@
+"""A DEM in many files: one grid of samples over all of them, of one horizontal system and one height datum.
+
+Files of one spacing have to lie on one grid, as the cells of a DEM do. Where cells become wider towards the poles
+(Copernicus, DTED), the grid has the finest columns, and a row of the others is interpolated between their own samples,
+over the border of two cells of one kind too. Rows are the same everywhere.
+"""
+
+from __future__ import annotations
+
+import functools
+import glob
+import math
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+
+from ortho_pipeline.errors import CrsError, DatumError, InputError
+from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
+from ortho_pipeline.surface.base import Array
+from ortho_pipeline.surface.dem_file import DemFile, SampleGrid
+
+#: Handles of GDAL that a thread keeps open.
+_OPEN_FILES = 32
+#: Files that one DEM may have.
+_MOST_FILES = 30_000
+#: Part of a sample by which a file may lie off the grid.
+_OFF_GRID = 0.01
+#: Samples of an arc that says to be the whole circle.
+_CIRCLE = 360.0
+_WARP = "make one grid of them (gdalwarp in1.tif in2.tif out.tif), or leave out what does not belong"
+
+
+class Samples(Protocol):
+    """What holds samples: a `DemFile`, a `DemMosaic`, or ground that is known without a file."""
+
+    @property
+    def path(self) -> str:
+        """What the user knows it by."""
+
+    @property
+    def block(self) -> int:
+        """Bytes that are decoded at once to read a sample."""
+
+    @property
+    def unit(self) -> str:
+        """The unit of the heights, as the file calls it; empty where it says nothing."""
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files that are read."""
+
+    def place(self) -> tuple[pyproj.CRS, SampleGrid]:
+        """Return the full CRS and the grid of the samples."""
+
+    def read(self, left: int, top: int, width: int, height: int, metres_per_unit: float) -> Array:
+        """Return the heights ``(height, width)`` of a window inside in metres; NaN for voids."""
+
+    def close(self) -> None:
+        """Let go of what this thread holds open."""
+
+
+def matching_files(pattern: str | os.PathLike[str]) -> list[str] | None:
+    """Return the files that a pattern such as ``folder/*.tif`` stands for, by name; None where it is no pattern.
+
+    Raises
+    ------
+    InputError
+        If there are none, or too many.
+    """
+    text = os.fspath(pattern)
+    if not glob.has_magic(text) or os.path.exists(text) or "://" in text or text.startswith("/vsi"):
+        return None
+    found = sorted(path for path in glob.iglob(text) if os.path.isfile(path))
+    if not 0 < len(found) <= _MOST_FILES:
+        raise InputError(
+            f"{len(found)} files have a name of this pattern", file=text, field="surface.dem",
+            remedy="give a DEM, or a pattern of the files that make one",
+        )  # fmt: skip
+    return found
+
+
+@dataclass(frozen=True)
+class Part:
+    """Samples that belong to a mosaic: whose they are, and where they lie in its layer.
+
+    `column` and `row` are those of their first sample, `shape` is (rows, columns).
+    """
+
+    samples: Samples
+    column: int
+    row: int
+    shape: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Parts of one spacing.
+
+    Parameters
+    ----------
+    parts : tuple of Part
+        Of two at one place the later one counts where it has a height.
+    first : float
+        Column of the mosaic at which its column 0 lies.
+    step : float
+        Columns of the mosaic from one of its own columns to the next, 1 or more.
+    columns : int
+        How many it has; all of them go round the world if `closed`.
+    """
+
+    parts: tuple[Part, ...]
+    first: float
+    step: float
+    columns: int
+    closed: bool = False
+
+    @functools.cached_property
+    def _boxes(self) -> NDArray[np.int64]:
+        """Left, top, right, bottom ``(4, N)`` of the parts."""
+        rows = [(one.column, one.row, one.column + one.shape[1], one.row + one.shape[0]) for one in self.parts]
+        return np.array(rows, dtype=np.int64).T
+
+    def within(self, left: int, top: int, width: int, height: int) -> Iterator[tuple[Part, int]]:
+        """Yield the parts that reach into a window, in their order, and the column at which they lie there."""
+        west, north, east, south = self._boxes
+        for turn in (-self.columns, 0, self.columns) if self.closed else (0,):
+            meets = (west + turn < left + width) & (east + turn > left) & (north < top + height) & (south > top)
+            for index in np.flatnonzero(meets):
+                yield self.parts[index], self.parts[index].column + turn
+
+
+@dataclass(frozen=True, eq=False)
+class DemMosaic:
+    """The samples of many files as those of one; see `DemFile`, which it stands for."""
+
+    path: str
+    crs: pyproj.CRS
+    grid: SampleGrid
+    unit: str
+    layers: tuple[Layer, ...]
+    _local: threading.local = field(default_factory=threading.local, init=False, repr=False)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return DemMosaic, (self.path, self.crs, self.grid, self.unit, self.layers)
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files that are read."""
+        return tuple(name for layer in self.layers for part in layer.parts for name in part.samples.files)
+
+    @property
+    def block(self) -> int:
+        """Bytes that GDAL decodes at once to read a sample: of the first file."""
+        return max((self._opened(layer.parts[0].samples).block for layer in self.layers), default=0)
+
+    def place(self) -> tuple[pyproj.CRS, SampleGrid]:
+        """Return the full CRS of the files and the grid of all samples."""
+        return self.crs, self.grid
+
+    def close(self) -> None:
+        """Let go of the files that this thread holds open."""
+        for samples in self._held().values():
+            samples.close()
+        self._held().clear()
+
+    def read(self, left: int, top: int, width: int, height: int, metres_per_unit: float) -> Array:
+        """Return the heights ``(height, width)`` of a window in metres; NaN where no file has one."""
+        out = np.full((height, width), np.nan)
+        for layer in self.layers:
+            if layer.step == 1.0:
+                self._lay(layer, out, left - round(layer.first), top, metres_per_unit)
+                continue
+            at = (np.arange(left, left + width, dtype=np.float64) - layer.first) / layer.step
+            first, last = int(np.floor(at[0])), int(np.floor(at[-1])) + 1
+            own = np.full((height, last - first + 1), np.nan)
+            self._lay(layer, own, first, top, metres_per_unit)
+            found = _between(own, at - first)
+            out = np.where(np.isnan(found), out, found)
+        return out
+
+    def _lay(self, layer: Layer, out: Array, left: int, top: int, metres_per_unit: float) -> None:
+        """Write the heights of a layer over `out`, whose first sample is the column `left` and the row `top` of it."""
+        height, width = out.shape
+        for part, column in layer.within(left, top, width, height):
+            west, east = max(left, column), min(left + width, column + part.shape[1])
+            north, south = max(top, part.row), min(top + height, part.row + part.shape[0])
+            window = west - column, north - part.row, east - west, south - north
+            found = self._opened(part.samples).read(*window, metres_per_unit)
+            place = out[north - top : south - top, west - left : east - left]
+            np.copyto(place, found, where=~np.isnan(found))
+
+    def _held(self) -> OrderedDict[int, Samples]:
+        if not hasattr(self._local, "held"):
+            self._local.held = OrderedDict()
+        return self._local.held
+
+    def _opened(self, samples: Samples) -> Samples:
+        """Return samples, and let go of the file that this thread has not read for the longest time."""
+        held = self._held()
+        held[id(samples)] = samples
+        held.move_to_end(id(samples))
+        if len(held) > _OPEN_FILES:
+            held.popitem(last=False)[1].close()
+        return samples
+
+
+def _between(own: Array, at: Array) -> Array:
+    """Interpolate rows linearly at columns `at`; a void counts only where its weight is not zero."""
+    low = np.floor(at).astype(int)
+    part = at - low
+    # Places that are a column but for rounding are that column.
+    nearest = np.rint(at)
+    exact = np.abs(at - nearest) < 1e-6
+    low, part = np.where(exact, nearest, low).astype(int), np.where(exact, 0.0, part)
+    high = np.minimum(low + 1, own.shape[1] - 1)
+    return np.where(part > 0, own[:, low] * (1 - part) + own[:, high] * part, own[:, low])
+
+
+# -- laying out ------------------------------------------------------------------------------------------------------
+
+
+def open_mosaic(name: str, paths: Sequence[str], access: Mapping[str, Any]) -> DemMosaic:
+    """Return many files as one DEM; where two have a height, the later one counts.
+
+    Parameters
+    ----------
+    name : str
+        What the whole is called in messages.
+    access : mapping
+        What `raster.open_pixels` may do for it.
+
+    Raises
+    ------
+    CrsError
+        If they have several horizontal systems, or no grid holds them all.
+    DatumError
+        If they say different things of what their heights are measured above, or of their unit.
+    InputError
+        If one cannot be read.
+    """
+    samples = [DemFile(path, access) for path in paths]
+    placed: list[tuple[Samples, pyproj.CRS, SampleGrid, str]] = []
+    for one in samples:
+        placed.append((one, *one.place(), one.unit))
+        one.close()
+    return laid_out(name, placed)
+
+
+def laid_out(name: str, placed: Sequence[tuple[Samples, pyproj.CRS, SampleGrid, str]]) -> DemMosaic:
+    """Return samples, each with its full CRS, grid and unit, as one DEM: see `open_mosaic`."""
+    first, crs, grid, unit = placed[0]
+    for other, its_crs, its_grid, its_unit in placed[1:]:
+        _refuse_other_system(first, crs, grid, other, its_crs, its_grid)
+        if _datum(its_crs) != _datum(crs) or its_unit != unit:
+            raise DatumError(
+                f"this file has {_said(its_crs, its_unit)}, and {first.path} has {_said(crs, unit)}: they are not one "
+                "DEM", file=other.path, field="height datum",
+                remedy="leave one of the two out, or bring them to one datum and unit (gdalwarp -t_srs)",
+            )  # fmt: skip
+    grids = [grid for _, _, grid, _ in placed]
+    whole = _whole_grid(name, grids)
+    layers: dict[float, list[tuple[Samples, SampleGrid]]] = {}
+    for samples, _, own, _ in placed:
+        steps = [step for step in layers if abs(own.crs_from_pixel[1] / step - 1) < 1e-6]
+        layers.setdefault(steps[0] if steps else own.crs_from_pixel[1], []).append((samples, own))
+    # The finest last: it counts where it has heights.
+    made = (_layer(whole, layers[step]) for step in sorted(layers, key=abs, reverse=True))
+    return DemMosaic(name, crs, whole, unit, tuple(made))
+
+
+def _refuse_other_system(
+    first: Samples, crs: pyproj.CRS, grid: SampleGrid, other: Samples, its_crs: pyproj.CRS, its_grid: SampleGrid
+) -> None:
+    if not its_grid.crs.equals(grid.crs):
+        raise CrsError(
+            f"this file is in {its_crs.name!r}, and {first.path} in {crs.name!r}", file=other.path, field="CRS",
+            remedy=_WARP,
+        )  # fmt: skip
+    (_, a, b, _, c, d), (_, own_a, own_b, _, own_c, own_d) = grid.crs_from_pixel, its_grid.crs_from_pixel
+    if b or c or own_b or own_c or abs(own_d / d - 1) > 1e-6 or own_a * a < 0:
+        raise CrsError(
+            f"the rows of this file do not have the direction and spacing of those of {first.path}", file=other.path,
+            field="geotransform", remedy=_WARP,
+        )  # fmt: skip
+
+
+def _datum(crs: pyproj.CRS) -> tuple[object, object] | None:
+    declared = declared_vertical(crs)
+    return None if declared is None else (declared.vertical or declared.name, declared.metres_per_unit)
+
+
+def _said(crs: pyproj.CRS, unit: str) -> str:
+    declared: DeclaredVertical | None = declared_vertical(crs)
+    return f"heights in {declared.name if declared else 'a datum that it does not say'!r} ({unit or 'no unit'})"
+
+
+def _whole_grid(name: str, grids: Sequence[SampleGrid]) -> SampleGrid:
+    """Return the grid over all grids: from the first sample in x and y to the last ones, with the finest columns."""
+    dx = min((grid.crs_from_pixel[1] for grid in grids), key=abs)
+    dy = grids[0].crs_from_pixel[5]
+    x = min((grid.crs_from_pixel[0] for grid in grids), key=lambda value: value * np.sign(dx))
+    y = min((grid.crs_from_pixel[3] for grid in grids), key=lambda value: value * np.sign(dy))
+    ends = ((g.crs_from_pixel[0] - x) / dx + (g.shape[1] - 1) * g.crs_from_pixel[1] / dx for g in grids)
+    right = max(math.floor(end + _OFF_GRID) for end in ends)
+    bottom = max(round((g.crs_from_pixel[3] - y) / dy) + g.shape[0] for g in grids)
+    columns = right + 1
+    if grids[0].crs.is_geographic and columns * abs(dx) > _CIRCLE - 1.5 * max(abs(g.crs_from_pixel[1]) for g in grids):
+        # The last samples of coarse cells lie before the end of a circle that these cells close.
+        columns = round(_CIRCLE / abs(dx))
+    size = bottom * columns
+    if not 0 < size <= 1e13:
+        raise CrsError(f"these files span {bottom} x {columns} samples", file=name, field="extent", remedy=_WARP)
+    return replace(grids[0], shape=(bottom, columns), crs_from_pixel=(x, dx, 0.0, y, 0.0, dy))
+
+
+def _layer(whole: SampleGrid, members: Sequence[tuple[Samples, SampleGrid]]) -> Layer:
+    """Return parts of one spacing as a layer of the whole."""
+    x, dx, _, y, _, dy = whole.crs_from_pixel
+    step = members[0][1].crs_from_pixel[1]
+    west = min((grid.crs_from_pixel[0] for _, grid in members), key=lambda value: value * np.sign(step))
+    # Columns that are those of the whole are counted in it, whatever rounding says of the spacing.
+    fine = abs(step / dx - 1) < 1e-6
+    first, width = (x, dx) if fine else (west, step)
+    parts = []
+    for samples, grid in members:
+        column, row = (grid.crs_from_pixel[0] - first) / width, (grid.crs_from_pixel[3] - y) / dy
+        if max(abs(column - round(column)), abs(row - round(row))) > _OFF_GRID:
+            raise CrsError(
+                "this file lies between the samples of the others", file=samples.path, field="geotransform",
+                remedy=_WARP,
+            )  # fmt: skip
+        parts.append(Part(samples, round(column), round(row), grid.shape))
+    circle = round(_CIRCLE / abs(step)) if whole.crs.is_geographic else 0
+    closed = whole.crs.is_geographic and abs(whole.shape[1] * dx) > _CIRCLE - 1e-9
+    return Layer(tuple(parts), (first - x) / dx, 1.0 if fine else step / dx, circle, closed)

@@ -1,0 +1,150 @@
+"""A DEM in many files is the DEM that GDAL's mosaic of them is, and what does not belong together is refused."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from osgeo import gdal, osr
+
+from ortho_pipeline.commands import rectify
+from ortho_pipeline.errors import CrsError, DatumError, InputError
+from ortho_pipeline.options import SurfaceOptions
+from ortho_pipeline.surface.base import Surface
+
+gdal.UseExceptions()
+#: Samples from one degree to the next in this test's cells.
+ROWS = 20
+
+
+def terrain(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+    """Heights that are linear in longitude between any samples, so that interpolation has one right answer."""
+    return 500 + 3 * lon + 40 * np.sin(5 * np.deg2rad(lat))
+
+
+def write_cell(
+    folder: Path, lon: int, lat: int, columns: int = ROWS, crs: str = "EPSG:4326", unit: str = "",
+    heights: np.ndarray | None = None, shift: float = 0.0,
+) -> Path:  # fmt: skip
+    """Write a cell as Copernicus does: the first sample on the north-west corner, without the east and south border."""
+    longitudes, latitudes = lon + np.arange(columns) / columns, lat + 1 - np.arange(ROWS) / ROWS
+    if heights is None:
+        heights = terrain(*np.meshgrid(longitudes, latitudes))
+    path = folder / f"cell_{'N' if lat >= 0 else 'S'}{abs(lat):02}_{'E' if lon >= 0 else 'W'}{abs(lon):03}.tif"
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), columns, ROWS, 1, gdal.GDT_Float32)
+    reference = osr.SpatialReference()
+    reference.SetFromUserInput(crs)
+    reference.SetAxisMappingStrategy(osr.OAMS_TRADITIONAL_GIS_ORDER)
+    dataset.SetSpatialRef(reference)
+    west, north = lon - 0.5 / columns + shift, lat + 1 + 0.5 / ROWS
+    dataset.SetGeoTransform((west, 1 / columns, 0, north, 0, -1 / ROWS))
+    band = dataset.GetRasterBand(1)
+    band.SetNoDataValue(-9999.0)
+    if unit:
+        band.SetUnitType(unit)
+    band.WriteArray(heights.astype(np.float32))
+    dataset = band = None
+    return path
+
+
+def test_many_files_are_the_dem_that_gdals_mosaic_of_them_is(tmp_path: Path) -> None:
+    holes = np.random.default_rng(1).uniform(0, 900, (ROWS, ROWS))
+    holes[3:6, 7:12] = -9999.0
+    paths = [write_cell(tmp_path, 30, 41), write_cell(tmp_path, 31, 41, heights=holes), write_cell(tmp_path, 31, 40)]
+    gdal.BuildVRT(str(tmp_path / "all.vrt"), [str(path) for path in sorted(paths)]).FlushCache()
+    one, many = (Surface.open(tmp_path / name, "ellipsoid", fill="mask") for name in ("all.vrt", "*.tif"))
+    # GDAL computes the spacing of a mosaic from the first file's, which costs the last bit.
+    np.testing.assert_allclose(many.grid.crs_from_pixel, one.grid.crs_from_pixel, rtol=1e-15)
+    assert many.provenance["path"] == str(tmp_path / "*.tif")
+    windows = [(0, 0, *one.shape[::-1]), (-3, 15, 30, 12), (17, 1, 9, 38)]
+    for window in windows:
+        np.testing.assert_array_equal(many.window(*window), one.window(*window))
+    places = np.random.default_rng(2).uniform((29.9, 39.9), (32.1, 42.1), (500, 2))
+    np.testing.assert_allclose(many.heights(places), one.heights(places), rtol=1e-9)
+    again = pickle.loads(pickle.dumps(many))
+    np.testing.assert_array_equal(again.heights(places), many.heights(places))
+    assert set(many.file.files) == set(map(str, paths))
+
+
+def test_cells_that_are_wider_towards_the_poles_are_one_grid_of_the_finest_columns(tmp_path: Path) -> None:
+    """Rows of the wide cells are interpolated between their own samples, over the border of two of them too."""
+    for lon in (30, 31):
+        write_cell(tmp_path, lon, 49, 30)
+        write_cell(tmp_path, lon, 50, 20)
+    dem = Surface.open(tmp_path / "*.tif", "ellipsoid", fill="mask")
+    assert dem.shape == (40, 60)
+    v, u = np.mgrid[:40, :60]
+    lon, lat = dem.grid.lonlat(u.ravel().astype(float), v.ravel().astype(float))
+    found = dem.window(0, 0, 60, 40)
+    known = ~np.isnan(found)
+    # Beyond the last sample of a wide cell in the east there is nothing.
+    assert known.sum() == known.size - 20
+    np.testing.assert_allclose(found[known], terrain(lon, lat).reshape(40, 60)[known], atol=2e-4)
+    for window in ((13, 15, 20, 10), (29, 18, 2, 4)):
+        left, top, width, height = window
+        np.testing.assert_array_equal(dem.window(*window), found[top : top + height, left : left + width])
+
+
+def test_cells_on_both_sides_of_the_antimeridian_are_neighbours(tmp_path: Path) -> None:
+    east = write_cell(tmp_path, 179, 10, heights=np.full((ROWS, ROWS), 100.0))
+    west = write_cell(tmp_path, -180, 10, heights=np.full((ROWS, ROWS), 200.0))
+    assert east.name > west.name[:5]
+    dem = Surface.open(tmp_path / "*.tif", "ellipsoid", fill="mask").around(180.0)
+    places = np.array([[179.5, 10.5], [180.5, 10.5], [-179.5, 10.5], [179.975, 10.5]])
+    np.testing.assert_allclose(dem.heights(places), [100.0, 200.0, 200.0, 150.0])
+
+
+@pytest.mark.parametrize(
+    ("other", "error", "said"),
+    [
+        ({"crs": "EPSG:4326+5773"}, DatumError, "EGM96"),
+        ({"unit": "ft"}, DatumError, "'ft'|\\(ft\\)"),
+        ({"crs": "EPSG:4258"}, CrsError, "ETRS89"),
+        ({"shift": 0.02}, CrsError, "between the samples"),
+    ],
+)
+def test_what_is_not_one_dem_is_refused_by_the_name_of_the_file(
+    tmp_path: Path, other: dict[str, object], error: type[Exception], said: str
+) -> None:
+    write_cell(tmp_path, 30, 41)
+    odd = write_cell(tmp_path, 31, 41, **other)
+    with pytest.raises(error, match=said) as caught:
+        Surface.open(tmp_path / "*.tif", "ellipsoid")
+    assert caught.value.file == str(odd)
+    assert caught.value.remedy
+
+
+def test_a_pattern_without_files_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="0 files"):
+        Surface.open(tmp_path / "*.tif", "ellipsoid")
+
+
+def test_few_files_are_open_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for lon in range(10):
+        write_cell(tmp_path, lon, 0)
+    monkeypatch.setattr("ortho_pipeline.surface.mosaic._OPEN_FILES", 3)
+    dem = Surface.open(tmp_path / "*.tif", "ellipsoid", fill="mask")
+    whole = dem.window(0, 0, *dem.shape[::-1])
+    assert not np.isnan(whole).any()
+    opened = sum(hasattr(part.samples._local, "dataset") for part in dem.file.layers[0].parts)
+    assert opened <= 3
+
+
+def test_an_ortho_on_many_files_is_that_on_one_and_names_them_all(tiny: Any, tmp_path: Path) -> None:
+    folder = tmp_path / "cells"
+    folder.mkdir()
+    dem = gdal.Open(str(tiny.dem))
+    half = dem.RasterXSize // 2
+    for name, first, count in (("west", 0, half), ("east", half, dem.RasterXSize - half)):
+        gdal.Translate(str(folder / f"{name}.tif"), dem, srcWin=[first, 0, count, dem.RasterYSize])
+    orthos = []
+    for name, given in (("one", tiny.dem), ("many", folder / "*.tif")):
+        surface = SurfaceOptions(dem=str(given), vertical="ellipsoid")
+        made = rectify(tiny.image, tmp_path / name, surface=surface)
+        orthos.append(gdal.Open(str(made.files["ortho"])).ReadAsArray())
+        inputs = made.document["report"]["provenance"]["inputs"]
+    np.testing.assert_array_equal(*orthos)
+    assert {Path(one["path"]).name for one in inputs if one["role"] == "DEM"} == {"west.tif", "east.tif"}
