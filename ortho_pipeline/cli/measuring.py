@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import webbrowser
 from pathlib import Path
 
 import click
@@ -67,6 +66,8 @@ def measure(
             click.echo(f"Measuring at {address}")
             click.echo(f"Points: {session.output}. Ctrl-C ends.")
         if not no_browser:
+            import webbrowser
+
             webbrowser.open(address)
 
     serve(session, scene, ready, port)

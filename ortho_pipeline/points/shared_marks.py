@@ -33,12 +33,12 @@ def one_mark(points: HasGround) -> list[tuple[str, str]]:
 
     Of a crowd each point stands in one pair, with its nearest neighbour.
     """
-    from scipy.spatial import cKDTree
-
     plan = np.isfinite(points.ground[:, :2]).all(axis=1)
     place = np.nan_to_num(points.ground[plan])
     if len(place) < 2:
         return []
+    from scipy.spatial import cKDTree  # takes as long to load as a small scene to warp
+
     place = ground_transform(points.crs, "EPSG:4978")(place)
     index = np.flatnonzero(plan)[np.isfinite(place).all(axis=1)]
     place = place[np.isfinite(place).all(axis=1)]

@@ -14,7 +14,7 @@ from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import flat, metres, px
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import counted
-from ortho_pipeline.files.documents import json_value, record_of
+from ortho_pipeline.files.documents import json_value, made_of
 from ortho_pipeline.points.rows import ROLES
 from ortho_pipeline.report.adjustment_records import Rmse, is_known
 from ortho_pipeline.report.block_records import (
@@ -61,11 +61,11 @@ def build_report(
             facts={str(key): str(value) for key, value in start.scene.facts.items()},
             rpc=None if found is None else RpcRecord(exact=found.exact, max_error_px=found.max_error_px),
         )
-    adjustment, noted = record_of(BlockAdjustment, json_value(fit.to_json())), to_document(warnings)
+    adjustment, noted = made_of(BlockAdjustment, json_value(fit.to_json())), to_document(warnings)
     return BlockReport(
         images=images,
         adjustment=adjustment,
-        provenance=record_of(BlockProvenance, json_value(provenance)),
+        provenance=made_of(BlockProvenance, json_value(provenance)),
         warnings=tuple(noted["warnings"]),
         notices=tuple(noted["notices"]),
         headline=headline(adjustment),

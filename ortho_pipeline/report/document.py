@@ -27,7 +27,7 @@ from ortho_pipeline.estimation.fit import Fit, root_mean_square
 from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rmse_metres, viewing
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
-from ortho_pipeline.files.documents import DocumentError, json_position, json_value, record_of
+from ortho_pipeline.files.documents import DocumentError, json_position, json_value, made_of, record_of
 from ortho_pipeline.geodesy.crs import Vertical, crs_text, ground_transform
 from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
@@ -132,7 +132,7 @@ def build_report(
     seen = viewing(fit.model, scene.width, scene.height)
     heights, doubts = (None, []) if surface is None else _heights_of_points(fit, surface, seen)
     noted = to_document([*warnings, *doubts])
-    adjustment, rmse_m = _adjustment(fit, noted), record_of(RmsesOnGround, rmse_metres(fit))
+    adjustment, rmse_m = _adjustment(fit, noted), made_of(RmsesOnGround, rmse_metres(fit))
     matched = None if matching is None else matching_record(matching, fit)
     hull = control_hull(fit.points.image[fit.used], (scene.width, scene.height))
     return SceneReport(
@@ -142,15 +142,15 @@ def build_report(
         view_rmse=_view_rmse(fit),
         covariance=_covariances(fit, near),
         map_scale=_map_scale(fit, seen),
-        control_hull=None if hull is None else record_of(ControlHull, hull),
-        comparison=None if comparison is None else record_of(ComparisonRecord, json_value(comparison)),
+        control_hull=None if hull is None else made_of(ControlHull, hull),
+        comparison=None if comparison is None else made_of(ComparisonRecord, json_value(comparison)),
         matching=matched,
         heights=heights,
         surface=None if surface is None else _surface(surface, coverage),
         rpc=None if exported is None else RpcRecord(exact=exported.exact, max_error_px=exported.max_error_px),
         ortho=None if grid is None else _ortho(grid, warp),
         warp=None if warp is None else _warped(warp),
-        provenance=record_of(Provenance, json_value(provenance or {})),
+        provenance=made_of(Provenance, json_value(provenance or {})),
         warnings=tuple(noted["warnings"]),
         notices=tuple(noted["notices"]),
         headline=headline(
@@ -167,7 +167,7 @@ def _scene(scene: Scene, seen: Mapping[str, Any]) -> SceneRecord:
         "model_source": scene.model_source,
         "facts": json_value(scene.facts),
     }
-    return record_of(SceneRecord, {**known, **seen})
+    return made_of(SceneRecord, {**known, **seen})
 
 
 def _adjustment(fit: Fit, noted: Mapping[str, Any]) -> Adjustment:
@@ -179,18 +179,18 @@ def _adjustment(fit: Fit, noted: Mapping[str, Any]) -> Adjustment:
         point["residual_m"] = json_position(shifts[i])
         point["view_residual"] = json_position(views[i])
         point["height_m"] = json_value(fit.points.ground[i, 2])
-    return record_of(Adjustment, document)
+    return made_of(Adjustment, document)
 
 
 def _covariances(fit: Fit, near: float | None) -> Covariances:
     found = analyse_fit(fit, near=near)
-    return record_of(Covariances, {role: one and one.to_json() for role, one in found.items()})
+    return made_of(Covariances, {role: one and one.to_json() for role, one in found.items()})
 
 
 def _map_scale(fit: Fit, seen: Mapping[str, Any]) -> MapScaleRecord | None:
     pixels = seen["ground_pixel_m"]
     found = map_scale(fit, max(pixels) if pixels else None)
-    return None if found is None else record_of(MapScaleRecord, found.to_json())
+    return None if found is None else made_of(MapScaleRecord, found.to_json())
 
 
 def _view_rmse(fit: Fit) -> RmsesOfView:
@@ -208,7 +208,7 @@ def _view_rmse(fit: Fit) -> RmsesOfView:
 def _surface(surface: Surface, coverage: float | None) -> FlatGround | Dem:
     if isinstance(surface, FlatSurface):
         return FlatGround(coverage=coverage, constant_height=surface.height)
-    return record_of(Dem, {"coverage": coverage, **json_value(surface.provenance)})
+    return made_of(Dem, {"coverage": coverage, **json_value(surface.provenance)})
 
 
 def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> tuple[PointHeights | None, list[Notice]]:
@@ -259,7 +259,7 @@ def _ortho(grid: Grid, warp: WarpResult | None) -> OrthoRecord:
 
 def _warped(warp: WarpResult) -> WarpRecord:
     """Return what the warp did without how long it took: the same inputs make the same report, byte by byte."""
-    return record_of(WarpRecord, {name: value for name, value in asdict(warp).items() if name != "seconds"})
+    return made_of(WarpRecord, {name: value for name, value in asdict(warp).items() if name != "seconds"})
 
 
 def with_layers(

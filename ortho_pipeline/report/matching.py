@@ -12,7 +12,7 @@ from ortho_pipeline.display.numbers import metres, px, share
 from ortho_pipeline.errors import counted
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres
-from ortho_pipeline.files.documents import json_value, record, record_of
+from ortho_pipeline.files.documents import json_value, made_of, record
 from ortho_pipeline.report.adjustment_records import Adjustment, Count, Pair
 
 #: Code of the notice of an adjustment to matches: its figures are no absolute ones.
@@ -135,7 +135,7 @@ def matching_record(matching: Mapping[str, Any], fit: Fit) -> MatchingRecord:
     tested = {
         "relative": _tested(fit, fit.points.check & matched), "absolute": _tested(fit, fit.points.check & ~matched)
     }  # fmt: skip
-    return record_of(MatchingRecord, json_value({**matching, **tested}))
+    return made_of(MatchingRecord, json_value({**matching, **tested}))
 
 
 def is_relative(adjustment: Adjustment) -> bool:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ortho_pipeline.errors import InputError, counted, reads
 from ortho_pipeline.files import read_bounded, read_json
@@ -56,6 +55,8 @@ class Shot:
 
     def exterior(self) -> Array:
         """Return the perspective centre (m) and omega, phi, kappa (rad) in east, north, up: ``(6,)``."""
+        from scipy.spatial.transform import Rotation  # half of what all plugins together would take to load
+
         turn = Rotation.from_rotvec(self.rotation).as_matrix()
         # Its camera has y down and z forward.
         angles = angles_of_rotation(np.diag([1.0, -1.0, -1.0]) @ turn)

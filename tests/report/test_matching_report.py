@@ -17,7 +17,7 @@ from osgeo import gdal
 
 from ortho_pipeline.commands.control.matching import Matched, Search
 from ortho_pipeline.estimation.fit import Fit, fit
-from ortho_pipeline.files.documents import json_value, record_of
+from ortho_pipeline.files.documents import json_value, made_of, record_of
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.matching import REASONS, Matches
 from ortho_pipeline.imaging.matching.search import Level
@@ -118,6 +118,7 @@ def test_every_candidate_is_in_the_json_and_the_counts_agree(plain: Case) -> Non
     # What could not be measured has no score: null, not NaN.
     assert [one["score"] for one in matching["candidates"] if one["reason"] == "not measured"] == [None]
     assert json_value(record_of(SceneReport, document)) == document
+    assert repr(made_of(SceneReport, document)) == repr(record_of(SceneReport, document))
 
 
 def test_the_map_shows_each_match_once_where_it_is(plain: Case) -> None:

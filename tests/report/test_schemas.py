@@ -16,7 +16,7 @@ import pytest
 
 from ortho_pipeline import commands
 from ortho_pipeline.commands import block as blocks
-from ortho_pipeline.files.documents import json_value, record_of, schema_of
+from ortho_pipeline.files.documents import json_value, made_of, record_of, schema_of
 from ortho_pipeline.options import BlockOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.records import SceneReport
@@ -75,6 +75,15 @@ def test_real_reports_hold_what_their_schema_says(reports, of):
     name, document = reports[of]
     jsonschema.validate(document, json.loads((DOCS / name).read_text()), cls=jsonschema.Draft202012Validator)
     assert json_value(record_of(SCHEMAS[name][0], document)) == document
+
+
+@pytest.mark.parametrize("of", OF)
+def test_what_this_program_makes_becomes_the_record_that_a_checked_reading_gives(reports, of):
+    kind, document = SCHEMAS[reports[of][0]][0], reports[of][1]
+    # repr tells 1 from 1.0 and a list from a tuple, which compare alike or print alike.
+    assert repr(made_of(kind, document)) == repr(record_of(kind, document))
+    with pytest.raises(TypeError, match="surplus"):
+        made_of(kind, {**document, "surplus": 1})
 
 
 def test_errors_that_points_share_are_in_the_schema(reports):
