@@ -60,9 +60,27 @@ def record(kind: type[_T]) -> type[_T]:
     kind.__pydantic_config__ = {  # type: ignore[attr-defined]
         "extra": "forbid", "allow_inf_nan": False, "json_schema_serialization_defaults_required": True,
     }  # fmt: skip
-    # Made once for all of them: dataclass() would compile each anew, for half of the time that a report takes to load.
+    # Made once for all of them: dataclass() would compile each anew, for most of the time that a report takes to load.
     kind.__eq__, kind.__hash__, kind.__repr__ = _same, _hashed, _shown  # type: ignore[assignment, method-assign]
-    return dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)(kind)
+    kind.__init__, kind.__setattr__, kind.__delattr__ = _filled, _frozen, _frozen  # type: ignore[method-assign]
+    return dataclasses.dataclass(kw_only=True, init=False, eq=False, repr=False)(kind)
+
+
+def _filled(self: Any, **members: Any) -> None:
+    """Set the members of a record; those that are missing have their defaults."""
+    for field in dataclasses.fields(self):
+        if field.name not in members:
+            if field.default is not dataclasses.MISSING:
+                members[field.name] = field.default
+            elif field.default_factory is not dataclasses.MISSING:
+                members[field.name] = field.default_factory()
+    if wrong := members.keys() ^ {field.name for field in dataclasses.fields(self)}:
+        raise TypeError(f"{type(self).__name__}: missing or not known: {', '.join(sorted(wrong))}")
+    vars(self).update((field.name, members[field.name]) for field in dataclasses.fields(self))
+
+
+def _frozen(self: Any, name: str, *_: Any) -> None:
+    raise dataclasses.FrozenInstanceError(f"cannot change {name!r}")
 
 
 def _same(one: Any, other: object) -> Any:
