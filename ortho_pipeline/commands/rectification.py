@@ -100,7 +100,7 @@ def rectify(
         opened = adjusted.scene
         exported, complaints = _as_rpc(model)
         source = source_of(opened, image, scene, output)
-        budget, notes = layers.budget_of(placed, match, output)
+        budget, notes = layers.budget_of(placed, output)
         path = layers.ortho_of(placed, files, output, other_of(placed, source, scene, output))
         warped = _warp(model, exported, source, heights, grid, path, output, progress)
         accuracy = layers.write_layers(placed, budget, warped, files, output)
@@ -151,7 +151,7 @@ def check(
     sun_of(opened.facts, output)
     placed = place_scene(opened, points, scene, open_surface(surface, scene, output.memory), output, match)
     other_of(placed, source_of(placed.scene, image, scene, output), scene, output)
-    layers.budget_of(placed, match, output)
+    layers.budget_of(placed, output)
     return placed.to_json()
 
 

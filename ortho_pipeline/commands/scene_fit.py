@@ -242,14 +242,27 @@ def relative_to_reference(adjusted: Fit, match: MatchOptions) -> list[Notice]:
     count, control = int((adjusted.points.groups[adjusted.used] >= 0).sum()), int(adjusted.used.sum())
     if not count:
         return []
-    sigma = match.reference_sigma
+    sigma = float(adjusted.points.sigma_common[adjusted.used].max()) or match.reference_sigma
     part = "all control was matched" if count == control else f"{count} of {control} control points were matched"
-    floor = f"its own {metres(sigma)} per axis are the floor" if sigma else "how accurate that is was not stated"
+    common = adjusted.common_error
+    floor = "how accurate that is was not stated"
+    if sigma:
+        floor = f"its own {metres(sigma)} per axis are the floor of all residuals"
+    if common is not None:
+        floor += ", and in the sigmas of the parameters"
     text = (
         f"{part}: the accuracy is relative to the reference, and {floor}; an error that scene and reference have in "
         "common is not seen"
     )
-    return [Notice("relative-to-reference", text, reference_sigma_m=sigma, matched=count, control=control)]
+    if common is not None and common.value.any():
+        east, north = common.value * common.sigma
+        text += f"; the other points put the reference {east:+.2f} m along x and {north:+.2f} m along y"
+    return [
+        Notice(
+            "relative-to-reference", text, reference_sigma_m=sigma, matched=count, control=control,
+            in_sigmas=common is not None,
+        )
+    ]  # fmt: skip
 
 
 def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:

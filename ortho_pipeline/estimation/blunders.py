@@ -251,16 +251,21 @@ class Outlying:
         return {**asdict(self), "reason": self.reason}
 
 
-def outlying(solution: Solution, points: Points, used: np.ndarray) -> tuple[Outlying, ...]:
+def outlying(solution: Solution, points: Points, used: np.ndarray, common: Array | None = None) -> tuple[Outlying, ...]:
     """Return check points, and used control points, that contradict the fit; none without redundancy.
 
     A check point is tested with its own uncertainty and that of the model there; from five check points on their own
     (median) scatter is the scale where it is larger than sigma0, so that a model that is poor everywhere makes none of
     them an outlier. A control point is tested by its residual had it taken no part, against the sigma0 of the others.
+    `common` ``(P, P)`` is what the error that control points have in common leaves in the parameters: check points that
+    do not share it may lie off by it.
     """
     if solution.sigma0 is None:
         return ()
-    return (*_outlying_control(solution, points, used), *_outlying_checks(solution, points, float(solution.sigma0)))
+    return (
+        *_outlying_control(solution, points, used),
+        *_outlying_checks(solution, points, float(solution.sigma0), common),
+    )
 
 
 def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> list[Outlying]:
@@ -292,7 +297,7 @@ def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> l
     return found
 
 
-def _outlying_checks(solution: Solution, points: Points, sigma0: float) -> list[Outlying]:
+def _outlying_checks(solution: Solution, points: Points, sigma0: float, common: Array | None) -> list[Outlying]:
     from scipy.special import fdtrc
 
     usable = points.check & np.isfinite(solution.model.ground_to_image(points.ground)).all(axis=1)
@@ -312,6 +317,10 @@ def _outlying_checks(solution: Solution, points: Points, sigma0: float) -> list[
     if len(squares) >= _OWN_SCATTER and own > scale:
         # The median of n is about as certain as a mean square of half as many.
         scale, freedom = own, float(len(squares))
+    if common is not None:
+        apart = problem.points.sigma_common == 0
+        spread[apart] += (jacobian @ common @ jacobian.transpose(0, 2, 1))[apart] / scale
+        squares = squared_distances(standardised, spread)
     chances = fdtrc(2, freedom, squares / 2 / scale)
     expected = np.sqrt(scale * problem.errors.mean_square(spread))
     return [

@@ -15,7 +15,7 @@ import numpy as np
 
 from ortho_pipeline.display.notebook import fit_html
 from ortho_pipeline.display.notices import Notice, to_document
-from ortho_pipeline.errors import DegeneratePoints, InputError, counted
+from ortho_pipeline.errors import DegeneratePoints, InputError, ModelError, counted
 from ortho_pipeline.estimation.blunders import REJECTED_LIMIT, Outlying, find_blunders, outlying
 from ortho_pipeline.estimation.determinacy import (
     EXTRAPOLATION_WARNING,
@@ -26,6 +26,7 @@ from ortho_pipeline.estimation.determinacy import (
 )
 from ortho_pipeline.estimation.problem import Prior, Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
+from ortho_pipeline.estimation.spatial.common_error import CommonError
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors, shared_errors
 from ortho_pipeline.estimation.statistics import correlation_of, student_of, total_correlation_of
 from ortho_pipeline.files.documents import json_value
@@ -50,7 +51,8 @@ class Fit:
     `corner_ratio` tells how many times less certain the model is at a corner of the scene than a measured point.
     `outlying` are points that contradict the fit and were not left out: check points, and control points that the
     search for gross errors does not take for such. Where points have groups, `shared_errors` says what neighbours err
-    together, and `covariance` has grown by it.
+    together, and `covariance` has grown by it. Where they have an error in common, `common_error` is that, `covariance`
+    has its part, and `residuals` are what is left beside its estimate.
     """
 
     model: SensorModel
@@ -75,6 +77,7 @@ class Fit:
     corner_ratio: float = 0.0
     outlying: tuple[Outlying, ...] = ()
     shared_errors: SharedErrors | None = None
+    common_error: CommonError | None = None
 
     @property
     def reservations(self) -> tuple[str, ...]:
@@ -107,6 +110,11 @@ class Fit:
         return np.sqrt(np.diag(self.covariance))
 
     @property
+    def relative_covariance(self) -> Array:
+        """The covariance ``(P, P)`` without what an error leaves in the parameters that points have in common."""
+        return self.covariance if self.common_error is None else self.covariance - self.common_error.covariance
+
+    @property
     def correlation(self) -> Array:
         """Correlation matrix of the parameters ``(P, P)``."""
         return correlation_of(self.covariance)
@@ -118,8 +126,13 @@ class Fit:
 
     @property
     def student(self) -> tuple[Array, Array]:
-        """Student's t and two-sided p of the hypotheses that parameters are zero, each ``(P,)``."""
-        return student_of(self.values, self.covariance, self.degrees_of_freedom if self.sigma0 is not None else 0.0)
+        """Student's t and two-sided p of the hypotheses that parameters are zero, each ``(P,)``.
+
+        Relative to what points have in common: by how much a reference may be off says nothing for the delivered model.
+        """
+        return student_of(
+            self.values, self.relative_covariance, self.degrees_of_freedom if self.sigma0 is not None else 0.0
+        )
 
     @property
     def not_justified(self) -> tuple[str, ...]:
@@ -183,6 +196,7 @@ class Fit:
             "condition": json_value(self.condition),
             "corner_ratio": json_value(self.corner_ratio),
             **({} if self.shared_errors is None else {"shared_errors": self.shared_errors.to_json()}),
+            **({} if self.common_error is None else {"common_error": self.common_error.to_json()}),
         }
 
     def __repr__(self) -> str:
@@ -273,18 +287,26 @@ def fit(
     points = _placed(points, model)
     raw = points.image - model.ground_to_image(points.ground)
     known_bad = {points.ids.index(name): reason for name, reason in (exclude or {}).items() if name in points.ids}
-    problem, warnings = _posed(model, points, raw, priors, known_bad)
+    common = _common_error(model, points, raw, priors, robust=robust)
+    problem, warnings = _posed(model, _without(common, model, points), raw, priors, known_bad)
     keep, rejected, problem, strength = _searched(problem, points, ridge, robust=robust)
     solution = problem.solve(keep)
     if rejected:
         # A start that gross errors had a part in took those of the ground to move in directions of their making.
         solution = problem.started(solution.model).solve(keep)
+    if common is not None:
+        measured = replace(problem, points=points.select(problem.rows))
+        solution, common = common.settled(measured, keep, solution)
     ratio = corner_ratio_of(solution, points.source, strength)
     warnings += uncertain_edge(ratio) + unstable(solution, strength)
     used = np.zeros(len(points), dtype=bool)
     used[problem.rows[keep]] = True
-    found = _result(solution, points, used, raw, {**known_bad, **rejected}, warnings, name, strength, problem.priors)
-    return replace(found, corner_ratio=ratio, outlying=outlying(solution, points, used))
+    seen = _without(common, model, points)
+    found = _result(
+        solution, seen, used, raw, {**known_bad, **rejected}, warnings, name, strength, problem.priors, common
+    )
+    said = outlying(solution, seen, used, None if common is None else common.covariance)
+    return replace(found, points=points, corner_ratio=ratio, outlying=said)
 
 
 def gross_errors(
@@ -305,6 +327,30 @@ def gross_errors(
     problem, _ = _posed(model, points, points.image - model.ground_to_image(points.ground), priors, {})
     _, rejected, _, _ = _searched(problem, points, ridge, robust=True)
     return {points.ids[i]: reason for i, reason in sorted(rejected.items())}
+
+
+def _common_error(
+    model: SensorModel, points: Points, raw: Array, priors: Mapping[str, Prior] | None, *, robust: bool
+) -> CommonError | None:
+    """Return what control points have in common, with a start from those without it, or None."""
+    usable = points.control & np.isfinite(raw).all(axis=1)
+    common = CommonError.of(model, points, usable)
+    others = usable & (points.sigma_common == 0)
+    if common is None or not others.any():
+        return common
+    # Else the few that do not share it would look like gross errors among the many that do.
+    try:
+        first = fit(model, points.select(usable & ~others), priors=priors, robust=robust)
+    except (InputError, ModelError):
+        return common
+    return common.seen_by(first.model, points.select(others))
+
+
+def _without(common: CommonError | None, model: SensorModel, points: Points) -> Points:
+    """Return points as they were measured, but for what they have in common."""
+    if common is None or not common.value.any():
+        return points
+    return replace(points, image=points.image - common.offset(model, points))
 
 
 def _posed(
@@ -370,17 +416,19 @@ def _result(
     name: str | None,
     strength: float | None,
     priors: Mapping[str, Prior],
+    common: CommonError | None,
 ) -> Fit:
     predicted = solution.model.ground_to_image(points.ground)
     loo = np.full((len(points), 2), np.nan)
     loo[used] = solution.leave_one_out()
     sigma0 = solution.sigma0
-    shared = shared_errors(solution, points.image[used])
-    usual = solution.cofactors * (1.0 if sigma0 is None else sigma0**2)
+    shared = shared_errors(solution, points.image[used], common)
+    usual = common.cofactors(solution) if common is not None else solution.cofactors
+    covariance = usual * (1.0 if sigma0 is None else sigma0**2) if shared is None else shared[1]
     return Fit(
         model=solution.model,
         model_name=str(name or getattr(solution.model, "family", solution.model.kind)),
-        covariance=usual if shared is None else shared[1],
+        covariance=covariance if common is None else covariance + common.covariance,
         points=points,
         used=used,
         predicted=predicted,
@@ -397,6 +445,7 @@ def _result(
         ridge=strength,
         priors=priors,
         shared_errors=None if shared is None else shared[0],
+        common_error=common,
     )
 
 

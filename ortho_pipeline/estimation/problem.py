@@ -249,6 +249,10 @@ class Problem:
         """Their measurements ``(n, 2)`` px."""
         return self.points.image
 
+    def shifted(self, offset: Array) -> Problem:
+        """Return this problem with images moved by ``(n, 2)`` px."""
+        return replace(self, points=replace(self.points, image=self.points.image + offset))
+
     def with_ridge(self, ridge: Mapping[str, float]) -> Problem:
         """Return this problem with a pseudo-observation of zero for each of these parameters."""
         return replace(self, ridge=dict(ridge))

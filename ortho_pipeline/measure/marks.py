@@ -46,6 +46,7 @@ class Mark:
     covariance: tuple[float, float, float] | None = None
     sigma_xy: float = 0.0
     sigma_h: float = 0.0
+    sigma_common: float = 0.0
     group: int | None = None
     how: Literal["manual", "matched", "file"] = "manual"
     ground_from: Literal["reference", "typed", "file"] | None = None
@@ -94,7 +95,7 @@ def checked(mark: Mark) -> Mark:
             raise InputError("this is no place on Earth", field="ground", remedy="check the coordinates and their CRS")
     if mark.sigma_image is not None and not 1e-6 <= mark.sigma_image <= 1e6:
         raise InputError("a standard deviation is positive", field="sigma_image", remedy="give pixels")
-    for key in ("sigma_xy", "sigma_h"):
+    for key in ("sigma_xy", "sigma_h", "sigma_common"):
         if not 0 <= getattr(mark, key) <= 1e6:
             raise InputError("a standard deviation is not negative", field=key, remedy="give metres")
     if mark.covariance is not None:
@@ -147,6 +148,7 @@ class Marks:
             roles=np.array([mark.role for mark in used], dtype="<U7"), sigma_image=sigma,
             sigma_ground=np.array([[mark.sigma_xy] * 2 + [mark.sigma_h] for mark in used], dtype=float).reshape(-1, 3),
             crs=horizontal(parse_crs(GROUND_CRS)), source=source, covariance_image=covariance, groups=groups,
+            sigma_common=np.array([mark.sigma_common for mark in used], dtype=float),
         )  # fmt: skip
 
     def document(self, source: str) -> dict[str, Any]:
@@ -182,7 +184,7 @@ def marks_of(points: Points, at: str) -> list[Mark]:
             ground=point.ground if all(map(math.isfinite, point.ground)) else None,
             role=point.role,  # type: ignore[arg-type]
             sigma_image=None if more[k] else point.sigma_image, covariance=(column, row, both) if more[k] else None,
-            sigma_xy=max(point.sigma_ground[:2]), sigma_h=point.sigma_ground[2],
+            sigma_xy=max(point.sigma_ground[:2]), sigma_h=point.sigma_ground[2], sigma_common=point.sigma_common,
             group=point.group if point.group >= 0 else None, how="file", ground_from="file", at=at,
         )))  # fmt: skip
     return found

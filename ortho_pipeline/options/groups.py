@@ -427,7 +427,7 @@ class MatchOptions:
     reference_sigma: Annotated[
         float | None,
         Option(
-            "--reference-sigma", "Standard deviation of the reference's own places, in each axis.", "M",
+            "--reference-sigma", "Standard deviation of where the reference lies as a whole, in each axis.", "M",
             kind="number", above=0,
         ),
     ] = None  # fmt: skip

@@ -49,6 +49,7 @@ _ALIASES = {
         "var_col": "varcol",
         "var_row": "varrow",
         "cov_col_row": "covcolrow",
+        "sigma_common": "sigmacommon",
     }.items()
     for alias in aliases.split()
 }
@@ -244,7 +245,7 @@ def _row(
             return None
         role = role_of(found, path, of.column("status"))
     sigma = of.sigma("sigma_image", False)
-    covariance, group = read_image_errors(
+    covariance, group, common = read_image_errors(
         [of.plain(name) for name in CSV_ERRORS], path, [of.column(name) for name in CSV_ERRORS], sigma
     )
     return Row(
@@ -259,6 +260,7 @@ def _row(
         image_name=of.text(CSV_IMAGE) or None,
         covariance=covariance,
         group=group,
+        sigma_common=common,
     )
 
 

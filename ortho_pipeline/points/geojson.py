@@ -79,7 +79,7 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: C
         raise InputError(f"{short(name)} is not an id", file=path, field=f"{where}.properties.id")
     role = properties.get("role") or expected.role
     sigma_image = sigma("sigma_image", False)
-    covariance, group = read_image_errors(
+    covariance, group, common = read_image_errors(
         [properties.get(one) for one in CSV_ERRORS], path, [f"{where}.properties.{one}" for one in CSV_ERRORS],
         sigma_image,
     )  # fmt: skip
@@ -94,6 +94,7 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: C
         sigma_h=sigma("sigma_h", True),
         covariance=covariance,
         group=group,
+        sigma_common=common,
     )
     if "col" not in expected.needed:
         return [row]
@@ -155,4 +156,8 @@ def _error_properties(point: Point) -> dict[str, float]:
     found: dict[str, float] = {}
     if says_more(np.array([point.covariance_image]))[0]:
         found.update(zip(CSV_ERRORS[:3], (column, row, both), strict=True))
-    return {**found, CSV_ERRORS[3]: point.group} if point.group >= 0 else found
+    if point.group >= 0:
+        found[CSV_ERRORS[3]] = point.group
+    if point.sigma_common:
+        found[CSV_ERRORS[4]] = point.sigma_common
+    return found

@@ -1,4 +1,4 @@
-"""Errors of image measurements: covariance of a point, and groups of points that share errors.
+"""Errors of image measurements: covariance of a point, groups of points that share errors, what all have in common.
 
 A covariance that is the same in all directions says no more than a standard deviation, and is that one's square.
 """
@@ -114,6 +114,20 @@ def checked_groups(groups: ArrayLike | None, count: int) -> Index:
     return found.astype(np.int64)
 
 
+def checked_common(sigma: ArrayLike | None, count: int) -> Array:
+    """Return standard deviations ``(N,)`` m, 0 for points that have no error in common with others.
+
+    Raises
+    ------
+    InputError
+        If they are not so many numbers from 0 on.
+    """
+    found = np.zeros(count) if sigma is None else np.asarray(sigma, dtype=float)
+    if found.shape != (count,) or not ((found >= 0) & np.isfinite(found)).all():
+        raise InputError(f"sigma_common is {count} numbers (m), none negative", field="sigma_common")
+    return found
+
+
 def _refuse_impossible(covariance: Array, rows: Index) -> None:
     if not np.isfinite(covariance).all():
         k = int(np.flatnonzero(~np.isfinite(covariance).all(axis=(1, 2)))[0])
@@ -138,14 +152,14 @@ def _is_positive_definite(covariance: Array) -> NDArray[np.bool_]:
 
 def read_image_errors(
     values: Sequence[Any], path: str | os.PathLike[str], where: Sequence[str], sigma: float | None
-) -> tuple[tuple[float, float, float] | None, int | None]:
-    """Return variances and covariance of a measurement, and the group of its point; None for what is not given.
+) -> tuple[tuple[float, float, float] | None, int | None, float | None]:
+    """Return variances and covariance of a measurement, group and sigma_common of its point; None is not given.
 
     Parameters
     ----------
-    values : sequence of four
+    values : sequence of five
         Of `CSV_ERRORS`, as a file has them; None and empty text are not given.
-    where : sequence of four str
+    where : sequence of five str
         Where in the file each stands.
     sigma : float or None
         The standard deviation beside them, which has to agree.
@@ -157,8 +171,9 @@ def read_image_errors(
     """
     there = [value is not None and value != "" for value in values]
     group = _group(values[3], path, where[3]) if there[3] else None
+    common = sigma_of(values[4], path, where[4], zero=True) if there[4] else None
     if not any(there[:3]):
-        return None, group
+        return None, group, common
     if not all(there[:3]):
         missing = CSV_ERRORS[there[:3].index(False)]
         raise InputError(
@@ -179,7 +194,7 @@ def read_image_errors(
             f"sigma_image is {sigma:g}, and the covariance beside it has {derived:g}", file=path, field=where[0],
             remedy="leave sigma_image empty where a covariance is given",
         )  # fmt: skip
-    return (column, row, both), group
+    return (column, row, both), group, common
 
 
 def _group(value: Any, path: str | os.PathLike[str], where: str) -> int:
@@ -205,6 +220,11 @@ def covariance_of(rows: Sequence[Row], sigma: Array) -> Array:
 def groups_of(rows: Sequence[Row]) -> Index:
     """Return the groups ``(N,)`` of the rows of a file."""
     return np.array([-1 if row.group is None else row.group for row in rows], dtype=np.int64)
+
+
+def common_of(rows: Sequence[Row]) -> Array:
+    """Return the standard deviations ``(N,)`` m of what points have in common, of the rows of a file."""
+    return np.array([row.sigma_common or 0.0 for row in rows], dtype=np.float64)
 
 
 def sigmas_of(rows: Sequence[Row], default: float) -> Array:

@@ -28,8 +28,8 @@ ROLES = ("control", "check", "tie")
 CSV_COLUMNS = ("id", "col", "row", "x", "y", "h", "role", "sigma_image", "sigma_xy", "sigma_h")
 #: Column of a CSV of several images: the file that a point was measured in.
 CSV_IMAGE = "image"
-#: Columns of points whose errors differ with the direction, or are shared with those of neighbours.
-CSV_ERRORS = ("var_col", "var_row", "cov_col_row", "group")
+#: Columns of points whose errors differ with the direction, or are shared with those of neighbours, or with all.
+CSV_ERRORS = ("var_col", "var_row", "cov_col_row", "group", "sigma_common")
 
 
 class Columns(NamedTuple):
@@ -56,7 +56,7 @@ OWN_IMAGE: Placement = (0.0, 0.0, 1.0)
 class Point(NamedTuple):
     """One of the points of a table, in its units; `image` and `sigma_image` in px, sigmas of the ground in metres.
 
-    `covariance_image` (px^2) and `group` are those of its measurement, as in `Points`.
+    `covariance_image` (px^2) and `group` are those of its measurement, as in `Points`, and so is `sigma_common`.
     """
 
     id: str
@@ -67,6 +67,7 @@ class Point(NamedTuple):
     sigma_ground: tuple[float, float, float]
     covariance_image: tuple[tuple[float, float], tuple[float, float]]
     group: int
+    sigma_common: float
 
 
 @dataclass(slots=True)
@@ -88,6 +89,7 @@ class Row:
     piece: Placement = OWN_IMAGE
     covariance: tuple[float, float, float] | None = None
     group: int | None = None
+    sigma_common: float | None = None
 
     def __post_init__(self) -> None:
         if self.id is not None:

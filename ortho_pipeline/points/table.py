@@ -32,8 +32,10 @@ from ortho_pipeline.points.formats import read_table
 from ortho_pipeline.points.geojson import feature_of
 from ortho_pipeline.points.ground import ground_of
 from ortho_pipeline.points.image_errors import (
+    checked_common,
     checked_covariance,
     checked_groups,
+    common_of,
     covariance_of,
     groups_of,
     reconciled,
@@ -89,6 +91,9 @@ class Points:
     groups : ndarray (N,) of int, optional
         -1 is a point that errs on its own, as one that was measured by hand; points of one number from 0 on share
         errors, as matched neighbours do.
+    sigma_common : ndarray (N,), optional
+        Standard deviation in metres, per axis in plan, of an error of the ground that all points with one have in
+        common, as matches have that of their reference; 0 without. No number of points makes it less.
     """
 
     ids: tuple[str, ...]
@@ -101,6 +106,7 @@ class Points:
     source: str
     covariance_image: Array = None  # type: ignore[assignment]  # filled below, as `groups` is
     groups: NDArray[np.int64] = None  # type: ignore[assignment]
+    sigma_common: Array = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         count = len(self.ids)
@@ -118,6 +124,7 @@ class Points:
         object.__setattr__(self, "sigma_image", sigma)
         object.__setattr__(self, "covariance_image", covariance)
         object.__setattr__(self, "groups", checked_groups(self.groups, count))
+        object.__setattr__(self, "sigma_common", checked_common(self.sigma_common, count))
         roles = np.asarray(self.roles, dtype="<U7")
         if roles.shape != (count,) or not np.isin(roles, ROLES).all():
             raise InputError(f"each point has one role of {', '.join(ROLES)}", field="roles")
@@ -136,12 +143,12 @@ class Points:
     def __iter__(self) -> Iterator[Point]:
         columns = self.image.tolist(), self.ground.tolist(), self.roles.tolist()
         sigmas = self.sigma_image.tolist(), self.sigma_ground.tolist()
-        errors = self.covariance_image.tolist(), self.groups.tolist()
-        for name, image, ground, role, sigma, sigma_ground, both, group in zip(
+        errors = self.covariance_image.tolist(), self.groups.tolist(), self.sigma_common.tolist()
+        for name, image, ground, role, sigma, sigma_ground, both, group, common in zip(
             self.ids, *columns, *sigmas, *errors, strict=True
         ):
             covariance = tuple(both[0]), tuple(both[1])
-            yield Point(name, tuple(image), tuple(ground), role, sigma, tuple(sigma_ground), covariance, group)
+            yield Point(name, tuple(image), tuple(ground), role, sigma, tuple(sigma_ground), covariance, group, common)
 
     @property
     def __geo_interface__(self) -> dict[str, Any]:
@@ -184,6 +191,7 @@ class Points:
             sigma_ground=self.sigma_ground[index],
             covariance_image=self.covariance_image[index],
             groups=self.groups[index],
+            sigma_common=self.sigma_common[index],
         )
 
     def with_covariance_image(self, covariance: ArrayLike, groups: ArrayLike | None = None) -> Points:
@@ -273,6 +281,7 @@ def read_points(
         source=os.fspath(path),
         covariance_image=covariance_of(table.rows, sigma_image),
         groups=groups_of(table.rows),
+        sigma_common=common_of(table.rows),
     )
 
 
@@ -433,6 +442,8 @@ def _error_columns(points: Points) -> dict[str, list[str]]:
             found[name] = [repr(value) if there else "" for value, there in zip(values, more, strict=True)]
     if (points.groups >= 0).any():
         found[CSV_ERRORS[3]] = [str(group) if group >= 0 else "" for group in points.groups.tolist()]
+    if points.sigma_common.any():
+        found[CSV_ERRORS[4]] = [repr(sigma) if sigma else "" for sigma in points.sigma_common.tolist()]
     return found
 
 

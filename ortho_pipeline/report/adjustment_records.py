@@ -110,6 +110,19 @@ class Parameter:
 
 
 @record
+class CommonError:
+    """An error that points have in common, as matches that of their reference, per axis of the map in metres.
+
+    `estimate_m` is what other points tell of it, and `estimate_sigma_m` what that leaves.
+    """
+
+    points: Count
+    sigma_m: float
+    estimate_m: Pair
+    estimate_sigma_m: Pair
+
+
+@record
 class Statistics:
     """Tests of the parameters; ridge is the regularisation, condition that of the design."""
 
@@ -124,6 +137,7 @@ class Statistics:
     ridge: float | None
     condition: float | None
     corner_ratio: float | None = None
+    common_error: CommonError | None = None
 
 
 @record

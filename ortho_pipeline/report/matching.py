@@ -111,7 +111,8 @@ class MatchingRecord:
         if self.reference_sigma_m is None:
             return "How accurate the reference itself is was not stated; it is not in the figure."
         return (
-            f"The reference's own {metres(self.reference_sigma_m)} per axis are not in the figure: they are its floor."
+            f"The reference's own {metres(self.reference_sigma_m)} per axis are not in the figure, of which they are "
+            "the floor; the sigmas of the parameters and the raster of accuracy have them."
         )
 
     def absolute_text(self) -> str | None:

@@ -154,7 +154,7 @@ def surveyed(case: Case, count: int = 6) -> op.Points:
 
 def test_measured_points_see_what_matches_cannot(moved: Case, tmp_path: Path) -> None:
     op.write_points(surveyed(moved), tmp_path / "survey.csv")
-    words = ("--gcps", tmp_path / "survey.csv", "--reference-sigma", 2)
+    words = ("--gcps", tmp_path / "survey.csv", "--reference-sigma", 2, "--accuracy-raster")
     done = matched(moved, "rectify", "-o", tmp_path / "out", "-of", "GTiff", *words)
     assert done.exit_code == 0, done.output
     report = json.loads((tmp_path / "out" / "scene_report.json").read_text())
@@ -170,6 +170,11 @@ def test_measured_points_see_what_matches_cannot(moved: Case, tmp_path: Path) ->
         assert rmse["check"]["total"] > 10 * rmse["matched"]["total"]
     assert report["view_rmse"]["check"]["n"] == report["covariance"]["check"]["n"] == 6
     assert matching["relative"]["m"] < 0.3
+    # The 2 m are in the sigmas of the shift, once, and in the raster of accuracy, once.
+    shifts = [report["adjustment"]["parameters"][name]["sigma"] for name in ("col_shift", "row_shift")]
+    assert np.hypot(*shifts) == pytest.approx(2 * np.sqrt(2), rel=0.05)
+    assert np.hypot(*report["accuracy"]["sigma_m"]) == pytest.approx(2 * np.sqrt(2), rel=0.05)
+    assert report["accuracy"]["shares"]["reference"] > 0.9
     head = report["headline"]
     assert "relative to the reference" in head["what"]
     assert any(note.startswith("Absolute: ") and "6 measured points" in note for note in head["notes"])
@@ -195,6 +200,21 @@ def test_measured_points_control_if_the_user_says_so(moved: Case, tmp_path: Path
     assert notice["control"] - notice["matched"] == sum(
         one["used"] for one in found["points"][:6]
     )  # those that contradict the many are left out, and named
+
+
+def test_measured_points_say_where_a_reference_lies_whose_sigma_is_stated(moved: Case, tmp_path: Path) -> None:
+    op.write_points(surveyed(moved), tmp_path / "survey.csv")
+    words = ("--gcps", tmp_path / "survey.csv", "--gcps-as", "control", "--select", "even:4", "--json")
+    found = document(matched(moved, "fit", *words, "--reference-sigma", 4))
+    said = found["statistics"]["common_error"]
+    np.testing.assert_allclose(said["estimate_m"], (5.0, -3.0), atol=0.2)
+    assert max(said["estimate_sigma_m"]) < 0.2
+    assert not {"m0", "m1", "m2", "m3", "m4", "m5"} & {one["id"] for one in found["rejected"]}
+    assert found["rmse"]["check"]["n"] == 2
+    assert found["rmse"]["check"]["total"] < 0.3
+    notice = next(one for one in found["notices"] if one["code"] == "relative-to-reference")
+    assert notice["in_sigmas"]
+    assert "along x" in notice["text"]
 
 
 def test_of_many_points_the_worst_are_printed(case: Case, written_points: tuple[Path, dict]) -> None:

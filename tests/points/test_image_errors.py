@@ -36,13 +36,14 @@ def made(count: int = 6, seed: int = 0) -> Points:
     half = random.normal(0, 1, (count, 2, 2))
     covariance[some] = (half @ half.transpose(0, 2, 1) + 1e-3 * np.eye(2))[some]
     groups = np.where(random.random(count) < 0.5, -1, random.integers(0, 9, count))
-    return plain.with_covariance_image(covariance, groups)
+    return replace(plain.with_covariance_image(covariance, groups), sigma_common=np.where(groups >= 0, 1.7, 0.0))
 
 
 def assert_same(one: Points, other: Points) -> None:
     np.testing.assert_array_equal(one.covariance_image, other.covariance_image)
     np.testing.assert_array_equal(one.sigma_image, other.sigma_image)
     np.testing.assert_array_equal(one.groups, other.groups)
+    np.testing.assert_array_equal(one.sigma_common, other.sigma_common)
 
 
 def test_a_point_without_a_covariance_errs_alike_in_all_directions_and_on_its_own() -> None:
@@ -123,6 +124,7 @@ def test_covariances_and_groups_are_read_as_they_were_written(
 def test_files_say_no_more_than_there_is_to_say(tmp_path: Path) -> None:
     points = made()
     plain = replace(points, covariance_image=points.sigma_image[:, None, None] ** 2 * np.eye(2), groups=None)
+    plain = replace(plain, sigma_common=None)
     write_points(plain, tmp_path / "plain.csv")
     write_points(plain, tmp_path / "plain.geojson")
     assert "sigma_h\n" in (tmp_path / "plain.csv").read_text()
@@ -132,16 +134,16 @@ def test_files_say_no_more_than_there_is_to_say(tmp_path: Path) -> None:
     assert "sigma_h,group,image\n" in (tmp_path / "groups.csv").read_text()
     assert read_points(tmp_path / "groups.csv").groups.tolist() == [3, -1, -1, -1, -1, -1]
     write_points(points, tmp_path / "all.csv")
-    assert "sigma_h,var_col,var_row,cov_col_row,group\n" in (tmp_path / "all.csv").read_text()
+    assert "sigma_h,var_col,var_row,cov_col_row,group,sigma_common\n" in (tmp_path / "all.csv").read_text()
     kept = {field.name for field in dataclasses.fields(points)}
     assert {"covariance_image", "groups"} <= kept
 
 
-HEADER = "id,col,row,x,y,h,sigma_image,var_col,var_row,cov_col_row,group\n"
+HEADER = "id,col,row,x,y,h,sigma_image,var_col,var_row,cov_col_row,group,sigma_common\n"
 
 
 def read(path: Path, cells: str) -> Points:
-    path.write_text(HEADER + f"a,1,2,24,-33,100,{cells}\n")
+    path.write_text(HEADER + f"a,1,2,24,-33,100,{cells}{'' if cells.count(',') == 5 else ','}\n")
     return read_points(path, crs="EPSG:4326", vertical="ellipsoid")
 
 
@@ -169,6 +171,8 @@ def test_a_covariance_needs_no_scalar_beside_it(tmp_path: Path) -> None:
         (",,,,-1", "column group"),
         (",,,,1e30", "column group"),
         (",,,,cell", "column group"),
+        (",,,,,-1", "column sigma_common"),
+        (",,,,,metres", "column sigma_common"),
     ],
 )
 def test_bad_covariances_and_groups_in_files_are_named(tmp_path: Path, cells: str, field: str) -> None:
@@ -186,6 +190,7 @@ def test_bad_covariances_in_geojson_are_named(tmp_path: Path) -> None:
         ({"var_col": 1.0, "var_row": 1.0, "cov_col_row": True}, "cov_col_row"),
         ({"group": [1]}, "group"),
         ({"group": -1}, "group"),
+        ({"sigma_common": -2.0}, "sigma_common"),
     ):
         one = document["features"][0]
         bare = {key: value for key, value in one["properties"].items() if key in ("id", "ji")}

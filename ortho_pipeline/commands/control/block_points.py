@@ -20,6 +20,7 @@ from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import Vertical, parse_crs
 from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, SurfaceOptions, numbers_of
@@ -125,7 +126,9 @@ def _refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: 
 
 
 def _relative(sigma: float | None) -> Notice:
-    floor = f"its own {metres(sigma)} per axis are the floor" if sigma else "how accurate that is was not stated"
+    floor = "how accurate that is was not stated"
+    if sigma:
+        floor = f"its own {metres(sigma)} per axis are the floor of that"
     text = (
         f"all control was matched: accuracy is relative to the reference, and {floor}; an error that images and "
         "reference have in common is not seen, and the sigmas know nothing of errors that neighbouring matches share"
@@ -146,9 +149,12 @@ def _matches(scenes: Any, match: MatchOptions, surface: Any, opened: SceneOption
             notices.append(Notice("no-matches", f"not matched with the reference: {error.message}").in_image(label))
             continue
         points = found.matches.points
+        # A block weighs each match by all that it may be off by; it knows of nothing that points have in common.
+        plan = metre_partials(scene.model, points.ground)[0] * points.sigma_common[:, None, None]
         tables[label] = replace(
-            points, ids=tuple(f"{label} {name}" for name in points.ids), sigma_ground=np.full((len(points), 3), _EXACT)
-        )
+            points.with_covariance_image(points.covariance_image + plan @ plan.transpose(0, 2, 1)),
+            ids=tuple(f"{label} {name}" for name in points.ids), sigma_ground=np.full((len(points), 3), _EXACT),
+        )  # fmt: skip
         notices += [notice.in_image(label) for notice in found.notices]
         document[label] = found.to_json()
         text.append(f"{label}: {counted(len(points), 'match', 'matches')} with the reference")

@@ -105,7 +105,7 @@ def _joined(surveyed: Points, matches: Points) -> Points:
         ids=(*surveyed.ids, *(prefix + name for name in matches.ids)), image=both("image"), ground=both("ground"),
         roles=both("roles"), sigma_image=both("sigma_image"), sigma_ground=both("sigma_ground"), crs=matches.crs,
         source=f"{surveyed.source}, {matches.source}", covariance_image=both("covariance_image"),
-        groups=np.concatenate([surveyed.groups, groups]),
+        groups=np.concatenate([surveyed.groups, groups]), sigma_common=both("sigma_common"),
     )  # fmt: skip
 
 

@@ -14,12 +14,13 @@ from ortho_pipeline.commands.placement import Placement
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.files import write_text
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import RPC, ImageCorrection, Pieces, SensorModel
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options import MatchOptions, OutputOptions
+from ortho_pipeline.options import OutputOptions
 from ortho_pipeline.report.document import accuracy_style
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.surface.base import Surface
@@ -39,15 +40,19 @@ _OTHER_GEOID = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Known:
-    """What is known of the errors, and in words what is not and what is assumed."""
+    """What is known of the errors, and in words what is not and what is assumed.
+
+    `common` is the variance on the ground (m², both axes) that the covariance of the parameters has of the reference.
+    """
 
     budget: Budget
     unknown: tuple[str, ...]
     assumptions: tuple[str, ...]
     adjusted: bool
+    common: float = 0.0
 
 
-def budget_of(placed: Placement, match: MatchOptions, output: OutputOptions) -> tuple[Known | None, list[Notice]]:
+def budget_of(placed: Placement, output: OutputOptions) -> tuple[Known | None, list[Notice]]:
     """Return what is known of the errors of an ortho, None where nobody asks, and what there is to say about it.
 
     Raises
@@ -63,10 +68,10 @@ def budget_of(placed: Placement, match: MatchOptions, output: OutputOptions) -> 
     covariance = _covariance(placed)
     stated = None if covariance is not None else stated_accuracy(placed.model)
     datum = 0.0 if surface.sigma is None else _datum(surface)
-    shared, shared_unknown = _shared(fit.warnings, placed.scene.adjusted, match)
-    budget = Budget(covariance=covariance, stated=stated, heights=surface.sigma, datum=datum, reference=shared)
+    apart, unstated = _reference(fit.warnings, placed.scene.adjusted)
+    budget = Budget(covariance=covariance, stated=stated, heights=surface.sigma, datum=datum, reference=apart)
     unknown = [name for name, missing in (("model", not budget.knows_model), ("heights", surface.sigma is None),
-                                          ("reference", shared_unknown)) if missing]  # fmt: skip
+                                          ("reference", unstated)) if missing]  # fmt: skip
     if not budget.knows_model and surface.sigma is None:
         raise InputError(
             "nothing is known of the errors of this ortho: its model has no stated accuracy, and the heights have none",
@@ -78,7 +83,7 @@ def budget_of(placed: Placement, match: MatchOptions, output: OutputOptions) -> 
         assumed.append(
             f"pixels from {Path(output.fill_from).name} are as accurate as that is: the layer is of the others"
         )
-    known = Known(budget, tuple(unknown), tuple(assumed), covariance is not None)
+    known = Known(budget, tuple(unknown), tuple(assumed), covariance is not None, _common(placed))
     if not unknown:
         return known, []
     names = {"model": "the model", "heights": "the heights (`surface.sigma`)",
@@ -139,12 +144,28 @@ def _datum(surface: Surface) -> float:
     return _GEOIDS.get(surface.vertical.name, _OTHER_GEOID)
 
 
-def _shared(warnings: tuple[Notice, ...], before: Mapping[str, Any] | None, match: MatchOptions) -> tuple[float, bool]:
-    """Return the standard deviation (m) of a reference that points were matched with, and whether it is unknown."""
-    matched = any(one.code == "relative-to-reference" for one in warnings)
-    earlier = [one for one in (before or {}).get("notices", ()) if one.get("code") == "relative-to-reference"]
-    sigma = match.reference_sigma if matched else earlier[0].get("reference_sigma_m") if earlier else None
-    return float(sigma or 0.0), bool((matched or earlier) and not sigma)
+def _reference(warnings: tuple[Notice, ...], before: Mapping[str, Any] | None) -> tuple[float, bool]:
+    """Return what a reference that points were matched with may be off by beside what the parameters have of it.
+
+    Its standard deviation (m), and whether it is unknown.
+    """
+    said = [one.fields for one in warnings if one.code == "relative-to-reference"]
+    said += [one for one in (before or {}).get("notices", ()) if one.get("code") == "relative-to-reference"]
+    if not said:
+        return 0.0, False
+    sigma = said[0].get("reference_sigma_m")
+    return 0.0 if said[0].get("in_sigmas") else float(sigma or 0.0), not sigma
+
+
+def _common(placed: Placement) -> float:
+    """Return the variance (m², both axes) in the middle of the scene that control points have in common."""
+    fit, scene = placed.adjusted.fit, placed.scene
+    if fit.common_error is None:
+        return 0.0
+    middle = fit.model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), fit.model.reference_height)
+    there = np.linalg.pinv(metre_partials(fit.model, middle)[0][0])
+    spread = there @ fit.model.param_partials(middle)[0] @ fit.common_error.gain
+    return float((spread**2).sum()) if np.isfinite(spread).all() else 0.0
 
 
 def _assumptions(budget: Budget, surface: Surface) -> list[str]:
@@ -203,10 +224,12 @@ def _record(found: AccuracyResult, known: Known, step: int) -> AccuracyLayer:
     stated = 0.0 if known.adjusted or not budget.stated else budget.stated**2
     part = stated / (stated + budget.reference**2) if even else 0.0
     by = "points" if known.adjusted else "model"
+    common = min(known.common / max(sum(sigma**2 for sigma in found.sigma), 1e-300), shares["model"])
     return AccuracyLayer(
         ce90_m=found.ce90, range_m=found.quantiles, sigma_m=found.sigma,
         shares={
-            by: shares["model"] + even * part, "heights": shares["heights"], "reference": even * (1.0 - part),
+            by: shares["model"] - common + even * part, "heights": shares["heights"],
+            "reference": even * (1.0 - part) + common,
             "interpolation": shares["interpolation"],
         },
         unknown=known.unknown, known=found.known, assumptions=known.assumptions, cell=found.cell * step,

@@ -1,1 +1,1 @@
-"""Errors that neighbours share, and what they do to the parameters of a fit."""
+"""Errors that points share, with neighbours or with all, and what they do to the parameters of a fit."""

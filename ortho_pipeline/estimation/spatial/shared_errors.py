@@ -3,7 +3,7 @@ r"""What neighbouring points err together, and what it does to the parameters of
 Matched points share the errors of the DEM and of the reference with their neighbours: of whitened errors :math:`u` of
 points with a group, along each of two axes, :math:`\mathrm{cov}(u_i, u_j) = \sigma_n^2 \delta_{ij} + \sigma_s^2
 k(d_{ij} / c)`. With whitened design :math:`A` and cofactors :math:`Q`, the covariance of the parameters of a weighted
-fit is then :math:`Q A^T \Sigma A Q` (sandwich), not :math:`\sigma_0^2 Q`.
+fit is then :math:`L^T \Sigma L` with the influences :math:`L = A Q` (sandwich), not :math:`\sigma_0^2 Q`.
 
 Residuals hide the part that the model absorbs. So the function is estimated by restricted likelihood, which looks only
 at what no value of the parameters can explain, in the means over cells of a twelfth of the extent: the parameters feel
@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.estimation.problem import Solution
+from ortho_pipeline.estimation.spatial.common_error import CommonError
 from ortho_pipeline.models.base import Array
 
 #: Fewer points with groups, or degrees of freedom, say nothing of a function: each group then counts as one point.
@@ -75,7 +76,9 @@ class SharedErrors:
         return asdict(self)
 
 
-def shared_errors(solution: Solution, image: Array) -> tuple[SharedErrors, Array] | None:
+def shared_errors(
+    solution: Solution, image: Array, common: CommonError | None = None
+) -> tuple[SharedErrors, Array] | None:
     """Return what neighbours share and the covariance ``(P, P)`` of the parameters; None where no point has a group.
 
     Parameters
@@ -84,6 +87,8 @@ def shared_errors(solution: Solution, image: Array) -> tuple[SharedErrors, Array
         With redundancy.
     image : (n, 2)
         Its points, px.
+    common : CommonError, optional
+        What the points have in common; its own part of the covariance is not in what is returned.
     """
     rows = np.flatnonzero(solution.groups >= 0)
     if not len(rows) or solution.sigma0 is None or not len(solution.cofactors):
@@ -93,21 +98,22 @@ def shared_errors(solution: Solution, image: Array) -> tuple[SharedErrors, Array
     residuals = solution.errors.whitened(solution.residuals)[rows]
     shift = solution.errors.whitened(np.broadcast_to(np.eye(2), (len(solution.groups), 2, 2)))
     groups = len(np.unique(solution.groups[rows]))
-    usual = variance * solution.cofactors
-    scene = _Scene.of(image[rows], residuals, np.concatenate([design, shift[rows]], axis=2))
+    own, usual = design @ solution.cofactors, variance * solution.cofactors
+    if common is not None:
+        own, usual = common.influence(solution)[rows], variance * common.cofactors(solution)
+    scene = _Scene.of(image[rows], residuals, np.concatenate([design, own, shift[rows]], axis=2))
     if scene is None:
         # All that is known is who shares: a group is one point.
         effective = float(len(solution.groups) - len(rows) + groups)
         return SharedErrors(len(rows), groups, effective), usual * max(len(rows) / groups, 1.0)
     middle, likely = scene.middle(variance)
     count = design.shape[2]
-    sandwich = solution.cofactors @ middle[:count, :count] @ solution.cofactors
-    covariance = usual + _positive(sandwich, usual)
+    covariance = usual + _positive(middle[count : 2 * count, count : 2 * count], usual)
     # The same for a shift alone, of all points: those on their own count as they are.
     normal = np.einsum("nij,nik->jk", shift, shift)
     inverse = np.linalg.inv(normal)
     total = variance * inverse
-    grown = total + _positive(inverse @ middle[count:, count:] @ inverse, total)
+    grown = total + _positive(inverse @ middle[2 * count :, 2 * count :] @ inverse, total)
     effective = len(solution.groups) * float(np.trace(total) / np.trace(grown))
     return SharedErrors(len(rows), groups, effective, *likely), covariance
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ortho_pipeline.errors import InputError, TooFewPoints, counted
 from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.geodesy.crs import parse_crs
-from ortho_pipeline.geodesy.ellipsoid import units_per_metre
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
 from ortho_pipeline.imaging.matching.chip_search import (
     FEWEST,
@@ -78,7 +77,7 @@ class MatchSettings:
     dem_sigma : float
         Standard deviation (m) of the DEM's heights.
     reference_sigma : float
-        Standard deviation (m) per axis of the reference's own places.
+        Standard deviation (m) per axis of the place of the reference as a whole.
     threads : int
     memory : int
         Bytes that are meant for all of the work, of which GDAL's cache has a part.
@@ -367,10 +366,6 @@ class _Tried:
         # Of the heights' errors the residuals show what differs from place to place; a stated sigma is the least.
         parts = replace(self.components, height=max(self.components.height, settings.dem_sigma))
         covariance = parts.covariance(self.covariance[good], partials[:, :, 2])
-        if settings.reference_sigma > 0:
-            spread = settings.reference_sigma * units_per_metre(parse_crs(self.view.model.crs), self.ground[good])
-            plan = partials[:, :, :2] * spread[:, None, :2]
-            covariance = covariance + plan @ plan.transpose(0, 2, 1)
         groups, roles = held_out(self.centres[good])
         delivered = np.full(self.offset.shape, np.nan)
         delivered[good] = self.view.model.ground_to_image(self.ground[good]) - self.centres[good]
@@ -380,6 +375,7 @@ class _Tried:
             ids=tuple(f"m{cell}" for cell in self.cells[good]), image=self.centres[good], ground=self.ground[good],
             roles=roles, sigma_image=sigma_of_covariance(covariance), sigma_ground=np.zeros((len(good), 3)), crs=crs,
             source=f"matched with {names}", covariance_image=covariance, groups=groups,
+            sigma_common=np.full(len(good), settings.reference_sigma),
         )  # fmt: skip
         return Matches(
             self.centres, delivered, self.score, self.reason, self.cells, self.scene, self.target, self.found,

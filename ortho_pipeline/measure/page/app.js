@@ -183,7 +183,7 @@ const decimal = (id) => {
 };
 
 /** The members of a mark that the server knows. */
-const plain = (mark) => Object.fromEntries(['id', 'image', 'ground', 'role', 'off', 'sigma_image', 'covariance', 'sigma_xy', 'sigma_h', 'group', 'how', 'ground_from', 'score', 'note']
+const plain = (mark) => Object.fromEntries(['id', 'image', 'ground', 'role', 'off', 'sigma_image', 'covariance', 'sigma_xy', 'sigma_h', 'sigma_common', 'group', 'how', 'ground_from', 'score', 'note']
   .filter((key) => mark[key] !== undefined).map((key) => [key, mark[key]]));
 
 const act = safely(async (action) => { const next = await ask('act', { action }); show(next); return next; });

@@ -12,7 +12,7 @@ moves per metre of height), the covariance of the place that it really shows is
   adjusted :math:`\sigma^2 I` on the ground, as its vendor states;
 - :math:`\beta`: the bound of the warp's interpolation (px), taken as the limits of an even distribution;
 - :math:`\sigma_h, \sigma_0`: standard deviations of the heights and of their datum;
-- :math:`\sigma_r`: of the places of a reference that points were matched with.
+- :math:`\sigma_r`: of the place of a reference that points were matched with, where :math:`C_p` does not have it.
 
 Assumed is that these are independent, that the model follows the scene but for its parameters, and that the slope of
 the terrain is small against that of the ray. The parts are interpolated between nodes that are exact, to `_TOLERANCE`.
@@ -72,7 +72,7 @@ class Budget:
     datum : float
         Standard deviation (m) of the datum of the heights.
     reference : float
-        Standard deviation (m, per axis) of what all points have in common.
+        Standard deviation (m, per axis) of what all points have in common, beside what the covariance has of it.
     interpolation_px : float
         Bound on the warp's error (px).
     """

@@ -1,0 +1,172 @@
+r"""An error that many points have in common, as matches have that of their reference, in an adjustment.
+
+The ground of such points is off by one unknown vector, in units of its standard deviation :math:`c \sim N(0, I)` (x and
+y of the map). Nothing within these points shows it: what it moves them by in the image is taken to be what the
+parameters can follow, :math:`A \Pi c`, with :math:`\Pi` the least-squares fit of the parameters to a shift of one
+standard deviation. So it is one more pair of unknowns, which only points without it, and prior knowledge of the
+parameters, tell anything of. With whitened design :math:`A`, cofactors :math:`Q`, and :math:`U = A \Pi` for the
+points that share it and 0 for others,
+
+.. math::
+    S = I + U^T U - U^T A Q A^T U, \quad G = Q A^T U S^{-1}, \quad
+    C = \sigma_0^2 (Q + G (S - I) G^T) + G G^T
+
+Points that all share it leave :math:`S = I`, :math:`G = \Pi`: it is added in full, whatever their number, and sigma0,
+which is of what differs from point to point, does not scale it.
+
+Source: Koch 1999, section 3.2 (elimination of unknowns) and 3.6 (mixed model).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.estimation.problem import Problem, Solution
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.geodesy.ellipsoid import units_per_metre
+from ortho_pipeline.models.base import Array, SensorModel, solve_2x2
+from ortho_pipeline.points import Points
+
+#: The estimate stands when it moves by less than this (standard deviations); the model is nearly linear in it.
+_STANDS, _ROUNDS = 1e-4, 5
+#: Other points that put the reference farther off than so many of its sigmas contradict it: they do not correct it.
+_BELIEVED = 4.0
+#: Information that is less than this part of what it is the rest of.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class CommonError:
+    """What some points have in common, and what the others tell of it.
+
+    Parameters
+    ----------
+    sigma : float
+        Its standard deviation per axis, m: the largest, where points state several.
+    points : int
+        Control points that share it.
+    per_sigma : (P, 2)
+        What the parameters follow it by, per standard deviation along each axis.
+    value : (2,)
+        Its estimate, in standard deviations: how far the ground of these points lies from the truth along x and y of
+        the map; 0 where nothing tells of it.
+    told : (2, 2)
+        Information of other points and of priors on it; that of its own standard deviation is I.
+    gain : (P, 2)
+        What it leaves in the parameters.
+    shares : (n,) of bool
+        Which points of the last solution share it.
+    """
+
+    sigma: float
+    points: int
+    per_sigma: Array
+    value: Array
+    told: Array
+    gain: Array
+    shares: np.ndarray
+
+    @classmethod
+    def of(cls, model: SensorModel, points: Points, used: np.ndarray) -> CommonError | None:
+        """Return that of points, in the CRS of the model, of which those in a mask ``(N,)`` control; None without."""
+        shares = used & (points.sigma_common > 0)
+        count = len(model.params)
+        if not shares.any() or not count:
+            return None
+        problem = Problem.of(model, points, shares, {})
+        units = units_per_metre(parse_crs(model.crs), problem.ground) * problem.points.sigma_common[:, None]
+        # Where ground is said to lie farther east than it does, it is seen farther west of where the model puts it.
+        moved = -problem.errors.whitened(model.ground_partials(problem.ground)[:, :, :2] * units[:, None, :2])
+        design = problem.errors.whitened(model.param_partials(problem.ground))
+        scale = np.maximum(np.linalg.norm(design, axis=(0, 1)), 1e-300)
+        found = np.linalg.lstsq((design / scale).reshape(-1, count), moved.reshape(-1, 2), rcond=1e-10)[0]
+        per_sigma = np.asarray(found / scale[:, None])
+        largest = float(problem.points.sigma_common.max())
+        everyone = np.ones(len(problem.rows), dtype=bool)
+        return cls(largest, len(everyone), per_sigma, np.zeros(2), np.zeros((2, 2)), per_sigma, everyone)
+
+    def offset(self, model: SensorModel, points: Points) -> Array:
+        """Return how far (px) it moves each of points ``(N, 2)``; 0 for those that do not share it."""
+        shares = points.sigma_common > 0
+        found = np.zeros((len(points), 2))
+        found[shares] = model.param_partials(points.ground[shares]) @ (self.per_sigma @ self.value)
+        return found
+
+    def seen_by(self, model: SensorModel, others: Points) -> CommonError:
+        """Return it as points without it see it, by their median, from a model that was adjusted to those with it.
+
+        For a start that gross errors do not spoil. If they put it beyond what its sigma allows, it stays 0.
+        """
+        miss = others.image - model.ground_to_image(others.ground)
+        moved = model.param_partials(others.ground) @ self.per_sigma
+        each = solve_2x2(moved, -miss)
+        each = each[np.isfinite(each).all(axis=1)]
+        value = np.median(each, axis=0) if len(each) else np.zeros(2)
+        return replace(self, value=value) if (np.abs(value) < _BELIEVED).all() else self
+
+    def settled(self, problem: Problem, keep: np.ndarray, solution: Solution) -> tuple[Solution, CommonError]:
+        """Return the solution with it as an unknown.
+
+        Parameters
+        ----------
+        problem : Problem
+            With the images as they were measured.
+        keep : (n,) of bool
+            The points that take part.
+        solution : Solution
+            With its present value.
+        """
+        found = replace(self, shares=problem.points.sigma_common[keep] > 0)
+        for _ in range(_ROUNDS):
+            design = solution.errors.whitened(solution.jacobian)
+            moved = found.moved(solution)
+            cross = np.einsum("nip,nik->pk", design, moved)
+            gain = solution.cofactors @ cross
+            told = _difference(np.einsum("nik,nil->kl", moved, moved), cross.T @ gain)
+            slope = np.einsum("nik,ni->k", moved, solution.errors.whitened(solution.residuals)) - found.value
+            step = np.linalg.solve(np.eye(2) + told, slope)
+            found = replace(found, told=told, gain=gain @ np.linalg.inv(np.eye(2) + told))
+            if np.abs(step).max() < _STANDS:
+                break
+            found = replace(found, value=found.value + step)
+            solution = problem.shifted(-found.offset(problem.model, problem.points)).solve(keep)
+        return solution, found
+
+    def moved(self, solution: Solution) -> Array:
+        """Return by how much one sigma of it moves the points of a solution ``(n, 2, 2)``, whitened."""
+        moved = solution.errors.whitened(solution.jacobian) @ self.per_sigma
+        return np.where(self.shares[:, None, None], moved, 0.0)
+
+    def cofactors(self, solution: Solution) -> Array:
+        """Return the cofactors ``(P, P)`` of the parameters, of what differs from point to point."""
+        return solution.cofactors + self.gain @ self.told @ self.gain.T
+
+    def influence(self, solution: Solution) -> Array:
+        """Return what each whitened observation does to the parameters ``(n, 2, P)``."""
+        design, moved = solution.errors.whitened(solution.jacobian), self.moved(solution)
+        cross = np.einsum("nip,nik->pk", design, moved)
+        left = moved - design @ (solution.cofactors @ cross)
+        return design @ solution.cofactors - left @ self.gain.T
+
+    @property
+    def covariance(self) -> Array:
+        """Its part ``(P, P)`` of the covariance of the parameters."""
+        return self.gain @ self.gain.T
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the section ``common_error`` of the statistics of a fit: sigmas and estimate per axis in metres."""
+        left = np.sqrt(np.diag(np.linalg.inv(np.eye(2) + self.told)))
+        return {
+            "points": self.points, "sigma_m": self.sigma, "estimate_m": (self.value * self.sigma).tolist(),
+            "estimate_sigma_m": (left * self.sigma).tolist(),
+        }  # fmt: skip
+
+
+def _difference(whole: Array, part: Array) -> Array:
+    """Return a symmetric matrix less a part of it, without what rounding made of it."""
+    values, vectors = np.linalg.eigh(whole - (part + part.T) / 2)
+    values[values < _ROUNDING * np.trace(whole)] = 0.0
+    return np.asarray((vectors * values) @ vectors.T)
