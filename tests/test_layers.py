@@ -68,7 +68,7 @@ GDAL_MODULES |= {
     "exchange.gcp",
     "exchange.export",
     "imaging.band_stack",
-    "warp.mosaic",
+    "warp.mosaic.writing",
     "warp.gdal_engine",
 }
 NUMBA_MODULES = {"files.compiled"}

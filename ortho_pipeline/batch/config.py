@@ -21,6 +21,7 @@ from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.options import (
     MatchOptions,
+    MosaicOptions,
     Option,
     OutputOptions,
     PointOptions,
@@ -133,16 +134,7 @@ class Entry(Settings):
         return self
 
 
-class MosaicSettings(_Strict):
-    """One raster of all scenes."""
-
-    format: Literal["VRT", "COG"] = "VRT"
-    order: Literal["best-view", "first-on-top", "most-accurate"] = Field(
-        default="best-view",
-        description="What lies on top: the scene that looks down most steeply, or the first; or at each pixel "
-        "the scene that is most accurate there, as their output.accuracy_raster says.",
-    )
-    seams: bool = Field(default=True, description="Measure how well the scenes agree where they overlap.")
+MosaicSettings = _settings("MosaicSettings", MosaicOptions)
 
 
 class Config(_Strict):
@@ -158,7 +150,7 @@ class Config(_Strict):
         "the command. Default: that one.",
     )
     defaults: Settings = Field(default=Settings(), description="What holds for all scenes.")
-    mosaic: MosaicSettings | None = None
+    mosaic: MosaicSettings | None = None  # type: ignore[valid-type]
 
 
 def schema() -> dict[str, Any]:

@@ -18,17 +18,25 @@ from typing import Any
 import pyproj
 
 from ortho_pipeline import plugins
-from ortho_pipeline.batch.config import Config, Entry, MosaicSettings, Settings, merged, read_config
+from ortho_pipeline.batch.config import Config, Entry, Settings, merged, read_config
 from ortho_pipeline.commands.inputs import OWN_POINTS
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import (
+    MatchOptions,
+    MosaicOptions,
+    OutputOptions,
+    PointOptions,
+    SceneOptions,
+    SurfaceOptions,
+)
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.surface.mosaic import matching_files
 
 #: Folder of records and locks within the output folder.
 STATE = ".run"
 #: Files of a run beside the folders of the scenes, by what they are.
-RUN_FILES = {"log": "run.jsonl", "summary": "run.json", "catalog": "catalog.json", "seams": "mosaic.json"}
+RUN_FILES = {"log": "run.jsonl", "summary": "run.json", "catalog": "catalog.json", "seams": "mosaic.json",
+             "page": "mosaic.html"}  # fmt: skip
 _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _NAME_BYTES = 150
 _WALKS, _PATTERN_BYTES = 2, 1000
@@ -92,7 +100,7 @@ class Plan:
     path: Path
     output: Path
     jobs: tuple[Job, ...]
-    mosaic: MosaicSettings | None = None
+    mosaic: MosaicOptions | None = None
 
     def chosen(self, only: Sequence[str] = (), shard: tuple[int, int] | None = None) -> tuple[Job, ...]:
         """Return the jobs of these names, or the k-th (from 1) of n parts.
@@ -166,7 +174,8 @@ class _Planner:
         jobs = [self._job(image, entries) for image, entries in found.items()]
         self._check_names(jobs)
         self._check_mosaic(jobs)
-        return Plan(self.path, self.output, tuple(jobs), self.config.mosaic)
+        settings = None if self.config.mosaic is None else MosaicOptions(**dict(self.config.mosaic))
+        return Plan(self.path, self.output, tuple(jobs), settings)
 
     # -- images ------------------------------------------------------------------------------------------------------
 

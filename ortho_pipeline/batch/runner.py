@@ -13,7 +13,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,11 +24,12 @@ from ortho_pipeline.batch.plan import RUN_FILES, STATE, Job, Plan, for_run, plan
 from ortho_pipeline.batch.records import Digests, FileState, Record, key_of, locked, siblings
 from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.mosaic.assembly import assemble
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
 from ortho_pipeline.options import EXECUTORS
 from ortho_pipeline.report.stac import write_catalog
-from ortho_pipeline.warp import mosaic
+from ortho_pipeline.warp.mosaic import Ortho, Overlap, measure_seam
 
 #: Larger files beside an image are not metadata.
 _COMPANION_BYTES = 5_000_000
@@ -358,7 +359,8 @@ class _Run:
         if not self.part:
             files["summary"] = self.planned.output / RUN_FILES["summary"]
         if made is not None and "file" in made:
-            files |= {"mosaic": Path(made["file"]), "seams": self.planned.output / RUN_FILES["seams"]}
+            files |= {"mosaic": Path(made["file"]), "seams": self.planned.output / RUN_FILES["seams"],
+                      "mosaic page": self.planned.output / RUN_FILES["page"]}  # fmt: skip
         result = BatchResult(ordered, files, time.monotonic() - self.begin, made)
         if not self.part:
             write_json(files["summary"], result.to_json())
@@ -382,10 +384,10 @@ class _Mosaic:
         assert planned.mosaic is not None
         self.output, self.settings = planned.output, planned.mosaic
         self.path = planned.output / f"mosaic.{'vrt' if self.settings.format == 'VRT' else 'tif'}"
-        self.report = planned.output / RUN_FILES["seams"]
+        self.report, self.page = planned.output / RUN_FILES["seams"], planned.output / RUN_FILES["page"]
         self.record = planned.output / STATE / "mosaic" / "record.json"
         self.orthos = [
-            mosaic.Ortho(
+            Ortho(
                 job.name, Path(outcomes[job.name].files["ortho"]), outcomes[job.name].facts["lean_m_per_m"],
                 _path_of(outcomes[job.name].files.get("accuracy")),
             )
@@ -400,7 +402,7 @@ class _Mosaic:
             if state.role in ("ortho", "accuracy")
         )
         order = {ortho.name: ortho.relief_displacement for ortho in self.orthos}
-        self.key = key_of(self.inputs, {**self.settings.model_dump(), "order": list(order.items())}, versions())
+        self.key = key_of(self.inputs, {**asdict(self.settings), "order": list(order.items())}, versions())
 
     def make(self, crew: Executor | Processes) -> dict[str, Any]:
         record = Record.read(self.record)
@@ -411,28 +413,20 @@ class _Mosaic:
                 if isinstance(document, dict):
                     return {**document, "status": "unchanged"}
         self.record.unlink(missing_ok=True)
-        placed = mosaic.lay_out(self.orthos, self.settings.order)
+        files = {"mosaic": self.path, "seams": self.report, "page": self.page}
         with together(self.output, "mosaic"):
-            if self.settings.format == "VRT":
-                mosaic.write_vrt(placed, self.path)
-            else:
-                mosaic.write_cog(placed, self.path)
-            document = {"file": str(self.path), **mosaic.summary(placed, self._seams(placed, crew))}
+            document = assemble(self.orthos, files, self.settings, measure=lambda pairs: self._seams(pairs, crew))
             write_json(self.report, document)
             if record is not None:
-                retire({self.output / one.path for one in record.outputs} - {self.path, self.report})
-        made = tuple(FileState.of(role, path, name=path.name) for role, path in
-                     (("mosaic", self.path), ("seams", self.report)))  # fmt: skip
+                retire({self.output / one.path for one in record.outputs} - set(files.values()))
+        made = tuple(FileState.of(role, path, name=path.name) for role, path in files.items())
         Record("mosaic", self.key, "done", self.inputs, made).write(self.record)
         return {**document, "status": "done"}
 
-    def _seams(self, placed: mosaic.Mosaic, crew: Executor | Processes) -> list[dict[str, Any]]:
-        if not self.settings.seams:
-            return []
-        pairs = mosaic.overlaps(placed)
+    def _seams(self, pairs: Sequence[Overlap], crew: Executor | Processes) -> list[dict[str, Any]]:
         # New processes for a few seams take longer than these.
         crew = Sequential() if isinstance(crew, Processes) and len(pairs) < _MANY_SEAMS else crew
-        found = {id(pair): future.result() for pair, future in completed(crew, mosaic.measure_seam, pairs)}
+        found = {id(pair): future.result() for pair, future in completed(crew, measure_seam, pairs)}
         return [found[id(pair)] for pair in pairs]
 
 

@@ -1,7 +1,8 @@
-"""The command `ortho run`: many scenes by a pipeline file."""
+"""The commands `ortho run`, many scenes by a pipeline file, and `ortho mosaic`, one raster of their orthos."""
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -10,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ortho_pipeline.cli.flags import as_typed
-from ortho_pipeline.cli.options import json_option
+from ortho_pipeline.cli.options import json_option, mosaic_options
 from ortho_pipeline.cli.parsing import Command, Megabytes
-from ortho_pipeline.cli.printing import print_json, progress
+from ortho_pipeline.cli.printing import print_json, print_result, progress
 from ortho_pipeline.errors import counted
-from ortho_pipeline.options import EXECUTORS
+from ortho_pipeline.options import EXECUTORS, MosaicOptions
 
 if TYPE_CHECKING:
     from ortho_pipeline.batch.plan import Plan
@@ -114,6 +115,25 @@ def run(
     return None
 
 
+@click.command(cls=Command)
+@click.argument("orthos", metavar="ORTHO...", nargs=-1, required=True, type=click.Path())
+@click.option(
+    "--output", "-o", type=click.Path(dir_okay=False), required=True, metavar="FILE",
+    help="The mosaic: .tif (a COG) or .vrt. Its record (.json) and its page (.html) lie beside it.",
+)  # fmt: skip
+@mosaic_options
+@json_option
+def mosaic(orthos: tuple[str, ...], output: str, mosaic: MosaicOptions, as_json: bool) -> None:
+    """Make one raster of ORTHOs that lie on one grid, and measure how well they agree.
+
+    Pixels are taken over, not resampled. What one ortho leaves empty another fills.
+    """
+    from ortho_pipeline.commands.mosaic.assembly import mosaic as command
+
+    options = dataclasses.replace(mosaic, format="VRT" if output.lower().endswith(".vrt") else "COG")
+    print_result(command(orthos, output, options), as_json)
+
+
 def _check(planned: Plan, only: Sequence[str], shard: tuple[int, int] | None, as_json: bool) -> None:
     """Print what stands in the way of each scene; exit as a run would if that were all."""
     from ortho_pipeline.batch import runner as batch
@@ -182,16 +202,11 @@ def _row(scene: Outcome) -> list[str]:
 
 def _mosaic_text(mosaic: Mapping[str, Any]) -> str:
     """Return what there is to say of a mosaic and its seams."""
+    from ortho_pipeline.report.mosaic.document import summary_text
+
     if mosaic.get("error"):
         return f"mosaic: {_error_text(mosaic['error'])}"
-    lines = [f"mosaic: {mosaic['size'][0]} x {mosaic['size'][1]} px of {counted(len(mosaic['on_top_first']), 'scene')}"]
-    if mosaic["seams"]:
-        text = f"seams: {mosaic['seams_measured']} of {len(mosaic['seams'])} measured"
-        if mosaic["worst_seam"]:
-            worst = mosaic["worst_seam"]
-            text += f", median {mosaic['median_seam_px']:.2f} px, worst {worst['px']:.2f} px"
-            text += f" ({worst['first']} and {worst['second']})"
-        lines.append(text)
+    lines = [summary_text(mosaic)]
     if mosaic["missing"]:
         lines.append(f"not in the mosaic: {', '.join(mosaic['missing'])}")
     return "\n".join(lines)

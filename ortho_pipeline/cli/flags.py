@@ -8,13 +8,15 @@ from collections.abc import Mapping
 import click
 
 from ortho_pipeline.errors import OrthoError
-from ortho_pipeline.options import GROUPS, options_of
+from ortho_pipeline.options import GROUPS, MosaicOptions, options_of
 
 _NAMED = re.compile(r"`([a-z_]+(?:\.[a-z_]+)?)(?:\.(\w+))?(?:=([^`]*))?`")
+#: Those of a scene, and of a mosaic.
+_GROUPS = {**GROUPS, "mosaic": MosaicOptions}
 #: Name of an option in messages -> its flag, where a command has it under that flag.
 FLAGS = {
     f"{group}.{name}": option.flags.split()[0]
-    for group, options in GROUPS.items()
+    for group, options in _GROUPS.items()
     for name, option in options_of(options).items()
 }
 
@@ -30,7 +32,7 @@ def flags_of(command: click.Command) -> dict[str, str]:
         group, _, field = str(one.name).partition("_")
         if not isinstance(one, click.Option):
             continue
-        if group in GROUPS and field:
+        if group in _GROUPS and field:
             found[f"{group}.{field}"] = one.opts[0]
         else:
             found[str(one.name)] = one.opts[0]

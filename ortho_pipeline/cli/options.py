@@ -16,6 +16,7 @@ from ortho_pipeline.cli.parsing import Megabytes, OneOrTwo
 from ortho_pipeline.options import (
     BlockOptions,
     MatchOptions,
+    MosaicOptions,
     Option,
     OutputOptions,
     PointOptions,
@@ -187,6 +188,8 @@ tie_options = _grouped("match", MatchOptions, "search", "points")
 dem_datum_options = _grouped("surface", SurfaceOptions, "vertical", "override_vertical")
 network_option = _grouped("scene", SceneOptions, "allow_network")
 output_options = _grouped("output", OutputOptions)
+#: The file says which format, and seams are always measured.
+mosaic_options = _grouped("mosaic", MosaicOptions, "order", "seamlines", "balance")
 
 image_argument = click.argument("image", type=click.Path())
 images_argument = click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())

@@ -15,7 +15,7 @@ from typing import Any
 
 import click
 
-from ortho_pipeline.cli.batch import run
+from ortho_pipeline.cli.batch import mosaic, run
 from ortho_pipeline.cli.block import adjust, intersect
 from ortho_pipeline.cli.matching import match, ties
 from ortho_pipeline.cli.measuring import measure
@@ -178,6 +178,7 @@ cli.add_command(intersect)
 cli.add_command(match)
 cli.add_command(ties)
 cli.add_command(measure)
+cli.add_command(mosaic)
 
 # -- commands --------------------------------------------------------------------------------------------------------
 

@@ -18,6 +18,7 @@ from ortho_pipeline.options.groups import (
     SceneOptions,
     SurfaceOptions,
 )
+from ortho_pipeline.options.mosaic import MosaicOptions
 from ortho_pipeline.options.option import (
     CORRECTIONS,
     EXECUTORS,
@@ -43,6 +44,7 @@ __all__ = [
     "BlockOptions",
     "Kind",
     "MatchOptions",
+    "MosaicOptions",
     "Option",
     "OutputOptions",
     "PathLike",

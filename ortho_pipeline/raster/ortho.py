@@ -115,6 +115,34 @@ def as_written(pixels: NDArray[Any], valid: NDArray[np.bool_], dtype: np.dtype[A
     return written
 
 
+def value_range(dtype: np.dtype[Any], profile: Profile) -> tuple[float, float, bool, Any]:
+    """Return lowest and highest value of the output type, whether it is an integer type, and the fill value."""
+    empty = 0 if dtype.kind in "iu" else math.nan
+    fill = dtype.type(empty if profile.nodata is None else profile.nodata)
+    if dtype.kind in "iu":
+        limits = np.iinfo(dtype)
+        return float(limits.min), float(limits.max), True, fill
+    return -math.inf, math.inf, False, fill
+
+
+def keep_off_nodata(out: NDArray[Any], valid: NDArray[np.bool_], fill: Any, low: float) -> None:
+    """Move valid pixels that happened to get the nodata value to the value beside it, for every kernel.
+
+    To the one that GDAL takes: of integers one less (one more for the least), of floating point the next. GDAL before
+    3.11 does so for integers that it interpolates only.
+    """
+    if np.isnan(fill):
+        return
+    for band, good in zip(out, valid, strict=True):
+        clash = (band == fill) & good
+        if clash.any():
+            if band.dtype.kind in "iu":
+                band[clash] = fill - 1 if fill > low else fill + 1
+            else:
+                greatest = np.finfo(band.dtype).max
+                band[clash] = np.nextafter(fill, greatest if fill < greatest else 0, dtype=band.dtype)
+
+
 def refuse_empty(valid_pixels: int, path: str | os.PathLike[str]) -> None:
     """Refuse an ortho none of whose pixels has a value.
 

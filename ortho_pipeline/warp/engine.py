@@ -26,7 +26,14 @@ from ortho_pipeline.exchange.rpc_fit import RpcExport
 from ortho_pipeline.files.process_limits import Resources, require_memory, startable_threads
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.raster.block_cache import limit_cache
-from ortho_pipeline.raster.ortho import Profile, RasterWriter, as_written, refuse_empty
+from ortho_pipeline.raster.ortho import (
+    Profile,
+    RasterWriter,
+    as_written,
+    keep_off_nodata,
+    refuse_empty,
+    value_range,
+)
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp import kernels
@@ -296,7 +303,7 @@ class _Job:
         )  # fmt: skip
         self.cubic_dem, self.window_bytes = cubic_dem, window_bytes
         self.profile = profile
-        self.resampling = kernels.Resampling(kernel, 0, (1.0, 1.0), *_range(source.dtype, profile))
+        self.resampling = kernels.Resampling(kernel, 0, (1.0, 1.0), *value_range(source.dtype, profile))
         self.any_band = profile.validity == "nodata" or profile.dtype.kind == "f"
         self._lock = threading.Lock()
         self.valid_pixels = 0
@@ -321,12 +328,12 @@ class _Job:
         classes, hidden = None, None
         if self.looked is not None:
             classes, hidden = self.looked.look(left, top, tile.pixels, tile.valid, self.resampling.fill)
-        low, _, _, fill = _range(self.profile.dtype, self.profile)
+        low, _, _, fill = value_range(self.profile.dtype, self.profile)
         out = as_written(tile.pixels, tile.valid, self.profile.dtype, fill)
         if self.looked is not None:
             self.looked.fill(left, top, hidden, out, tile.valid)
         if self.profile.validity == "nodata":
-            _keep_off_nodata(out, tile.valid, fill, low)
+            keep_off_nodata(out, tile.valid, fill, low)
         # NaN says for itself which band has no value; an integer cannot, so there a pixel needs all of its bands.
         mask = np.asarray((np.any if self.any_band else np.all)(tile.valid, axis=0))
         with self._lock:
@@ -401,31 +408,3 @@ def _wider(source: RasterSource, window: kernels.SourceWindow) -> kernels.Source
         min(source.width, window.left + width + 64),
         min(source.height, window.top + height + 64),
     )
-
-
-def _range(dtype: np.dtype[Any], profile: Profile) -> tuple[float, float, bool, Any]:
-    """Return lowest and highest value of the output type, whether it is an integer type, and the fill value."""
-    empty = 0 if dtype.kind in "iu" else math.nan
-    fill = dtype.type(empty if profile.nodata is None else profile.nodata)
-    if dtype.kind in "iu":
-        limits = np.iinfo(dtype)
-        return float(limits.min), float(limits.max), True, fill
-    return -math.inf, math.inf, False, fill
-
-
-def _keep_off_nodata(out: NDArray[Any], valid: NDArray[np.bool_], fill: Any, low: float) -> None:
-    """Move valid pixels that happened to get the nodata value to the value beside it, for every kernel.
-
-    To the one that GDAL takes: of integers one less (one more for the least), of floating point the next. GDAL before
-    3.11 does so for integers that it interpolates only.
-    """
-    if np.isnan(fill):
-        return
-    for band, good in zip(out, valid, strict=True):
-        clash = (band == fill) & good
-        if clash.any():
-            if band.dtype.kind in "iu":
-                band[clash] = fill - 1 if fill > low else fill + 1
-            else:
-                greatest = np.finfo(band.dtype).max
-                band[clash] = np.nextafter(fill, greatest if fill < greatest else 0, dtype=band.dtype)

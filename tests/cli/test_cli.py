@@ -193,7 +193,7 @@ COMMANDS = [
     "adjust a.tif b.tif --points c.csv -o out", "intersect a.tif b.tif --points c.csv", "run a.yaml",
     "simulate ikonos -o out", "reproduce bilsat", "register a.tif b.tif -o out", "dem-check a.tif --points b.csv",
     "match a.tif --reference b.tif --height 5 -o c.csv", "ties a.tif b.tif --height 5 -o c.csv",
-    "measure a.tif --reference b.tif --height 5 -o c.geojson",
+    "measure a.tif --reference b.tif --height 5 -o c.geojson", "mosaic a.tif b.tif -o c.tif",
 ]  # fmt: skip
 
 

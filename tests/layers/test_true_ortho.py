@@ -10,7 +10,7 @@ from scipy.ndimage import binary_dilation
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.warp import engine
 from ortho_pipeline.warp.layers.hiding import Hiding
-from ortho_pipeline.warp.mosaic import Ortho, lay_out, write_cog
+from ortho_pipeline.warp.mosaic import Ortho, lay_out, owners_of, write_cog
 
 #: Houses with streets between them, some of them narrow; each roof has a brightness of its own.
 BLOCK = City(tuple(
@@ -69,6 +69,12 @@ def test_two_opposite_views_show_all_of_a_block_and_nothing_twice(tmp_path):
     # Away from edges every pixel is what the ground truth has there, so no roof is shown a second time.
     clear = inner & ~edge & (found > 0)
     assert (found[clear] == truth[clear]).mean() > 0.9999
+    # Seams that move take nothing away, and show nothing twice either.
+    placed = lay_out(orthos)
+    write_cog(placed, tmp_path / "seams.tif", owners=owners_of(placed, None, seamlines=True))
+    moved = gdal.Open(str(tmp_path / "seams.tif")).ReadAsArray()
+    np.testing.assert_array_equal(moved > 0, found > 0)
+    assert (moved[clear] == truth[clear]).mean() > 0.9999
     plain = made(tmp_path, "plain", 270.0, surface, hide=False)
     twice = gdal.Open(str(plain.path)).ReadAsArray()
     assert (twice[clear] != truth[clear]).mean() > 0.02

@@ -23,8 +23,8 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
 from ortho_pipeline.raster.source import Grid, open_dataset
-from ortho_pipeline.warp import mosaic
-from ortho_pipeline.warp.mosaic import Ortho, lay_out, measure_seam, overlaps, write_cog, write_vrt
+from ortho_pipeline.report.mosaic.document import mosaic_document
+from ortho_pipeline.warp.mosaic import Ortho, lay_out, measure_seam, overlaps, write_cog, write_vrt, writing
 
 UTM = pyproj.CRS("EPSG:32635")
 SIDE = 700
@@ -98,7 +98,7 @@ def test_a_mosaic_larger_than_its_windows(tmp_path, landscape, monkeypatch):
     orthos = [cut(tmp_path, f"s{i}", landscape + 100 * i, 90 * i, 70 * i, 250, 230) for i in range(4)]
     placed = lay_out(orthos, "first-on-top")
     write_cog(placed, tmp_path / "one.tif")
-    monkeypatch.setattr(mosaic, "_WINDOW", 97)
+    monkeypatch.setattr(writing, "_WINDOW", 97)
     write_cog(placed, tmp_path / "many.tif")
     for one, many in zip(read(tmp_path / "one.tif"), read(tmp_path / "many.tif"), strict=True):
         np.testing.assert_array_equal(one, many)
@@ -149,7 +149,7 @@ def test_seams_without_detail_or_room(tmp_path, landscape):
     found = [measure_seam(pair) for pair in overlaps(placed)]
     assert [(seam["first"], seam["second"]) for seam in found] == [("a", "b"), ("a", "c"), ("b", "c")]
     assert all(seam["patches"] == 0 and seam["median_px"] is None for seam in found)
-    summary = mosaic.summary(placed, found)
+    summary = mosaic_document(placed, found)
     assert (summary["seams_measured"], summary["worst_seam"], summary["median_seam_px"]) == (0, None, None)
     json.dumps(summary, allow_nan=False)
 
@@ -213,6 +213,11 @@ def test_a_run_ends_in_a_mosaic(block):
     assert json.loads(report.read_text())["worst_seam"]["px"] > 2
     (block / "out" / "mosaic.vrt").unlink()
     assert batch.run(block / "p.yaml", executor="sequential").mosaic["status"] == "done"
+    (block / "p.yaml").write_text(FILE.replace("FORMAT", "COG, seamlines: true, balance: true"))
+    chosen = batch.run(block / "p.yaml", executor="sequential")
+    assert chosen.mosaic["balance"]["cells"] > 10
+    assert all(seam["after"] for seam in chosen.mosaic["seams"] if seam["before"])
+    assert "along the seams" in (block / "out" / "mosaic.html").read_text().lower()
     (block / "p.yaml").write_text(FILE.replace("FORMAT", "COG"))
     other = batch.run(block / "p.yaml", executor="sequential")
     assert other.mosaic["status"] == "done"

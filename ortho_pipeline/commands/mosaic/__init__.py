@@ -1,0 +1,1 @@
+"""Mosaics: orthos that share a grid in, one raster out."""

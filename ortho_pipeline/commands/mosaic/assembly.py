@@ -1,0 +1,156 @@
+"""`ortho mosaic`, and the mosaic of a run: orthos on one grid in; one raster, its record and its page out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ortho_pipeline.commands.inputs import refuse_changed
+from ortho_pipeline.commands.results import ENDINGS, Result
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import states, together, write_json
+from ortho_pipeline.files.process_limits import Resources
+from ortho_pipeline.options import MosaicOptions
+from ortho_pipeline.report.document import read_report
+from ortho_pipeline.report.mosaic.document import mosaic_document, summary_text
+from ortho_pipeline.report.mosaic.page import write_page
+from ortho_pipeline.warp.mosaic import (
+    Ortho,
+    Overlap,
+    along_seams,
+    balanced,
+    lay_out,
+    measure_seam,
+    overlaps,
+    owners_of,
+    write_cog,
+    write_vrt,
+)
+
+Measure = Callable[[Sequence[Overlap]], list[dict[str, Any]]]
+
+
+def mosaic(
+    orthos: Sequence[str | os.PathLike[str]],
+    path: str | os.PathLike[str],
+    options: MosaicOptions | None = None,
+    *,
+    resources: Resources | None = None,
+) -> Result:
+    """Make one raster of orthos that share a grid.
+
+    How each was seen is taken from its report beside it (`<stem>_report.json`), how accurate it is from
+    `<stem>_accuracy.tif`.
+
+    Parameters
+    ----------
+    path : path
+        Of the mosaic; its record and its page lie beside it.
+
+    Raises
+    ------
+    InputError
+        If an ortho is given twice or would be overwritten, and as `warp.mosaic.lay_out`.
+    """
+    paths, path = [Path(ortho) for ortho in orthos], Path(path)
+    files = {"mosaic": path, "seams": path.with_suffix(".json"), "page": path.with_suffix(".html")}
+    _check_paths(paths, files)
+    layers = [_ortho(one, name) for one, name in zip(paths, _names(paths), strict=True)]
+    begun = states([*paths, *(one.accuracy for one in layers if one.accuracy)])
+    with together(path.parent, path.stem):
+        document = assemble(layers, files, options or MosaicOptions(format="COG"), resources=resources)
+        write_json(files["seams"], document)
+        refuse_changed(begun)
+    return Result(files, {"mosaic": document}, summary_text(document))
+
+
+def _check_paths(orthos: Sequence[Path], files: Mapping[str, Path]) -> None:
+    if len(set(files.values())) < len(files):
+        raise InputError("record and page lie beside the mosaic under its name", file=files["mosaic"], field="output",
+                         remedy="let the name end in .tif or .vrt")  # fmt: skip
+    known = [ortho.resolve() for ortho in orthos]
+    for path in files.values():
+        if path.resolve() in known:
+            raise InputError("this path would be read and written", file=path, field="output", remedy="choose another")
+    for ortho in orthos:
+        if known.count(ortho.resolve()) > 1:
+            raise InputError("this ortho is given twice", file=ortho, field="orthos", remedy="name it once")
+
+
+def assemble(
+    orthos: Sequence[Ortho],
+    files: Mapping[str, Path],
+    options: MosaicOptions,
+    *,
+    resources: Resources | None = None,
+    measure: Measure | None = None,
+) -> dict[str, Any]:
+    """Write a mosaic and its page; return its document (docs/run.md), which the caller writes.
+
+    Parameters
+    ----------
+    files : mapping
+        `mosaic` and `page`.
+    measure : callable, optional
+        Measures all overlaps, as the processes of a run do; one after the other without.
+
+    Raises
+    ------
+    InputError
+        If what is asked for cannot be said in a VRT, and as the functions of `warp.mosaic`.
+    """
+    resources, placed = resources or Resources(), lay_out(orthos, options.order)
+    for field in ("seamlines", "balance"):
+        if options.format == "VRT" and getattr(options, field):
+            raise InputError("a VRT refers to pixels as they are", file=files["mosaic"], field=f"mosaic.{field}",
+                             remedy="make a COG, or leave it out")  # fmt: skip
+    pairs = overlaps(placed) if options.seams or options.balance else []
+    memory, threads = resources.memory, resources.threads or 1
+    balance = balanced(placed, pairs, memory=memory) if options.balance else None
+    owners, clamped = None, 0.0
+    if options.seamlines or options.balance:
+        owners = owners_of(placed, balance, seamlines=options.seamlines, memory=memory)
+    if options.format == "VRT":
+        write_vrt(placed, files["mosaic"])
+    else:
+        clamped = write_cog(
+            placed, files["mosaic"], owners=owners if options.seamlines else None, balance=balance, memory=memory,
+            threads=threads,
+        )  # fmt: skip
+    seams: list[dict[str, Any]] = []
+    if options.seams:
+        seams = [measure_seam(pair) for pair in pairs] if measure is None else measure(pairs)
+        if owners is not None:
+            before = along_seams(placed, owners.ordered, owners.cell, None, memory=memory)
+            after = along_seams(placed, owners.owners, owners.cell, balance, memory=memory)
+            seams = [{**seam, "before": _of(before, seam), "after": _of(after, seam)} for seam in seams]
+    document = {
+        "file": str(files["mosaic"]),
+        **mosaic_document(placed, seams, balance, owners if options.seamlines else None, clamped),
+    }
+    write_page(document, files["page"], files["mosaic"], owners)
+    return document
+
+
+def _of(found: Mapping[tuple[str, str], dict[str, Any]], seam: Mapping[str, Any]) -> dict[str, Any] | None:
+    return found.get((seam["first"], seam["second"]))
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Return names of orthos that tell them apart: their stems, with folders where these are alike."""
+    ending = Path(ENDINGS["ortho"]).stem
+    stems = [path.stem.removesuffix(ending) for path in paths]
+    if len(set(stems)) < len(stems):
+        stems = [f"{path.resolve().parent.name}/{stem}" for path, stem in zip(paths, stems, strict=True)]
+    if len(set(stems)) < len(stems):
+        stems = [str(path) for path in paths]
+    return stems
+
+
+def _ortho(path: Path, name: str) -> Ortho:
+    stem = path.stem.removesuffix(Path(ENDINGS["ortho"]).stem)
+    report, accuracy = (path.with_name(f"{stem}{ENDINGS[kind]}") for kind in ("report", "accuracy"))
+    seen = read_report(report).scene.lean_m_per_m if report.is_file() else None
+    return Ortho(name, path, seen, accuracy if accuracy.is_file() else None)

@@ -1,0 +1,1 @@
+"""Mosaics in the report: their document, words and page."""

@@ -1,0 +1,162 @@
+"""Orthos placed on their common grid, and which lies on top."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.raster.valid_area import grid_of
+
+#: Part of a pixel by which grids may differ: rounding of coordinates, no more.
+_SAME = 1e-3
+Box = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class Ortho:
+    """An orthoimage of a mosaic; `relief_displacement` is that of a metre of height (m), None where it is not known.
+
+    `accuracy` is the raster that `layers.accuracy` wrote of it.
+    """
+
+    name: str
+    path: Path
+    relief_displacement: float | None = None
+    accuracy: Path | None = None
+
+
+@dataclass(frozen=True)
+class Layer:
+    """An orthoimage and where it lies in the mosaic."""
+
+    ortho: Ortho
+    grid: Grid
+    left: int
+    top: int
+
+
+@dataclass(frozen=True)
+class Mosaic:
+    """Orthos placed on one grid: layers, the topmost first, or the most accurate first at each pixel."""
+
+    grid: Grid
+    layers: tuple[Layer, ...]
+    by_pixel: bool = False
+
+
+def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
+    """Return where orthos lie on their common grid.
+
+    Parameters
+    ----------
+    order : {'best-view', 'first-on-top', 'most-accurate'}
+        What lies on top: the steepest view, in which errors of the DEM move pixels least, or the first; or at each
+        pixel the ortho with the smallest ce90 there (the steepest view of equal ones).
+
+    Raises
+    ------
+    InputError
+        If they do not share a grid, or differ in bands, type or nodata; if one has no accuracy that would decide.
+    """
+    if not orthos:
+        raise InputError("a mosaic needs an ortho", field="mosaic")
+    without = [ortho for ortho in orthos if ortho.accuracy is None]
+    if order == "most-accurate" and without:
+        raise InputError(
+            f"nobody says how accurate {without[0].name} is at each place", file=without[0].path, field="mosaic.order",
+            remedy="give all scenes `output.accuracy_raster`, or order them by best-view",
+        )  # fmt: skip
+    if order != "first-on-top":
+        orthos = sorted(
+            orthos, key=lambda ortho: math.inf if ortho.relief_displacement is None else ortho.relief_displacement
+        )
+    grids = [grid_of(ortho.path) for ortho in orthos]
+    first = grids[0]
+    for ortho, grid in zip(orthos, grids, strict=True):
+        _check_grid(orthos[0], first, ortho, grid)
+    _check_bands(orthos)
+    left, top = min(grid.left for grid in grids), max(grid.top for grid in grids)
+    right = max(grid.left + grid.width * grid.dx for grid in grids)
+    bottom = min(grid.top - grid.height * grid.dy for grid in grids)
+    width, height = round((right - left) / first.dx), round((top - bottom) / first.dy)
+    whole = Grid(first.crs, left, top, first.dx, first.dy, width, height)
+    layers = [
+        Layer(ortho, grid, round((grid.left - left) / first.dx), round((top - grid.top) / first.dy))
+        for ortho, grid in zip(orthos, grids, strict=True)
+    ]
+    return Mosaic(whole, tuple(layers), order == "most-accurate")
+
+
+def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
+    columns, rows = (grid.left - first.left) / first.dx, (first.top - grid.top) / first.dy
+    same_pixels = math.isclose(grid.dx, first.dx, rel_tol=1e-9) and math.isclose(grid.dy, first.dy, rel_tol=1e-9)
+    off = max(abs(columns - round(columns)), abs(rows - round(rows)))
+    if grid.crs != first.crs or not same_pixels or off > _SAME:
+        raise InputError(
+            f"{other.name} is not on the grid of {one.name}: {grid.crs.name}, {grid.dx:g} x {grid.dy:g}, off by "
+            f"{off:.3f} px beside {first.crs.name}, {first.dx:g} x {first.dy:g}",
+            file=other.path, field="output",
+            remedy="give all scenes one crs and resolution, and an extent on multiples of it or none",
+        )  # fmt: skip
+
+
+def _check_bands(orthos: Sequence[Ortho]) -> None:
+    first = None
+    for ortho in orthos:
+        source = RasterSource(ortho.path)
+        nodata = tuple(None if value is None else str(value) for value in source.nodata)
+        kind = f"{counted(source.count, 'band')} of {source.dtype}", source.validity, nodata
+        first = first or kind
+        if kind != first:
+            raise InputError(
+                f"{ortho.name} has {kind[0]} (valid by {kind[1]}), {orthos[0].name} {first[0]} (by {first[1]})",
+                file=ortho.path, remedy="make mosaics of scenes of one kind",
+            )  # fmt: skip
+
+
+# -- windows ---------------------------------------------------------------------------------------------------------
+
+
+def box_of(layer: Layer) -> Box:
+    """Return left, top, right and bottom of a layer in pixels of the mosaic."""
+    return layer.left, layer.top, layer.left + layer.grid.width, layer.top + layer.grid.height
+
+
+def intersection(one: Box, other: Box) -> Box | None:
+    """Return the common part of two boxes (left, top, right, bottom); None where there is none."""
+    left, top, right, bottom = (
+        max(one[0], other[0]),
+        max(one[1], other[1]),
+        min(one[2], other[2]),
+        min(one[3], other[3]),
+    )
+    return (left, top, right, bottom) if left < right and top < bottom else None
+
+
+def windows(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
+    """Yield left, top, width and height of the windows of a grid, row by row."""
+    for top in range(0, grid.height, side):
+        for left in range(0, grid.width, side):
+            yield left, top, min(side, grid.width - left), min(side, grid.height - top)
+
+
+def circular_errors(layer: Layer, left: int, top: int, width: int, height: int) -> NDArray[np.float32]:
+    """Return the circular error (m) in a window of an ortho, of the nearest pixel of its raster of accuracy.
+
+    Where nothing is known it is larger than any that is.
+    """
+    assert layer.ortho.accuracy is not None
+    source = RasterSource(layer.ortho.accuracy)
+    own = grid_of(layer.ortho.accuracy)
+    steps = [round(size / pixel) for size, pixel in zip((own.dx, own.dy), (layer.grid.dx, layer.grid.dy), strict=True)]
+    columns, rows = (np.arange(left, left + width) // steps[0], np.arange(top, top + height) // steps[1])
+    part = source.read(int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1))
+    found = part[-1][np.ix_(rows - rows[0], columns - columns[0])]
+    return np.where(np.isfinite(found), found, np.finfo(np.float32).max).astype(np.float32)

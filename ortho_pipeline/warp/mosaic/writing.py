@@ -1,0 +1,142 @@
+"""The mosaic as a file: a VRT that refers to its orthos, or a COG, written window by window."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.raster.ortho import Profile, RasterWriter, as_written, keep_off_nodata, value_range
+from ortho_pipeline.raster.output import raster_output, written
+from ortho_pipeline.raster.source import MEMORY
+from ortho_pipeline.warp.mosaic.balance import Balance
+from ortho_pipeline.warp.mosaic.layout import Mosaic, box_of, circular_errors, intersection, windows
+from ortho_pipeline.warp.mosaic.reading import Opened, open_layers
+from ortho_pipeline.warp.mosaic.seamlines import Owners
+
+#: Side of the windows in which a mosaic is written.
+_WINDOW = 2048
+
+
+def write_vrt(placed: Mosaic, path: Path) -> None:
+    """Write the mosaic as a VRT that refers to the orthos by relative paths; they have to lie below its folder.
+
+    Raises
+    ------
+    InputError
+        If GDAL leaves an ortho out.
+    """
+    if placed.by_pixel:
+        raise InputError("a VRT does not choose pixel by pixel", file=path, field="mosaic.format", remedy="make a COG")
+    names = [str(layer.ortho.path) for layer in reversed(placed.layers)]
+    with raster_output(path) as temporary:
+        made = gdal.BuildVRT(
+            str(temporary), names, outputBounds=placed.grid.extent, xRes=placed.grid.dx, yRes=placed.grid.dy,
+            resolution="user",
+        )  # fmt: skip
+        with written(made) as dataset:
+            size = dataset.RasterXSize, dataset.RasterYSize
+            listed = {Path(name).resolve() for name in dataset.GetFileList()}
+        missing = [layer.ortho.name for layer in placed.layers if layer.ortho.path.resolve() not in listed]
+        if missing or size != (placed.grid.width, placed.grid.height):
+            raise InputError(f"GDAL leaves out {', '.join(missing) or 'pixels'}", file=path, remedy="make a COG of it")
+
+
+def write_cog(
+    placed: Mosaic,
+    path: Path,
+    *,
+    owners: Owners | None = None,
+    balance: Balance | None = None,
+    memory: int = MEMORY,
+    threads: int = 1,
+) -> float:
+    """Write the mosaic as a COG, window by window; return the share of its pixels that had to be clamped.
+
+    Parameters
+    ----------
+    owners : Owners, optional
+        Which ortho a pixel is taken from, if that has a value there; else and without, as the order has it.
+    balance : Balance, optional
+        What becomes of the pixels of each ortho; they are taken over as they are without.
+    """
+    opened = open_layers(placed, memory)
+    profile, grid = Profile.of(opened[0].source), placed.grid
+    fill = profile.dtype.type(0 if profile.nodata is None else profile.nodata)
+    clamped = shown = 0
+    with RasterWriter(path, grid, profile, threads=threads) as writer:
+        for left, top, width, height in windows(grid, _WINDOW):
+            made = _Window(
+                left, top, np.full((profile.count, height, width), fill, dtype=profile.dtype),
+                np.zeros((profile.count, height, width), dtype=bool),
+                None if owners is None else owners.window(left, top, width, height),
+                np.full((height, width), np.inf, dtype=np.float32) if owners is not None or placed.by_pixel else None,
+            )  # fmt: skip
+            for number, one in enumerate(opened):
+                clamped += made.put(number, one, balance, profile, by_pixel=placed.by_pixel)
+            shown += int(np.count_nonzero(made.valid))
+            writer.write(left, top, made.pixels, np.all(made.valid, axis=0))
+    return clamped / max(shown, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """A window of the mosaic in the making: its pixels, which are valid, and where it is chosen pixel by pixel whose
+    they shall be and the ranks ``(h, w)`` of those that there are.
+    """
+
+    left: int
+    top: int
+    pixels: NDArray[Any]
+    valid: NDArray[np.bool_]
+    owners: NDArray[np.int16] | None
+    best: NDArray[np.float32] | None
+
+    def put(self, number: int, one: Opened, balance: Balance | None, profile: Profile, *, by_pixel: bool) -> int:
+        """Take from an ortho what has no value yet, or a worse rank; return how many values were clamped."""
+        _, height, width = self.pixels.shape
+        box = intersection((self.left, self.top, self.left + width, self.top + height), box_of(one.layer))
+        if box is None:
+            return 0
+        part = (slice(box[1] - self.top, box[3] - self.top), slice(box[0] - self.left, box[2] - self.left))
+        place = (slice(None), *part)
+        if self.best is None and self.valid[place].all():
+            return 0
+        values, good = one.read(box)
+        if self.best is None:
+            new = ~self.valid[place] & good
+        else:
+            rank = np.full(values.shape[1:], number, dtype=np.float32)
+            if by_pixel:
+                there = box[0] - one.layer.left, box[1] - one.layer.top
+                rank = circular_errors(one.layer, *there, box[2] - box[0], box[3] - box[1])
+            if self.owners is not None:
+                rank[self.owners[part] == number] = -1.0
+            better = good.all(axis=0) & (rank < self.best[part])
+            self.best[part][better] = rank[better]
+            new = np.broadcast_to(better, values.shape)
+        clamped = 0
+        if balance is not None:
+            values, clamped = _balanced(balance, number, values, good, new, profile)
+        self.pixels[place] = np.where(new, values, self.pixels[place])
+        self.valid[place] |= new
+        return clamped
+
+
+def _balanced(
+    balance: Balance, number: int, values: NDArray[Any], good: NDArray[np.bool_], new: NDArray[np.bool_],
+    profile: Profile,
+) -> tuple[NDArray[Any], int]:  # fmt: skip
+    """Return pixels of an ortho as they are in the mosaic, and how many that are new were clamped."""
+    exact = balance.apply(number, np.where(good, values, 0).astype(np.float64))
+    low, high, _, fill = value_range(profile.dtype, profile)
+    beyond = int(np.count_nonzero(((exact < low - 0.5) | (exact > high + 0.5)) & new))
+    made = as_written(exact, good, profile.dtype, fill)
+    if profile.validity == "nodata":
+        keep_off_nodata(made, good, fill, low)
+    return made, beyond

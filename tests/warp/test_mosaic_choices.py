@@ -1,0 +1,317 @@
+"""Mosaics with a choice: brightness against known gains, seams against a path that is known to be the best."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+from click.testing import CliRunner
+from osgeo import gdal
+from scipy.ndimage import gaussian_filter
+
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.mosaic.assembly import mosaic
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import MosaicOptions
+from ortho_pipeline.raster.ortho import Profile, RasterWriter
+from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.warp.mosaic import (
+    Ortho,
+    along_seams,
+    balanced,
+    lay_out,
+    overlaps,
+    owners_of,
+    seamlines,
+    write_cog,
+    writing,
+)
+
+UTM = pyproj.CRS("EPSG:32635")
+Box = tuple[int, int, int, int]
+
+
+def texture(side: tuple[int, int], seed: int, *scales: float) -> np.ndarray:
+    """Return a picture with detail of some sizes, standard deviation 1."""
+    random = np.random.default_rng(seed)
+    found = sum(gaussian_filter(random.normal(size=side), scale) * scale for scale in scales)
+    return found / found.std()
+
+
+GROUND = 900 + 150 * texture((400, 520), 1, 1.5, 4, 30)
+
+
+def write(folder: Path, name: str, values: np.ndarray, left: int, top: int, valid: np.ndarray | None = None,
+          dtype: str = "uint16", nodata: float | None = None) -> Ortho:  # fmt: skip
+    """Write an ortho of values ``(bands, h, w)`` whose first pixel lies at a place of the ground."""
+    values = np.atleast_3d(values.T).T
+    count, height, width = values.shape
+    valid = np.ones((height, width), dtype=bool) if valid is None else valid
+    grid = Grid(UTM, 500000 + 2.0 * left, 4e6 - 2.0 * top, 2.0, 2.0, width, height)
+    path = folder / f"{name}_ortho.tif"
+    kind = "mask" if nodata is None else "nodata"
+    with RasterWriter(path, grid, Profile(count, np.dtype(dtype), kind, nodata), driver="GTiff") as writer:
+        writer.write(0, 0, np.where(valid, np.rint(values), nodata or 0).astype(dtype), valid)
+    return Ortho(name, path)
+
+
+def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    dataset = gdal.Open(str(path))
+    return dataset.ReadAsArray(), dataset.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0
+
+
+# -- brightness ------------------------------------------------------------------------------------------------------
+
+#: Where orthos lie, and gain and offset by which each is too bright in two bands.
+PLACES = {"a": (0, 0), "b": (180, 20), "c": (90, 150), "d": (300, 160)}
+WRONG = {"a": [(1.0, 0.0), (1.2, -40.0)], "b": [(1.3, -90.0), (1.0, 30.0)], "c": [(0.8, 60.0), (0.9, 0.0)],
+         "d": [(1.1, 25.0), (1.4, -200.0)]}  # fmt: skip
+
+
+def quartet(folder: Path, *, clouds: str = "none", far: bool = False) -> list[Ortho]:
+    """Write four orthos of two bands; a fifth lies far away.
+
+    Clouds cover up to a third of an overlap, or as much as they like where they are saturated.
+    """
+    orthos = []
+    for name, (left, top) in PLACES.items():
+        part = GROUND[top : top + 240, left : left + 220]
+        bands = np.stack([gain * part + offset for gain, offset in WRONG[name]])
+        if clouds == "saturated" and name in "bc":
+            bands[:, 20:70, 10:110] = 2500.0
+        if clouds == "bright" and name in "bc":
+            bands[:, 20:100, 10:60] = 2500.0 + np.random.default_rng(6).normal(0, 30, (80, 50))
+        orthos.append(write(folder, name, bands, left, top))
+    if far:
+        orthos.append(write(folder, "far", np.full((2, 50, 50), 700.0), 5000, 0))
+    return orthos
+
+
+@pytest.mark.parametrize("clouds", ["none", "bright", "saturated"])
+def test_gains_that_are_known_are_found(tmp_path, clouds):
+    placed = lay_out(quartet(tmp_path, clouds=clouds, far=True), "first-on-top")
+    found = balanced(placed, overlaps(placed))
+    gains = np.array([[gain for gain, _ in WRONG[name]] for name in PLACES])
+    offsets = np.array([[offset for _, offset in WRONG[name]] for name in PLACES])
+    # Up to what is the same for all, the datum: gain times its inverse, and where zero is.
+    common = found.gains[:4] * gains
+    np.testing.assert_allclose(common / common.mean(axis=0), 1.0, atol=2e-3)
+    zero = found.gains[:4] * offsets + found.offsets[:4]
+    np.testing.assert_allclose(zero - zero.mean(axis=0), 0.0, atol=2.0)
+    np.testing.assert_allclose(found.gains[:4].mean(axis=0), 1.0)
+    np.testing.assert_allclose(found.offsets[:4].mean(axis=0), 0.0, atol=1e-6)
+    # What nothing overlaps stays as it is.
+    np.testing.assert_allclose(found.gains[4], 1.0)
+    np.testing.assert_allclose(found.offsets[4], 0.0, atol=1e-6)
+    assert (found.after < 0.5).all()
+    assert (found.before > 50).all()
+    assert (found.outlying > 0.05) == (clouds != "none")
+
+
+def test_a_balanced_mosaic_has_no_steps_and_clamps_what_does_not_fit(tmp_path):
+    orthos = quartet(tmp_path)
+    result = mosaic(
+        [one.path for one in orthos],
+        tmp_path / "m.tif",
+        MosaicOptions(format="COG", balance=True, order="first-on-top"),
+    )
+    values, valid = read(tmp_path / "m.tif")
+    balance = result.document["mosaic"]["balance"]
+    for band in range(2):
+        made = np.zeros(valid.shape)
+        for name in reversed(PLACES):
+            (left, top), scene = PLACES[name], balance["scenes"][name]
+            own = read(tmp_path / f"{name}_ortho.tif")[0][band]
+            place = slice(top, top + 240), slice(left, left + 220)
+            made[place] = own * scene["gain"][band] + scene["offset"][band]
+        np.testing.assert_array_equal(values[band][valid], np.floor(made + 0.5)[valid])
+        # The mosaic is the ground but for one gain and one offset.
+        ground = GROUND[: valid.shape[0], : valid.shape[1]][valid]
+        fitted = np.polyval(np.polyfit(ground, values[band][valid], 1), ground)
+        assert np.std(values[band][valid] - fitted) < 2.0
+    assert balance["clamped_share"] == 0.0
+    dark = [
+        write(tmp_path, f"x{one.name}", read(one.path)[0] - 700.0 * (one.name == "a"), *PLACES[one.name], dtype="int16")
+        for one in orthos
+    ]
+    bytes_of = [
+        write(
+            tmp_path,
+            f"y{one.name}",
+            np.clip(read(one.path)[0] / 5.0, 1, 255),
+            *PLACES[one.name[1:]],
+            dtype="uint8",
+            nodata=0.0,
+        )
+        for one in dark
+    ]
+    result = mosaic([one.path for one in bytes_of], tmp_path / "n.tif", MosaicOptions(format="COG", balance=True))
+    assert result.document["mosaic"]["balance"]["clamped_share"] > 0.0005
+    assert (read(tmp_path / "n.tif")[0][:, read(tmp_path / "n.tif")[1]] > 0).all()
+
+
+def test_orthos_that_do_not_look_alike_are_refused_by_name(tmp_path):
+    one = write(tmp_path, "one", GROUND[:200, :200], 0, 0)
+    other = write(tmp_path, "other", 900 + 150 * texture((200, 200), 7, 2, 20), 60, 0)
+    other = write(tmp_path, "other", 0.02 * GROUND[:200, 60:260] + 500, 60, 0)
+    placed = lay_out([one, other])
+    with pytest.raises(InputError, match="gain") as caught:
+        balanced(placed, overlaps(placed))
+    assert caught.value.field == "mosaic.balance"
+
+
+# -- seams -----------------------------------------------------------------------------------------------------------
+
+
+def winding(height: int, width: int) -> np.ndarray:
+    """Return a corridor, 17 px wide, that winds down through a field."""
+    rows = np.arange(height)
+    middle = width / 2 + 0.3 * width * np.sin(rows / 31.0) * np.cos(rows / 97.0)
+    return np.abs(np.arange(width)[None] - middle[:, None]) <= 8.0
+
+
+def test_a_seam_runs_where_it_is_known_to_be_best(tmp_path):
+    """Two orthos differ everywhere in their overlap, but for a winding corridor."""
+    first = GROUND[:300, :300].copy()
+    second = GROUND[:300, 160:460].copy()
+    random = np.random.default_rng(4)
+    way = winding(300, 140)
+    second[:, :140] += np.where(way, 0.0, random.choice([-1.0, 1.0], way.shape) * random.uniform(150, 300, way.shape))
+    placed = lay_out([write(tmp_path, "a", first, 0, 0), write(tmp_path, "b", second, 160, 0)], "first-on-top")
+    owners = owners_of(placed, None, seamlines=True)
+    assert owners.cell == 1
+    assert (owners.ordered[:, :300] == 0).all()
+    labels = owners.owners[:, 160:300]
+    edges = labels[:, 1:] != labels[:, :-1]
+    assert (edges.sum(axis=1) >= 1).all()
+    assert (way[:, 1:] | way[:, :-1])[edges].all()
+    write_cog(placed, tmp_path / "m.tif", owners=owners)
+    values, valid = read(tmp_path / "m.tif")
+    assert valid.all()
+    wanted = np.where(owners.owners == 0, np.pad(first, ((0, 0), (0, 160))), np.pad(second, ((0, 0), (160, 0))))
+    np.testing.assert_array_equal(values, np.rint(wanted))
+
+
+def scenes(folder: Path) -> list[Ortho]:
+    """Write three overlapping orthos with ragged edges, holes, and things that only one of them shows."""
+    orthos = []
+    for number, (left, top) in enumerate([(0, 0), (150, 40), (60, 150)]):
+        part = GROUND[top : top + 240, left : left + 250].copy()
+        random = np.random.default_rng(number)
+        for _ in range(25):
+            row, column = random.integers(0, 225, 2)
+            part[row : row + 12, column : column + 8] += random.choice([300.0, 500.0])
+        valid = np.add.outer(np.arange(240), np.arange(250)) > 60
+        valid[100:108, 120:135] = False
+        orthos.append(write(folder, f"s{number}", part, left, top, valid))
+    return orthos
+
+
+def test_the_same_for_any_windows_and_no_pixel_is_lost(tmp_path, monkeypatch):
+    placed = lay_out(scenes(tmp_path), "first-on-top")
+    plain, owners = owners_of(placed, None, seamlines=False), owners_of(placed, None, seamlines=True)
+    write_cog(placed, tmp_path / "plain.tif")
+    write_cog(placed, tmp_path / "seams.tif", owners=owners)
+    assert 0.01 < (owners.owners != plain.owners).mean() < 0.5
+    known = read(tmp_path / "plain.tif")[1]
+    np.testing.assert_array_equal(read(tmp_path / "seams.tif")[1], known)
+    monkeypatch.setattr(seamlines, "_WINDOW", 61)
+    monkeypatch.setattr(writing, "_WINDOW", 97)
+    again = owners_of(placed, None, seamlines=True)
+    np.testing.assert_array_equal(again.owners, owners.owners)
+    write_cog(placed, tmp_path / "again.tif", owners=again)
+    np.testing.assert_array_equal(read(tmp_path / "again.tif")[0], read(tmp_path / "seams.tif")[0])
+    # Cells of several pixels: fewer choices, no pixel lost.
+    monkeypatch.setattr(seamlines, "_CELLS", 20_000)
+    coarse = owners_of(placed, None, seamlines=True)
+    assert coarse.cell > 1
+    write_cog(placed, tmp_path / "coarse.tif", owners=coarse)
+    np.testing.assert_array_equal(read(tmp_path / "coarse.tif")[1], known)
+
+
+def test_along_the_seams_less_differs_than_before(tmp_path):
+    placed = lay_out(scenes(tmp_path), "first-on-top")
+    owners = owners_of(placed, None, seamlines=True)
+    before = along_seams(placed, owners.ordered, owners.cell, None)
+    after = along_seams(placed, owners.owners, owners.cell, None)
+    assert set(before) == {("s0", "s1"), ("s0", "s2"), ("s1", "s2")}
+    for pair in after:
+        assert after[pair]["rms"][0] <= 0.5 * before[pair]["rms"][0]
+    labels = owners.owners
+    crossed = [
+        (one != other) & (one >= 0) & (other >= 0)
+        for one, other in ((labels[1:], labels[:-1]), (labels[:, 1:], labels[:, :-1]))
+    ]
+    assert sum(found["length_px"] for found in after.values()) == sum(int(one.sum()) for one in crossed)
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (3, -2)])
+def test_content_beside_a_seam_is_measured_by_the_matcher(tmp_path, shift):
+    """The second ortho shows the ground some columns and rows elsewhere, darker and with noise."""
+    noise = np.random.default_rng(3).normal(0, 8, (280, 280))
+    second = 0.7 * GROUND[20 - shift[1] : 300 - shift[1], 180 - shift[0] : 460 - shift[0]] + 200 + noise
+    placed = lay_out(
+        [write(tmp_path, "a", GROUND[20:300, 40:320], 40, 20), write(tmp_path, "b", second, 180, 20)], "first-on-top"
+    )
+    owners = owners_of(placed, None, seamlines=False)
+    (found,) = along_seams(placed, owners.owners, owners.cell, None).values()
+    assert found["matched"] >= 5
+    np.testing.assert_allclose(found["median_px"], shift, atol=0.1)
+    assert found["rmse_px"] == pytest.approx(np.hypot(*shift), abs=0.2)
+
+
+# -- the command -----------------------------------------------------------------------------------------------------
+
+
+def test_the_command_writes_mosaic_record_and_page(tmp_path):
+    paths = [str(one.path) for one in quartet(tmp_path, clouds="bright")]
+    out = tmp_path / "all" / "m.tif"
+    asked = ["mosaic", *paths, "-o", str(out), "--order", "first-on-top", "--seamlines", "--balance"]
+    done = CliRunner().invoke(cli, [*asked, "--json"])
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    assert json.loads(out.with_suffix(".json").read_text()) == document["mosaic"]
+    assert document["mosaic"]["on_top_first"] == list(PLACES)
+    for seam in document["mosaic"]["seams"]:
+        if seam["after"]:
+            assert max(seam["after"]["rms"]) < 0.2 * max(seam["before"]["rms"])
+    page = out.with_suffix(".html").read_text()
+    assert "along the seams" in page.lower()
+    assert '<path class="seam" d="M' in page
+    said = CliRunner().invoke(cli, asked)
+    assert "balance: cells of the overlaps differ by" in said.stdout
+    vrt = CliRunner().invoke(cli, ["mosaic", *paths, "-o", str(tmp_path / "m.vrt")])
+    assert vrt.exit_code == 0, vrt.output
+    assert json.loads((tmp_path / "m.json").read_text())["balance"] is None
+
+
+def test_what_cannot_be_is_refused(tmp_path):
+    one, other = (write(tmp_path, name, GROUND[:80, :80], 40 * k, 0) for k, name in enumerate("ab"))
+    paths = [one.path, other.path]
+    for field in ("seamlines", "balance"):
+        with pytest.raises(InputError, match="VRT") as caught:
+            mosaic(paths, tmp_path / "m.vrt", MosaicOptions(format="VRT", **{field: True}))
+        assert caught.value.field == f"mosaic.{field}"
+        assert not (tmp_path / "m.vrt").exists()
+    with pytest.raises(InputError, match="given twice"):
+        mosaic([*paths, one.path], tmp_path / "m.tif")
+    with pytest.raises(InputError, match="read and written"):
+        mosaic(paths, one.path)
+    palette = gdal.ColorTable()
+    for name in "pq":
+        dataset = gdal.GetDriverByName("GTiff").Create(str(tmp_path / f"{name}.tif"), 50, 50, 1, gdal.GDT_Byte)
+        dataset.SetGeoTransform((500000.0, 2.0, 0, 4e6, 0, -2.0))
+        dataset.SetProjection(UTM.to_wkt())
+        palette.SetColorEntry(3, (10, 20, 30, 255))
+        dataset.GetRasterBand(1).SetColorTable(palette)
+        dataset = None
+    for field in ("seamlines", "balance"):
+        with pytest.raises(InputError, match="palette"):
+            mosaic(
+                [tmp_path / "p.tif", tmp_path / "q.tif"],
+                tmp_path / "m.tif",
+                MosaicOptions(format="COG", **{field: True}),
+            )
