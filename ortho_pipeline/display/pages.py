@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import importlib.util
+import os
+import sys
+from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.display.numbers import fixed, metres, plain_size, px, share, short, signed
@@ -30,9 +35,30 @@ def _environment() -> Any:
     """Return the environment, with the filters that write numbers as people read them."""
     import jinja2
 
+    class Kept(jinja2.BytecodeCache):
+        """Templates compiled once per installation, where Python keeps its modules and under the same conditions."""
+
+        def get_cache_key(self, name: str, filename: str | None = None) -> str:
+            return importlib.util.cache_from_source(filename or name)
+
+        def load_bytecode(self, bucket: Any) -> None:
+            with contextlib.suppress(OSError), open(bucket.key, "rb") as file:
+                bucket.load_bytecode(file)  # nothing, if the template has changed since
+
+        def dump_bytecode(self, bucket: Any) -> None:
+            if sys.dont_write_bytecode:
+                return
+            place = Path(bucket.key)
+            with contextlib.suppress(OSError):
+                place.parent.mkdir(exist_ok=True)
+                # Another process may read it, or write it as well.
+                temporary = place.with_name(f"{place.name}.{os.getpid()}")
+                temporary.write_bytes(bucket.bytecode_to_string())
+                temporary.replace(place)
+
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("ortho_pipeline", ""), autoescape=True, undefined=jinja2.StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
+        trim_blocks=True, lstrip_blocks=True, bytecode_cache=Kept(),
     )  # fmt: skip
     environment.filters |= {
         "px": px, "m": metres, "signed": signed, "share": share, "fixed": fixed, "number": short, "plain": plain_size,

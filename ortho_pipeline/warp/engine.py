@@ -335,7 +335,8 @@ class _Job:
         if self.profile.validity == "nodata":
             keep_off_nodata(out, tile.valid, fill, low)
         # NaN says for itself which band has no value; an integer cannot, so there a pixel needs all of its bands.
-        mask = np.asarray((np.any if self.any_band else np.all)(tile.valid, axis=0))
+        bands = tile.valid
+        mask = bands[0] if len(bands) == 1 else np.asarray((np.any if self.any_band else np.all)(bands, axis=0))
         with self._lock:
             self.valid_pixels += int(np.count_nonzero(mask))
         return left, top, out, mask, classes

@@ -43,6 +43,17 @@ def test_python_m_is_the_same_command():
         assert f"\n  {command} " in done.stdout
 
 
+@pytest.mark.parametrize(("words", "code"), [(["--version"], 0), (["rectify", "--nonsense"], 2)])
+def test_the_process_ends_with_its_code_and_what_was_asked_for_at_the_end(words, code):
+    program = (
+        "import atexit, sys; atexit.register(print, 'at the end'); from ortho_pipeline.__main__ import run; "
+        f"sys.argv = ['ortho', *{words!r}]; run()"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (code, "at the end")
+    assert "Traceback" not in done.stderr
+
+
 def test_importing_the_package_is_light():
     code = f"import sys, ortho_pipeline; print([name for name in {HEAVY!r} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
