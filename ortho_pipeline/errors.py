@@ -12,6 +12,7 @@
         ModelError            the mathematics failed
             NotConverged      an iteration did not come to an end
         PluginError           a plugin broke the contract
+        StorageError          a store of objects or a server failed, after requests were repeated
 
 A bad point is NaN; a bad request is one of these.
 """
@@ -187,3 +188,7 @@ class NotConverged(ModelError):
 
 class PluginError(OrthoError):
     """A plugin broke the contract of hookspecs.py."""
+
+
+class StorageError(OrthoError):
+    """A store of objects or a server failed, after requests were repeated."""

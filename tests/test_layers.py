@@ -235,7 +235,7 @@ def test_the_map_of_the_house_is_true() -> None:
 
 
 #: Whole command lines, of this program and of others, which are typed as they are.
-COMMAND_LINE = re.compile(r"\b(ortho (adjust|fit|rectify|run)|pyproj sync|projsync) ")
+COMMAND_LINE = re.compile(r"\b(ortho (adjust|doctor|fit|rectify|run)|pyproj sync|projsync) ")
 
 
 def texts(path: Path) -> Iterator[str]:
@@ -254,7 +254,7 @@ def texts(path: Path) -> Iterator[str]:
 
 @pytest.mark.parametrize(
     "path",
-    [path for path in FILES + PLUGIN_FILES if path.parent.name not in ("cli", "options")],
+    [path for path in FILES + PLUGIN_FILES if not {"cli", "options"} & set(path.relative_to(ROOT).parts)],
     ids=lambda path: str(path.relative_to(ROOT)),
 )
 def test_messages_name_options_by_their_fields(path: Path) -> None:

@@ -19,8 +19,10 @@ import pyproj
 
 from ortho_pipeline import plugins
 from ortho_pipeline.batch.config import Config, Entry, Settings, merged, read_config
+from ortho_pipeline.commands.heights.automatic import AUTO
 from ortho_pipeline.commands.inputs import OWN_POINTS
 from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.files.storage.objects import is_address
 from ortho_pipeline.options import (
     MatchOptions,
     MosaicOptions,
@@ -249,9 +251,12 @@ class _Planner:
 
     def _surface(self, settings: Settings, image: Path, where: str) -> SurfaceOptions:
         values: dict[str, Any] = dict(settings.surface)
-        values["dem"] = self._file(values["dem"], image, f"{where}.surface.dem")
+        if values["dem"] != AUTO:
+            values["dem"] = self._file(values["dem"], image, f"{where}.surface.dem")
         for cell in () if values["dem"] is None else matching_files(values["dem"]) or ():
             self._inside(cell, f"{where}.surface.dem")
+        if values["source"] is not None and not is_address(values["source"]):
+            values["source"] = self._file(values["source"], image, f"{where}.surface.source")
         values["fill"] = str(values["fill"])
         if isinstance(values["sigma"], str):
             values["sigma"] = self._perhaps_file(values["sigma"], image, f"{where}.surface.sigma")

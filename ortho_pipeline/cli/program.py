@@ -17,6 +17,8 @@ import click
 
 from ortho_pipeline.cli.batch import mosaic, run
 from ortho_pipeline.cli.block import adjust, intersect
+from ortho_pipeline.cli.machine.cache import cache
+from ortho_pipeline.cli.machine.doctor import doctor
 from ortho_pipeline.cli.matching import match, ties
 from ortho_pipeline.cli.measuring import measure
 from ortho_pipeline.cli.options import (
@@ -179,6 +181,8 @@ cli.add_command(match)
 cli.add_command(ties)
 cli.add_command(measure)
 cli.add_command(mosaic)
+cli.add_command(doctor)
+cli.add_command(cache)
 
 # -- commands --------------------------------------------------------------------------------------------------------
 
@@ -469,25 +473,3 @@ def dem_check(
 
     given = {"crs": points_crs, "vertical": points_vertical}
     print_result(commands.dem_check(dem, points, **given, surface=surface, scene=scene), as_json)
-
-
-@cli.command()
-@json_option
-def doctor(as_json: bool) -> None:
-    """Show what is installed: GDAL, PROJ, geoid grids, plugins."""
-    from ortho_pipeline import commands
-
-    document = commands.doctor()
-    if as_json:
-        return print_json(document)
-    gdal, proj = document["gdal"], document["proj"]
-    click.echo("Packages   " + ", ".join(f"{name} {version}" for name, version in document["packages"].items()))
-    click.echo(f"GDAL       {gdal['version']} (bindings {gdal['bindings']}), reads {', '.join(gdal['drivers'])}")
-    click.echo(f"PROJ       {proj['proj']}, looks in {', '.join(proj['search_path'])}")
-    for grid in document["grids"]:
-        click.echo(f"{grid['datum']:<10} " + (f"{grid['path']}" if grid["found"] else f"missing: {grid.get('remedy')}"))
-    for plugin in document["plugins"]:
-        click.echo(f"plugin     {plugin['plugin']} ({plugin['distribution']} {plugin['version']})")
-    for broken in document["broken"]:
-        click.echo(f"broken     {broken['plugin']}: {broken['error']}")
-    return None

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from ortho_pipeline.commands.scene import dem_check as dem_check
     from ortho_pipeline.commands.scene import doctor as doctor
     from ortho_pipeline.commands.scene import edge as edge
+    from ortho_pipeline.commands.scene import forget_kept_files as forget_kept_files
     from ortho_pipeline.commands.scene import info as info
+    from ortho_pipeline.commands.scene import kept_files as kept_files
     from ortho_pipeline.commands.scene import models as models
     from ortho_pipeline.commands.scene import sensors as sensors
     from ortho_pipeline.commands.scene import write_plots as write_plots
@@ -26,7 +28,17 @@ if TYPE_CHECKING:
 _NAMES = {
     "fitting": ("compare", "fit"),
     "rectification": ("check", "export", "rectify"),
-    "scene": ("dem_check", "doctor", "edge", "info", "models", "sensors", "write_plots"),
+    "scene": (
+        "dem_check",
+        "doctor",
+        "edge",
+        "forget_kept_files",
+        "info",
+        "kept_files",
+        "models",
+        "sensors",
+        "write_plots",
+    ),
 }
 #: Public name -> module that holds it.
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}

@@ -44,7 +44,7 @@ def fit(
     """
     _require_points(points, match)
     opened = open_adjustable(image, scene, points, match)
-    heights = open_surface(surface, scene) if has_surface(surface) else None
+    heights = open_surface(surface, scene, under=[opened]) if has_surface(surface) else None
     adjusted = adjust(opened, points, scene, heights, match)
     return FitResult(
         adjusted.scene, adjusted.fit, adjusted.warnings(heights), tuple(adjusted.removed_json()), points.near,
@@ -93,7 +93,7 @@ def compare(
         )
     opened = inputs.open_image(image, scene, needs_model=False)
     names = comparing.choose_models(models, opened.model if opened.models else None)
-    heights = open_surface(surface, scene) if has_surface(surface) else None
+    heights = open_surface(surface, scene, under=[opened]) if has_surface(surface) else None
     opened = on_surface(opened, heights)
     own = opened.model if opened.models else None
     given, matched = control_of(opened, points, match, scene, heights)
@@ -120,7 +120,7 @@ def compare(
     if best.model in {family.name for family in families()}:
         opened = replace(opened, models={best.model: chosen.model}, model_source="control points")
     adjusted = Adjusted(opened, chosen, matched=matched)
-    hashed = inputs.hashed(inputs.files_read(image, scene, points, surface, match, opened))
+    hashed = inputs.hashed(inputs.files_read(image, scene, points, surface, match, opened, heights=heights))
     asked = {"scene": scene, "surface": surface, **match_asked(match)}
     record = inputs.provenance(opened, points, heights, hashed, command, asked)
     made = report.build_report(

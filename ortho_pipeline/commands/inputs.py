@@ -242,10 +242,11 @@ def files_read(
     match: MatchOptions = MatchOptions(),
     opened: Scene | None = None,
     fill_from: str | os.PathLike[str] | None = None,
+    heights: Surface | None = None,
 ) -> dict[Path, str]:
     """Return every file that is read and its role, side-cars and sources of a VRT included.
 
-    Of what lies in an archive that is the archive. `opened` knows what its sensor read.
+    Of what lies in an archive that is the archive. `opened` knows what its sensor read, `heights` what was found.
     """
     read: dict[Path, str] = {}
 
@@ -264,7 +265,7 @@ def files_read(
         add("image", _files_of(opened.path, scene) if opened.path != Path(image) else ())
         add("metadata", [*opened.sources, opened.model_source])
     add("points", [point_file(points)])
-    for dem in dem_files(surface):
+    for dem in dem_files(surface) or (() if heights is None else heights.files):
         add("DEM", [dem, *_files_of(dem, scene)])
     if surface.vertical is not None:
         add("geoid", [surface.vertical])

@@ -90,9 +90,9 @@ def rectify(
     # Before the DEM is read: left alone, GDAL keeps blocks in a share of the machine's memory.
     limit_cache(output.memory, 1)
     opened = open_adjustable(image, scene, points, match)
-    heights = open_surface(surface, scene, output.memory)
+    heights = open_surface(surface, scene, output.memory, [opened])
     acquired, sun = _acquired(opened.facts, output), sun_of(opened.facts, output)
-    read = inputs.files_read(image, scene, points, surface, match, opened, output.fill_from)
+    read = inputs.files_read(image, scene, points, surface, match, opened, output.fill_from, heights)
     begun = states(read) | begun
     with inputs.hashed_beside(read, digest) as hashing:
         placed = place_scene(opened, points, scene, heights, output, match)
@@ -149,7 +149,7 @@ def check(
     opened = open_adjustable(image, scene, points, match)
     _acquired(opened.facts, output)
     sun_of(opened.facts, output)
-    placed = place_scene(opened, points, scene, open_surface(surface, scene, output.memory), output, match)
+    placed = place_scene(opened, points, scene, open_surface(surface, scene, output.memory, [opened]), output, match)
     other_of(placed, source_of(placed.scene, image, scene, output), scene, output)
     layers.budget_of(placed, output)
     return placed.to_json()
@@ -191,7 +191,7 @@ def export(
     files = {name: Path(folder) / f"{stem}{formats_of_models.ENDINGS[name]}" for name in formats}
     inputs.check_paths(files, image, scene, points, surface, match)
     opened = open_adjustable(image, scene, points, match)
-    heights = open_surface(surface, scene) if has_surface(surface) else None
+    heights = open_surface(surface, scene, under=[opened]) if has_surface(surface) else None
     adjusted = adjust(opened, points, scene, heights, match)
     dataset = raster.open_dataset(image, **scene.access)
     size = opened.width, opened.height

@@ -1,4 +1,4 @@
-"""Facts about a scene, an image, a DEM and the installation: `ortho info`, `edge`, `dem-check`, `report`, `doctor`."""
+"""Facts about a scene, an image, a DEM and this machine: `ortho info`, `edge`, `dem-check`, `doctor`, `cache`."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from ortho_pipeline.errors import InputError, completed, counted
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files import write_json, write_text
 from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.storage import kept
 from ortho_pipeline.geodesy.crs import crs_text, ground_transform
-from ortho_pipeline.geodesy.proj_grids import grids, proj_info
+from ortho_pipeline.geodesy.proj_grids import fetch_missing, grids, proj_info
 from ortho_pipeline.imaging import resolution
 from ortho_pipeline.models import families
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
@@ -179,11 +180,13 @@ def dem_check(
     return Result({}, document, dem_accuracy.summary(document))
 
 
-def doctor() -> dict[str, Any]:
+def doctor(*, fetch_grids: bool = False) -> dict[str, Any]:
     """Return versions of GDAL, PROJ and the compiled parts, geoid grids, and plugins with their distributions.
 
-    A plugin that breaks the contract, at which other commands stop, is among the broken ones here.
+    A plugin that breaks the contract, at which other commands stop, is among the broken ones here. With `fetch_grids`
+    those that are missing are fetched from PROJ's store before.
     """
+    fetched = fetch_missing() if fetch_grids else []
     host = plugins.Host(installed=True, lenient=True)
     packages = ("ortho-pipeline", "numpy", "scipy", "numba", "pyproj", "click", "pluggy")
     allowed = [name for name in raster.DRIVERS if raster.gdal.GetDriverByName(name) is not None]
@@ -197,8 +200,28 @@ def doctor() -> dict[str, Any]:
         },
         "proj": proj_info(),
         "grids": grids(),
+        "fetched": fetched,
         "plugins": [entry.to_json() for entry in host.plugins()],
         "sensors": list(host.sensors),
         "broken": [entry.to_json() for entry in host.broken],
         "cpus": os.cpu_count(),
     }
+
+
+def kept_files(*, verify: bool = False) -> dict[str, Any]:
+    """Return the files that are kept of the network: folder, and address, path, bytes and SHA-256 of each.
+
+    With `verify` also their state: sound, damaged, of another size, missing.
+    """
+    files = [
+        {"address": one.address, "path": str(one.path), "bytes": one.bytes, "sha256": one.sha256}
+        | ({"state": one.state()} if verify else {})
+        for one in kept.records()
+    ]
+    return {"schema_version": SCHEMA_VERSION, "folder": str(kept.folder()), "files": files}
+
+
+def forget_kept_files() -> dict[str, Any]:
+    """Remove the files that are kept of the network; return how many, and of how many bytes."""
+    count, size = kept.clear()
+    return {"schema_version": SCHEMA_VERSION, "folder": str(kept.folder()), "files": count, "bytes": size}

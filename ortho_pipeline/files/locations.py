@@ -263,15 +263,25 @@ def located(path: AnyPath, *, allow_network: bool = False) -> AnyPath:
                 f"URLs of the kind {scheme!r} are not read", file=name, remedy=f"one of {', '.join(SCHEMES)}, or a file"
             )
         name = SCHEMES[scheme] + name[url.end() :]
-    if not allow_network and not in_local_archive(name):
-        raise InputError(
-            "files of the network are not opened unasked",
-            file=os.fspath(path),
-            remedy="allow them with `scene.allow_network`",
-        )
-    if allow_network and not in_local_archive(name):
-        _open_network()
+    if not in_local_archive(name):
+        require_network(os.fspath(path), allow_network)
     return VsiPath(name)
+
+
+def require_network(address: str, allowed: bool) -> None:
+    """Let this process reach the network, if that is allowed.
+
+    Raises
+    ------
+    InputError
+        If it is not; `address` is what would be read or written there.
+    """
+    if not allowed:
+        raise InputError(
+            "files of the network are not opened unasked", file=address,
+            remedy="allow them with `scene.allow_network`",
+        )  # fmt: skip
+    _open_network()
 
 
 def in_local_archive(name: str) -> bool:

@@ -1,15 +1,24 @@
-"""PROJ and its grids: which are there, and where."""
+"""PROJ and its grids: which are there, and where, and how they are fetched."""
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Any
 
 import pyproj
 
-from ortho_pipeline.errors import DatumError
+from ortho_pipeline.errors import DatumError, InputError, StorageError
+from ortho_pipeline.files import parse_json
+from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.geodesy.crs import VERTICAL_NAMES, add_system_grids, vertical_transformer
+from ortho_pipeline.geodesy.geoid_grid import header_fault
+
+#: What PROJ's store has: a list with names, sizes and checksums.
+_LIST, _LIST_BYTES = "files.geojson", 50_000_000
+#: No grid is larger.
+_GRID_BYTES = 2_000_000_000
 
 
 def proj_info() -> dict[str, Any]:
@@ -50,3 +59,66 @@ def _grid_path(name: str, folders: list[str]) -> str | None:
             if (Path(folder) / candidate).is_file():
                 return str(Path(folder) / candidate)
     return None
+
+
+def missing_grid(vertical: str) -> str | None:
+    """Return the name of the geoid grid that a height datum (``EPSG:n``) needs and that is not installed."""
+    try:
+        vertical_transformer(vertical)
+    except DatumError as error:
+        grid = re.search(r"geoid grid (\S+),", error.message)
+        return grid.group(1) if grid else None
+    return None
+
+
+def fetch_grid(name: str) -> Path:
+    """Fetch a grid from PROJ's own store into the user's folder of PROJ, where it is found from now on.
+
+    Whole or not at all: size and SHA-256 are those of the list that PROJ publishes beside its grids, and the header is
+    that of a grid. The caller is allowed to use the network.
+
+    Raises
+    ------
+    InputError
+        If PROJ has no grid of this name, or the folder cannot be written.
+    StorageError
+        If it cannot be fetched as it is stored.
+    """
+    from pyproj.sync import get_proj_endpoint
+
+    store = Objects(get_proj_endpoint(), allow_network=True)
+    try:
+        listed = parse_json(store.read(_LIST, _LIST_BYTES)[0], store.of(_LIST), "try again later")
+        facts = next(one["properties"] for one in listed["features"] if one["properties"]["name"] == name)
+        digest = str(facts["sha256sum"])
+    except FileNotFoundError as error:
+        raise StorageError("PROJ's store has no list of grids", file=store.of(_LIST), remedy="try later") from error
+    except (StopIteration, KeyError, TypeError) as error:
+        raise InputError(f"PROJ has no grid {name}", file=store.of(_LIST), remedy="check the name") from error
+    path = Path(pyproj.datadir.get_user_data_dir(True)) / name
+    part = path.with_name(f"{name}.{os.getpid()}.part")
+    try:
+        content = store.fetch(name, part, _GRID_BYTES)
+        wrong = header_fault(part) or (
+            "" if content.sha256 == digest else "its SHA-256 is not the one that PROJ states"
+        )
+        if wrong:
+            raise StorageError(f"what was fetched is not the grid: {wrong}", file=store.of(name), remedy="try later")
+        os.replace(part, path)
+    except OSError as error:
+        raise InputError(
+            f"the grid cannot be kept here ({error.strerror or error})", file=path.parent,
+            remedy="name a folder that you may write to in PROJ_USER_WRITABLE_DIRECTORY",
+        ) from error  # fmt: skip
+    finally:
+        part.unlink(missing_ok=True)
+    # PROJ remembers which grids were not there, until it is told of its folders.
+    pyproj.datadir.set_data_dir(pyproj.datadir.get_data_dir())
+    vertical_transformer.cache_clear()
+    return path
+
+
+def fetch_missing() -> list[dict[str, Any]]:
+    """Fetch the grids of the common height datums that are not there; return the name and the path of each."""
+    wanted = [row["grid"] for row in grids() if not row["found"] and row["grid"]]
+    return [{"grid": name, "path": str(fetch_grid(name))} for name in wanted]

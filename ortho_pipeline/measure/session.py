@@ -302,7 +302,7 @@ def open_session(
                          remedy="leave it out, and fit the model to the saved points")  # fmt: skip
     require_heights(surface)
     opened = inputs.open_scene(image, scene)
-    heights: Surface = open_surface(surface, scene)
+    heights: Surface = open_surface(surface, scene, under=[opened])
     opened = on_surface(opened, heights)
     view, references = open_reference_views(opened, match, heights, scene)
     inputs.check_paths({"points": path}, image, scene, PointOptions(), surface, match)

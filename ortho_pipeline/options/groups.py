@@ -238,8 +238,11 @@ class SurfaceOptions:
 
     dem: Annotated[
         PathLike | None,
-        Option("--dem", "Digital elevation model: a file, or a pattern of the files that make one.", "FILE"),
-    ] = None
+        Option(
+            "--dem", "Digital elevation model: a file, a pattern of the files that make one, or 'auto' for the cells "
+            "of the Copernicus DEM under the scene.", "FILE|auto",
+        ),
+    ] = None  # fmt: skip
     vertical: Annotated[
         str | None, Option("--dem-vertical", f"Height datum of the DEM: {_VERTICAL_FORMS}.", "DATUM")
     ] = None
@@ -264,6 +267,13 @@ class SurfaceOptions:
         Option(
             "--dem-sigma", "Standard deviation of the heights, metres: a number or a raster, such as Copernicus' HEM.",
             "M|FILE", kind="number or word", unset="unknown",
+        ),
+    ] = None  # fmt: skip
+    source: Annotated[
+        PathLike | None,
+        Option(
+            "--dem-source", "Where `surface.dem=auto` finds cells: a folder of them, or an address (https, s3, gs, "
+            "az).", "DIR|URL", unset="the environment variable ORTHO_DEM_SOURCE, or the public bucket",
         ),
     ] = None  # fmt: skip
 

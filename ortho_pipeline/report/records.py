@@ -299,6 +299,9 @@ class Dem:
     metres_per_unit: float | None = None
     fill: str | float | None = None
     warnings: tuple[str, ...] = ()
+    #: Of heights that were found: the cells that have land, and those that have none.
+    cells: tuple[str, ...] = ()
+    sea_cells: tuple[str, ...] = ()
 
     @property
     def is_flat(self) -> bool:

@@ -104,6 +104,15 @@ class SampleGrid:
         return lonlat[:, 0], lonlat[:, 1]
 
 
+@functools.lru_cache(maxsize=32)
+def _crs_of(wkt: str) -> tuple[pyproj.CRS, pyproj.CRS]:
+    """Return a CRS and its horizontal part, the same for the many files of one DEM."""
+    crs = parse_crs(wkt)
+    plane = horizontal(crs)
+    ground_transform(plane, "EPSG:4979")
+    return crs, plane
+
+
 @dataclass(frozen=True, eq=False)
 class DemFile:
     """The samples as they stand in a file; every thread has a GDAL handle of its own.
@@ -191,9 +200,7 @@ class DemFile:
     def _crs(self, wkt: str) -> tuple[pyproj.CRS, pyproj.CRS]:
         """Return the CRS and its horizontal part."""
         try:
-            crs = parse_crs(wkt)
-            plane = horizontal(crs)
-            ground_transform(plane, "EPSG:4979")
+            return _crs_of(wkt)
         except (CrsError, CRSError) as error:
             raise CrsError(
                 f"the CRS of this DEM cannot be used ({getattr(error, 'message', error)})",
@@ -201,7 +208,6 @@ class DemFile:
                 field="CRS",
                 remedy="set a CRS of known datum with gdal_edit.py -a_srs",
             ) from error
-        return crs, plane
 
     def read(self, left: int, top: int, width: int, height: int, metres_per_unit: float) -> Array:
         """Return the heights ``(height, width)`` of a window inside the file in metres; NaN for voids."""

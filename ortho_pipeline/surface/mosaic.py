@@ -258,7 +258,7 @@ def laid_out(name: str, placed: Sequence[tuple[Samples, pyproj.CRS, SampleGrid, 
     first, crs, grid, unit = placed[0]
     for other, its_crs, its_grid, its_unit in placed[1:]:
         _refuse_other_system(first, crs, grid, other, its_crs, its_grid)
-        if _datum(its_crs) != _datum(crs) or its_unit != unit:
+        if (its_crs is not crs and _datum(its_crs) != _datum(crs)) or its_unit != unit:
             raise DatumError(
                 f"this file has {_said(its_crs, its_unit)}, and {first.path} has {_said(crs, unit)}: they are not one "
                 "DEM", file=other.path, field="height datum",
@@ -278,7 +278,7 @@ def laid_out(name: str, placed: Sequence[tuple[Samples, pyproj.CRS, SampleGrid, 
 def _refuse_other_system(
     first: Samples, crs: pyproj.CRS, grid: SampleGrid, other: Samples, its_crs: pyproj.CRS, its_grid: SampleGrid
 ) -> None:
-    if not its_grid.crs.equals(grid.crs):
+    if its_grid.crs is not grid.crs and not its_grid.crs.equals(grid.crs):
         raise CrsError(
             f"this file is in {its_crs.name!r}, and {first.path} in {crs.name!r}", file=other.path, field="CRS",
             remedy=_WARP,

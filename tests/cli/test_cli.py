@@ -174,10 +174,10 @@ def test_a_missing_file_is_named():
 
 
 def test_failure_and_interruption_have_their_exit_codes(monkeypatch):
-    def fail() -> None:
+    def fail(**_: bool) -> None:
         raise ModelError("the mathematics failed")
 
-    def interrupt() -> None:
+    def interrupt(**_: bool) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(commands, "doctor", fail)
@@ -205,6 +205,7 @@ COMMANDS = [
     "simulate ikonos -o out", "reproduce bilsat", "register a.tif b.tif -o out", "dem-check a.tif --points b.csv",
     "match a.tif --reference b.tif --height 5 -o c.csv", "ties a.tif b.tif --height 5 -o c.csv",
     "measure a.tif --reference b.tif --height 5 -o c.geojson", "mosaic a.tif b.tif -o c.tif",
+    "cache list",
 ]  # fmt: skip
 
 
@@ -222,7 +223,7 @@ def test_without_gdal_every_command_says_one_line_and_its_remedy(tmp_path):
 
 
 def test_an_unforeseen_error_is_one_line_and_a_traceback_only_with_debug(monkeypatch):
-    def fail() -> None:
+    def fail(**_: bool) -> None:
         raise KeyError("nobody thought of this")
 
     monkeypatch.setattr(commands, "doctor", fail)

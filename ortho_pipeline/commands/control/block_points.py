@@ -70,11 +70,9 @@ def gather(
         tables.append(table)
         notices += notes
     if matched:
-        heights = open_surface(surface, scenes[0])
-        opened = {
-            label: on_surface(inputs.open_scene(image, scene), heights)
-            for label, image, scene in zip(labels, images, scenes, strict=True)
-        }
+        alone = [inputs.open_scene(image, scene) for image, scene in zip(images, scenes, strict=True)]
+        heights = open_surface(surface, scenes[0], under=alone)
+        opened = {label: on_surface(scene, heights) for label, scene in zip(labels, alone, strict=True)}
         if options.ties is not None:
             tied = tie_scenes(opened, match, heights, scenes[0])
             tables.append(tied.points)

@@ -60,12 +60,12 @@ def match(
     files |= _page(report)
     inputs.check_paths(files, image, scene, PointOptions(), surface, match)
     opened = inputs.open_scene(image, scene)
-    heights = open_surface(surface, scene)
+    heights = open_surface(surface, scene, under=[opened])
     adjusted = None if report is None else adjust(opened, PointOptions(), scene, heights, match)
     matched = None if adjusted is None else adjusted.matched
     if matched is None:
         matched = match_scene(on_surface(opened, heights), match, heights, scene)
-    read = inputs.files_read(image, scene, PointOptions(), surface, match, opened)
+    read = inputs.files_read(image, scene, PointOptions(), surface, match, opened, heights=heights)
     record = inputs.provenance(
         opened, PointOptions(), heights, inputs.hashed(read), None, {"scene": scene, "surface": surface, "match": match}
     )  # fmt: skip

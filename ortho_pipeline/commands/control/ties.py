@@ -205,8 +205,8 @@ def ties(
         raise InputError("ties are not written in this format", file=output, field="output", remedy="give a .csv file")
     for image in images:
         inputs.check_paths(files, image, scene, PointOptions(), surface)
-    heights = open_surface(surface, scene)
     scenes = {name: inputs.open_scene(image, scene) for name, image in zip(names, images, strict=True)}
+    heights = open_surface(surface, scene, under=scenes.values())
     tied = tie_scenes(scenes, match, heights, scene)
     write_text(output, _csv(tied.points))
     notices = [notice.in_image(name) for name, one in scenes.items() for notice in one.notices]

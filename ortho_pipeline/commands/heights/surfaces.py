@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterable
 
+from ortho_pipeline.commands.heights.automatic import is_automatic, open_automatic
 from ortho_pipeline.errors import InputError, completed, of_option
 from ortho_pipeline.geodesy.crs import Vertical
+from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions, number_of
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
@@ -17,12 +20,17 @@ _LARGEST_SIGMA = 10_000.0
 
 
 def open_surface(
-    options: SurfaceOptions, scene: SceneOptions = SceneOptions(), memory: int = OutputOptions.memory
+    options: SurfaceOptions,
+    scene: SceneOptions = SceneOptions(),
+    memory: int = OutputOptions.memory,
+    under: Iterable[Scene] = (),
 ) -> Surface:
-    """Open the DEM, or take the ground to be flat.
+    """Open the DEM, or find one, or take the ground to be flat.
 
     Parameters
     ----------
+    under : iterable of Scene
+        What lies on it, where heights are to be found.
     memory : int
         Bytes of the whole job.
 
@@ -43,6 +51,8 @@ def open_surface(
     if options.height is not None:
         return Surface.constant(options.height).with_sigma(sigma)
     assert options.dem is not None
+    if is_automatic(options):
+        return open_automatic(options, scene, memory, under).with_sigma(sigma)
     return open_dem(options.dem, options, scene, memory).with_sigma(sigma)
 
 
@@ -77,6 +87,11 @@ def open_dem(
     path: str | os.PathLike[str], options: SurfaceOptions, scene: SceneOptions, memory: int = OutputOptions.memory
 ) -> DemSurface:
     """Open a DEM; of the options it is those that say how its heights are to be understood."""
+    if options.source is not None:
+        raise InputError(
+            "this says where heights are found, and the DEM is given", field="surface.source",
+            remedy="leave it out, or give `surface.dem=auto`",
+        )  # fmt: skip
     with of_option("surface.vertical"):
         vertical = None if options.vertical is None else Vertical.parse(options.vertical)
     return Surface.open(
@@ -86,7 +101,7 @@ def open_dem(
 
 def dem_files(options: SurfaceOptions) -> list[str]:
     """Return the files of the DEM that the user gave: one, those of a pattern, or none."""
-    if options.dem is None:
+    if options.dem is None or is_automatic(options):
         return []
     return [*(matching_files(options.dem) or [os.fspath(options.dem)])]
 
@@ -113,6 +128,7 @@ def has_surface(options: SurfaceOptions) -> bool:
         "surface.override_vertical": options.override_vertical,
         "surface.fill": options.fill != SurfaceOptions.fill,
         "surface.sigma": options.sigma is not None and options.height is None,
+        "surface.source": options.source is not None,
     }
     for field in (field for field, given in idle.items() if given and options.dem is None):
         raise InputError("this is said of a DEM, and there is none", field=field,

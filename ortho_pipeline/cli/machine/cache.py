@@ -1,0 +1,63 @@
+"""``ortho cache``: the files of the network that are kept on this machine."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from ortho_pipeline.cli.options import json_option
+from ortho_pipeline.cli.parsing import Group
+from ortho_pipeline.cli.printing import print_json
+
+_FAILED = 1
+
+
+@click.group(cls=Group)
+def cache() -> None:
+    """Show, check or remove what is kept of the network: cells of DEMs."""
+
+
+@cache.command("list")
+@json_option
+def list_kept(as_json: bool) -> None:
+    """List what is kept, and where."""
+    from ortho_pipeline import commands
+
+    _print(commands.kept_files(), as_json)
+
+
+@cache.command()
+@json_option
+@click.pass_context
+def verify(ctx: click.Context, as_json: bool) -> None:
+    """Hold every file against its checksum; what is damaged is fetched again when it is needed."""
+    from ortho_pipeline import commands
+
+    document = commands.kept_files(verify=True)
+    _print(document, as_json)
+    if any(one["state"] != "sound" for one in document["files"]):
+        ctx.exit(_FAILED)
+
+
+@cache.command()
+@json_option
+def clear(as_json: bool) -> None:
+    """Remove all that is kept."""
+    from ortho_pipeline import commands
+
+    document = commands.forget_kept_files()
+    if as_json:
+        return print_json(document)
+    click.echo(f"Removed {document['files']} files of {document['bytes'] / 1e6:.1f} MB from {document['folder']}")
+    return None
+
+
+def _print(document: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        return print_json(document)
+    for one in document["files"]:
+        click.echo(f"{one.get('state', ''):<8} {one['bytes'] / 1e6:9.1f} MB  {one['address']}".lstrip())
+    total = sum(one["bytes"] for one in document["files"])
+    click.echo(f"{len(document['files'])} files, {total / 1e6:.1f} MB, in {document['folder']}")
+    return None

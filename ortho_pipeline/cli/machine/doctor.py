@@ -1,0 +1,34 @@
+"""``ortho doctor``: what is installed on this machine."""
+
+from __future__ import annotations
+
+import click
+
+from ortho_pipeline.cli.options import json_option
+from ortho_pipeline.cli.parsing import Command
+from ortho_pipeline.cli.printing import print_json
+
+
+@click.command(cls=Command)
+@click.option("--fetch-grids", is_flag=True, help="Fetch the geoid grids that are missing from PROJ's store, once.")
+@json_option
+def doctor(fetch_grids: bool, as_json: bool) -> None:
+    """Show what is installed: GDAL, PROJ, geoid grids, plugins."""
+    from ortho_pipeline import commands
+
+    document = commands.doctor(fetch_grids=fetch_grids)
+    if as_json:
+        return print_json(document)
+    gdal, proj = document["gdal"], document["proj"]
+    click.echo("Packages   " + ", ".join(f"{name} {version}" for name, version in document["packages"].items()))
+    click.echo(f"GDAL       {gdal['version']} (bindings {gdal['bindings']}), reads {', '.join(gdal['drivers'])}")
+    click.echo(f"PROJ       {proj['proj']}, looks in {', '.join(proj['search_path'])}")
+    for grid in document["grids"]:
+        click.echo(f"{grid['datum']:<10} " + (f"{grid['path']}" if grid["found"] else f"missing: {grid.get('remedy')}"))
+    for fetched in document["fetched"]:
+        click.echo(f"fetched    {fetched['grid']} to {fetched['path']}")
+    for plugin in document["plugins"]:
+        click.echo(f"plugin     {plugin['plugin']} ({plugin['distribution']} {plugin['version']})")
+    for broken in document["broken"]:
+        click.echo(f"broken     {broken['plugin']}: {broken['error']}")
+    return None

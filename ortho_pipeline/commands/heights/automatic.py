@@ -1,0 +1,94 @@
+"""Heights that are found by themselves: where the scenes of a command lie, and the cells under them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from ortho_pipeline.errors import DatumError, InputError, OrthoError, of_option
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform
+from ortho_pipeline.geodesy.proj_grids import fetch_grid, missing_grid
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.options import SceneOptions, SurfaceOptions
+from ortho_pipeline.surface.cells.assembled import open_cells
+from ortho_pipeline.surface.cells.copernicus import Extent, extent_of
+from ortho_pipeline.surface.cells.sources import source_of
+from ortho_pipeline.surface.dem import DemSurface
+from ortho_pipeline.surface.dem_file import SANE_HEIGHTS
+from ortho_pipeline.surface.footprint import border
+
+#: The DEM that is no file.
+AUTO = "auto"
+
+
+def is_automatic(options: SurfaceOptions) -> bool:
+    """Tell whether heights are to be found."""
+    return options.dem == AUTO
+
+
+def open_automatic(options: SurfaceOptions, access: SceneOptions, memory: int, scenes: Iterable[Scene]) -> DemSurface:
+    """Return the heights under scenes, of the cells of the Copernicus DEM.
+
+    Raises
+    ------
+    InputError
+        If the network is needed and not allowed, a scene has no model of its own, or land has no cell.
+    """
+    extents = [extent_under(scene) for scene in scenes]
+    if not extents:
+        raise InputError("heights are only found under a scene", field="surface.dem", remedy="give `surface.dem=FILE`")
+    source = source_of(options.source, allow_network=access.allow_network)
+    with of_option("surface.vertical"):
+        vertical = None if options.vertical is None else Vertical.parse(options.vertical)
+    if vertical is None:
+        _require_geoid(access.allow_network)
+    return open_cells(source, extents, vertical, options.override_vertical, options.fill, memory)
+
+
+def extent_under(scene: Scene) -> Extent:
+    """Return where a scene lies, whatever of the heights that its model is meant for the ground has there.
+
+    Raises
+    ------
+    InputError
+        If it has no model, or one that does not project.
+    """
+    if not scene.models:
+        raise InputError(
+            "an image without a model of its own does not say where it lies", file=scene.path, field="surface.dem",
+            remedy="give `surface.dem=FILE`",
+        )  # fmt: skip
+    model = scene.model
+    ring = border(scene.width, scene.height)
+    levels = np.clip(model.height_range, *SANE_HEIGHTS)
+    to_degrees = ground_transform(model.crs, "EPSG:4979")
+    ground = np.concatenate([to_degrees(model.image_to_ground(ring, float(level))) for level in levels])
+    found = extent_of(ground[:, :2])
+    if found is None:
+        raise InputError(
+            "no border pixel meets the ground: the model does not belong to this image", file=scene.path, field="model",
+            remedy="give the metadata of this very image",
+        )  # fmt: skip
+    return found
+
+
+def _require_geoid(allow_network: bool) -> None:
+    """Fetch the geoid grid of EGM2008 if it is not installed and the network is allowed."""
+    grid = missing_grid("EPSG:3855")
+    if grid is None:
+        return
+    if not allow_network:
+        raise DatumError(
+            f"the cells' heights are above EGM2008, whose geoid grid {grid} is not installed", field="surface.dem",
+            remedy="fetch it once with `ortho doctor --fetch-grids`, allow the network with `scene.allow_network`, or "
+            f"give the file with `surface.vertical=FOLDER/{grid}`",
+        )  # fmt: skip
+    try:
+        fetch_grid(grid)
+    except OrthoError as error:
+        raise DatumError(
+            f"the cells' heights are above EGM2008, and its geoid grid cannot be fetched: {error.message}",
+            file=error.file, field="surface.dem",
+            remedy=f"{error.remedy or 'try again later'}; or give the file with `surface.vertical=FOLDER/{grid}`",
+        ) from error  # fmt: skip

@@ -1,0 +1,340 @@
+"""Folders of objects: behind ``https://``, and in the stores of ``s3://``, ``gs://`` and ``az://``.
+
+Whole objects only: what is read in windows is read by GDAL. Requests that fail in passing (429, 5xx, a connection that
+is cut) are repeated with growing pauses, and a download that is cut goes on where it was cut, by `obstore`. What
+arrives is held against the size and the checksum that the store states. Credentials are those that the store's own
+clients find (environment, role of the machine); nothing of them, and nothing that a server says in its own words, is in
+a message.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+from ortho_pipeline.errors import InputError, StorageError
+from ortho_pipeline.files.locations import require_network
+
+#: Kinds of address.
+SCHEMES = ("https", "http", "s3", "gs", "az")
+#: An address of a folder or an object.
+_ADDRESS = re.compile(rf"({'|'.join(SCHEMES)})://[^/]")
+#: How often a request is repeated, and for how long, before it has failed.
+RETRIES: dict[str, Any] = {
+    "max_retries": 8, "retry_timeout": timedelta(minutes=3),
+    "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=15), "base": 2},
+}  # fmt: skip
+#: How often an object is fetched whose content is not what the store says of it.
+_ATTEMPTS = 3
+_TIMEOUTS = {"connect_timeout": "10s", "timeout": "900s"}
+_CHUNK = 4 << 20
+#: Bytes of the parts in which a large object is stored.
+PART = 8 << 20
+#: The ETag of an object that was stored at once is the MD5 of its content; of one in parts see `Content`.
+_TAG = re.compile(r'"?([0-9a-f]{32}(?:-([0-9]+))?)"?')
+
+
+def is_address(text: str | os.PathLike[str]) -> bool:
+    """Tell whether a text is an address of one of `SCHEMES`."""
+    return bool(_ADDRESS.match(os.fspath(text)))
+
+
+@dataclass(frozen=True)
+class Content:
+    """What an object was when it was written or read: its size, checksums, and the store's name of this version.
+
+    `tags` are the ETags that stores give such a content: the MD5 of what is stored at once, and for what is stored in
+    parts the MD5 of theirs, with their number.
+    """
+
+    size: int
+    sha256: str
+    tags: tuple[str, ...]
+    e_tag: str | None
+
+
+class Objects:
+    """A folder of objects.
+
+    Parameters
+    ----------
+    address : str
+        Of the folder: ``https://host/folder``, ``s3://bucket/prefix``, ``gs://…``, ``az://…``.
+    allow_network : bool
+
+    Raises
+    ------
+    InputError
+        If the network is not allowed, or the address is none of these.
+    """
+
+    def __init__(self, address: str, *, allow_network: bool) -> None:
+        require_network(address, allow_network)
+        if not is_address(address):
+            raise InputError(
+                "this is no address of a folder", file=address, remedy=f"one of {', '.join(SCHEMES)}, and a name"
+            )
+        self.address = address.rstrip("/")
+        self._store = _store_of(self.address)
+
+    def __repr__(self) -> str:
+        return f"Objects({self.address!r})"
+
+    def of(self, name: str) -> str:
+        """Return the address of an object in the folder."""
+        return f"{self.address}/{name}"
+
+    # -- reading -----------------------------------------------------------------------------------------------------
+
+    def read(self, name: str, limit: int) -> tuple[bytes, Content]:
+        """Return an object of at most `limit` bytes, and what it is.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is none.
+        InputError
+            If it is larger, or may not be read.
+        StorageError
+            If the store does not answer, or gives other bytes than it says.
+        """
+        return self._attempts(name, limit, b"".join)
+
+    def fetch(self, name: str, path: Path, limit: int) -> Content:
+        """Write an object to a file, which has no other name yet; see `read`."""
+
+        def write(chunks: Iterator[bytes]) -> None:
+            with path.open("wb") as file:
+                for chunk in chunks:
+                    file.write(chunk)
+                file.flush()
+                os.fsync(file.fileno())
+
+        return self._attempts(name, limit, write)[1]
+
+    def _attempts(self, name: str, limit: int, take: Any) -> tuple[Any, Content]:
+        wrong = ""
+        for _ in range(_ATTEMPTS):
+            with self._errors(name):
+                result = self._store.get(name)
+                if result.meta["size"] > limit:
+                    raise InputError(
+                        f"this object has {result.meta['size']} bytes, and {limit} are the most that is read",
+                        file=self.of(name), remedy="check the address",
+                    )  # fmt: skip
+                digests = _Digests()
+                taken = take(digests.through(result.stream(min_chunk_size=_CHUNK), limit))
+                content = digests.content(result.meta["e_tag"])
+                wrong = _difference(content, result.meta)
+            if not wrong:
+                return taken, content
+        raise StorageError(
+            f"{wrong}, {_ATTEMPTS} times", file=self.of(name),
+            remedy="try again later; if it stays so, the object is damaged in its store",
+        )  # fmt: skip
+
+    def names(self, prefix: str = "") -> Iterator[tuple[str, int]]:
+        """Yield names and sizes of the objects whose names begin so; a plain web server lists none."""
+        with self._errors(prefix):
+            for chunk in self._store.list(prefix or None):
+                for one in chunk:
+                    yield one["path"], one["size"]
+
+    def exists(self, name: str) -> bool:
+        """Tell whether there is such an object."""
+        try:
+            with self._errors(name):
+                self._store.head(name)
+        except FileNotFoundError:
+            return False
+        return True
+
+    # -- writing -----------------------------------------------------------------------------------------------------
+
+    def put(self, name: str, data: bytes | Path, *, replacing: str | None = None, new: bool = False) -> Content:
+        """Store an object, whole or not at all, and hold the store's checksum against that of the content.
+
+        Parameters
+        ----------
+        replacing : str, optional
+            The ETag of the version that it takes the place of: not written if another one is there.
+        new : bool
+            Do not write it if there is one of this name.
+
+        Raises
+        ------
+        Conflict
+            If there is another version, or one at all.
+        StorageError
+            If the store does not answer, or has other bytes than it was given.
+        """
+        content = _content(data)
+        if new or replacing is not None:
+            return self._put_if(name, data, content, "create" if new else {"e_tag": replacing})
+        for _ in range(_ATTEMPTS):
+            with self._errors(name):
+                self._store.put(name, data, chunk_size=PART, max_concurrency=4)
+                stored = self._store.head(name)
+            if not (wrong := _difference(content, stored, ours=True)):
+                return replace(content, e_tag=stored["e_tag"])
+        self.delete(name)
+        raise StorageError(
+            f"{wrong} after it was written, {_ATTEMPTS} times; it was removed", file=self.of(name),
+            remedy="try again; if it stays so, check the store and the way to it",
+        )  # fmt: skip
+
+    def _put_if(self, name: str, data: bytes | Path, content: Content, mode: Any) -> Content:
+        try:
+            with self._errors(name):
+                made = self._store.put(name, data, mode=mode, use_multipart=False)
+            if not (wrong := _difference(content, {"size": content.size, "e_tag": made["e_tag"]}, ours=True)):
+                return replace(content, e_tag=made["e_tag"])
+        except Conflict:
+            # A request whose answer was lost is repeated, and finds what it wrote itself.
+            wrong = ""
+        with contextlib.suppress(FileNotFoundError):
+            _, there = self.read(name, content.size)
+            if there.sha256 == content.sha256:
+                return there
+        if not wrong:
+            raise Conflict("another version of this object is there", file=self.of(name))
+        self.delete(name)
+        raise StorageError(
+            f"{wrong} after it was written; it was removed", file=self.of(name), remedy="check the way to the store"
+        )
+
+    def delete(self, name: str) -> None:
+        """Remove an object; one that is not there is no error."""
+        with contextlib.suppress(FileNotFoundError), self._errors(name):
+            self._store.delete(name)
+
+    @contextlib.contextmanager
+    def _errors(self, name: str) -> Iterator[None]:
+        """Say what went wrong in our words: those of libraries and servers may hold signed addresses."""
+        from obstore import exceptions
+
+        try:
+            yield
+        except FileNotFoundError as error:
+            raise FileNotFoundError(2, "there is no such object", self.of(name)) from error
+        except (exceptions.AlreadyExistsError, exceptions.PreconditionError) as error:
+            raise Conflict("another version of this object is there", file=self.of(name)) from error
+        except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError) as error:
+            raise InputError(
+                "the store does not let you do this", file=self.of(name),
+                remedy="give credentials as the store's own clients find them (docs/scale.md), or check their rights",
+            ) from error  # fmt: skip
+        except exceptions.BaseError as error:
+            raise StorageError(
+                f"the store does not do what was asked ({_status(error)})", file=self.of(name),
+                remedy="check the address; try again later",
+            ) from error  # fmt: skip
+
+
+class Conflict(StorageError):
+    """Another version of an object is there than the one that was to be replaced."""
+
+
+class _Digests:
+    """Sizes and checksums of what goes through."""
+
+    def __init__(self) -> None:
+        self._size = 0
+        self._sha256, self._md5 = hashlib.sha256(), hashlib.md5(usedforsecurity=False)
+        self._part = hashlib.md5(usedforsecurity=False)
+        self._parts: list[bytes] = []
+
+    def through(self, chunks: Iterable[Any], limit: int) -> Iterator[bytes]:
+        """Yield the chunks; stop with an error beyond `limit` bytes, whatever a server said of their number."""
+        for chunk in chunks:
+            piece = bytes(chunk)
+            self._sha256.update(piece)
+            self._md5.update(piece)
+            self._add_to_parts(piece)
+            self._size += len(piece)
+            if self._size > limit:
+                raise InputError(f"this object has more than {limit} bytes", remedy="check the address")
+            yield piece
+
+    def _add_to_parts(self, piece: bytes) -> None:
+        at = 0
+        while at < len(piece):
+            room = PART - (self._size + at) % PART
+            self._part.update(piece[at : at + room])
+            at += room
+            if at <= len(piece):
+                self._parts.append(self._part.digest())
+                self._part = hashlib.md5(usedforsecurity=False)
+
+    def content(self, e_tag: str | None) -> Content:
+        """Return what went through."""
+        parts = self._parts + ([self._part.digest()] if self._size % PART else [])
+        joined = hashlib.md5(b"".join(parts), usedforsecurity=False).hexdigest()
+        tags = (self._md5.hexdigest(), f"{joined}-{len(parts)}")
+        return Content(self._size, self._sha256.hexdigest(), tags, e_tag)
+
+
+def _content(data: bytes | Path) -> Content:
+    digests = _Digests()
+    if isinstance(data, bytes):
+        for _ in digests.through([data], len(data)):
+            pass
+        return digests.content(None)
+    with data.open("rb") as file:
+        for _ in digests.through(iter(lambda: file.read(_CHUNK), b""), os.fstat(file.fileno()).st_size):
+            pass
+    return digests.content(None)
+
+
+def _difference(content: Content, stated: Mapping[str, Any], *, ours: bool = False) -> str:
+    """Return how a content differs from what a store states of it; empty if it does not.
+
+    The ETag of what others stored in parts says nothing of the content alone.
+    """
+    if content.size != stated["size"]:
+        return f"{content.size} bytes, and the store states {stated['size']}"
+    tag = _TAG.fullmatch(stated["e_tag"] or "")
+    if tag is None or tag[1] in content.tags or (tag[2] and not ours):
+        return ""
+    return "the checksum is not the one that the store states"
+
+
+def _status(error: Exception) -> str:
+    found = re.search(r"status code: (\d{3})", str(error))
+    if found:
+        return f"HTTP status {found[1]}"
+    return "it cannot be reached" if "connect" in str(error) else "the connection failed"
+
+
+def _store_of(address: str) -> Any:
+    from obstore import store
+
+    options: Any = {**_TIMEOUTS, "user_agent": "ortho-pipeline"}
+    scheme = address.partition("://")[0]
+    if scheme == "http" or os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes"):
+        options["allow_http"] = True
+    given: dict[str, Any] = {}
+    if scheme == "s3":
+        given = _s3_settings()
+        options["allow_http"] = options.get("allow_http", False) or given.get("endpoint", "").startswith("http://")
+    make: Any = store.from_url  # one signature for each kind of store
+    return make(address, client_options=options, retry_config=RETRIES, **given)
+
+
+def _s3_settings() -> dict[str, Any]:
+    """Return what the names of GDAL and of Amazon's clients say and `obstore` does not read itself."""
+    given: dict[str, Any] = {}
+    endpoint = os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_S3_ENDPOINT")
+    if endpoint:
+        plain = os.environ.get("AWS_HTTPS", "YES").upper() in ("NO", "FALSE", "0")
+        given["endpoint"] = endpoint if "://" in endpoint else f"http{'' if plain else 's'}://{endpoint}"
+    if os.environ.get("AWS_NO_SIGN_REQUEST", "").upper() in ("YES", "TRUE", "1"):
+        given["skip_signature"] = True
+    return given

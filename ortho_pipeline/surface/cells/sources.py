@@ -1,0 +1,137 @@
+"""Where cells come from: a folder on disk, or one of objects, whose cells are kept on this machine once fetched."""
+
+from __future__ import annotations
+
+import functools
+import os
+from abc import ABC, abstractmethod
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import read_bounded
+from ortho_pipeline.files.process_limits import startable_threads
+from ortho_pipeline.files.storage.kept import kept
+from ortho_pipeline.files.storage.objects import Objects, is_address
+from ortho_pipeline.raster.source import open_pixels
+from ortho_pipeline.surface.cells.copernicus import LARGEST, LIST, PUBLIC, PUBLIC_LAND, Cell, cells_of_list
+from ortho_pipeline.surface.dem_file import Affine
+
+#: Environment variable: where cells come from, if no option says it.
+VARIABLE = "ORTHO_DEM_SOURCE"
+_LIST_BYTES = 20_000_000
+#: Part of a sample by which a file may lie off the grid of its cell.
+_OFF_GRID = 0.01
+#: Cells that are fetched at a time.
+_AT_ONCE = 4
+
+
+class Source(ABC):
+    """Where cells come from."""
+
+    address: str
+
+    @abstractmethod
+    def files(self, cells: list[Cell]) -> dict[Cell, str]:
+        """Return the files of those cells that are there."""
+
+    @abstractmethod
+    def land(self) -> frozenset[Cell] | None:
+        """Return all cells that there ought to be: any other one is sea. None where nobody says."""
+
+
+def source_of(given: str | os.PathLike[str] | None, *, allow_network: bool) -> Source:
+    """Return the source that is given, that of the environment variable, or the public bucket.
+
+    Raises
+    ------
+    InputError
+        If there is no such folder, or the network is not allowed.
+    """
+    text = os.fspath(given or os.environ.get(VARIABLE) or PUBLIC)
+    if is_address(text):
+        return _Bucket(text, allow_network)
+    if not Path(text).is_dir():
+        raise InputError(
+            "there is no such folder of cells", file=text, field="surface.source",
+            remedy="give a folder that holds cells by their names in the public bucket, or an address",
+        )  # fmt: skip
+    return _Folder(text)
+
+
+class _Folder(Source):
+    def __init__(self, path: str) -> None:
+        self.address = path
+
+    def files(self, cells: list[Cell]) -> dict[Cell, str]:
+        found = {}
+        for cell in cells:
+            for place in (Path(self.address) / f"{cell.name}.tif", Path(self.address) / cell.name / f"{cell.name}.tif"):
+                if place.is_file():
+                    found[cell] = str(place)
+        return found
+
+    def land(self) -> frozenset[Cell] | None:
+        path = Path(self.address) / LIST
+        return cells_of_list(read_bounded(path, _LIST_BYTES).decode("latin-1")) if path.is_file() else None
+
+
+class _Bucket(Source):
+    def __init__(self, address: str, allow_network: bool) -> None:
+        self._objects = Objects(address, allow_network=allow_network)
+        self.address = self._objects.address
+        self._allow_network = allow_network
+
+    def files(self, cells: list[Cell]) -> dict[Cell, str]:
+        startable_threads(_AT_ONCE)
+        with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="cells") as pool:
+            found = dict(zip(cells, pool.map(self._kept, cells), strict=True))
+        return {cell: path for cell, path in found.items() if path is not None}
+
+    def land(self) -> frozenset[Cell] | None:
+        own = self._list(self._objects)
+        if self.address != PUBLIC or own is None:
+            return own
+        others = self._list(Objects(PUBLIC_LAND, allow_network=self._allow_network))
+        return None if others is None else own | others
+
+    def _kept(self, cell: Cell) -> str | None:
+        name = f"{cell.name}/{cell.name}.tif"
+        fetch = functools.partial(self._objects.fetch, name, limit=LARGEST)
+        try:
+            return str(kept("dem", self._objects.of(name), fetch, fault=functools.partial(fault_of, cell)))
+        except FileNotFoundError:
+            return None
+
+    @staticmethod
+    def _list(objects: Objects) -> frozenset[Cell] | None:
+        fetch = functools.partial(objects.fetch, LIST, limit=_LIST_BYTES)
+        try:
+            return cells_of_list(kept("dem", objects.of(LIST), fetch).read_text("latin-1"))
+        except FileNotFoundError:
+            return None
+
+
+def fault_of(cell: Cell, path: Path | str) -> str:
+    """Return what is wrong with the file of a cell: its size, its place, or a block that cannot be unpacked."""
+    try:
+        dataset, _ = open_pixels(path)
+        shape, place = (dataset.RasterYSize, dataset.RasterXSize), dataset.GetGeoTransform()
+        dataset.GetRasterBand(1).Checksum()
+    except (InputError, RuntimeError) as error:
+        return f"it cannot be read ({getattr(error, 'message', error)})"
+    x, dx, _, y, _, dy = place
+    return misplaced(cell, shape, (x + dx / 2, dx, 0.0, y + dy / 2, 0.0, dy))
+
+
+def misplaced(cell: Cell, shape: tuple[int, int], place: Affine) -> str:
+    """Return how the samples of a file do not lie where those of a cell do; empty if they do."""
+    if shape != cell.grid.shape:
+        rows, columns = cell.grid.shape
+        return f"it has {shape[1]} x {shape[0]} samples, and this cell has {columns} x {rows}"
+    own = np.array(cell.grid.crs_from_pixel)
+    ends = np.array([[1, 0, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0], [1, shape[1], 0, 0, 0, 0], [0, 0, 0, 1, 0, shape[0]]])
+    off = np.abs(ends @ (np.array(place) - own)).max() / own[1]
+    return "" if off < _OFF_GRID else "it lies elsewhere than this cell"
