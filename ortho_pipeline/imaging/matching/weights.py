@@ -18,11 +18,13 @@ from scipy import optimize
 from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.models.base import Array
 
-_ROUNDS = 4
+_ROUNDS = 30
 #: No match is more certain than this (px): residuals that are all of one direction leave nothing for the other.
 _LEAST = 0.01
 #: Squared residuals beyond this many times their expectation tell of blunders, not of weights.
 _BLUNDER = 9.0
+#: Of two squares and a product of independent standard normal errors: one over the root of their variances.
+_WEIGHT = np.array([1.0 / np.sqrt(2), 1.0 / np.sqrt(2), 1.0])
 
 
 @dataclass(frozen=True)
@@ -60,33 +62,50 @@ class Components:
 def components(residuals: Array, matched: Array, along: Array) -> Components:
     """Estimate the factors from residuals ``(n, 2)`` of a fit to many matches.
 
-    Squares and products of the residuals are fitted by non-negative least squares to what the parts predict, each
-    weighted by its own variance under the last estimate; what is far beyond it takes no part.
+    Squares and products of the residuals are fitted by non-negative least squares to what the parts predict, weighted
+    by their covariance under the last estimate; what is far beyond it takes no part.
     """
     sight = along[:, :, None] * along[:, None, :]
     parts = np.stack([matched, sight, np.broadcast_to(np.eye(2), matched.shape)], axis=-1)
     squares = residuals[:, :, None] * residuals[:, None, :]
-    scale = 1.4826**2 * np.median((residuals - np.median(residuals, axis=0)) ** 2)
-    found = np.array([0.0, 0.0, max(float(scale), 1e-6)])
+    found, before = _start(residuals, along), np.zeros(3)
+    least = found[2]
     for _ in range(_ROUNDS):
         expected = parts @ found + 1e-9 * np.eye(2)
         distance = squared_distances(residuals, expected)
         good = distance <= _BLUNDER
         if good.sum() < 8:
             break
-        variance = np.stack([expected[:, 0, 0], expected[:, 1, 1], expected[:, 0, 1]], axis=1)[good]
-        weight = 1.0 / np.stack(
-            [np.sqrt(2) * variance[:, 0], np.sqrt(2) * variance[:, 1],
-             np.sqrt(variance[:, 0] * variance[:, 1] + variance[:, 2] ** 2)], axis=1,
-        )  # fmt: skip
-        rows = np.stack([parts[good][:, 0, 0], parts[good][:, 1, 1], parts[good][:, 0, 1]], axis=1)
-        right = np.stack([squares[good][:, 0, 0], squares[good][:, 1, 1], squares[good][:, 0, 1]], axis=1)
-        design, observed = (rows * weight[:, :, None]).reshape(-1, 3), (right * weight).ravel()
+        # In units of what is expected, where squares and products are independent, with the variances 2 and 1:
+        # in the image, where heights spread matches far along one direction, what lies across it would be the
+        # difference of large numbers that are not.
+        white = np.linalg.inv(np.linalg.cholesky(expected[good]))
+        rows = _three(np.einsum("nij,njkp,nlk->nilp", white, parts[good], white))
+        right = _three(white @ squares[good] @ white.transpose(0, 2, 1))
+        design, observed = (rows * _WEIGHT[:, None]).reshape(-1, 3), (right * _WEIGHT).ravel()
         # What is cut off beyond the limit of a chi-squared of two degrees of freedom, relative to all of it.
         cut = 1.0 - np.exp(-_BLUNDER / 2) * (1.0 + _BLUNDER / 2)
         length = np.linalg.norm(design, axis=0)
         length[length == 0] = 1.0
         found = optimize.nnls(design / length, observed / cut)[0] / length
         if not found.any():
-            found[2] = max(float(scale), 1e-6)
+            found[2] = least
+        if np.allclose(found, before, rtol=1e-3, atol=1e-9):
+            break
+        before = found
     return Components(float(found[0]), float(np.sqrt(found[1])), max(float(np.sqrt(found[2])), _LEAST))
+
+
+def _start(residuals: Array, along: Array) -> Array:
+    """Return squares of a first height and of the rest, by medians along and across the line of sight."""
+    length = np.linalg.norm(along, axis=1)
+    unit = np.divide(along, length[:, None], out=np.tile([1.0, 0.0], (len(along), 1)), where=length[:, None] > 0)
+    across = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
+    far, near = (1.4826 * float(np.median(np.abs((residuals * axis).sum(axis=1)))) for axis in (unit, across))
+    rest = max(near**2, 1e-6)
+    return np.array([0.0, max(far**2 - rest, 0.0) / max(float(np.median(length)) ** 2, 1e-12), rest])
+
+
+def _three(matrix: Array) -> Array:
+    """Return the entries ``(n, 3, ...)`` of symmetric matrices ``(n, 2, 2, ...)``."""
+    return np.stack([matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 0, 1]], axis=1)
