@@ -9,6 +9,7 @@ from pathlib import Path
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.points import control_of, has_control, match_asked
 from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
+from ortho_pipeline.commands.placement import source_of
 from ortho_pipeline.commands.results import ENDINGS, CompareResult, FitResult, outputs_together, write_report
 from ortho_pipeline.commands.scene_fit import (
     Adjusted,
@@ -24,7 +25,7 @@ from ortho_pipeline.estimation import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import ridge_of
 from ortho_pipeline.models import families
-from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.report import document as report
 
 
@@ -127,7 +128,7 @@ def compare(
         scene=opened, fit=chosen, surface=heights, comparison=document, near=points.near,
         provenance=record, warnings=adjusted.warnings(heights), matching=adjusted.matching,
     )  # fmt: skip
-    write_report(made, chosen, files, matched)
+    write_report(made, chosen, files, matched, source_of(opened, image, scene, OutputOptions()))
     return replace(result, files=files)
 
 

@@ -116,7 +116,7 @@ def rectify(
                   *notes, *warped.notes(output.memory)],
     )  # fmt: skip
     made = report.with_layers(made, accuracy=accuracy, angles=angles)
-    write_report(made, adjusted.fit, files, adjusted.matched)
+    write_report(made, adjusted.fit, files, adjusted.matched, source)
     if acquired is not None:
         stac_items.write_item(files["stac"], made, files, acquired, name or stem)
     inputs.refuse_changed(begun)

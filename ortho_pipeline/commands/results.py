@@ -22,6 +22,7 @@ from ortho_pipeline.files import staged, together, write_text
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import OutputOptions
+from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.map_scale import map_scale
 from ortho_pipeline.report.matching import MatchingRecord, matching_record
@@ -156,10 +157,16 @@ def outputs_together(command: Callable[_P, _R]) -> Callable[_P, _R]:
     return wrapper
 
 
-def write_report(made: SceneReport, fit: Fit, files: dict[str, Path], matched: Matched | None = None) -> None:
+def write_report(
+    made: SceneReport,
+    fit: Fit,
+    files: dict[str, Path],
+    matched: Matched | None = None,
+    pixels: RasterSource | None = None,
+) -> None:
     """Write report and residuals; without points there are no residuals, and they are taken out of `files`.
 
-    Of what was matched the page shows the chips.
+    The page shows chips of what was matched, and of `pixels`, those of the scene, about measured points.
     """
     if len(fit.points):
         write_text(files["residuals"], json.dumps(report.residuals_geojson(fit), allow_nan=False))
@@ -169,5 +176,5 @@ def write_report(made: SceneReport, fit: Fit, files: dict[str, Path], matched: M
     report.write_report_json(made, files["report"])
     report.write_report_html(
         made, files["html"], ortho=staged(files["ortho"]) if "ortho" in files else None,
-        matches=None if matched is None else matched.matches,
+        matches=None if matched is None else matched.matches, pixels=pixels,
     )  # fmt: skip

@@ -45,6 +45,11 @@ LOOKS = {
     "loo": Look("control", "paper", 1.7),
     "out": Look("ink", None, 1.6, 0.6),
     "bar": Look("ink", "ink", 1.7),
+    "rule": Look("ink", None, 1.7),
+    "casing": Look("paper", None, 4.4, 0.6),
+    "halo": Look(None, "paper", fill_opacity=0.45),
+    "graticule": Look("ink", None, 0.8, 0.45),
+    "land": Look(None, "ink", fill_opacity=0.22),
     "plus": Look(None, "control"),
     "minus": Look(None, "check"),
     "control-dash": Look("control", None, 1.7, dash="6 4"),
@@ -97,9 +102,9 @@ class Drawing:
         self.items.append(("text", {"x": x, "y": y, "text": text, "anchor": anchor, "quiet": quiet, "turn": turn}))
 
     @contextmanager
-    def titled(self, title: str) -> Iterator[None]:
-        """Show `title` where the pointer rests on what is drawn within."""
-        self.items.append(("open", {"title": title}))
+    def titled(self, title: str, *, key: int | None = None) -> Iterator[None]:
+        """Show `title` where the pointer rests on what is drawn within; a page finds it by `key` (``data-point``)."""
+        self.items.append(("open", {"title": title, "key": key}))
         yield
         self.items.append(("close", {}))
 
@@ -193,7 +198,7 @@ def style_sheet(*, alone: bool = False) -> str:
 
 def _svg_item(what: str, **given: Any) -> str:
     makers: dict[str, Callable[..., str]] = {
-        "open": lambda title: f"<g><title>{escape(title)}</title>",
+        "open": _svg_group,
         "close": lambda: "</g>",
         "line": _svg_line,
         "path": _svg_path,
@@ -202,6 +207,11 @@ def _svg_item(what: str, **given: Any) -> str:
         "text": _svg_text,
     }
     return makers[what](**given)
+
+
+def _svg_group(title: str, key: int | None) -> str:
+    found = "" if key is None else f' data-point="{key}"'
+    return f"<g{found}><title>{escape(title)}</title>"
 
 
 def _svg_line(kind: str, xy: list[tuple[float, float]]) -> str:

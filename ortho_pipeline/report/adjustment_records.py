@@ -163,7 +163,8 @@ class GroupedStatistics(Statistics):
 class Point:
     """A point in the image: `residual_m` is where the ortho shows it minus where it belongs, metres along x and y.
 
-    `view_residual` is along and across the direction of view, `raw_residual` of the model as delivered.
+    `view_residual` is along and across the direction of view, `raw_residual` of the model as delivered. `lon_lat` is
+    where it belongs and `shown_lon_lat` where the ortho shows it, degrees (WGS 84).
     """
 
     id: str
@@ -177,6 +178,8 @@ class Point:
     residual_m: Residual | None = None
     view_residual: Residual | None = None
     height_m: float | None = None
+    lon_lat: Residual | None = None
+    shown_lon_lat: Residual | None = None
 
     @property
     def kind(self) -> Literal["control", "check", "out"]:

@@ -7,7 +7,6 @@ the assumption that the DEM is right there.
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
@@ -18,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.display.drawing import round_down, style_sheet
-from ortho_pipeline.display.notices import Notice, texts_but, to_document
-from ortho_pipeline.display.numbers import flat, metres
+from ortho_pipeline.display.drawing import round_down
+from ortho_pipeline.display.notices import Notice, to_document
+from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.estimation.fit import Fit, root_mean_square
@@ -28,17 +27,17 @@ from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rm
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
 from ortho_pipeline.files.documents import DocumentError, json_position, json_value, made_of, record_of
-from ortho_pipeline.geodesy.crs import Vertical, crs_text, ground_transform
+from ortho_pipeline.geodesy.crs import Vertical, crs_text, ground_transform, parse_crs
+from ortho_pipeline.geodesy.ellipsoid import units_per_metre
 from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.adjustment_records import Adjustment, RmseOfView, RmsesOfView, RmsesOnGround, is_known
 from ortho_pipeline.report.delivered import accuracy_before
-from ortho_pipeline.report.gallery.chips import gallery
-from ortho_pipeline.report.gallery.plots import residuals_by_axis
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.report.layers.angles import AnglesLayer
 from ortho_pipeline.report.map_scale import map_scale
 from ortho_pipeline.report.matching import matching_record
+from ortho_pipeline.report.page.scene import write_report_html
 from ortho_pipeline.report.plots import plots
 from ortho_pipeline.report.records import (
     ComparisonRecord,
@@ -63,7 +62,6 @@ if TYPE_CHECKING:
 
     from ortho_pipeline.exchange.rpc_fit import RpcExport
     from ortho_pipeline.hookspecs import Scene
-    from ortho_pipeline.imaging.matching import Matches
     from ortho_pipeline.raster.source import Grid
     from ortho_pipeline.surface.base import Surface
     from ortho_pipeline.warp.engine import WarpResult
@@ -174,12 +172,24 @@ def _adjustment(fit: Fit, noted: Mapping[str, Any]) -> Adjustment:
     """Return the adjustment with all that there is to warn of, and its points as they are on the ground."""
     document = json_value(fit.to_json()) | noted
     shifts, views = in_metres(fit, fit.residuals), along_view(fit)
+    places, shown = _in_degrees(fit, shifts)
     for i, point in enumerate(document["points"]):
         point["raw_residual"] = json_position(fit.raw_residuals[i])
         point["residual_m"] = json_position(shifts[i])
         point["view_residual"] = json_position(views[i])
         point["height_m"] = json_value(fit.points.ground[i, 2])
+        point["lon_lat"], point["shown_lon_lat"] = json_position(places[i]), json_position(shown[i])
     return made_of(Adjustment, document)
+
+
+def _in_degrees(fit: Fit, shifts: Array) -> tuple[Array, Array]:
+    """Return where points belong and where the ortho shows them, longitude and latitude ``(N, 2)``."""
+    points = fit.points
+    if not len(points):
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    to_degrees, moved = ground_transform(points.crs, "EPSG:4979"), points.ground.copy()
+    moved[:, :2] += shifts * units_per_metre(parse_crs(points.crs), points.ground)[:, :2]
+    return to_degrees(points.ground)[:, :2], to_degrees(moved)[:, :2]
 
 
 def _covariances(fit: Fit, near: float | None) -> Covariances:
@@ -400,49 +410,3 @@ def write_plots(report: SceneReport, folder: Path, stem: str, kind: str = "svg")
         with whole_or_nothing(files[name]) as temporary:
             temporary.write_bytes(drawing.png())
     return files
-
-
-def write_report_html(
-    report: SceneReport,
-    path: str | PathLike[str],
-    *,
-    ortho: str | PathLike[str] | bytes | None = None,
-    matches: Matches | None = None,
-) -> None:
-    """Write the report as one page that needs no other file and no network.
-
-    Parameters
-    ----------
-    ortho : path or bytes, optional
-        The orthoimage, of which a preview is made, or the PNG of a preview.
-    matches : Matches, optional
-        Those that `report.matching` is of, whose chips are shown.
-    """
-    png = ortho if isinstance(ortho, bytes) or ortho is None else preview_png(ortho)
-    adjustment = report.adjustment
-    page = render(
-        "report/report.html.j2",
-        report=report,
-        adjustment=adjustment,
-        head=report.headline,
-        # The headline's notes have said these already.
-        warnings=texts_but(report.warnings, report.notices, "no-redundancy", "few-check-points"),
-        rejected={one.id: one.reason for one in adjustment.rejected},
-        outlying={one.id: one.reason for one in adjustment.outlying},
-        has_loo=any(point.loo_residual for point in adjustment.points),
-        provenance=list(flat({**report.scene.facts, **_brief(report.provenance)})),
-        inputs=report.provenance.inputs,
-        plots={name: drawing.svg() for name, drawing in plots(report).items()},
-        plotted_role=report.covariance.drawn_role,
-        plot_style=style_sheet(),
-        preview=base64.b64encode(png).decode() if png else None,
-        match_axes=residuals_by_axis(report)[0],
-        gallery=None if matches is None else gallery(report, matches),
-    )
-    write_text(path, page)
-
-
-def _brief(provenance: Provenance) -> dict[str, Any]:
-    """Return the provenance without what the page shows in tables of its own."""
-    shown = ("inputs", "surface", "model_source")
-    return {key: value for key, value in json_value(provenance).items() if key not in shown}

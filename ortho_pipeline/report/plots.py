@@ -46,11 +46,12 @@ def plots(report: SceneReport) -> dict[str, Drawing]:
 
 
 class Shown(NamedTuple):
-    """A point that is drawn: where it was measured in the image and its residual, pixels, and what it is drawn as."""
+    """A point that is drawn: where it was measured in the image, its residual, pixels, and its number in the report."""
 
     point: Point
     image: Pair
     residual: Pair
+    number: int
 
     @property
     def kind(self) -> str:
@@ -60,8 +61,8 @@ class Shown(NamedTuple):
 
 def _shown(report: SceneReport) -> list[Shown]:
     return [
-        Shown(point, point.image, point.residual)
-        for point in report.adjustment.points
+        Shown(point, point.image, point.residual, k)
+        for k, point in enumerate(report.adjustment.points)
         if is_known(point.image) and is_known(point.residual) and point.role != "tie"
     ]
 
@@ -114,7 +115,7 @@ def _draw_point(drawing: Drawing, point: Shown, at: Any, arrow: float, label: bo
     x, y = (float(value) for value in at)
     dx, dy = (value * arrow for value in point.residual)
     kind = point.kind
-    with drawing.titled(_title(point)):
+    with drawing.titled(_title(point), key=point.number):
         if kind != "out":
             drawing.arrow(kind, x, y, dx, dy)
         drawing.mark(kind, x, y)
@@ -165,7 +166,7 @@ def plot_directions(report: SceneReport) -> Drawing | None:
     axes = Axes(drawing, (52.0, 14.0, 354.0, 316.0), (-reach, reach), (-reach, reach))
     axes.draw("along the direction of view, px", "across, px")
     for one, vector in inside:
-        with drawing.titled(_title(one)):
+        with drawing.titled(_title(one), key=one.number):
             drawing.mark(one.kind, *axes.at(*vector))
     _legend(drawing, [one for one, _ in inside], 406)
     return drawing
@@ -193,7 +194,7 @@ def plot_heights(report: SceneReport) -> Drawing | None:
     axes = Axes(drawing, (52.0, 14.0, 354.0, 316.0), (low, high), (-reach, reach))
     axes.draw("height above the ellipsoid, m", "along the view, px" if viewed else "row, px")
     for one, height, value in inside:
-        with drawing.titled(f"{_title(one)}\nheight {height:.1f} m"):
+        with drawing.titled(f"{_title(one)}\nheight {height:.1f} m", key=one.number):
             drawing.mark(one.kind, *axes.at(height, value))
     _legend(drawing, [one for one, _, _ in inside], 406)
     return drawing

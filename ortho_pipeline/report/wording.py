@@ -79,6 +79,28 @@ def headline(
     return Headline(figure="Not tested", metres=None, what=what, notes=tuple(notes))
 
 
+def verdict(report: SceneReport) -> str:
+    """Say in one sentence what the accuracy suffices for, and under which conditions."""
+    found = report.map_scale
+    if found is None:
+        if report.headline.figure == "Not tested":
+            return "What it is fit for nobody can say: no point tests it."
+        return "What it is fit for depends on the reference: no measured point tests it."
+    paper = "no usual map scale" if found.paper_scale is None else f"maps of 1 : {found.paper_scale:,}"
+    nmas = "no usual scale" if found.nmas_scale is None else f"1 : {found.nmas_scale:,}"
+    limit = "" if found.limited_by is None else f", limited by the {found.limited_by}"
+    said = f"Fit for {paper} (0.25 mm in the map{limit}); ASPRS 2023 horizontal class {found.class_cm} cm; NMAS {nmas}"
+    points = {
+        "check": counted(found.n, "check point"),
+        "delivered": f"{counted(found.n, 'point')} of the model as delivered",
+        "loo": f"{counted(found.n, 'control point')} left out in turn",
+    }[found.evidence]
+    if found.claim:
+        stated = "" if found.survey else ", whose own accuracy is not stated and not in it"
+        return f"{said}: by {points}{stated}."
+    return f"{said}: an indication by {points}, no claim, for which ASPRS asks for {ENOUGH_CHECK_POINTS} check points."
+
+
 def _of_matches(matching: MatchingRecord, relative: Tested, notes: list[str]) -> Headline:
     """Say how well matches that were held out agree, and apart from that what measured points tell."""
     if said := matching.absolute_text():
@@ -160,8 +182,8 @@ def summary_text(report: SceneReport) -> str:
             filled = "" if warp.filled_share is None else f"; {share(warp.filled_share)} from another ortho"
             rows.append(("visible", f"{share(1.0 - warp.hidden_share)} of what the image reaches{filled}"))
     # The headline and the rows above have said these already.
-    said = ("left-out", "no-redundancy", "few-check-points")
-    rows += [("warning", text) for text in texts_but(report.warnings, report.notices, *said)]
+    others = texts_but(report.warnings, report.notices, "left-out", "no-redundancy", "few-check-points")
+    rows += [("warning", text) for text in others]
     return "\n".join(f"{key:<10}{value}" for key, value in rows)
 
 

@@ -241,7 +241,7 @@ def test_names_of_files_and_points_are_text(tmp_path: Path) -> None:
     points = dataclasses.replace(points, ids=(HOSTILE, *points.ids[1:]))
     one = case(points=points, reference=f"{HOSTILE}.tif", rejected=3)
     page = page_of(one, tmp_path)
-    assert "<script" not in page
+    assert page.count("<script") == 1
     assert "&lt;script&gt;" in page
 
 
@@ -251,7 +251,7 @@ def test_the_page_needs_nothing_and_stays_small(tmp_path: Path) -> None:
     assert len(page) < 1_000_000
     assert re.findall(r'(?:src|href)="(?!#)([^,"]*)', page) == ["data:image/png;base64"]
     assert "url(" not in page
-    assert "<script" not in page
+    assert page.count("<script") == 1
     # Each chip has words for those who do not see it.
     assert page.count('aria-label="Scene at m') == page.count('aria-label="Reference at m') == 32
     assert "The 24 of 500 matches with the largest residuals" in page

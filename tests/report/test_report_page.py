@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
-import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 import pytest
 from click.testing import CliRunner
-from osgeo import gdal
 
 from ortho_pipeline import commands
 from ortho_pipeline.cli.program import cli
@@ -21,9 +19,6 @@ from ortho_pipeline.options import PointOptions, SurfaceOptions
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-
-#: Where the browser itself calls, whatever page it shows (and does not get through to, in these tests).
-BROWSERS_OWN = {"accounts.google.com", "clients2.google.com", "update.googleapis.com", "www.google.com"}
 
 
 @pytest.fixture(scope="module")
@@ -62,50 +57,87 @@ def test_plots_of_a_report_from_the_command_line(made, tmp_path):
     assert all(Path(path).read_text().startswith("<svg") for path in files.values())
 
 
-def browse(page: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run a headless browser with a new profile; its log goes to stderr."""
-    profile = folder / "profile"
-    shutil.rmtree(profile, ignore_errors=True)
-    command = [
-        str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-        "--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars",
-        "--host-resolver-rules=MAP * ~NOTFOUND",
-        f"--user-data-dir={profile}", "--enable-logging=stderr", "--v=0", *arguments, page.resolve().as_uri(),
-    ]  # fmt: skip
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on this machine (apt install chromium)")
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu", "--host-resolver-rules=MAP * ~NOTFOUND"]
+        )
+        yield browser
+        browser.close()
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine (apt install chromium)")
-@pytest.mark.parametrize("which", ["rectify", "compare"])
-def test_page_opens_in_a_browser_without_errors_or_requests(made, tmp_path, which):
-    log = tmp_path / "net.json"
-    done = browse(made[which].files["html"], tmp_path, "--dump-dom", f"--log-net-log={log}")
-    assert "CONSOLE" not in done.stderr
-    plots = set(re.findall(r'<svg[^>]*data-plot="(\w+)"', done.stdout))
-    assert {"residuals", "directions", "heights", "correlation", "neighbours", "relative"} <= plots
+def opened(browser: Any, page: Path, width: int = 1440, **context: Any) -> tuple[Any, list[str]]:
+    """Open a page; the list gets whatever it complains of or asks of a network."""
+    context = browser.new_context(viewport={"width": width, "height": 900}, **context)
+    shown, complaints = context.new_page(), []
+    shown.on("console", lambda message: complaints.append(message.text))
+    shown.on("pageerror", lambda error: complaints.append(str(error)))
+    asked = lambda request: request.url.startswith(("file:", "data:")) or complaints.append(request.url)  # noqa: E731
+    shown.on("request", asked)
+    shown.goto(page.resolve().as_uri())
+    return shown, complaints
+
+
+@pytest.mark.parametrize("which", ["rectify", "compare", "bare"])
+def test_page_fits_every_screen_and_asks_for_nothing(made, browser, which):
+    for width in (1440, 1024, 390) if which == "rectify" else (390,):
+        page, complaints = opened(browser, made[which].files["html"], width)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert complaints == []
+        plots = set(page.eval_on_selector_all("[data-plot]", "all => all.map(one => one.dataset.plot)"))
+        page.context.close()
+    assert ("ortho" in plots) is (which != "compare")
     assert ("comparison" in plots) is (which == "compare")
-    asked = set(re.findall(r'"url":"((?:http|ws|ftp)s?://[^/"]*)', log.read_text()))
-    assert {url.split("://")[1] for url in asked} <= BROWSERS_OWN
+    if which != "bare":
+        assert {"residuals", "directions", "heights", "correlation", "neighbours", "relative", "locator"} <= plots
 
 
-LOOKS: dict[str, Any] = {
-    "desktop": ((1100, 1400), (), (255, 255, 255)),
-    "phone": ((500, 1000), (), (255, 255, 255)),
-    "dark": ((1100, 1400), ("--force-dark-mode", "--blink-settings=preferredColorScheme=0"), (0x15, 0x18, 0x1B)),
-}
+def test_first_screen_says_how_good_by_what_evidence_what_is_wrong_and_what_next(made, browser):
+    """A fresh reader answers these from what is seen before scrolling."""
+    page, _ = opened(browser, made["rectify"].files["html"])
+    for where in (".figure", ".what", ".verdict", ".signals li .to-do", ".map .check-head", ".map .rule"):
+        box = page.locator(where).last.bounding_box()
+        assert box is not None
+        assert box["y"] + box["height"] <= 900, where
+    page.context.close()
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine (apt install chromium)")
-@pytest.mark.parametrize("look", LOOKS)
-def test_page_is_drawn_in_its_colours_and_does_not_overflow(made, tmp_path, look):
-    (width, height), arguments, paper = LOOKS[look]
-    shot = tmp_path / "shot.png"
-    browse(
-        made["rectify"].files["html"], tmp_path, f"--window-size={width},{height}", f"--screenshot={shot}", *arguments
-    )
-    pixels = gdal.Open(str(shot)).ReadAsArray()[:3]
-    assert tuple(pixels[:, 2, 2].tolist()) == paper
-    # Nothing but paper along the right border: no table or figure is wider than the page.
-    border = pixels[:, :, -3]
-    assert (border == border[:, :1]).all()
-    assert pixels.std() > 10
+def test_vector_chip_and_row_of_a_point_are_shown_together(made, browser):
+    page, complaints = opened(browser, made["rectify"].files["html"])
+    key = page.locator(".map g[data-point]").first.get_attribute("data-point")
+    page.locator(".map g[data-point] circle.control").first.hover()
+    lit = page.eval_on_selector_all(".lit", "all => all.map(one => [one.tagName, one.dataset.point])")
+    assert {"g", "LI", "TR"} <= {tag for tag, _ in lit}
+    assert {point for _, point in lit} == {key}
+    table = page.locator("table.sorts").last
+    lengths = "all => all.map(one => parseFloat(one.cells[8].textContent))"
+    table.get_by_role("button", name="length").focus()
+    for order in (1, -1):
+        page.keyboard.press("Enter")
+        found = table.locator("tbody tr").evaluate_all(lengths)
+        assert found == sorted(found, reverse=order < 0)
+    page.get_by_role("searchbox").last.fill("check")
+    assert table.locator("tbody tr:visible").count() == 6
+    assert complaints == []
+    page.context.close()
+
+
+def test_without_a_script_nothing_essential_is_missing(made, browser):
+    page, _ = opened(browser, made["rectify"].files["html"], java_script_enabled=False)
+    assert page.locator("table.sorts").last.locator("tbody tr").count() == 18
+    assert page.locator(".measured li").count() == 18
+    assert page.locator("button, input").count() == 0
+    page.context.close()
+
+
+def test_page_can_be_used_by_everybody(made, browser):
+    axe = (ROOT / "tests" / "measure" / "axe" / "axe.min.js").read_text(encoding="utf-8")
+    for scheme, rules in (("light", "{}"), ("dark", "{runOnly: ['color-contrast']}")):
+        page, _ = opened(browser, made["rectify"].files["html"], bypass_csp=True, color_scheme=scheme)
+        page.evaluate(axe)
+        assert [one["id"] for one in page.evaluate(f"axe.run({rules})")["violations"]] == []
+        page.context.close()

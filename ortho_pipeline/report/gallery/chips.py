@@ -140,11 +140,11 @@ def _picture(matches: Matches, order: list[int]) -> NDArray[np.uint8]:
     for place, index in enumerate(order):
         corners = _corners(place, side)
         for (left, top), chip in zip(corners, (matches.scene[index], matches.target[index]), strict=True):
-            found[:, top : top + side, left : left + side] = _stretched(chip)
+            found[:, top : top + side, left : left + side] = stretched(chip)
     return found
 
 
-def _stretched(chip: NDArray[Any]) -> NDArray[np.uint8]:
+def stretched(chip: NDArray[Any]) -> NDArray[np.uint8]:
     """Return a chip as grey and alpha, transparent where it shows nothing."""
     seen = np.isfinite(chip)
     low, high = np.percentile(chip[seen], _STRETCH) if seen.any() else (0.0, 1.0)

@@ -1,0 +1,113 @@
+"""What to do about a notice, and how much it matters: the traffic lights of a page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Level = Literal["stop", "look", "know"]
+
+_STOP: dict[str, str] = {
+    "heights-disagree": "Find out which height datum points and DEM have, state both, and make it again.",
+    "model-elsewhere": "Check that image, points and their CRS belong together, and that columns and rows are not "
+    "swapped.",
+    "reference-made-of-scene": "Take another reference: one that was not made of this scene.",
+    "unstable": "Add points, or take a correction with fewer parameters.",
+    "undecided-contradiction": "Measure the points named again; one of them is wrong.",
+    "only-a-start": "Add control points or a reference to match with before the ortho is used.",
+    "rpc-elsewhere": "Check that the RPC belongs to this image, and is not that of a crop or of another scene.",
+    "sparse-ortho": "Check the extent that was asked for and the validity mask of the image.",
+    "metadata-contradict": "Find out which of the two is right before the ortho is used; ask who delivered the scene.",
+}
+_LOOK: dict[str, str] = {
+    "left-out": "Look at its chip and its coordinates: measure it again, or leave it out of the file.",
+    "more-left-out": "So many gross errors mean that the points or the model do not suit the scene: see both.",
+    "contradicting-point": "Look at its chip and its coordinates: measure it again, or take it out with a reason.",
+    "no-projection": "Give the points a height, and check their CRS.",
+    "takes-no-part": "Measure these points in one more image.",
+    "outside-of-image": "Check whether these were measured in another image or in a crop of this one.",
+    "one-mark-twice": "Keep one of each pair: they count as two proofs of the same thing.",
+    "images-not-given": "Give these images too, or take them out of the file of points.",
+    "no-intersection": "Measure these points again.",
+    "few-check-points": "Keep more points apart as check points before accuracy is claimed to others.",
+    "no-redundancy": "Add points: so far the residuals prove nothing.",
+    "control-covers-part": "Add control points in the empty part, or do not rely on the ortho there.",
+    "uncertain-at-edge": "Add control points near the corners, or take a correction with fewer parameters.",
+    "inseparable-parameters": "Take a correction with fewer parameters, or let prune remove them.",
+    "unsuited-model": "Take a model that the sensor suggests, unless you know better.",
+    "search-by-default": "State how accurate the delivered model is, if you know it.",
+    "few-ties": "Measure some ties by hand between these images.",
+    "no-matches": "Give this image control points, or a reference that resembles it more.",
+    "dem-datum-by-name": "State the height datum of the DEM, so that nothing rests on its name.",
+    "dem-covers-part": "Give a DEM that covers the scene: what lies outside of it has no value or a guessed height.",
+    "accuracy-in-part": "State the accuracy of what is named, so that the figures include it.",
+    "memory-exceeded": "Allow more memory, or take the engine of ortho-pipeline.",
+    "rpc-approximate": "Use the model file or the ortho, and not the RPC, where this error matters.",
+    "maybe-a-crop": "If it is a crop, state the column and row of its corner in the original image.",
+    "no-pushbroom": "Take the RPC, or ask for complete metadata.",
+    "rpc-and-rigorous-differ": "Compare both at check points, and keep the better.",
+    "bands-differ": "Rectify the bands one by one where this difference matters.",
+    "unchecked-product": "Check the result at points that you know before you rely on it.",
+    "rpc-not-used": "Repair or remove the RPC file beside the image.",
+    "rpcs-differ": "Check which of the RPCs belongs to this image, and remove the other.",
+    "damaged-metadata": "Ask for the metadata again.",
+    "maybe-cut-off": "Copy the file again.",
+    "processing-level": "Check that the product has not been resampled to a map before.",
+    "from-sensor": "Read it before the ortho is used.",
+}
+_KNOW: dict[str, str] = {
+    "control-without-height": "Nothing, if heights come from elsewhere; else give the points heights.",
+    "unstated-sigma": "State how accurate the points are, if you know it.",
+    "parameters-removed": "Nothing: what the points could not tell was left out.",
+    "relative-to-reference": "Measure some check points if the position has to be right, and not only consistent.",
+    "dem-sigma-by-default": "State how accurate the DEM is, if you know it.",
+    "correction-by-matches": "Nothing, unless you know which correction suits the sensor.",
+    "dem-datum-overridden": "Make sure that the datum stated is the right one.",
+    "no-rpc": "Use the ortho or the model file; programs that need an RPC cannot have one.",
+    "crop-stated": "Nothing, if the offset is right.",
+    "crop-noted": "Nothing.",
+    "rigorous-left-out": "Nothing, if the RPC is the model that you want.",
+    "part-left-out": "Rectify the other parts as scenes of their own.",
+    "radar-on-a-plane": "Give a DEM.",
+    "no-rpc-text": "Nothing.",
+    "gcps-beside-rpc": "Tell users of other programs, which may prefer these points to the RPC.",
+    "piece-left-out": "Nothing, if this piece is the one that you want.",
+}
+_LEVELS: tuple[tuple[Level, dict[str, str]], ...] = (("stop", _STOP), ("look", _LOOK), ("know", _KNOW))
+#: Of a code that this version does not know.
+_UNKNOWN = "Read it before the ortho is used."
+#: The levels in words, the gravest first.
+WORDS: dict[Level, str] = {"stop": "Wrong until shown otherwise", "look": "To look at", "know": "To know"}
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A notice as a page shows it: what it says, how much it matters, and what to do."""
+
+    level: Level
+    text: str
+    to_do: str
+
+
+def advised(code: str) -> tuple[Level, str]:
+    """Return how much a notice of a code matters, and what to do about it."""
+    for level, found in _LEVELS:
+        if code in found:
+            return level, found[code]
+    return "look", _UNKNOWN
+
+
+def signals(warnings: Sequence[str], notices: Sequence[Mapping[str, Any]]) -> list[Signal]:
+    """Return the notices of a document, the gravest first; of earlier versions, which have no codes, the texts."""
+    if not notices:
+        notices = [{"code": "from-sensor", "text": text} for text in warnings]
+    found = [Signal(*_of(one)) for one in notices]
+    order = list(WORDS)
+    return sorted(found, key=lambda one: order.index(one.level))
+
+
+def _of(notice: Mapping[str, Any]) -> tuple[Level, str, str]:
+    level, to_do = advised(notice["code"])
+    text = str(notice["text"])
+    return level, text[:1].upper() + text[1:], to_do

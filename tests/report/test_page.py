@@ -1,0 +1,214 @@
+"""The first screen: residuals over the ortho, chips of the points, what to do about notices, and the verdict."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.display.drawing import Drawing
+from ortho_pipeline.estimation.fit import fit
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.points import Points
+from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.report import document as report
+from ortho_pipeline.report.gallery.points import SIDE, point_chips
+from ortho_pipeline.report.page.advice import WORDS, advised, signals
+from ortho_pipeline.report.page.locator import plot_locator
+from ortho_pipeline.report.page.ortho_map import degrees, plot_ortho
+from ortho_pipeline.report.records import SceneReport
+from ortho_pipeline.report.wording import verdict
+from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
+from ortho_pipeline.simulation.terrain import Terrain
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+CAMERA = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(650.0, 1350.0))
+TERRAIN = Terrain("EPSG:32636", 531100.0, 4122700.0)
+
+
+def measured(control: int = 12, check: int = 6, **noise: float) -> Points:
+    return simulate_points(CAMERA, TERRAIN, control=control, check=check, seed=5, **noise).measured
+
+
+def made(points: Points, crs: str = "EPSG:32636", correction: str = "shift") -> SceneReport:
+    """Return the report of a scene whose ortho lies in a CRS."""
+    result = fit(ImageCorrection(CAMERA, correction, (500.0, 500.0), np.zeros(6)), points)
+    scene = Scene("simulated", "scene.tif", 1000, 1000, {"camera": result.model}, "from a seed", {})
+    x, y = pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(*points.ground[:, :2].T)
+    margin = 0.1 * (max(x) - min(x)) or 100.0
+    cell = (max(x) - min(x) + 2 * margin) / 1200
+    extent = (min(x) - margin, min(y) - margin, max(x) + margin, max(y) + margin)
+    grid = Grid.of_extent(pyproj.CRS(crs), extent, (cell, cell))
+    return report.build_report(scene=scene, fit=result, grid=grid)
+
+
+def onto(made_: SceneReport, drawing: Drawing, lon_lat: np.ndarray) -> np.ndarray:
+    """Return pixels of the drawing of longitudes and latitudes, by PROJ and the extent of the ortho."""
+    left, bottom, right, top = made_.ortho.extent
+    to = pyproj.Transformer.from_crs("EPSG:4326", made_.ortho.crs, always_xy=True)
+    x, y = to.transform(*lon_lat.T)
+    return np.column_stack([(x - left) / (right - left) * drawing.width, (top - y) / (top - bottom) * drawing.height])
+
+
+# Of the last the axes are turned by 33 degrees against north there.
+@pytest.mark.parametrize("crs", ["EPSG:32636", "EPSG:4326", "EPSG:3995"])
+def test_vectors_lead_from_where_a_point_belongs_to_where_the_ortho_shows_it(crs):
+    points = measured(check=1, sigma_image=1e-6, sigma_ground=0.0)
+    index = int(np.flatnonzero(points.check)[0])
+    image = points.image.copy()
+    image[index] += (30.0, 10.0)
+    shown = CAMERA.image_to_ground(image[index : index + 1], points.ground[index, 2])
+    said = made(dataclasses.replace(points, image=image), crs)
+    drawing = plot_ortho(said)
+    start, end = onto(said, drawing, np.vstack([points.ground[index, :2], shown[0, :2]]))
+    opened = next(k for k, (what, given) in enumerate(drawing.items) if what == "open" and given["key"] == index)
+    (x1, y1), (x2, y2) = next(given["xy"] for what, given in drawing.items[opened:] if what == "line")
+    assert (x1, y1) == pytest.approx(tuple(start), abs=0.2)
+    assert math.atan2(y2 - y1, x2 - x1) == pytest.approx(math.atan2(*(end - start)[::-1]), abs=0.01)
+    # The longest of all is a tenth of the longer side.
+    assert math.hypot(x2 - x1, y2 - y1) == pytest.approx(72.0, abs=0.1)
+
+
+def test_graticule_scale_bar_and_north_are_those_of_the_map():
+    said = made(measured())
+    drawing = plot_ortho(said)
+    texts = [given for what, given in drawing.items if what == "text"]
+    lines = [given["lines"][0] for what, given in drawing.items if what == "path" and given["kind"] == "graticule"]
+    east = next(given for given in texts if given["text"].endswith("E"))
+    d, m, s = re.fullmatch(r"(\d+)°(?:(\d+)′)?(?:(\d+)″)? E", east["text"]).groups(default="0")
+    lon = int(d) + int(m) / 60 + int(s) / 3600
+    lats = [point.lon_lat[1] for point in said.adjustment.points]
+    truth = onto(said, drawing, np.array([[lon, min(lats)], [lon, max(lats)]]))
+    line = min((np.array(one) for one in lines), key=lambda one: abs(one[0, 0] - truth[0, 0]))
+    line = line[np.argsort(line[:, 1])]
+    assert np.interp(truth[:, 1], *line.T[::-1]) == pytest.approx(truth[:, 0], abs=0.3)
+    bar = next(given["lines"][0] for what, given in drawing.items if what == "path" and given["kind"] == "rule")
+    label = next(given["text"] for given in texts if re.fullmatch(r"[\d.]+ k?m", given["text"]))
+    metres = float(label.split()[0]) * (1000 if label.endswith("km") else 1)
+    left, _, right, _ = said.ortho.extent
+    # UTM shows lengths too short by up to four in ten thousand.
+    assert (bar[-1][0] - bar[0][0]) / drawing.width * (right - left) == pytest.approx(metres, rel=1e-3)
+
+
+def test_degrees_are_written_as_far_as_they_are_not_zero():
+    assert degrees(33.35, "EW") == "33°21′ E"
+    assert degrees(-0.5 / 60, "NS") == "0°00′30″ S"
+    assert degrees(-12.0, "EW") == "12° W"
+
+
+def test_locator_finds_land_where_there_is_land():
+    drawing = plot_locator(made(measured()))
+    (land,) = (given["lines"] for what, given in drawing.items if what == "path" and given["kind"] == "land")
+    (mark,) = (given for what, given in drawing.items if what == "circle")
+    from shapely.geometry import Point, Polygon
+
+    assert any(Polygon(ring).buffer(0).contains(Point(mark["x"], mark["y"])) for ring in land)  # Anatolia
+    pacific = Point((-140 + 180) * 300 / 360, 84 * 300 / 360)
+    assert not any(Polygon(ring).buffer(0).contains(pacific) for ring in land)
+
+
+# -- chips -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def noise(tmp_path_factory) -> RasterSource:
+    """A scene of noise, which no compression makes smaller."""
+    path = tmp_path_factory.mktemp("noise") / "scene.tif"
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), 1000, 1000, 1)
+    dataset.GetRasterBand(1).WriteArray(np.random.default_rng(1).integers(1, 255, (1000, 1000)).astype(np.uint8))
+    del dataset
+    return RasterSource(path)
+
+
+def test_chips_show_the_pixels_about_a_point(noise, tmp_path):
+    points = measured()
+    image = points.image.copy()
+    image[2] += (100.0, 0.0)
+    said = made(dataclasses.replace(points, image=image))
+    found = point_chips(said, noise)
+    assert [chip.index for chip in found.chips] == list(range(18))
+    one = found.chips[0]
+    window = np.floor(image[0]).astype(int) - SIDE // 2
+    assert one.measured == pytest.approx(tuple(image[0] - window))
+    assert np.subtract(one.measured, one.predicted) == pytest.approx(said.adjustment.points[0].residual)
+    gross = found.chips[2]
+    assert gross.factor == 7  # 100 px are within three quarters of half a chip
+    assert all(0 < value < SIDE for value in (*gross.measured, *gross.predicted))
+    (tmp_path / "sheet.png").write_bytes(base64.b64decode(found.picture))
+    sheet = gdal.Open(str(tmp_path / "sheet.png")).ReadAsArray()[0]
+    chip = sheet[one.corner[1] : one.corner[1] + SIDE, one.corner[0] : one.corner[0] + SIDE].astype(float)
+    truth = noise.read(*(int(value) for value in window), SIDE, SIDE)[0].astype(float)
+    inside = (chip > 0) & (chip < 255)
+    assert np.corrcoef(chip[inside], truth[inside])[0, 1] > 0.999
+
+
+def test_page_of_a_hundred_points_is_below_three_megabytes(noise, tmp_path):
+    """Of noise in three bands, which is larger than any image."""
+    said = made(measured(control=70, check=30))
+    colours = tmp_path / "ortho.tif"
+    dataset = gdal.GetDriverByName("GTiff").Create(str(colours), 900, 900, 3)
+    dataset.WriteArray(np.random.default_rng(2).integers(1, 255, (3, 900, 900)).astype(np.uint8))
+    del dataset
+    report.write_report_html(said, tmp_path / "r.html", ortho=colours, pixels=noise)
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert page.count('<li data-point="') == 100
+    assert len(page.encode()) < 3_000_000
+
+
+def test_page_without_pixels_to_read_is_made_all_the_same(noise, tmp_path, monkeypatch):
+    from ortho_pipeline.errors import InputError
+
+    def refuse(*window: int) -> np.ndarray:
+        raise InputError("a block cannot be read")
+
+    monkeypatch.setattr(noise, "read", refuse)
+    assert point_chips(made(measured()), noise) is None
+
+
+# -- words -----------------------------------------------------------------------------------------------------------
+
+
+def test_every_notice_has_a_light_and_something_to_do():
+    listed = re.findall(r"^\| `([a-z0-9-]+)` \|", (ROOT / "docs" / "notices.md").read_text(encoding="utf-8"), re.M)
+    unknown = advised("a-code-of-tomorrow")
+    assert [code for code in listed if advised(code) == unknown and code != "from-sensor"] == []
+    assert all(advised(code)[1].endswith(".") for code in listed)
+
+
+def test_the_gravest_notice_comes_first():
+    codes = ("crop-noted", "few-check-points", "heights-disagree")
+    found = signals([], [{"code": code, "text": f"it is {code}"} for code in codes])
+    assert [one.level for one in found] == list(WORDS)
+    assert signals(["as of old"], [])[0].text == "As of old"
+
+
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        (measured(control=10, check=30), r"Fit for maps of 1 : [\d,]+ \(0\.25 mm.*class \d+ cm; NMAS .*: by 30 check"),
+        (measured(), r"an indication by 6 check points, no claim, for which ASPRS asks for 30"),
+        (measured(check=0), r"an indication by 12 control points left out in turn, no claim"),
+        (measured().select(np.arange(18) < 1), r"What it is fit for nobody can say"),
+    ],
+)
+def test_verdict_is_one_sentence_with_its_conditions(points, said):
+    text = verdict(made(points))
+    assert re.search(said, text)
+    assert text.count(". ") == 0
+    assert text.endswith(".")
+
+
+def test_places_of_points_are_in_the_json(tmp_path):
+    points = measured()
+    report.write_report_json(made(points), tmp_path / "r.json")
+    found = json.loads((tmp_path / "r.json").read_text())["adjustment"]["points"]
+    assert [one["lon_lat"] for one in found] == pytest.approx(points.ground[:, :2], abs=1e-9)
