@@ -7,7 +7,7 @@ import inspect
 import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -20,8 +20,9 @@ from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import staged, together, write_text
 from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.storage.delivery import address_of, delivered
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.options import OutputOptions
+from ortho_pipeline.options import OutputOptions, SceneOptions
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.map_scale import map_scale
@@ -96,9 +97,9 @@ class FitResult:
 
 @dataclass(frozen=True)
 class Result:
-    """Files that a command wrote, what it says about them, and a summary for people."""
+    """Files that a command wrote (paths, or addresses in a store), what it says about them, a summary for people."""
 
-    files: Mapping[str, Path]
+    files: Mapping[str, Any]
     document: Mapping[str, Any]
     summary: str
 
@@ -110,7 +111,8 @@ class Result:
     def _repr_html_(self) -> str:
         """Show the report in a notebook, or the summary where there is none."""
         if "html" in self.files:
-            return notebook.page_html(self.files["html"].read_text(encoding="utf-8"))
+            page = self.files["html"]
+            return notebook.page_html(page.read_text(encoding="utf-8")) if isinstance(page, Path) else self.summary
         return notebook.text_html(self.summary)
 
 
@@ -143,7 +145,10 @@ def outputs(folder: str | os.PathLike[str], stem: str, asked: OutputOptions) -> 
 
 
 def outputs_together(command: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Let the outputs of a command (its first parameter is a file, another one `folder`) appear together."""
+    """Let the outputs of a command (its first parameter is a file, another one `folder`) appear together.
+
+    In a store of objects too: they are made on this machine and uploaded then.
+    """
     signature = inspect.signature(command)
 
     @functools.wraps(command)
@@ -151,10 +156,30 @@ def outputs_together(command: Callable[_P, _R]) -> Callable[_P, _R]:
         bound = signature.bind(*given, **named).arguments
         if bound.get("folder") is None:
             return command(*given, **named)
+        if address_of(bound["folder"]) is not None:
+            return _to_store(wrapper, signature.bind(*given, **named))
         with together(bound["folder"], Path(next(iter(bound.values()))).stem):
             return command(*given, **named)
 
     return wrapper
+
+
+def _to_store(command: Callable[..., Any], bound: inspect.BoundArguments) -> Any:
+    """Run a command in a folder of this machine, upload what it wrote, and return its result with the addresses."""
+    address = str(bound.arguments["folder"]).rstrip("/")
+    allowed = bound.arguments.get("scene", SceneOptions()).allow_network
+    name = Path(next(iter(bound.arguments.values()))).stem
+    with delivered(address, name, allow_network=allowed, keep=_goes_along) as folder:
+        bound.arguments["folder"] = folder
+        result = command(*bound.args, **bound.kwargs)
+        files = {role: path for role, path in result.files.items() if _goes_along(Path(path))}
+        names = {role: Path(path).relative_to(folder).as_posix() for role, path in files.items()}
+    return replace(result, files={role: f"{address}/{one}" for role, one in names.items()})
+
+
+def _goes_along(path: Path) -> bool:
+    """Tell whether a file means the same elsewhere: a VRT names an image of this machine by its way from here."""
+    return path.suffix != ".vrt" or 'relativeToVRT="1"' not in path.read_text(encoding="utf-8", errors="replace")
 
 
 def write_report(

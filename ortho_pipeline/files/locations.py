@@ -203,6 +203,8 @@ _CLOSED = {
     "GDAL_HTTP_MAX_RETRY": "0", "GDAL_HTTP_CONNECTTIMEOUT": "1", "NO_PROXY": "", "no_proxy": "",
 }  # fmt: skip
 _closed_with: dict[str, str | None] = {}
+#: A request that fails in passing (429, 502, 503, 504, no answer) is repeated by GDAL too, if nobody says otherwise.
+_PATIENT = {"GDAL_HTTP_MAX_RETRY": "5", "GDAL_HTTP_RETRY_DELAY": "0.2", "GDAL_HTTP_CONNECTTIMEOUT": "10"}
 
 
 def close_network() -> None:
@@ -227,6 +229,8 @@ def _open_network() -> None:
         else:
             os.environ[key] = value
     _closed_with.clear()
+    for key, value in _PATIENT.items():
+        os.environ.setdefault(key, value)
 
 
 #: What readers of metadata take.

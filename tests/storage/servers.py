@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import http.client
 import http.server
+import random
 import threading
+import time
+import urllib.request
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -65,27 +69,139 @@ class PublicFolder:
 
 
 @contextmanager
-def serving(folder: Path) -> Iterator[PublicFolder]:
-    """Serve a folder on the loopback for the length of a block."""
-    public = PublicFolder(folder)
+def _running(served: Any) -> Iterator[Any]:
+    """Let an object answer requests on the loopback for the length of a block."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
 
         def log_message(self, *_: Any) -> None: ...
 
+        def handle(self) -> None:
+            with suppress(ConnectionError):
+                super().handle()
+
         def do_GET(self) -> None:
-            public.answer(self)
+            served.answer(self)
 
-        do_HEAD = do_GET  # noqa: N815
+        do_HEAD = do_PUT = do_POST = do_DELETE = do_GET  # noqa: N815
 
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        server.daemon_threads = True
+    class Server(http.server.ThreadingHTTPServer):
+        daemon_threads = True
+
+        def handle_error(self, *_: Any) -> None:
+            """A client that has gone, or a connection that was cut on purpose."""
+
+    with Server(("127.0.0.1", 0), Handler) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
         thread.start()
-        public.address = f"http://127.0.0.1:{server.server_port}"
+        served.address = f"http://127.0.0.1:{server.server_port}"
         try:
-            yield public
+            yield served
         finally:
             server.shutdown()
             thread.join()
+
+
+@contextmanager
+def serving(folder: Path) -> Iterator[PublicFolder]:
+    """Serve a folder on the loopback for the length of a block."""
+    with _running(PublicFolder(folder)) as public:
+        yield public
+
+
+class FaultyWay:
+    """A proxy before a server, on which things go wrong: drawn from a seed, each request by itself.
+
+    Parameters
+    ----------
+    target : (str, int)
+        Host and port of the server.
+    share : float
+        Of requests at which something goes wrong, but for the first `good` ones.
+    """
+
+    KINDS = ("cut", "delay", "429", "500", "503", "truncated", "flipped", "flipped request", "answer lost")
+
+    def __init__(self, target: tuple[str, int], seed: int, share: float = 0.3) -> None:
+        self.target, self.share = target, share
+        self.random = random.Random(seed)
+        self.lock = threading.Lock()
+        self.met: Counter[str] = Counter()
+        self.asked = self.sent = self.good = 0
+
+    address = ""
+
+    def drawn(self) -> str:
+        with self.lock:
+            self.asked += 1
+            faulty = self.random.random() < self.share and self.asked > self.good
+            kind = self.random.choice(self.KINDS) if faulty else "none"
+            self.met[kind] += 1
+            return kind
+
+    def answer(self, handler: http.server.BaseHTTPRequestHandler) -> None:
+        size = int(handler.headers.get("Content-Length") or 0)
+        body = handler.rfile.read(size)
+        kind = self.drawn()
+        if kind in ("429", "500", "503"):
+            return self.say(handler, int(kind), [], b"")
+        if kind == "delay":
+            time.sleep(0.02)
+        if kind == "flipped request" and body:
+            body = self.flipped(body)
+        connection = http.client.HTTPConnection(*self.target, timeout=30)
+        headers = {key: value for key, value in handler.headers.items() if key.lower() != "connection"}
+        connection.request(handler.command, handler.path, body=body, headers=headers)
+        reply = connection.getresponse()
+        data = reply.read()
+        connection.close()
+        kept = [(k, v) for k, v in reply.getheaders() if k.lower() not in ("transfer-encoding", "connection", "date")]
+        if kind == "answer lost":
+            handler.close_connection = True
+            return handler.connection.close()
+        # What a signed answer to a question holds has no checksum: XML of listings is not what is delivered.
+        is_object = handler.command == "GET" and "?" not in handler.path
+        if kind == "flipped" and data and is_object:
+            data = self.flipped(data)
+        if kind == "truncated" and data and is_object:
+            data = data[: len(data) // 2]
+            kept = [(k, v) for k, v in kept if k.lower() != "content-length"] + [("Content-Length", str(len(data)))]
+        self.say(handler, reply.status, kept, data, cut=kind == "cut")
+        return None
+
+    def flipped(self, data: bytes) -> bytes:
+        with self.lock:
+            at = self.random.randrange(len(data))
+        return data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :]
+
+    def say(
+        self, handler: http.server.BaseHTTPRequestHandler, status: int, headers: list[tuple[str, str]], data: bytes,
+        *, cut: bool = False,
+    ) -> None:  # fmt: skip
+        handler.send_response(status)
+        for key, value in headers:
+            handler.send_header(key, value)
+        if not any(key.lower() == "content-length" for key, _ in headers):
+            handler.send_header("Content-Length", str(len(data)))
+        handler.end_headers()
+        if handler.command == "HEAD":
+            return
+        handler.wfile.write(data[: len(data) // 3] if cut else data)
+        self.sent += len(data)
+        if cut:
+            handler.wfile.flush()
+            handler.close_connection = True
+            handler.connection.close()
+
+
+@contextmanager
+def on_a_faulty_way(target: tuple[str, int], seed: int, share: float = 0.3) -> Iterator[FaultyWay]:
+    """Run a `FaultyWay` for the length of a block."""
+    with _running(FaultyWay(target, seed, share)) as way:
+        yield way
+
+
+def bucket_at(address: str, name: str) -> None:
+    """Make a bucket in a server."""
+    urllib.request.urlopen(urllib.request.Request(f"{address}/{name}", method="PUT")).close()

@@ -1,0 +1,80 @@
+"""Outputs that go to a store of objects: made on this machine, then uploaded, their record last.
+
+A record (``<name>_delivery.json``) lists the files with sizes and SHA-256. An older one is removed before the first
+file is uploaded, and the new one is written after the last file agreed with its checksum in the store: with a record,
+the files that it lists are whole and belong together.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.process_limits import startable_threads
+from ortho_pipeline.files.storage.objects import Content, Objects, is_address
+from ortho_pipeline.files.whole import json_text
+
+DOCUMENT, SCHEMA_VERSION = "ortho-pipeline delivery", 1
+_RECORD = "_delivery.json"
+#: Files that are uploaded at a time.
+_AT_ONCE = 4
+#: Schemes of stores that take files.
+_WRITABLE = ("s3", "gs", "az")
+
+
+@contextlib.contextmanager
+def delivered(address: str, name: str, *, allow_network: bool, keep: Callable[[Path], bool]) -> Iterator[Path]:
+    """Yield a folder on this machine, whose files are in the folder of objects when the block has ended well.
+
+    Parameters
+    ----------
+    name : str
+        What the outputs are called together; their record is named after it.
+    keep : callable (path) -> bool
+        Whether a file is uploaded.
+
+    Raises
+    ------
+    InputError
+        If the network is not allowed, or nothing can be written to such an address.
+    StorageError
+        If the store fails; there is no record then.
+    """
+    if address.partition("://")[0] not in _WRITABLE:
+        raise InputError(
+            "nothing is written to such an address", file=address, field="folder",
+            remedy=f"one of {', '.join(_WRITABLE)}, or a folder",
+        )  # fmt: skip
+    store = Objects(address, allow_network=allow_network)
+    with tempfile.TemporaryDirectory(prefix="ortho_") as folder:
+        yield Path(folder)
+        _upload(store, Path(folder), f"{name}{_RECORD}", keep)
+
+
+def _upload(store: Objects, folder: Path, record: str, keep: Callable[[Path], bool]) -> None:
+    paths = sorted(path for path in folder.rglob("*") if path.is_file() and keep(path))
+    names = [path.relative_to(folder).as_posix() for path in paths]
+    store.delete(record)
+    startable_threads(_AT_ONCE)
+    with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="upload") as pool:
+        contents = list(pool.map(store.put, names, paths))
+    store.put(record, _record_of(names, contents))
+
+
+def _record_of(names: list[str], contents: list[Content]) -> bytes:
+    files: list[dict[str, Any]] = [
+        {"name": name, "bytes": content.size, "sha256": content.sha256}
+        for name, content in zip(names, contents, strict=True)
+    ]
+    return json_text({"document": DOCUMENT, "schema_version": SCHEMA_VERSION, "files": files}).encode()
+
+
+def address_of(folder: str | os.PathLike[str] | None) -> str | None:
+    """Return a folder as address, None where it lies on this machine."""
+    return os.fspath(folder) if folder is not None and is_address(folder) else None
