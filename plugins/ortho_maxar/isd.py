@@ -192,10 +192,11 @@ def read_isd_pushbroom(
             ),
             heights=heights,
         )
+        model = replace(model, light=_LIGHT)
         require_view(model)  # damaged numbers may well make a camera that looks into the sky
     except InputError as error:
         raise InputError(error.message, file=isd.path, field=error.field, remedy=error.remedy) from error
-    return replace(model, light=_LIGHT)
+    return model
 
 
 def _look(file: XmlFields, band: str) -> tuple[Array, Array]:

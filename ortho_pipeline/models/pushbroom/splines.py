@@ -68,7 +68,13 @@ class Spline:
         empty = cls(degree, breaks, np.zeros((count, 3)), beyond)
         # About the mean, so that positions in space keep all their digits.
         middle = values.mean(axis=0)
-        found, _, rank, _ = np.linalg.lstsq(empty.basis(times), values - middle, rcond=1e-10)
+        basis = empty.basis(times)
+        if not (np.isfinite(basis).all() and np.isfinite(values).all()):
+            raise InputError(
+                "times or values of a table are so far apart that no spline follows them", field="breaks",
+                remedy="the file is damaged: copy it again",
+            )  # fmt: skip
+        found, _, rank, _ = np.linalg.lstsq(basis, values - middle, rcond=1e-10)
         if rank < count:
             raise InputError(
                 f"{counted(len(values), 'time does', 'times do')} not determine {counted(count, 'spline coefficient')}",

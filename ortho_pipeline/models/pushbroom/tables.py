@@ -26,8 +26,9 @@ _NEIGHBOURS = 8
 #: A cubic polynomial follows an orbit for so long (seconds) to a micrometre.
 _PATH_PIECE = 2.5
 _CUBIC = SplineForm(3)
-#: Positions (m) beyond this are damaged.
-_FARTHEST = 1e9
+#: Positions (m) beyond this are damaged, and those between which nothing in an orbit gets so fast (m/s: twice the escape
+#: velocity; metres by which tables are rounded).
+_FARTHEST, _FASTEST, _ROUNDED = 1e9, 22e3, 10.0
 
 
 def pushbroom_of_tables(
@@ -77,6 +78,12 @@ def pushbroom_of_tables(
     times, positions = _table(orbit, (3,), (first_time, last, slack), degree, "orbit")
     if not (np.abs(positions) < _FARTHEST).all():
         raise InputError("a position of this table is no place of a satellite (ECEF metres)", field="orbit")
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    if not (steps <= _FASTEST * np.diff(times) + _ROUNDED).all():
+        raise InputError(
+            f"between two positions of this table lie {steps.max():.4g} m: no satellite is so fast", field="orbit",
+            remedy="the file is damaged: copy it again; or give positions in ECEF metres at times in seconds",
+        )  # fmt: skip
     turn_times, turns = _table(attitude, (3, 3), (first_time, last, slack), degree, "attitude")
     if not are_rotations(turns):
         raise InputError("a matrix of this table is not a rotation", field="attitude")
