@@ -158,10 +158,7 @@ class Pushbroom(SensorModel):
         """Centre and half-size of the box that the image sees between `heights`."""
         seen = ground_of_grid(self, self.camera.size, 5, self.heights)
         if not np.isfinite(seen).any():
-            raise InputError(
-                "this camera does not see the Earth", field="attitude",
-                remedy="the file is damaged: copy it again; or give attitudes that turn camera axes to ECEF",
-            )  # fmt: skip
+            raise InputError("this camera does not see the Earth", field="attitude", remedy="copy its file again")
         return box_around(seen, self.heights)
 
     @property

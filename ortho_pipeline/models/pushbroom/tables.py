@@ -26,8 +26,8 @@ _NEIGHBOURS = 8
 #: A cubic polynomial follows an orbit for so long (seconds) to a micrometre.
 _PATH_PIECE = 2.5
 _CUBIC = SplineForm(3)
-#: Positions (m) beyond this are damaged, and those between which nothing in an orbit gets so fast (m/s: twice the escape
-#: velocity; metres by which tables are rounded).
+#: Positions (m) beyond this are damaged, and those between which nothing in an orbit gets so fast (m/s: twice what
+#: escapes from the Earth; metres by which tables are rounded).
 _FARTHEST, _FASTEST, _ROUNDED = 1e9, 22e3, 10.0
 
 
