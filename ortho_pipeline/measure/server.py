@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import parse_json
-from ortho_pipeline.measure.guard import App, Guard
+from ortho_pipeline.measure.guard import REPORT_POLICY, App, Guard
+from ortho_pipeline.measure.making import PICTURES, Making
 from ortho_pipeline.measure.session import Session
 from ortho_pipeline.measure.tiles import MOST, PANES, SIDE, Tiles
 from ortho_pipeline.options import CORRECTIONS, OutputOptions, SceneOptions
@@ -70,6 +71,7 @@ class _Answers:
 
     def __init__(self, session: Session, tiles: Tiles) -> None:
         self._session, self._tiles, self._windows = session, tiles, Windows()
+        self.making = Making(session)
 
     def begin(self, given: dict[str, Any]) -> dict[str, Any]:
         """Say what does not change: sizes, names, bands."""
@@ -90,9 +92,7 @@ class _Answers:
 
     def act(self, given: dict[str, Any]) -> dict[str, Any]:
         """Do an action; a window that does not write is refused."""
-        if not self._windows.claim(_window(given)):
-            raise InputError("another window measures these points: this one only shows them", field="window",
-                             remedy="take over")  # fmt: skip
+        self._require_writer(given)
         action = given.get("action")
         if not isinstance(action, dict):
             raise InputError("there is no action", field="action")
@@ -147,6 +147,20 @@ class _Answers:
         self._session.save()
         return {}
 
+    def make(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Begin to make the ortho."""
+        self._require_writer(given)
+        return self.making.begin()
+
+    def made(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Say how far the ortho is."""
+        return self.making.told()
+
+    def _require_writer(self, given: dict[str, Any]) -> None:
+        if not self._windows.claim(_window(given)):
+            raise InputError("another window measures these points: this one only shows them", field="window",
+                             remedy="take over")  # fmt: skip
+
     def _band(self, pane: str, band: int) -> int:
         if not 0 <= band <= self._tiles.bands[pane]:
             raise InputError("there is no such band", field="bands")
@@ -156,57 +170,88 @@ class _Answers:
 def application(session: Session, token: str, hosts: set[str], opened: SceneOptions = SceneOptions()) -> App:
     """Return the ASGI application of a session."""
     from starlette.applications import Starlette
-    from starlette.responses import JSONResponse, Response
     from starlette.routing import Route
 
-    tiles = Tiles(session, opened)
-    answers = _Answers(session, tiles)
-    files = {name: resources.files("ortho_pipeline.measure").joinpath("page", name).read_bytes() for name in PAGE}
-    workers = ThreadPoolExecutor(max(2, os.cpu_count() or 1), thread_name_prefix="measure")
+    given = _Given(session, Tiles(session, opened))
+    routes = [
+        Route("/", given.page),
+        Route("/api/{what}", given.answer, methods=["POST"]),
+        Route("/made/{which}", given.outcome),
+        Route("/tiles/{pane}/{version:int}/{factor:int}/{column:int}/{row:int}", given.tile),
+        Route("/{name}", given.page),
+    ]
+    return Guard(Starlette(routes=routes), hosts, token)
 
-    async def run(work: Callable[..., Any], *given: Any) -> Any:
-        return await asyncio.get_running_loop().run_in_executor(workers, work, *given)
 
-    async def page(request: Request) -> Response:
+class _Given:
+    """What a request is given: parts of the page, tiles, answers, and what was made; work is done by threads."""
+
+    def __init__(self, session: Session, tiles: Tiles) -> None:
+        self._session, self._tiles, self._answers = session, tiles, _Answers(session, tiles)
+        room = resources.files("ortho_pipeline.measure")
+        self._files = {name: room.joinpath("page", name).read_bytes() for name in PAGE}
+        self._workers = ThreadPoolExecutor(max(2, os.cpu_count() or 1), thread_name_prefix="measure")
+
+    async def _run(self, work: Callable[..., Any], *given: Any) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(self._workers, work, *given)
+
+    async def page(self, request: Request) -> Response:
+        """Give a part of the page."""
+        from starlette.responses import Response
+
         name = request.path_params.get("name", "index.html")
-        if name not in files:
+        if name not in self._files:
             return Response("refused\n", 404)
-        return Response(files[name], media_type=PAGE[name], headers={"cache-control": "no-cache"})
+        return Response(self._files[name], media_type=PAGE[name], headers={"cache-control": "no-cache"})
 
-    async def tile(request: Request) -> Response:
+    async def tile(self, request: Request) -> Response:
+        """Give a tile."""
+        from starlette.responses import JSONResponse, Response
+
         try:
             given = _tile(request)
-            made = await run(lambda: tiles.png(*given))
+            made = await self._run(lambda: self._tiles.png(*given))
         except OrthoError as error:
             return JSONResponse(_told(error), 400)
         # The address names all that the pixels depend on.
         return Response(made, media_type="image/png", headers={"cache-control": "private, max-age=86400, immutable"})
 
-    async def answer(request: Request) -> Response:
-        work = getattr(answers, request.path_params["what"]) if request.path_params["what"] in _ASKED else None
+    async def outcome(self, request: Request) -> Response:
+        """Give the report of the ortho that was made, or a picture of it."""
+        from starlette.responses import JSONResponse, Response
+
+        which, making, own = request.path_params["which"], self._answers.making, {"cache-control": "no-store"}
+        try:
+            if which == "report":
+                own["content-security-policy"] = REPORT_POLICY
+                return Response(await self._run(making.report), media_type="text/html; charset=utf-8", headers=own)
+            if which not in PICTURES:
+                return Response("refused\n", 404)
+            return Response(await self._run(making.picture, which), media_type="image/png", headers=own)
+        except OrthoError as error:
+            return JSONResponse(_told(error), 400)
+
+    async def answer(self, request: Request) -> Response:
+        """Answer what the page asks."""
+        from starlette.responses import JSONResponse, Response
+
+        what = request.path_params["what"]
+        work = getattr(self._answers, what) if what in _ASKED else None
         if work is None:
             return Response("refused\n", 404)
         try:
             given = parse_json(await request.body() or b"{}", "request", _REMEDY)
             if not isinstance(given, dict):
                 raise InputError("a request is a JSON object", remedy=_REMEDY)
-            done = await run(work, given)
+            done = await self._run(work, given)
         except OrthoError as error:
             return JSONResponse(_told(error), 409 if error.field == "window" else 400)
-        if request.path_params["what"] == "act":
-            workers.submit(session.save)
+        if what == "act":
+            self._workers.submit(self._session.save)
         return JSONResponse(done, headers={"cache-control": "no-store"})
 
-    routes = [
-        Route("/", page),
-        Route("/api/{what}", answer, methods=["POST"]),
-        Route("/tiles/{pane}/{version:int}/{factor:int}/{column:int}/{row:int}", tile),
-        Route("/{name}", page),
-    ]
-    return Guard(Starlette(routes=routes), hosts, token)
 
-
-_ASKED = ("begin", "leave", "act", "state", "predict", "propose", "typed", "stretch", "compare", "save")
+_ASKED = ("begin", "leave", "act", "state", "predict", "propose", "typed", "stretch", "compare", "save", "make", "made")
 
 
 def serve(session: Session, opened: SceneOptions, ready: Callable[[str], None], port: int = 0) -> None:

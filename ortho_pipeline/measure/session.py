@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import os
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from ortho_pipeline.commands.control.matching import open_reference_views, searc
 from ortho_pipeline.commands.control.points import read_control, with_heights
 from ortho_pipeline.commands.fitting import compare
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
+from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import sha256, write_json
@@ -57,14 +58,17 @@ class Session:
     opened : SceneOptions
     match : MatchOptions
         How far the model may be off.
+    surface : SurfaceOptions
+        The heights, as `ortho` opens them.
     """
 
     def __init__(
         self, scene: Scene, places: Places, output: Path, options: PointOptions,
         opened: SceneOptions = SceneOptions(), match: MatchOptions = MatchOptions(),
+        surface: SurfaceOptions = SurfaceOptions(),
     ) -> None:  # fmt: skip
         self.scene, self.places, self.output = scene, places, output
-        self._options, self._opened = options, opened
+        self._options, self._opened, self._surface = options, opened, surface
         self.search = search_of(scene, match, metres_per_pixel(places.view))
         self.grid = Grid.over(places)
         self.rendered: list[SensorModel] = [places.model]
@@ -263,6 +267,23 @@ class Session:
         asked = PointOptions(gcps=self.marks.points(self._called), significance=self._options.significance)
         return compare(self.scene, asked).to_json()
 
+    def ortho(self, progress: Callable[[float], None]) -> Result:
+        """Make what `ortho rectify` makes with the saved points, in a folder beside them."""
+        from ortho_pipeline.commands.rectification import rectify
+
+        with self._lock:
+            self.save()
+            correction = self.marks.correction or self._options.correction
+        # The saved points say themselves where they are and which of them check.
+        points = replace(
+            self._options, gcps=self.output, crs=None, vertical=None, pixel_origin="corner", check=None, select=None,
+            correction=correction,
+        )  # fmt: skip
+        return rectify(
+            self.scene.path, self.output.with_name(f"{self.output.stem}_ortho"), scene=self._opened, points=points,
+            surface=self._surface, progress=progress,
+        )  # fmt: skip
+
     def _radius(self, click: np.ndarray) -> float:
         """Return within how many px of the prediction a click is looked for."""
         fit = self._solution.fit
@@ -306,7 +327,8 @@ def open_session(
     opened = on_surface(opened, heights)
     view, references = open_reference_views(opened, match, heights, scene)
     inputs.check_paths({"points": path}, image, scene, PointOptions(), surface, match)
-    return Session(opened, Places(View(view.intensity, opened.model, heights), references), path, points, scene, match)
+    places = Places(View(view.intensity, opened.model, heights), references)
+    return Session(opened, places, path, points, scene, match, surface)
 
 
 def _plain(action: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,8 @@
-"""The preview of the orthoimage as PNG."""
+"""Rasters as small pictures (PNG)."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from os import PathLike
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.raster.output import png_bytes
-from ortho_pipeline.raster.source import open_pixels
+from ortho_pipeline.raster.source import Grid, open_pixels
 
 #: GDAL's number for averaging in a raster read.
 _AVERAGE = 5
@@ -21,15 +22,30 @@ def preview_png(path: str | PathLike[str], *, side: int = 800) -> bytes:
     Three bands or more give colours (the first three in their order), fewer give grey.
     """
     dataset = open_pixels(path)[0]
-    shrink = min(1.0, side / max(dataset.RasterXSize, dataset.RasterYSize))
-    size = max(1, round(dataset.RasterXSize * shrink)), max(1, round(dataset.RasterYSize * shrink))
+    size = _reduced(dataset.RasterXSize, dataset.RasterYSize, side)
     reading = {"buf_xsize": size[0], "buf_ysize": size[1]}
     bands = [dataset.GetRasterBand(k + 1) for k in range(3 if dataset.RasterCount >= 3 else 1)]
     mask = bands[0].GetMaskBand().ReadAsArray(**reading) > 0
     # Without overviews an average has to look at every pixel, which takes as long as making them did.
     way = {"resample_alg": _AVERAGE} if bands[0].GetOverviewCount() else {}
-    planes = [_stretched(np.abs(band.ReadAsArray(**way, **reading)), mask) for band in bands]
-    return png_bytes(np.stack([*planes, np.where(mask, 255, 0).astype(np.uint8)]))
+    return shaded_png(np.stack([np.abs(band.ReadAsArray(**way, **reading)) for band in bands]), mask)
+
+
+def shaded_png(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> bytes:
+    """Return pixels ``(1 or 3, h, w)`` as PNG, each band stretched, transparent where not `valid` ``(h, w)``."""
+    planes = [_stretched(band, valid) for band in pixels]
+    return png_bytes(np.stack([*planes, np.where(valid, 255, 0).astype(np.uint8)]))
+
+
+def reduced_grid(grid: Grid, side: int) -> Grid:
+    """Return the grid of the picture that `preview_png` makes of a raster on `grid`."""
+    width, height = _reduced(grid.width, grid.height, side)
+    return replace(grid, dx=grid.dx * grid.width / width, dy=grid.dy * grid.height / height, width=width, height=height)
+
+
+def _reduced(width: int, height: int, side: int) -> tuple[int, int]:
+    shrink = min(1.0, side / max(width, height))
+    return max(1, round(width * shrink)), max(1, round(height * shrink))
 
 
 def _stretched(values: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:

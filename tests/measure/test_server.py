@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import json
+import time
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from ortho_pipeline import commands
 from ortho_pipeline.measure.session import open_session
-from ortho_pipeline.options import MatchOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, PointOptions, SurfaceOptions
 
 pytest.importorskip("starlette", reason="the extra 'measure' is not installed")
 from starlette.testclient import TestClient
 
-from ortho_pipeline.measure.guard import MAX_BODY
+from ortho_pipeline.measure.guard import MAX_BODY, REPORT_POLICY
 from ortho_pipeline.measure.server import PAGE, application
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
@@ -138,3 +144,43 @@ def test_a_tile_is_a_picture_and_nonsense_is_none(client: TestClient) -> None:
     for wrong in ("scene/0/3/0/0?l=0,1", "scene/0/1/0/0?l=0,nan", "scene/0/1/0/0?l=0", "scene/0/1/0/0?b=1,2&l=0,1,2,3",
                   "scene/0/131072/0/0?l=0,1", "scene/0/1/9999999/0?l=0,1"):  # fmt: skip
         assert client.get(f"/{TOKEN}/tiles/{wrong}").status_code == 400
+
+
+def put(client: TestClient, truth: Any, features: np.ndarray) -> None:
+    """Let the window put one control point for each feature, where it is in truth."""
+    for k, (image, ground) in enumerate(zip(features, truth.ground_at(features), strict=True)):
+        mark = {"id": f"P{k}", "image": image.tolist(), "ground": ground.tolist(), "role": "control"}
+        action = {"do": "put", "mark": {**mark, "how": "manual", "ground_from": "typed"}}
+        answer = client.post(f"/{TOKEN}/api/act", json={"window": WINDOW, "action": action})
+        assert answer.status_code == 200, answer.text
+
+
+def test_the_ortho_of_the_points_is_made_and_shown_over_the_reference(
+    reference: Path, truth: Any, features: np.ndarray, tmp_path: Path
+) -> None:
+    session = open_session(
+        SAMPLE / "scene.tif", tmp_path / "p.geojson",
+        surface=SurfaceOptions(dem=SAMPLE / "dem.tif"), match=MatchOptions(reference=(str(reference),)),
+    )  # fmt: skip
+    with TestClient(application(session, TOKEN, {HOST}), base_url=f"http://{HOST}") as client:
+        ask = partial(client.post, json={"window": WINDOW})
+        assert ask(f"/{TOKEN}/api/made").json()["state"] == "none"
+        assert client.get(f"/{TOKEN}/made/ortho").status_code == 400
+        put(client, truth, features)
+        assert client.post(f"/{TOKEN}/api/make", json={"window": "another-window"}).status_code == 409
+        told = ask(f"/{TOKEN}/api/make").json()
+        while told["state"] == "running":
+            time.sleep(0.05)
+            told = ask(f"/{TOKEN}/api/made").json()
+        assert told["state"] == "done", told
+        pictures = [client.get(f"/{TOKEN}/made/{which}").content for which in ("ortho", "reference")]
+        # Both pictures are of one size, which stands in the header of a PNG.
+        assert pictures[0][16:24] == pictures[1][16:24]
+        page = client.get(f"/{TOKEN}/made/report")
+        assert "<h1" in page.text
+        assert page.headers.get_list("content-security-policy") == [REPORT_POLICY]
+        assert client.get(f"/{TOKEN}/made/nonsense").status_code == 404
+    session.close()
+    made = json.loads((tmp_path / "p_ortho/scene_report.json").read_text())["adjustment"]
+    again = commands.fit(SAMPLE / "scene.tif", PointOptions(gcps=tmp_path / "p.geojson")).to_json()
+    assert made["parameters"] == again["parameters"]

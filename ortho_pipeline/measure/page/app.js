@@ -61,6 +61,7 @@ function show(next) {
   $('what').textContent = state.error ? `${headline.what}: ${state.error}` : headline.what;
   $('undo').disabled = !state.undo || !facts.writes;
   $('redo').disabled = !state.redo || !facts.writes;
+  $('make').disabled = !facts.writes || !state.marks.some((mark) => mark.role === 'control' && !mark.off);
   $('correction').value = state.correction ?? '';
   skipped = 0;
   tellNext();
@@ -273,6 +274,40 @@ const models = safely(async () => {
   $('compared').showModal();
 });
 
+const wait = (milliseconds) => new Promise((resolve) => { setTimeout(resolve, milliseconds); });
+let making = false;
+
+/** Make the ortho, and show how far it is, then what it looks like beside the reference. */
+const makeOrtho = safely(async () => {
+  $('ortho').showModal();
+  if (making) return;
+  making = true;
+  try {
+    $('ortho-done').hidden = true;
+    $('ortho-share').hidden = false;
+    let told = await ask('make');
+    while (told.state === 'running') {
+      $('ortho-share').value = told.share;
+      $('ortho-said').textContent = told.share ? `${Math.round(100 * told.share)} % of the pixels are made. You can close this and go on measuring.` : 'Reading, fitting …';
+      await wait(300);
+      told = await ask('made');
+    }
+    $('ortho-share').hidden = true;
+    if (told.state !== 'done') { $('ortho-said').textContent = `No ortho: ${told.error}`; return; }
+    $('ortho-said').textContent = `${told.figure}: ${told.what}.`;
+    const again = Date.now();
+    $('ortho-own').src = `made/ortho?${again}`;
+    $('ortho-reference').src = `made/reference?${again}`;
+    $('ortho-report').href = `made/report?${again}`;
+    $('ortho-files').replaceChildren(...told.files.map((name) => { const item = document.createElement('li'); item.textContent = name; return item; }));
+    $('ortho-done').hidden = false;
+  } catch (error) {
+    $('ortho-share').hidden = true;
+    $('ortho-said').textContent = error.message;
+    throw error;
+  } finally { making = false; }
+});
+
 const typed = safely(async () => {
   begin();
   const mine = (turn += 1);
@@ -305,7 +340,7 @@ function pressed(event) {
   const along = (step) => { const { order } = table; if (order.length) choose(order[(order.indexOf(selected) + step + order.length) % order.length] ?? order[0]); };
   const keys = {
     m: () => measure(target.id === 'reference' ? 'reference' : 'scene', views.middle()),
-    n: goNext, j: () => along(1), k: () => along(-1), o: toggleOff, Delete: remove, c: models, s: stretch,
+    n: goNext, j: () => along(1), k: () => along(-1), o: toggleOff, Delete: remove, c: models, s: stretch, g: makeOrtho,
     r: () => { const roles = ['control', 'check', 'tie']; $('role').value = roles[(roles.indexOf($('role').value) + 1) % 3]; if (pending) pending.role = $('role').value; say(`Role: ${$('role').value}.`); },
     f: () => compare({ flicker: !compared.flicker, difference: false }), d: () => compare({ difference: !compared.difference, flicker: false }),
     z: () => act({ do: 'undo' }), Z: () => act({ do: 'redo' }), '?': () => $('keys').showModal(),
@@ -350,10 +385,11 @@ async function start(given = {}) {
 }
 
 for (const [id, work] of Object.entries({
-  undo: () => act({ do: 'undo' }), redo: () => act({ do: 'redo' }), compare: models, help: () => $('keys').showModal(), accept, cancel, off: toggleOff, remove, next: goNext, typed,
+  undo: () => act({ do: 'undo' }), redo: () => act({ do: 'redo' }), compare: models, make: makeOrtho, help: () => $('keys').showModal(), accept, cancel, off: toggleOff, remove, next: goNext, typed,
   flicker: () => compare({ flicker: !compared.flicker, difference: false }), difference: () => compare({ difference: !compared.difference, flicker: false }), stretch,
   take: () => safely(start)({ take: true }),
 })) $(id).addEventListener('click', work);
+$('ortho-mix').addEventListener('input', () => { $('ortho-reference').style.opacity = $('ortho-mix').value / 100; });
 $('swipe').addEventListener('input', () => compare({ swipe: Number($('swipe').value), flicker: false, difference: false }));
 $('correction').addEventListener('change', () => act({ do: 'correct', correction: $('correction').value || null }));
 for (const [id, key] of [['name', 'id'], ['role', 'role'], ['note', 'note']]) $(id).addEventListener('change', () => { if (pending) pending[key] = $(id).value; });
