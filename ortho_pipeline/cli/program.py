@@ -41,12 +41,11 @@ from ortho_pipeline.cli.printing import (
     print_json,
     print_models,
     print_result,
-    print_warnings,
     progress,
-    view_text,
 )
 from ortho_pipeline.cli.signals import ended_by_signals
 from ortho_pipeline.cli.studies import reproduce, simulate
+from ortho_pipeline.cli.survey.first_use import info, init, print_steps
 from ortho_pipeline.errors import InputError, OrthoError, Terminated
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 
@@ -163,15 +162,24 @@ def main() -> None:
             raise SystemExit(INTERRUPTED) from None
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.group(
+    cls=_Commands,
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+)
 @click.version_option(package_name="ortho-pipeline", prog_name="ortho")
-def cli() -> None:
+@click.pass_context
+def cli(ctx: click.Context) -> None:
     """Orthorectify satellite scenes, and say honestly how good the result is.
 
     Exit codes: 0 done, 1 failed, 2 you can correct it (the message says how), 3 partly done (run), 130 interrupted.
     """
+    if ctx.invoked_subcommand is None:
+        print_steps()
 
 
+cli.add_command(info)
+cli.add_command(init)
 cli.add_command(simulate)
 cli.add_command(reproduce)
 cli.add_command(run)
@@ -215,36 +223,6 @@ def models(as_json: bool) -> None:
     if as_json:
         return print_json(listed)
     return print_models(listed)
-
-
-@cli.command()
-@image_argument
-@scene_options
-@json_option
-def info(image: str, scene: SceneOptions, as_json: bool) -> None:
-    """Describe an image: sensor, model and where it was read from, position, ground sample distance."""
-    from ortho_pipeline import commands
-
-    document = commands.info(image, scene)
-    if as_json:
-        return print_json(document)
-    lines = {
-        "Image": f"{document['image']}  ({document['size'][0]} x {document['size'][1]})",
-        "Sensor": document["sensor"],
-        "Models": ", ".join(document["models"]),
-        "Read from": document["model_source"],
-        "Heights": "{:.0f} to {:.0f} m (ellipsoidal)".format(*document["height_range"]),
-        "Pixel": f"{document['gsd_m']:.3g} m at {document['reference_height']:.0f} m",
-        "View": view_text(document["view"]),
-        "UTM": document["utm"],
-        "Corners": "lon,lat " + "  ".join("outside" if lon is None else f"{lon:.5f},{lat:.5f}" for lon, lat in
-                                          document["corners_lon_lat"]),
-        **{name: str(value) for name, value in document["facts"].items()},
-    }  # fmt: skip
-    for name, value in lines.items():
-        click.echo(f"{name:<10} {value}")
-    print_warnings(document["warnings"])
-    return None
 
 
 @cli.command()

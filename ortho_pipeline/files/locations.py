@@ -6,9 +6,11 @@ strangers says of other files is text, which nothing here opens.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fnmatch
 import io
+import itertools
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -27,6 +29,20 @@ _SHOWN = 5
 MAX_READ = 5_000_000
 #: No delivery has more files in a folder; a store behind a URL may.
 MAX_LISTED = 10_000
+
+
+def check_path(path: str | os.PathLike[str]) -> str:
+    """Return the remedy where nothing lies at a path: the name in its folder that is most like it, if there is one."""
+    import difflib
+
+    place = Path(path)
+    if not place.parent.is_dir():
+        return f"check the path: there is no folder '{place.parent}'"
+    with contextlib.suppress(OSError), os.scandir(place.parent) as listed:
+        names = [entry.name for entry in itertools.islice(listed, MAX_LISTED)]
+        if close := difflib.get_close_matches(place.name, names, 1, 0.7):
+            return f"did you mean '{place.parent / close[0]}'?"
+    return "check the path"
 
 
 class VsiPath:

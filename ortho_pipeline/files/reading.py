@@ -14,7 +14,7 @@ from concurrent.futures import CancelledError
 from typing import Any
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.locations import VsiPath
+from ortho_pipeline.files.locations import VsiPath, check_path
 
 #: Bytes that are read at once for a checksum.
 _CHUNK = 1 << 20
@@ -41,6 +41,8 @@ def read_bounded(path: str | os.PathLike[str], limit: int, **told: str) -> bytes
                 raise InputError("this is not a file but a folder, a pipe or a device", file=path, **told)
             return file.read(limit + 1)
     except (OSError, ValueError) as error:
+        if isinstance(error, FileNotFoundError) and not isinstance(path, VsiPath):
+            told["remedy"] = check_path(path)
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"this file cannot be read ({reason})", file=path, **told) from error
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files.locations import VsiPath, archive_of, in_local_archive, located, members
+from ortho_pipeline.files.locations import VsiPath, archive_of, check_path, in_local_archive, located, members
 from ortho_pipeline.files.process_limits import require_memory
 from ortho_pipeline.options import PIXEL_TYPES
 from ortho_pipeline.raster.block_cache import keep_blocks
@@ -118,7 +118,7 @@ def _opened(
             raise InputError("there is no such file in an archive", file=name, remedy=_in_archive(name))
     elif not Path(name).is_file() and not (Path(name).is_dir()):
         what = "this is a pipe or a device" if Path(name).exists() else "there is no such file"
-        raise InputError(what, file=name, remedy="check the path")
+        raise InputError(what, file=name, remedy=check_path(name))
     elif Path(name).suffix.lower() in (".zip", ".tar", ".tgz"):
         raise InputError("this is an archive, not an image", file=name, remedy=_in_archive(name))
     elif Path(name).suffix.lower() != ".vrt":

@@ -200,7 +200,7 @@ print(json.dumps({line: [one.exit_code, one.stdout, one.stderr] for line, one in
 """
 COMMANDS = [
     "doctor", "sensors", "models", "info a.tif", "fit a.tif --gcps b.csv", "compare a.tif --gcps b.csv",
-    "rectify a.tif --height 5 -o out", "export a.tif -o out", "report a.json --plots out", "edge a.tif",
+    "rectify a.tif --height 5 -o out", "export a.tif -o out", "report a.json --plots out", "edge a.tif", "init .",
     "adjust a.tif b.tif --points c.csv -o out", "intersect a.tif b.tif --points c.csv", "run a.yaml",
     "simulate ikonos -o out", "reproduce bilsat", "register a.tif b.tif -o out", "dem-check a.tif --points b.csv",
     "match a.tif --reference b.tif --height 5 -o c.csv", "ties a.tif b.tif --height 5 -o c.csv",

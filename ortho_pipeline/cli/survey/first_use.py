@@ -1,0 +1,140 @@
+"""What a new user types first: `ortho` alone, `ortho info` and `ortho init`."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from typing import TYPE_CHECKING
+
+import click
+
+from ortho_pipeline.cli.options import json_option, scene_options
+from ortho_pipeline.cli.parsing import Command
+from ortho_pipeline.cli.printing import print_json, print_result, print_warnings, view_text
+from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.options import SceneOptions
+
+if TYPE_CHECKING:
+    from ortho_pipeline.commands.survey.folder import Kind, Survey
+
+#: What belongs to a scene.
+_KINDS: tuple[Kind, ...] = ("dem", "points", "map image")
+#: What one does with the program, and the command for it.
+STEPS = (
+    ("See what is there, and what to do next", "ortho info FOLDER"),
+    ("Make an orthoimage, with control points", "ortho rectify scene.tif --dem dem.tif --gcps points.csv -o out"),
+    ("The same without, from an ortho of the place", "ortho rectify scene.tif --dem auto --reference ortho.tif -o out"),
+    ("Compare models on the same points", "ortho compare scene.tif --gcps points.csv -o out"),
+    ("Make the orthos of many scenes", "ortho init FOLDER && ortho run FOLDER/pipeline.yaml"),
+)
+
+
+def print_steps() -> None:
+    """Print the five things that one does."""
+    wide = max(len(what) for what, _ in STEPS)
+    click.echo("Orthorectify satellite scenes, and say honestly how good the result is.\n")
+    for what, line in STEPS:
+        click.echo(f"  {what:<{wide}}   {line}")
+    click.echo(
+        "\n'ortho --help' lists all commands, 'ortho COMMAND --help' says all of one, 'ortho doctor' what is installed."
+    )
+
+
+@click.command(cls=Command)
+@click.argument("image", metavar="IMAGE|FOLDER", type=click.Path())
+@scene_options
+@json_option
+def info(image: str, scene: SceneOptions, as_json: bool) -> None:
+    """Describe an image: sensor, model and where it was read from, position, ground sample distance.
+
+    Of a FOLDER: which scenes, DEMs and points lie there, and what to do next.
+    """
+    from ortho_pipeline import commands
+
+    try:
+        document = commands.info(image, scene)
+    except InputError:
+        # Some formats are folders; any other folder is one of files.
+        if not os.path.isdir(image):
+            raise
+        return _print_survey(image, scene, as_json)
+    if as_json:
+        return print_json(document)
+    lines = {
+        "Image": f"{document['image']}  ({document['size'][0]} x {document['size'][1]})",
+        "Sensor": document["sensor"],
+        "Models": ", ".join(document["models"]),
+        "Read from": document["model_source"],
+        "Heights": "{:.0f} to {:.0f} m (ellipsoidal)".format(*document["height_range"]),
+        "Pixel": f"{document['gsd_m']:.3g} m at {document['reference_height']:.0f} m",
+        "View": view_text(document["view"]),
+        "UTM": document["utm"],
+        "Corners": "lon,lat " + "  ".join("outside" if lon is None else f"{lon:.5f},{lat:.5f}" for lon, lat in
+                                          document["corners_lon_lat"]),
+        **{name: str(value) for name, value in document["facts"].items()},
+    }  # fmt: skip
+    for name, value in lines.items():
+        click.echo(f"{name:<10} {value}")
+    print_warnings(document["warnings"])
+    return None
+
+
+def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:
+    from ortho_pipeline.commands.survey.folder import survey
+
+    seen = survey(folder, scene)
+    if as_json:
+        return print_json({**seen.to_json(), "next": next_steps(seen)})
+    wide = max([0, *(len(one.path) for one in seen.found)])
+    for one in seen.found:
+        click.echo(f"{one.kind:<10} {one.path:<{wide}}   {one.said}")
+    click.echo("\nNext:" if seen.found else "Next:")
+    for line in next_steps(seen):
+        click.echo(f"  {line}")
+    return None
+
+
+def next_steps(seen: Survey) -> list[str]:
+    """Return what to do next with what lies in a folder: sentences, and commands that can be typed there."""
+    scenes, images = seen.of("scene"), seen.of("image")
+    if not scenes:
+        if images and seen.of("points"):
+            line = shlex.join(["ortho", "compare", images[0], "--gcps", seen.of("points")[0]])
+            return ["No image has a model of its own; one can be fitted to the points:", f"  {line}"]
+        return ["No image with a model was found: put its metadata (RPC, DIMAP, .IMD ...) beside it."]
+    dems, points, maps = (seen.beside(scenes[0], kind) for kind in _KINDS)
+    said, words = [], ["--dem", dems[0] if dems else "auto"]
+    if not dems:
+        said.append(
+            "There is no DEM: '--dem FILE' gives one, '--dem auto' takes the Copernicus DEM under the scene, "
+            "'--height M' takes flat ground."
+        )
+    if points:
+        words += ["--gcps", points[0]]
+    elif maps:
+        words += ["--reference", maps[0]]
+        said.append(f"There are no control points: they can be matched with {maps[0]}.")
+    else:
+        said.append(
+            "There are no control points: the ortho is as accurate as the model was delivered. '--gcps FILE' gives "
+            "measured ones, '--reference ORTHO' matches them with an ortho of the same place."
+        )
+    if len(scenes) == 1:
+        return [*said, "Make the ortho:", "  " + shlex.join(["ortho", "rectify", scenes[0], *words, "-o", "out"])]
+    file = "pipeline.yaml"
+    lines = ["ortho init .", f"ortho run {file} --check", f"ortho run {file}"]
+    return [*said, f"Make the orthos of {counted(len(scenes), 'scene')}:", *(f"  {line}" for line in lines)]
+
+
+@click.command(cls=Command)
+@click.argument("folder", type=click.Path(file_okay=False))
+@click.option("--output", "-o", "path", type=click.Path(dir_okay=False), metavar="FILE",
+              help="Where to  [default: pipeline.yaml in the folder]")  # fmt: skip
+@click.option("--overwrite", is_flag=True, help="Replace the file if it is there.")
+@scene_options
+@json_option
+def init(folder: str, path: str | None, overwrite: bool, scene: SceneOptions, as_json: bool) -> None:
+    """Write the file of a run over the scenes of FOLDER, with comments, for 'ortho run'."""
+    from ortho_pipeline.commands.survey.pipeline_file import init as write
+
+    print_result(write(folder, path, options=scene, overwrite=overwrite), as_json)

@@ -1,0 +1,187 @@
+"""What lies in a folder: scenes with a model, DEMs, map images, points; and what to do next."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, Literal
+
+from ortho_pipeline import plugins
+from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION
+from ortho_pipeline.errors import InputError, OrthoError, counted
+from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.points import read_points
+from ortho_pipeline.raster.source import open_dataset
+
+Kind = Literal["scene", "dem", "map image", "image", "points"]
+
+#: Endings of files that are tried as images and as points.
+IMAGES = (
+    ".tif",
+    ".tiff",
+    ".ntf",
+    ".nitf",
+    ".jp2",
+    ".img",
+    ".vrt",
+    ".png",
+    ".jpg",
+    ".hdf",
+    ".h5",
+    ".nc",
+    ".xml",
+    ".til",
+)
+POINTS = (".csv", ".geojson", ".points", ".pts", ".txt")
+#: Files that are looked at, and folders below the given one.
+_MOST, _DEPTH = 2000, 3
+#: GDAL's numbers of the types that heights have: whole numbers with a sign, and floating point.
+_HEIGHTS = (3, 5, 6, 7)
+
+
+@dataclass(frozen=True)
+class Found:
+    """A file, by its path from the folder: what it is taken for, and what there is to say about it."""
+
+    path: str
+    kind: Kind
+    said: str
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What lies in a folder."""
+
+    folder: Path
+    found: tuple[Found, ...]
+
+    def of(self, kind: Kind) -> list[str]:
+        """Return the paths of a kind, from the folder."""
+        return [one.path for one in self.found if one.kind == kind]
+
+    def beside(self, scene: str, kind: Kind) -> list[str]:
+        """Return the files of a kind that belong to a scene: named after it, in its folder, or above it.
+
+        What bears another scene's name is that one's; what lies in a folder above belongs to the scenes of that folder
+        if it has some.
+        """
+        mine, others = Path(scene).stem, {Path(one).stem for one in self.of("scene")} - {Path(scene).stem}
+        for folder in Path(scene).parents:
+            if folder != Path(scene).parent and any(Path(one).parent == folder for one in self.of("scene")):
+                break
+            here = [one for one in self.of(kind) if Path(one).parent == folder]
+            if named := [one for one in here if Path(one).stem.startswith(mine)]:
+                return named
+            if free := [one for one in here if not any(Path(one).stem.startswith(other) for other in others)]:
+                return free
+        return []
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of ``ortho info FOLDER --json``."""
+        files = [{"path": one.path, "kind": one.kind, "said": one.said} for one in self.found]
+        return {"schema_version": SCHEMA_VERSION, "folder": str(self.folder), "files": files}
+
+
+def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> Survey:
+    """Look at the files of a folder and of those in it; outputs of this program are left out.
+
+    Raises
+    ------
+    InputError
+        If there is no such folder, or it has more files than can be looked at.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise InputError("this is no folder", file=folder, remedy="give a folder")
+    names = list(islice(_files(place, _DEPTH), _MOST + 1))
+    if len(names) > _MOST:
+        raise InputError(
+            f"more than {_MOST} files lie here", file=folder, remedy="give the folder of one delivery, or write the "
+            "file of the run by hand (docs/run.md)",
+        )  # fmt: skip
+    found = [one for path in names if (one := _looked_at(path, place, options)) is not None]
+    return Survey(place, tuple(_without_parts(found)))
+
+
+def _files(folder: Path, depth: int) -> Iterator[Path]:
+    """Yield the files of a folder and of those in it, by name; hidden ones and linked folders are left out."""
+    with os.scandir(folder) as listed:
+        entries = sorted((entry for entry in listed if not entry.name.startswith(".")), key=lambda one: one.name)
+    for entry in entries:
+        if entry.is_file():
+            yield Path(entry.path)
+        elif depth and entry.is_dir(follow_symlinks=False):
+            yield from _files(Path(entry.path), depth - 1)
+
+
+def _looked_at(path: Path, folder: Path, options: SceneOptions) -> Found | None:
+    if any(path.name.endswith(ending) for ending in ENDINGS.values()) and _is_ours(path):
+        return None
+    suffix, name = path.suffix.lower(), str(path.relative_to(folder))
+    if suffix in IMAGES:
+        return _image(path, name, options)
+    return _points(path, name) if suffix in POINTS else None
+
+
+def _is_ours(path: Path) -> bool:
+    """Tell whether the report lies beside a file with which this program would have written it."""
+    ending = next(ending for ending in ENDINGS.values() if path.name.endswith(ending))
+    return path.with_name(path.name.removesuffix(ending) + ENDINGS["report"]).exists()
+
+
+def _image(path: Path, name: str, options: SceneOptions) -> Found | None:
+    try:
+        scene = plugins.open_scene(path, options.sensor, dict(options.sensor_options), **options.access)
+    except OrthoError as error:
+        return _raster(path, name, options, error)
+    models = ", ".join(scene.models)
+    return Found(
+        name, "scene", f"{scene.width} x {scene.height}, {scene.sensor}, {models} of {_short(scene.model_source)}"
+    )
+
+
+def _raster(path: Path, name: str, options: SceneOptions, refused: OrthoError) -> Found | None:
+    """Say what an image is that no sensor opens; None for what is no image."""
+    try:
+        dataset = open_dataset(path, **options.access)
+    except OrthoError:
+        return None
+    size = f"{dataset.RasterXSize} x {dataset.RasterYSize}"
+    if dataset.GetGeoTransform(can_return_null=True) is None or not dataset.GetProjection():
+        return Found(name, "image", f"{size}, no model: {refused.message}")
+    kind: Kind = "map image"
+    if dataset.RasterCount == 1 and dataset.GetRasterBand(1).DataType in _HEIGHTS:
+        kind = "dem"
+    crs = dataset.GetSpatialRef()
+    return Found(name, kind, f"{size}, {crs.GetName() if crs is not None else 'a CRS'}")
+
+
+def _points(path: Path, name: str) -> Found | None:
+    try:
+        points = read_points(path)
+    except OrthoError as error:
+        # Any text may end so; a table that says in its first line what it is gets told what it lacks.
+        return (
+            Found(name, "points", f"to be completed: {error.message}") if error.field in ("crs", "vertical") else None
+        )
+    roles = [
+        counted(int(mask.sum()), f"{role} point")
+        for role, mask in (("control", points.control), ("check", points.check))
+    ]
+    return Found(name, "points", ", ".join(roles))
+
+
+def _without_parts(found: list[Found]) -> list[Found]:
+    """Leave out what opens as the same image as another file: the metadata beside it."""
+    scenes = {Path(one.path).with_suffix("") for one in found if one.kind == "scene" and not one.path.endswith(".xml")}
+    return [
+        one for one in found
+        if not (one.path.lower().endswith(".xml") and (one.kind != "scene" or Path(one.path).with_suffix("") in scenes))
+    ]  # fmt: skip
+
+
+def _short(source: str) -> str:
+    return Path(source).name if os.sep in source else source

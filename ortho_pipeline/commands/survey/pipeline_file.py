@@ -1,0 +1,91 @@
+"""The file of a run over the scenes of a folder, with comments that say what each line is for."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+from ortho_pipeline.commands.results import Result
+from ortho_pipeline.commands.survey.folder import Kind, Survey, survey
+from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.files import write_text
+from ortho_pipeline.options import SceneOptions
+
+NAME = "pipeline.yaml"
+#: What belongs to a scene, and where it stands in the file.
+_GROUPS: tuple[tuple[Kind, str, str], ...] = (("dem", "surface", "dem"), ("points", "points", "gcps"))
+
+
+def init(
+    folder: str | os.PathLike[str],
+    path: str | os.PathLike[str] | None = None,
+    *,
+    options: SceneOptions = SceneOptions(),
+    overwrite: bool = False,
+) -> Result:
+    """Write the file of a run over the scenes of a folder.
+
+    Parameters
+    ----------
+    path : path, optional
+        Where to; ``pipeline.yaml`` in the folder without one. It has to lie in the folder or above it, as the paths in
+        it are written from there.
+
+    Raises
+    ------
+    InputError
+        If there is no scene with a model, the file is there and `overwrite` is not given, or lies elsewhere.
+    """
+    seen = survey(folder, options)
+    target = Path(folder) / NAME if path is None else Path(path)
+    if target.exists() and not overwrite:
+        raise InputError("this file is there already", file=target, remedy="give another name, or allow `overwrite`")
+    if not seen.of("scene"):
+        raise InputError(
+            "no image with a model lies here", file=folder, remedy="put the metadata (RPC, DIMAP, .IMD ...) beside it"
+        )  # fmt: skip
+    prefix = os.path.relpath(Path(folder).resolve(), target.resolve().parent)
+    if prefix.startswith(os.pardir):
+        raise InputError(
+            "the file of a run lies in the folder of its scenes or above it", file=target, remedy="give such a name"
+        )  # fmt: skip
+    write_text(target, text(seen, prefix))
+    count = counted(len(seen.of("scene")), "scene")
+    said = f"{count}. Look at the file, then:\n  ortho run {target} --check\n  ortho run {target}"
+    return Result({"pipeline": target}, {"scenes": seen.of("scene")}, said)
+
+
+def text(seen: Survey, prefix: str = ".") -> str:
+    """Return the file: what was found as settings, what was not as comments."""
+
+    def at(name: str) -> str:
+        # A JSON text is a YAML text; what begins with * or has a colon stays what it is.
+        return json.dumps(name if prefix == "." else f"{prefix}/{name}", ensure_ascii=False)
+
+    lines = [
+        "# Scenes for 'ortho run'. Paths are relative to this file; every field: docs/run.md, 'ortho run --schema'.",
+        "# 'ortho run FILE --check' opens everything and makes nothing; 'ortho run FILE' makes what is missing.",
+        "output: out                     # a folder of each scene goes here",
+        "defaults:                       # what holds for all scenes; a scene below may say otherwise",
+        "  surface:",
+        "    dem: auto                   # the Copernicus DEM under the scene; or a file:",
+        "    # dem: dem.tif",
+        "    # vertical: egm2008         # its height datum, where the file does not declare it",
+        "  # points:",
+        '  #   gcps: "gcps/{stem}.csv"   # control points: a file for each scene, by its name',
+        "  # match:",
+        "  #   reference: ortho.tif      # control points without a hand, from an ortho of the place",
+        "  # output:",
+        '  #   crs: "EPSG:32636"         # default: the UTM zone of the scene',
+        "  #   resolution: 2.5           # default: about that of the image",
+        "scenes:",
+    ]
+    for scene in seen.of("scene"):
+        lines.append(f"  - image: {at(scene)}")
+        for kind, group, key in _GROUPS:
+            found = seen.beside(scene, kind)
+            # Of several the first; which one is right only the user knows.
+            lines += [f"    {group}: {{{key}: {at(one)}}}" for one in found[:1]]
+            lines += [f"    # {group}: {{{key}: {at(one)}}}" for one in found[1:3]]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,121 @@
+"""What a new user meets: the steps, a folder that is looked at, the file of a run, names that were nearly right."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+
+from ortho_pipeline.batch.config import read_config
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.cli.survey.first_use import STEPS
+from ortho_pipeline.commands.survey.folder import survey
+from ortho_pipeline.commands.survey.pipeline_file import text
+
+SAMPLE = Path(__file__).resolve().parent.parent.parent / "sample_data"
+
+
+def run(*words: Any) -> Result:
+    return CliRunner().invoke(cli, [str(word) for word in words])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name in ("scene.tif", "scene_RPC.TXT", "dem.tif", "gcps.csv"):
+        shutil.copy(SAMPLE / name, tmp_path / name)
+    (tmp_path / "notes.txt").write_text("what the vendor wrote\n")
+    return tmp_path
+
+
+def test_without_a_word_it_shows_the_five_things_one_does():
+    done = run()
+    assert done.exit_code == 0
+    assert len(STEPS) == 5
+    for _, line in STEPS:
+        assert line in done.stdout
+        for part in line.split(" && "):
+            _, name, *words = shlex.split(part)
+            # Every option that is shown exists.
+            with cli.commands[name].make_context(name, words):
+                pass
+
+
+def test_info_of_a_folder_lists_what_is_there_and_the_next_command(folder):
+    document = json.loads(run("info", folder, "--json").stdout)
+    kinds = {one["path"]: one["kind"] for one in document["files"]}
+    assert kinds == {"scene.tif": "scene", "dem.tif": "dem", "gcps.csv": "points"}
+    assert document["next"][-1].strip() == "ortho rectify scene.tif --dem dem.tif --gcps gcps.csv -o out"
+    assert document["next"][-1].strip() in run("info", folder).stdout
+
+
+def test_what_is_missing_is_named_with_the_ways_to_get_it(folder):
+    for name in ("dem.tif", "gcps.csv"):
+        (folder / name).unlink()
+    said = run("info", folder).stdout
+    for word in ("--dem auto", "--height M", "--gcps FILE", "--reference ORTHO"):
+        assert word in said
+    (folder / "scene_RPC.TXT").unlink()
+    assert "No image with a model was found" in run("info", folder).stdout
+
+
+def test_outputs_are_no_inputs(folder):
+    shutil.copy(SAMPLE / "dem.tif", folder / "scene_ortho.tif")
+    assert "scene_ortho.tif" in survey(folder).of("dem")
+    (folder / "scene_report.json").write_text("{}")
+    assert "scene_ortho.tif" not in survey(folder).of("dem")
+
+
+def test_init_writes_a_file_that_a_run_takes(folder):
+    done = run("init", folder)
+    assert done.exit_code == 0, done.output
+    checked = json.loads(run("run", folder / "pipeline.yaml", "--check", "--json").stdout)
+    (scene,) = checked["scenes"]
+    assert (scene["points"]["control"], scene["points"]["check"], scene["coverage"]) == (12, 6, 1.0)
+    again = run("init", folder)
+    assert (again.exit_code, "there already" in again.stderr) == (2, True)
+    assert run("init", folder, "--overwrite").exit_code == 0
+    elsewhere = run("init", folder, "-o", folder / "deeper" / "p.yaml")
+    assert elsewhere.exit_code == 2
+
+
+def test_files_belong_to_the_scene_that_they_are_named_after_or_lie_beside(folder):
+    deeper = folder / "two: [*]"
+    deeper.mkdir()
+    for name in ("left", "right"):
+        shutil.copy(folder / "scene.tif", deeper / f"{name}.tif")
+        shutil.copy(folder / "scene_RPC.TXT", deeper / f"{name}_RPC.TXT")
+    shutil.copy(folder / "gcps.csv", deeper / "right_gcps.csv")
+    shutil.copy(folder / "dem.tif", deeper / "dem.tif")
+    seen = survey(folder)
+    assert seen.beside("scene.tif", "points") == ["gcps.csv"]
+    assert seen.beside("two: [*]/right.tif", "points") == ["two: [*]/right_gcps.csv"]
+    # The one above is of the scene there.
+    assert seen.beside("two: [*]/left.tif", "points") == []
+    (folder / "p.yaml").write_text(text(seen), encoding="utf-8")
+    left = read_config(folder / "p.yaml").scenes[1]
+    assert (left.image, left.surface.dem) == ("two: [*]/left.tif", "two: [*]/dem.tif")
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (("info", "{}/sceen.tif"), "scene.tif"),
+        (("fit", "{}/scene.tif", "--gcps", "{}/gcp.csv"), "gcps.csv"),
+        (("rectify", "{}/scene.tif", "--dem", "{}/dem.tiff", "-o", "{}/out"), "dem.tif"),
+        (("run", "{}/pipelin.yaml"), "pipeline.yaml"),
+    ],
+)
+def test_a_file_that_is_not_there_suggests_the_one_most_like_it(folder, words, meant):
+    (folder / "pipeline.yaml").write_text("scenes: []\n")
+    done = run(*(word.format(folder) for word in words))
+    assert done.exit_code == 2
+    assert f"did you mean '{folder / meant}'?" in done.stderr
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    assert "there is no folder" in run("info", tmp_path / "none" / "scene.tif").stderr
