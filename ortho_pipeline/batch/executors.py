@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 from ortho_pipeline.errors import InputError, OrthoError, print_no_error_twice
 from ortho_pipeline.files.process_limits import require_memory, startable_threads
+from ortho_pipeline.options import EXECUTORS
 
 #: Jobs that are handed over before their turn, so that no worker waits for the next one.
 _AHEAD = 256
@@ -229,3 +230,30 @@ def dask_executor(scheduler: str) -> Any:
             remedy="give its address, for example tcp://host:8786",
         ) from error  # fmt: skip
     return client, client.get_executor(pure=False)
+
+
+@contextlib.contextmanager
+def crew_of(
+    executor: str | Executor | None, workers: int | None, threads: int | None, scheduler: str | None, jobs: int
+) -> Iterator[tuple[Executor | Processes, int | None]]:
+    """Yield who does the work, and the threads of each scene."""
+    if scheduler is not None and executor not in ("dask", None):
+        raise InputError("a scheduler is for dask", field="scheduler", remedy="leave out `executor`, or say dask")
+    if isinstance(executor, Executor):
+        yield executor, threads or 1
+    elif executor == "dask" or scheduler is not None:  # a scheduler alone means dask
+        if scheduler is None:
+            raise InputError("dask needs the address of its scheduler", field="scheduler",
+                             remedy="for example tcp://host:8786")  # fmt: skip
+        client, pool = dask_executor(scheduler)
+        with client:
+            yield pool, threads or 1
+    elif executor == "sequential":
+        yield Sequential(), threads
+    elif executor in ("processes", None):
+        processors = len(os.sched_getaffinity(0))
+        count = max(1, min(workers or processors, jobs))
+        budget = threads or max(1, processors // count)
+        yield Processes(count, budget), budget
+    else:
+        raise InputError(f"no executor is called {executor!r}", field="executor", remedy=", ".join(EXECUTORS))

@@ -90,6 +90,7 @@ class Job:
         options = {name: dataclasses.asdict(getattr(self, name)) for name in ("scene", "points", "surface", "ortho")}
         for budget in ("memory", "threads"):
             del options["ortho"][budget]
+        options["scene"]["allow_network"] = False  # leave to reach a file is no part of what is made of it
         if self.match.reference:
             options["match"] = dataclasses.asdict(self.match)
         return {"name": self.name, "image": str(self.image), **options}
@@ -381,9 +382,17 @@ def _found(base: str, parts: Sequence[str]) -> Iterator[str]:
             yield from _found(folder, parts[at + 1 :] or ["*"])
 
 
-def for_run(jobs: Sequence[Job], run: str, memory: int, threads: int | None) -> list[Job]:
-    """Return the jobs of a run, with the bytes and threads that each may use."""
-    return [replace(job, run=run, ortho=replace(job.ortho, memory=memory, threads=threads)) for job in jobs]
+def for_run(
+    jobs: Sequence[Job], run: str, memory: int, threads: int | None, *, allow_network: bool = False
+) -> list[Job]:
+    """Return the jobs of a run, with the bytes and threads that each may use, and leave to use the network."""
+    return [
+        replace(
+            job, run=run, ortho=replace(job.ortho, memory=memory, threads=threads),
+            scene=replace(job.scene, allow_network=allow_network),
+        )
+        for job in jobs
+    ]  # fmt: skip
 
 
 def _is_file(path: Path) -> bool:

@@ -16,7 +16,8 @@ class Outcome:
 
     Parameters
     ----------
-    status : {'done', 'unchanged', 'failed'}
+    status : {'done', 'unchanged', 'failed', 'missing'}
+        Missing is what nobody has finished, in a summary of many workers.
     facts : mapping
         JSON values: sensor, model, RMSE, ortho, view.
     error : mapping, optional
@@ -47,13 +48,14 @@ class BatchResult:
     @property
     def failed(self) -> int:
         """How many scenes, or the mosaic of them, could not be made."""
-        return self.count("failed") + bool(self.mosaic and self.mosaic.get("error"))
+        return self.count("failed") + self.count("missing") + bool(self.mosaic and self.mosaic.get("error"))
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho run --json`` (docs/run.md)."""
         return {
             "schema_version": SCHEMA_VERSION,
-            "counts": {status: self.count(status) for status in ("done", "unchanged", "failed")},
+            "counts": {status: self.count(status) for status in ("done", "unchanged", "failed")}
+            | ({"missing": self.count("missing")} if self.count("missing") else {}),
             "seconds": self.seconds,
             "scenes": [dict(vars(scene)) for scene in self.scenes],
             "mosaic": self.mosaic,

@@ -19,15 +19,16 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline import commands
-from ortho_pipeline.batch.executors import Processes, Sequential, completed, dask_executor
+from ortho_pipeline.batch.executors import Processes, Sequential, completed, crew_of
 from ortho_pipeline.batch.plan import RUN_FILES, STATE, Job, Plan, for_run, plan, versions
 from ortho_pipeline.batch.records import Digests, FileState, Record, key_of, locked, siblings
 from ortho_pipeline.batch.results import BatchResult, Outcome
+from ortho_pipeline.batch.shared.run import SharedFolder, run_shared
+from ortho_pipeline.batch.summary import paths_of
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.mosaic.assembly import assemble
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
-from ortho_pipeline.options import EXECUTORS
 from ortho_pipeline.report.stac import write_catalog
 from ortho_pipeline.warp.mosaic import Ortho, Overlap, measure_seam
 
@@ -75,7 +76,7 @@ def _make_locked(job: Job, verify: bool, begin: float) -> Outcome:
             # A worker of this run may have made it and died before it could say so.
             mine = bool(job.run) and good.run == job.run
             seconds = good.seconds if mine else time.monotonic() - begin
-            return Outcome(job.name, "done" if mine else "unchanged", seconds, _paths(good, job), good.facts)
+            return Outcome(job.name, "done" if mine else "unchanged", seconds, paths_of(good, job), good.facts)
         if record is not None:
             Record(job.name, "", "started", outputs=before).write(job.record)
         result = commands.rectify(
@@ -91,7 +92,7 @@ def _make_locked(job: Job, verify: bool, begin: float) -> Outcome:
             time.monotonic() - begin, _facts(report), run=job.run,
         )  # fmt: skip
         done.write(job.record)
-        return Outcome(job.name, "done", done.seconds, _paths(done, job), done.facts)
+        return Outcome(job.name, "done", done.seconds, paths_of(done, job), done.facts)
     except Exception as error:
         told = error_document(error)
         failed = Record(job.name, "", "failed", outputs=before, seconds=time.monotonic() - begin, error=told)
@@ -175,10 +176,6 @@ def _remove(folder: Path, names: set[str]) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-def _paths(record: Record, job: Job) -> dict[str, str]:
-    return {one.role: str(job.folder / one.path) for one in record.outputs}
-
-
 def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a summary says of a scene."""
     scene, adjustment = report["scene"], report["adjustment"]
@@ -219,6 +216,8 @@ def run(
     shard: tuple[int, int] | None = None,
     verify: bool = False,
     progress: Callable[[float], None] | None = None,
+    allow_network: bool = False,
+    store: SharedFolder | None = None,
 ) -> BatchResult:
     """Make all scenes of a pipeline file.
 
@@ -234,6 +233,10 @@ def run(
         Names of scenes, or (k, n) for the k-th of n parts. The mosaic is made by a run of all scenes.
     verify : bool
         Take all checksums again.
+    allow_network : bool
+        Let the scenes be read from URLs, and `surface.dem=auto` fetch cells.
+    store : SharedFolder, optional
+        Where the outputs go in place of the folder of the file: a folder of objects, which other workers share.
 
     Raises
     ------
@@ -242,13 +245,29 @@ def run(
     """
     planned = config if isinstance(config, Plan) else plan(config)
     jobs, part = planned.chosen(only, shard), bool(only) or shard is not None
+    if store is not None:
+        _refuse_unshared(planned)
+        with crew_of(executor, workers, threads, scheduler, len(jobs)) as (crew, budget):
+            ready = for_run(planned.jobs, _run_id(), memory, budget, allow_network=allow_network)
+            own = [job for job in ready if job.name in {chosen.name for chosen in jobs}]
+            return run_shared(replace(planned, jobs=tuple(ready)), own, store, crew, make_scene, progress)
     lock = planned.output / STATE / "run.lock"
     with (
         confined(planned.output),
         locked(lock, shared=part, owner=f"'ortho run {planned.path.name}'"),
-        _crew(executor, workers, threads, scheduler, len(jobs)) as (crew, budget),
+        crew_of(executor, workers, threads, scheduler, len(jobs)) as (crew, budget),
     ):
-        return _Run(planned, part, verify, progress).make(crew, for_run(jobs, _run_id(), memory, budget))
+        return _Run(planned, part, verify, progress).make(
+            crew, for_run(jobs, _run_id(), memory, budget, allow_network=allow_network)
+        )
+
+
+def _refuse_unshared(planned: Plan) -> None:
+    if planned.mosaic is not None:
+        raise InputError(
+            "a mosaic is made of orthos in a folder, not in a store of objects", file=planned.path, field="mosaic",
+            remedy="take it out of the file, and make it of the orthos with `ortho mosaic`",
+        )  # fmt: skip
 
 
 def _run_id() -> str:
@@ -339,7 +358,7 @@ class _Run:
                 if left:
                     with contextlib.suppress(OrthoError):
                         clear_up(job.record)
-                self._note(Outcome(job.name, "unchanged", files=_paths(record, job), facts=record.facts), len(jobs))
+                self._note(Outcome(job.name, "unchanged", files=paths_of(record, job), facts=record.facts), len(jobs))
             else:
                 yield job
 
@@ -448,30 +467,3 @@ def _untouched(record: Record, job: Job, listings: dict[Path, list[str]]) -> boo
         and record.siblings == siblings(_folders(job), listings)
         and record.key == key_of(record.inputs, job.configuration, job.versions)
     )
-
-
-@contextlib.contextmanager
-def _crew(
-    executor: str | Executor | None, workers: int | None, threads: int | None, scheduler: str | None, jobs: int
-) -> Iterator[tuple[Executor | Processes, int | None]]:
-    """Yield who does the work, and the threads of each scene."""
-    if scheduler is not None and executor not in ("dask", None):
-        raise InputError("a scheduler is for dask", field="scheduler", remedy="leave out `executor`, or say dask")
-    if isinstance(executor, Executor):
-        yield executor, threads or 1
-    elif executor == "dask" or scheduler is not None:  # a scheduler alone means dask
-        if scheduler is None:
-            raise InputError("dask needs the address of its scheduler", field="scheduler",
-                             remedy="for example tcp://host:8786")  # fmt: skip
-        client, pool = dask_executor(scheduler)
-        with client:
-            yield pool, threads or 1
-    elif executor == "sequential":
-        yield Sequential(), threads
-    elif executor in ("processes", None):
-        processors = len(os.sched_getaffinity(0))
-        count = max(1, min(workers or processors, jobs))
-        budget = threads or max(1, processors // count)
-        yield Processes(count, budget), budget
-    else:
-        raise InputError(f"no executor is called {executor!r}", field="executor", remedy=", ".join(EXECUTORS))

@@ -27,11 +27,11 @@ _SHOWN = 60
 
 
 class _Shard(click.ParamType):
-    name = "K/N"
+    name = "K/N|auto"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        """Return (k, n) of 'k/n'."""
-        if isinstance(value, tuple):
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int] | str:
+        """Return (k, n) of 'k/n', or 'auto'."""
+        if isinstance(value, tuple) or value == "auto":
             return value
         match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", value)
         if not match or not 1 <= int(match[1]) <= int(match[2]):
@@ -53,7 +53,21 @@ class _Shard(click.ParamType):
 )
 @click.option("--scheduler", metavar="URL", help="Of dask, such as tcp://host:8786.")
 @click.option("--only", multiple=True, metavar="NAME", help="Only this scene; may be repeated.")
-@click.option("--shard", type=_Shard(), metavar="K/N", help="Only the K-th of N parts, for arrays of jobs.")
+@click.option(
+    "--shard",
+    type=_Shard(),
+    metavar="K/N|auto",
+    help="Only the K-th of N parts; auto: what AWS Batch, Kubernetes or Slurm say in the environment.",
+)
+@click.option(
+    "--output",
+    "-o",
+    "address",
+    metavar="URL",
+    help="Outputs to a folder of objects (s3, gs, az), which many workers share, in place of that of the file.",
+)
+@click.option("--allow-network", is_flag=True, help="Open URLs, write to a store of objects, fetch cells of DEMs.")
+@click.option("--summary", "as_summary", is_flag=True, help="Collect what all parts have made, and make nothing.")
 @click.option(
     "--root",
     type=click.Path(file_okay=False),
@@ -72,7 +86,9 @@ def run(
     as_list: bool,
     as_check: bool,
     as_schema: bool,
+    as_summary: bool,
     as_json: bool,
+    address: str | None,
     **options: Any,
 ) -> None:
     """Make the orthos of all scenes that PIPELINE.yaml names.
@@ -89,7 +105,12 @@ def run(
         raise click.UsageError("Missing argument 'PIPELINE.yaml'.")
     from ortho_pipeline.batch import runner as batch
     from ortho_pipeline.batch.results import SCHEMA_VERSION
+    from ortho_pipeline.batch.shared.arrays import part_of_array
+    from ortho_pipeline.batch.shared.run import SharedFolder
+    from ortho_pipeline.batch.summary import summarise
 
+    if options["shard"] == "auto":
+        options["shard"] = part_of_array()
     planned = batch.plan(pipeline_file, root)
     if as_list:
         listed = batch.list_scenes(planned)
@@ -100,9 +121,14 @@ def run(
         return None
     if as_check:
         return _check(planned, options["only"], options["shard"], as_json)
+    store = None if address is None else SharedFolder(address, options["allow_network"])
     try:
         with progress("Orthorectifying scenes") as advance:
-            result = batch.run(planned, memory=memory, progress=advance, **options)
+            result = (
+                summarise(planned, store)
+                if as_summary
+                else batch.run(planned, memory=memory, progress=advance, store=store, **options)
+            )
     except KeyboardInterrupt:
         click.echo("What is done is kept: run it again to go on.", err=True)
         raise
@@ -184,7 +210,11 @@ def _print_summary(result: BatchResult) -> None:
     for scene in scenes:
         if scene.error:
             console.print(f"\n{scene.name}: {_error_text(scene.error)}", markup=False)
-    counts = ", ".join(f"{result.count(status)} {status}" for status in ("done", "unchanged", "failed"))
+    counts = ", ".join(
+        f"{result.count(status)} {status}"
+        for status in ("done", "unchanged", "failed", "missing")
+        if status != "missing" or result.count(status)
+    )
     console.print(f"\n{counted(len(result.scenes), 'scene')}: {counts}  ({result.seconds:.1f} s)")
     if result.mosaic:
         console.print(_mosaic_text(result.mosaic), markup=False)

@@ -33,6 +33,8 @@ RETRIES: dict[str, Any] = {
 }  # fmt: skip
 #: How often an object is fetched whose content is not what the store says of it.
 _ATTEMPTS = 3
+#: Objects that are written on a condition are small (bytes).
+_MOST_ON_A_CONDITION = 100_000_000
 _TIMEOUTS = {"connect_timeout": "10s", "timeout": "900s"}
 _CHUNK = 4 << 20
 #: Bytes of the parts in which a large object is stored.
@@ -191,20 +193,29 @@ class Objects:
         )  # fmt: skip
 
     def _put_if(self, name: str, data: bytes | Path, content: Content, mode: Any) -> Content:
-        try:
-            with self._errors(name):
-                made = self._store.put(name, data, mode=mode, use_multipart=False)
-            if not (wrong := _difference(content, {"size": content.size, "e_tag": made["e_tag"]}, ours=True)):
-                return replace(content, e_tag=made["e_tag"])
-        except Conflict:
-            # A request whose answer was lost is repeated, and finds what it wrote itself.
-            wrong = ""
-        with contextlib.suppress(FileNotFoundError):
-            _, there = self.read(name, content.size)
-            if there.sha256 == content.sha256:
-                return there
-        if not wrong:
-            raise Conflict("another version of this object is there", file=self.of(name))
+        """Store an object on a condition.
+
+        Such a request is not repeated blindly: one whose answer was lost may have been carried out, and would be in its
+        own way. What is there tells.
+        """
+        for attempt in range(_ATTEMPTS):
+            wrong, failed = "", None
+            try:
+                with self._errors(name):
+                    made = self._store.put(name, data, mode=mode, use_multipart=False)
+                stated = {"size": content.size, "e_tag": made["e_tag"]}
+                if not (wrong := _difference(content, stated, ours=True)):
+                    return replace(content, e_tag=made["e_tag"])
+            except StorageError as error:
+                failed = error
+            with contextlib.suppress(FileNotFoundError):
+                _, there = self.read(name, _MOST_ON_A_CONDITION)
+                if there.sha256 == content.sha256:
+                    return there
+            if isinstance(failed, Conflict) or (failed is not None and attempt == _ATTEMPTS - 1):
+                raise failed
+            if wrong:
+                break
         self.delete(name)
         raise StorageError(
             f"{wrong} after it was written; it was removed", file=self.of(name), remedy="check the way to the store"

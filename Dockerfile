@@ -1,0 +1,19 @@
+# A slim image of the command line, with GDAL from its wheel; not root.
+#   docker build -t ortho-pipeline . && docker run --rm ortho-pipeline doctor
+FROM python:3.13-slim AS build
+WORKDIR /src
+COPY pyproject.toml README.md LICENSE ./
+COPY ortho_pipeline ortho_pipeline
+COPY plugins plugins
+RUN python -m venv /opt/ortho && /opt/ortho/bin/pip install --no-cache-dir '.[wheel,dask]'
+
+FROM python:3.13-slim
+RUN useradd --create-home --uid 10001 ortho && mkdir /cache /work /opt/numba && chown ortho:ortho /cache /work /opt/numba
+COPY --from=build /opt/ortho /opt/ortho
+ENV PATH=/opt/ortho/bin:$PATH ORTHO_CACHE=/cache/ortho NUMBA_CACHE_DIR=/opt/numba PYTHONUNBUFFERED=1
+USER ortho
+WORKDIR /work
+# Compiled code of the usual job is in the image: a new container does not compile.
+COPY --chown=ortho:ortho sample_data/scene.tif /tmp/sample/
+RUN ortho rectify /tmp/sample/scene.tif --height 1000 -o /tmp/warm && rm -r /tmp/warm
+ENTRYPOINT ["ortho"]

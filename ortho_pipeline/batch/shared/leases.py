@@ -1,0 +1,132 @@
+"""Who makes which scene: leases in a folder of objects, by writes that a store refuses if another one was faster.
+
+A scene has a lease, which its worker renews while it lives, and a result in the end. Times of several machines are not
+compared: a worker takes over a lease that it has seen unchanged for as long as `PATIENCE`, by its own clock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import secrets
+import socket
+import threading
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.files import json_text
+from ortho_pipeline.files.storage.objects import Conflict, Objects
+
+#: Seconds after which a lease that nobody renews is another's to take; it is renewed four times in that time.
+PATIENCE = 120.0
+_RENEWALS = 4
+_LEASE, _RESULT = ".lease.json", ".result.json"
+_MAX_BYTES = 20_000_000
+
+
+class Lost(OrthoError):
+    """Another worker has taken over the lease."""
+
+
+class Lease:
+    """A scene that this worker makes, until the block of `held` ends."""
+
+    def __init__(self, store: Objects, name: str, e_tag: str | None, holder: str, beat: int = 0) -> None:
+        self._store, self.name, self._e_tag, self._holder, self._beat = store, name, e_tag, holder, beat
+        self._lock, self._lost = threading.Lock(), False
+
+    @contextlib.contextmanager
+    def held(self, patience: float) -> Iterator[Lease]:
+        """Renew the lease in a thread for the length of the block."""
+        stop = threading.Event()
+
+        def renew() -> None:
+            while not stop.wait(patience / _RENEWALS):
+                with contextlib.suppress(OrthoError):
+                    self.renew()
+
+        thread = threading.Thread(target=renew, name="lease", daemon=True)
+        thread.start()
+        try:
+            yield self
+        finally:
+            stop.set()
+            thread.join()
+
+    def renew(self) -> None:
+        """Say that this worker lives.
+
+        Raises
+        ------
+        Lost
+            If another one has the lease.
+        """
+        with self._lock:
+            if self._lost:
+                raise Lost(f"another worker has taken over {self.name!r}")
+            self._beat += 1
+            data = lease_document(self._holder, self._beat)
+            try:
+                self._e_tag = self._store.put(self.name + _LEASE, data, replacing=self._e_tag).e_tag
+            except Conflict as error:
+                self._lost = True
+                raise Lost(f"another worker has taken over {self.name!r}") from error
+
+    def finish(self, result: Mapping[str, Any]) -> None:
+        """Write the result of the scene, in place of an older one.
+
+        Raises
+        ------
+        Lost
+            If another one has the lease.
+        """
+        self.renew()
+        self._store.put(self.name + _RESULT, json_text(result).encode())
+
+
+class Leases:
+    """The leases and the results of a run in a folder of objects."""
+
+    def __init__(self, address: str, *, allow_network: bool) -> None:
+        self._store = Objects(address, allow_network=allow_network)
+        self._holder = f"{socket.gethostname()} {os.getpid()} {secrets.token_hex(8)}"
+
+    def take(self, name: str, seen: str | None = None) -> Lease | str:
+        """Return the lease of a scene, or the version of the one that another worker holds.
+
+        Parameters
+        ----------
+        seen : str, optional
+            The version that may be taken over: that of a worker that does not live.
+        """
+        data = lease_document(self._holder, 0)
+        try:
+            made = self._store.put(name + _LEASE, data, new=seen is None, replacing=seen)
+        except Conflict:
+            with contextlib.suppress(FileNotFoundError):
+                return self._store.read(name + _LEASE, _MAX_BYTES)[1].e_tag or ""
+            return ""
+        return Lease(self._store, name, made.e_tag, self._holder)
+
+    def result(self, name: str) -> dict[str, Any] | None:
+        """Return the result of a scene, None where there is none that can be understood."""
+        with contextlib.suppress(FileNotFoundError, ValueError):
+            found = json.loads(self._store.read(name + _RESULT, _MAX_BYTES)[0])
+            return found if isinstance(found, dict) else None
+        return None
+
+    def finished(self) -> frozenset[str]:
+        """Return the names of the scenes that have a result."""
+        return frozenset(name.removesuffix(_RESULT) for name, _ in self._store.names() if name.endswith(_RESULT))
+
+    def forget(self, name: str) -> None:
+        """Remove result and lease of a scene that is to be made again."""
+        self._store.delete(name + _RESULT)
+        self._store.delete(name + _LEASE)
+
+
+def lease_document(holder: str, beat: int) -> bytes:
+    """Return the content of a lease, which no two workers and no two moments share."""
+    return json_text({"holder": holder, "beat": beat}).encode()

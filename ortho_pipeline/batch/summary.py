@@ -1,0 +1,40 @@
+"""What many runs of parts have made, collected."""
+
+from __future__ import annotations
+
+import os
+import time
+
+from ortho_pipeline.batch.plan import RUN_FILES, Job, Plan, plan
+from ortho_pipeline.batch.records import Record
+from ortho_pipeline.batch.results import BatchResult, Outcome
+from ortho_pipeline.batch.shared.run import SharedFolder, summary_of
+from ortho_pipeline.files import write_json
+
+
+def summarise(config: str | os.PathLike[str] | Plan, store: SharedFolder | None = None) -> BatchResult:
+    """Collect what the runs of all parts have made, and write the summary; make no scene.
+
+    A scene that nobody has finished has the status ``missing``.
+    """
+    planned = config if isinstance(config, Plan) else plan(config)
+    if store is not None:
+        return summary_of(planned, store)
+    begin, found = time.monotonic(), []
+    for job in planned.jobs:
+        record = Record.read(job.record)
+        if record is None or record.status not in ("done", "failed"):
+            found.append(Outcome(job.name, "missing"))
+        elif record.status == "failed":
+            found.append(Outcome(job.name, "failed", record.seconds, error=record.error))
+        else:
+            found.append(Outcome(job.name, "done", record.seconds, paths_of(record, job), record.facts))
+    files = {"summary": planned.output / RUN_FILES["summary"]}
+    result = BatchResult(tuple(found), files, time.monotonic() - begin)
+    write_json(files["summary"], result.to_json())
+    return result
+
+
+def paths_of(record: Record, job: Job) -> dict[str, str]:
+    """Return the outputs of a scene by what they are."""
+    return {one.role: str(job.folder / one.path) for one in record.outputs}

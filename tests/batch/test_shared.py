@@ -1,0 +1,239 @@
+"""Many workers of one run: parts from their environment, leases in a store of objects, takeover after a death."""
+
+from __future__ import annotations
+
+import functools
+import json
+import random
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from osgeo import gdal
+from servers import bucket_at, on_a_faulty_way
+
+from ortho_pipeline.batch.executors import Sequential
+from ortho_pipeline.batch.plan import STATE, Job, Plan
+from ortho_pipeline.batch.results import Outcome
+from ortho_pipeline.batch.shared.arrays import part_of_array
+from ortho_pipeline.batch.shared.leases import Leases
+from ortho_pipeline.batch.shared.run import SharedFolder, run_shared, summary_of
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.storage import objects
+from ortho_pipeline.files.storage.objects import Objects
+
+gdal.UseExceptions()
+
+
+@pytest.fixture(scope="module")
+def moto() -> Iterator[tuple[str, int]]:
+    server = pytest.importorskip("moto.server").ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    bucket_at(f"http://{host}:{port}", "runs")
+    yield host, port
+    server.stop()
+
+
+@pytest.fixture
+def store(moto: tuple[str, int], monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> str:
+    """A folder of objects for this test."""
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{moto[0]}:{moto[1]}")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "test")
+    monkeypatch.setenv("AWS_REGION", "us-east-1")
+    quick = {"init_backoff": timedelta(milliseconds=2), "max_backoff": timedelta(milliseconds=20), "base": 2}
+    monkeypatch.setattr(
+        objects, "RETRIES", {"max_retries": 6, "retry_timeout": timedelta(seconds=10), "backoff": quick}
+    )
+    return f"s3://runs/{abs(hash(request.node.name))}"
+
+
+# -- parts -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("environment", "part"),
+    [
+        ({"AWS_BATCH_JOB_ARRAY_INDEX": "0", "AWS_BATCH_JOB_ARRAY_SIZE": "4"}, (1, 4)),
+        ({"AWS_BATCH_JOB_ARRAY_INDEX": "3", "ORTHO_SHARDS": "4"}, (4, 4)),
+        ({"JOB_COMPLETION_INDEX": "1", "ORTHO_SHARDS": "2"}, (2, 2)),
+        ({"SLURM_ARRAY_TASK_ID": "1", "SLURM_ARRAY_TASK_MIN": "1", "SLURM_ARRAY_TASK_COUNT": "16"}, (1, 16)),
+        (
+            {
+                "SLURM_ARRAY_TASK_ID": "20", "SLURM_ARRAY_TASK_MIN": "10", "SLURM_ARRAY_TASK_STEP": "5",
+                "SLURM_ARRAY_TASK_COUNT": "3",
+            },
+            (3, 3),
+        ),
+    ],
+)  # fmt: skip
+def test_an_array_of_jobs_says_which_part_it_is(environment: dict[str, str], part: tuple[int, int]) -> None:
+    assert part_of_array(environment) == part
+
+
+@pytest.mark.parametrize(
+    ("environment", "said"),
+    [
+        ({}, "no array"),
+        ({"JOB_COMPLETION_INDEX": "0", "SLURM_ARRAY_TASK_ID": "0"}, "several"),
+        ({"JOB_COMPLETION_INDEX": "0"}, "nothing how many"),
+        ({"JOB_COMPLETION_INDEX": "2", "ORTHO_SHARDS": "2"}, "no worker of 2"),
+        ({"JOB_COMPLETION_INDEX": "-1", "ORTHO_SHARDS": "2"}, "no number"),
+        ({"SLURM_ARRAY_TASK_ID": "12", "SLURM_ARRAY_TASK_STEP": "5", "SLURM_ARRAY_TASK_COUNT": "4"}, "no worker"),
+    ],
+)  # fmt: skip
+def test_an_environment_that_does_not_say_it_is_refused(environment: dict[str, str], said: str) -> None:
+    with pytest.raises(InputError, match=said) as caught:
+        part_of_array(environment)
+    assert caught.value.remedy
+
+
+def test_parts_of_all_workers_are_all_scenes_once() -> None:
+    jobs = tuple(Job(f"s{k}", Path(f"s{k}.tif"), Path("out")) for k in range(23))
+    planned = Plan(Path("p.yaml"), Path("out"), jobs)
+    parts = (part_of_array({"JOB_COMPLETION_INDEX": str(k), "ORTHO_SHARDS": "5"}) for k in range(5))
+    made = [job.name for part in parts for job in planned.chosen(shard=part)]
+    assert sorted(made) == sorted(job.name for job in jobs)
+
+
+# -- leases ------------------------------------------------------------------------------------------------------------
+
+
+class Dies(BaseException):
+    """A worker that is killed: nothing of it runs any more."""
+
+
+def make(made: list[str], seconds: float, dying: random.Random | None, job: Job) -> Outcome:
+    """Stand for the work on a scene: write an output, sometimes die before or after."""
+    if dying is not None and dying.random() < 0.3:
+        raise Dies
+    time.sleep(seconds)
+    job.folder.mkdir(parents=True)
+    (job.folder / f"{job.name}_ortho.tif").write_text(job.name)
+    if dying is not None and dying.random() < 0.3:
+        raise Dies
+    made.append(job.name)
+    return Outcome(job.name, "done", seconds, {"ortho": str(job.folder / f"{job.name}_ortho.tif")})
+
+
+def work_together(address: str, count: int, scenes: int, patience: float, dying: int | None = None) -> Counter[str]:
+    """Let some workers make the scenes of one plan at once, each beginning with its own; return how often each was."""
+    jobs = tuple(Job(f"s{k:03}", Path(f"s{k}.tif"), Path("out")) for k in range(scenes))
+    planned = Plan(Path("p.yaml"), Path("out"), jobs)
+    made: list[str] = []
+    where = SharedFolder(address, allow_network=True, patience=patience)
+
+    def worker(part: int, random_or_none: random.Random | None) -> None:
+        work = functools.partial(make, made, 0.01, random_or_none)
+        try:
+            run_shared(planned, planned.chosen(shard=(part + 1, count)), where, Sequential(), work)
+        except Dies:
+            return
+
+    # The last worker never dies, and cleans up after the others.
+    mortal = [None if dying is None or k == count - 1 else random.Random(dying + k) for k in range(count)]
+    threads = [threading.Thread(target=worker, args=(k, mortal[k])) for k in range(count)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=60)
+    assert not any(thread.is_alive() for thread in threads)
+    store = Objects(address, allow_network=True)
+    for job in jobs:
+        assert store.read(f"{job.name}/{job.name}_ortho.tif", 100)[0] == job.name.encode()
+        assert store.exists(f"{job.name}/{job.name}_delivery.json")
+    summary = summary_of(planned, where)
+    assert [one.status for one in summary.scenes] == ["unchanged"] * scenes
+    return Counter(made)
+
+
+def test_two_workers_at_once_make_every_scene_once(store: str) -> None:
+    assert work_together(store, count=3, scenes=8, patience=4.0) == {f"s{k:03}": 1 for k in range(8)}
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_scenes_of_workers_that_died_are_taken_over(store: str, seed: int) -> None:
+    assert set(work_together(store, count=3, scenes=5, patience=0.4, dying=seed)) == {f"s{k:03}" for k in range(5)}
+
+
+@pytest.mark.slow
+def test_a_hundred_deaths(store: str) -> None:
+    for seed in range(100):
+        found = work_together(f"{store}/{seed}", count=3, scenes=4, patience=0.4, dying=1000 * seed)
+        assert set(found) == {f"s{k:03}" for k in range(4)}
+
+
+def test_a_lease_that_was_taken_over_ends_nothing(store: str) -> None:
+    """A worker that was silent for too long finds out before it writes a result."""
+    first, second = (Leases(store, allow_network=True) for _ in range(2))
+    lease = first.take("s")
+    seen = second.take("s")
+    assert isinstance(seen, str)
+    taken = second.take("s", seen)
+    assert not isinstance(taken, str)
+    with pytest.raises(Exception, match="taken over"):
+        lease.finish({"status": "done"})
+    assert first.result("s") is None
+    taken.finish({"status": "done"})
+    assert first.result("s") == {"status": "done"}
+    assert first.finished() == {"s"}
+
+
+def test_leases_hold_on_a_faulty_way(store: str, moto: tuple[str, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """An answer that is lost after the write was done is no conflict with oneself."""
+    with on_a_faulty_way(moto, 3, share=0.25) as way:
+        way.KINDS = ("answer lost", "503", "cut", "429")
+        monkeypatch.setenv("AWS_ENDPOINT_URL", way.address)
+        taken = [Leases(store, allow_network=True).take(f"s{k}") for k in range(12)]
+        assert not [one for one in taken if isinstance(one, str)]
+        for one in taken:
+            one.renew()
+            one.finish({"status": "done"})
+        assert way.met["answer lost"] > 0
+        assert len(Leases(store, allow_network=True).finished()) == 12
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+FILE = """
+output: out
+defaults:
+  surface: {dem: dem.tif, vertical: ellipsoid}
+  output: {format: GTiff}
+scenes:
+  - images: raw/*.tif
+"""
+
+
+def test_the_command_delivers_to_a_store_and_collects(store: str, tiny: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    raw = tiny.folder / "raw"
+    raw.mkdir()
+    for number in range(2):
+        gdal.Translate(str(raw / f"s{number}.tif"), str(tiny.image))
+    file = tiny.folder / "p.yaml"
+    file.write_text(FILE)
+    monkeypatch.setenv("JOB_COMPLETION_INDEX", "0")
+    monkeypatch.setenv("ORTHO_SHARDS", "2")
+    common = ["run", str(file), "-o", store, "--executor", "sequential", "--json"]
+    refused = CliRunner().invoke(cli, common)
+    assert refused.exit_code == 2
+    assert "--allow-network" in refused.stderr
+    done = CliRunner().invoke(cli, [*common, "--allow-network", "--shard", "auto"])
+    assert done.exit_code == 0, done.stderr
+    assert json.loads(done.stdout)["counts"]["done"] == 2, "the other worker never came"
+    again = CliRunner().invoke(cli, [*common, "--allow-network"])
+    assert json.loads(again.stdout)["counts"] == {"done": 0, "unchanged": 2, "failed": 0}
+    summary = CliRunner().invoke(cli, [*common, "--allow-network", "--summary"])
+    files = [one["files"]["ortho"] for one in json.loads(summary.stdout)["scenes"]]
+    assert files == [f"{store}/s{k}/s{k}_ortho.tif" for k in range(2)]
+    names = {name for name, _ in Objects(store, allow_network=True).names()}
+    assert {"run.json", f"{STATE}/s0.result.json", "s1/s1_report.json"} <= names
+    assert not (tiny.folder / "out").exists()
