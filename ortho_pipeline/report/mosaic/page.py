@@ -43,10 +43,8 @@ def _outlines(owners: Owners) -> dict[str, Any]:
     step = max(1, -(-max(owners.owners.shape) // _DRAWN))
     labels = owners.owners[::step, ::step]
     parts = []
-    for differs, form in (
-        (labels[1:] != labels[:-1], "M{1} {0}h{2}"),
-        ((labels[:, 1:] != labels[:, :-1]).T, "M{0} {1}v{2}"),
-    ):
+    for labels_of, form in ((labels, "M{1} {0}h{2}"), (labels.T, "M{0} {1}v{2}")):
+        differs = (labels_of[1:] != labels_of[:-1]) & (labels_of[1:] >= 0) & (labels_of[:-1] >= 0)
         edges = np.diff(np.pad(differs, ((0, 0), (1, 1))).astype(np.int8), axis=1)
         (line, begin), (_, end) = np.nonzero(edges == 1), np.nonzero(edges == -1)
         parts += [form.format(row + 1, first, last - first) for row, first, last in zip(line, begin, end, strict=True)]
