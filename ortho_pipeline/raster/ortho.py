@@ -20,6 +20,9 @@ from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.raster.output import abandon, check_written, checked_options, close, gdal_errors
 from ortho_pipeline.raster.source import Grid, RasterSource, holds, pixel_type
 
+#: Bytes up to which a raster that is going to be copied is kept in memory instead of in a file.
+_SMALL = 16_000_000
+
 
 @dataclass(frozen=True)
 class Profile:
@@ -188,7 +191,8 @@ class RasterWriter:
             self._temporary = stack.enter_context(whole_or_nothing(self.path))
             if self.driver == "COG":
                 # The COG driver copies a finished raster: overviews come before the pixels in the file.
-                self._work = self.scratch("work")
+                size = self.grid.width * self.grid.height * self.profile.count * self.profile.dtype.itemsize
+                self._work = None if size <= _SMALL and self.profile.validity == "nodata" else self.scratch("work")
                 options = {"TILED": "YES", "BIGTIFF": "IF_SAFER", "BLOCKXSIZE": "512", "BLOCKYSIZE": "512"}
             else:
                 self._work, options = self._temporary, self.options
@@ -213,15 +217,15 @@ class RasterWriter:
                 mask = valid.view(np.uint8) * np.uint8(255)
                 self._dataset.GetRasterBand(1).GetMaskBand().WriteArray(mask, left, top)
 
-    def _create(self, path: Path, options: Mapping[str, str]) -> gdal.Dataset:
+    def _create(self, path: Path | None, options: Mapping[str, str]) -> gdal.Dataset:
         from osgeo import gdal_array
 
         profile, grid = self.profile, self.grid
         code = gdal_array.NumericTypeCodeToGDALTypeCode(profile.dtype.type)
         with gdal_errors(self.path), contextlib.ExitStack() as failed:
-            dataset = gdal.GetDriverByName("GTiff").Create(
-                str(path), grid.width, grid.height, profile.count, code, [f"{k}={v}" for k, v in options.items()]
-            )
+            driver, where = ("MEM", "") if path is None else ("GTiff", str(path))
+            given = [] if path is None else [f"{k}={v}" for k, v in options.items()]
+            dataset = gdal.GetDriverByName(driver).Create(where, grid.width, grid.height, profile.count, code, given)
             failed.callback(abandon, dataset)
             dataset.SetProjection(grid.crs.to_wkt())
             dataset.SetGeoTransform(grid.geotransform)
@@ -240,12 +244,15 @@ class RasterWriter:
 
     def _finish(self) -> None:
         with gdal_errors(self.path):
-            close(self._dataset)
-            self._dataset = None
+            source = self._dataset
+            if self._work is not None:
+                close(self._dataset)
+                self._dataset = source = None
             if self.driver == "COG":
-                source = gdal.OpenEx(str(self._work), gdal.OF_RASTER, allowed_drivers=["GTiff"])
+                source = source or gdal.OpenEx(str(self._work), gdal.OF_RASTER, allowed_drivers=["GTiff"])
                 options = [f"{k}={v}" for k, v in self.options.items()]
                 close(gdal.GetDriverByName("COG").CreateCopy(str(self._temporary), source, options=options))
+            self._dataset = None
         # GDAL leaves out blocks of a file beyond 4 GB into which nothing was written.
         partly = self._written < self.grid.width * self.grid.height
         sparse = partly or self.options.get("SPARSE_OK", "NO").upper() in ("YES", "TRUE", "ON")

@@ -145,7 +145,7 @@ def rectify(
         writer = stack.enter_context(
             RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads)
         )
-        mask = None if job.looked is None else stack.enter_context(job.looked.writer(threads))
+        mask = None if job.looked is None else stack.enter_context(job.looked.writer(driver, threads))
         tiles = list(_tiles(grid, TILE))
         for done, (left, top, pixels, valid, classes) in enumerate(_in_order(threads, job.make, tiles), start=1):
             writer.write(left, top, pixels, valid)

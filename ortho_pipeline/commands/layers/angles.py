@@ -64,7 +64,8 @@ def write_angles(
     if sun is None:
         del files["shadow"]
         return AnglesLayer(view_zenith_deg=found.view_zenith_deg, sun_deg=None, shadow_share=None)
-    share = angles.write_shadows(sight, placed.surface, sun, files["shadow"], heights=heights, resources=resources)
+    share = angles.write_shadows(sight, placed.surface, sun, files["shadow"], heights=heights, resources=resources,
+                                 driver=output.format)  # fmt: skip
     return AnglesLayer(
         view_zenith_deg=found.view_zenith_deg, sun_deg=(sun.azimuth_deg, sun.elevation_deg), shadow_share=share
     )

@@ -53,6 +53,8 @@ _TOLERANCE, _PROBES = 0.005, 200
 _LEVELS = 3
 #: Places that the figures over the scene are taken of, about; cells per side of its map.
 _SAMPLE, _CELLS = 20_000, 32
+#: Side (px) up to which a layer has no overviews.
+_SMALL = 1024
 #: Of these so many are mixed for the error of all places together.
 _MIXED = 1000
 
@@ -233,18 +235,23 @@ def write_accuracy(
     """
     resources = resources or Resources()
     grid = layer_grid(sight.grid, step)
-    layer = _Layer(budget, Sight(sight.model, grid), surface, size, heights, resources.memory // 8)
+    layer = _Layer(budget, sight.on(grid), surface, size, heights, resources.memory // 8)
     profile = Profile(
         count=len(BANDS), dtype=np.dtype(np.float32), validity="nodata", nodata=math.nan, descriptions=BANDS,
         interpretations=(0,) * len(BANDS), metadata=dict(metadata or {}),
         scales=tuple((1.0, 0.0, unit) for unit in ("m", "m", "", "m")),
     )  # fmt: skip
     # Little is gained by more effort, and half of the time of the layer would be spent on it.
-    options = {"LEVEL": "1", "PREDICTOR": "NO", "OVERVIEW_RESAMPLING": "NEAREST"}
+    options = {"LEVEL": "1", "PREDICTOR": "NO", **overviews(grid)}
     with RasterWriter(path, grid, profile, creation_options=options, threads=resources.threads or 1) as writer:
         for left, top, width, height in tiles(grid, _TILE):
             writer.write(left, top, layer.make(left, top, width, height), None)
     return layer.result()
+
+
+def overviews(grid: Grid) -> dict[str, str]:
+    """Return creation options of a layer: a small one needs no overviews, which take as long as the pixels."""
+    return {"OVERVIEWS": "NONE"} if max(grid.width, grid.height) <= _SMALL else {"OVERVIEW_RESAMPLING": "NEAREST"}
 
 
 def tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
@@ -341,18 +348,17 @@ class _Layer:
             # Where the model ends between nodes, every pixel is one.
             spacing = 1
             nodes, samples = self._nodes(left, top, width, height, spacing)
-        bands = np.empty((len(BANDS), height, width), dtype=np.float32)
-        covariance = np.full((height, width, 3), np.nan)
+        bands = np.full((len(BANDS), height, width), np.nan, dtype=np.float32)
         for row, column, nj, ni in self._pieces(samples, height, width, spacing):
             j, i = row // spacing, column // spacing
             part = (slice(j, j + -(-nj // spacing) + 1), slice(i, i + -(-ni // spacing) + 1))
             here = (slice(row, row + nj), slice(column, column + ni))
             accuracy_kernel.fill(
                 Nodes(nodes[part], samples[part], spacing, self.middle, self.half), self._heights(samples[part]),
-                self.budget.even, (float(self.size[0]), float(self.size[1])), radii(), covariance[here],
-                bands[(slice(None), *here)], self.totals,
+                self.budget.even, (float(self.size[0]), float(self.size[1])), radii(), bands[(slice(None), *here)],
+                self.totals,
             )  # fmt: skip
-        self._count(left, top, bands, covariance)
+        self._count(left, top, bands)
         return _rounded(bands)
 
     def _pieces(self, samples: Array, height: int, width: int, spacing: int) -> Iterator[tuple[int, int, int, int]]:
@@ -379,10 +385,11 @@ class _Layer:
             return Heights(dem, _window(sigma, samples[..., 1]), -1.0, datum)
         return Heights(dem, dem, float(sigma or 0.0), datum)
 
-    def _count(self, left: int, top: int, bands: NDArray[np.float32], covariance: Array) -> None:
+    def _count(self, left: int, top: int, bands: NDArray[np.float32]) -> None:
         _, height, width = bands.shape
         first = (-top) % self.stride, (-left) % self.stride
-        taken = covariance[first[0] :: self.stride, first[1] :: self.stride].reshape(-1, 3)
+        east, north, rho = bands[:3, first[0] :: self.stride, first[1] :: self.stride].astype(float).reshape(3, -1)
+        taken = np.stack([east**2, north**2, rho * east * north], axis=1)
         self.taken.append(taken[np.isfinite(taken).all(axis=1)])
         rows, columns = (top + np.arange(height)) // self.cell, (left + np.arange(width)) // self.cell
         accuracy_kernel.gather(bands[3], rows, columns, self.sums)
@@ -411,8 +418,9 @@ class _Layer:
 def _rounded(bands: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return bands to one part in 2000, which is more than anybody knows of an accuracy and packs in half the time."""
     bits = bands.view(np.uint32)
-    known = np.isfinite(bands)
-    bits[known] = (bits[known] + np.uint32(1 << 12)) & np.uint32(0xFFFFE000)
+    # NumPy's NaN has none of the bits that go.
+    bits += np.uint32(1 << 12)
+    bits &= np.uint32(0xFFFFE000)
     return bands
 
 

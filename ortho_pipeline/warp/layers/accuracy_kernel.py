@@ -18,8 +18,8 @@ class Nodes(NamedTuple):
 
     Parameters
     ----------
-    fields : (rows, columns, levels, 10)
-        Polynomials in the normalised height, which is -1 at middle - half and 1 at middle + half (m).
+    fields : (rows, columns, 3, 10)
+        Quadratics in the normalised height, which is -1 at middle - half and 1 at middle + half (m).
     samples : (rows, columns, 2, k)
         Sample coordinates of the heights and of their standard deviations.
     spacing : int
@@ -43,45 +43,32 @@ class Heights(NamedTuple):
 
 
 @compiled
-def fill(
-    lattice: Nodes, heights: Heights, even: float, size: Any, radii: Any, covariance: Any, bands: Any, totals: Any
-) -> None:
-    """Fill covariances ``(h, w, 3)`` and bands ``(4, h, w)``; NaN where nothing is seen or known.
+def fill(lattice: Nodes, heights: Heights, even: float, size: Any, radii: Any, bands: Any, totals: Any) -> None:
+    """Fill bands ``(4, h, w)``, which stay as they are where nothing is seen or known.
 
     `even` is a variance, `size` that of the image. `totals` ``(8,)`` grows by the variances of the parts, of east and
     of north, and by the numbers of pixels that are known and that show the image.
     """
-    nodes, samples, spacing, middle, half = lattice
-    dem, sigma, constant, datum = heights
-    height, width = covariance.shape[:2]
-    value = np.empty(_FIELDS)
-    begin, grow = np.empty((nodes.shape[2], _FIELDS)), np.empty((nodes.shape[2], _FIELDS))
+    nodes, samples, spacing = lattice.fields, lattice.samples, lattice.spacing
+    _, height, width = bands.shape
+    begin, grow = np.empty((3, _FIELDS)), np.empty((3, _FIELDS))
     place, way = np.empty(samples.shape[2:]), np.empty(samples.shape[2:])
+    values, ticks, scaled = np.empty((_FIELDS, spacing)), np.arange(spacing) / spacing, np.empty(spacing)
     for row in range(height):
         j, fy = row // spacing, (row % spacing) / spacing
-        for column in range(width):
-            i, fx = column // spacing, (column % spacing) / spacing
-            if column % spacing == 0:
-                _along(nodes[j, i], nodes[j, i + 1], nodes[j + 1, i], nodes[j + 1, i + 1], fy, begin, grow)
-                _along(samples[j, i], samples[j, i + 1], samples[j + 1, i], samples[j + 1, i + 1], fy, place, way)
-            bands[:, row, column] = np.nan
-            h = dem_height_at(
-                dem.heights, place[0, 0] + way[0, 0] * fx, place[1, 0] + way[1, 0] * fx, dem.left, dem.top, False
-            )
-            t = (h - middle) / half
+        for i in range((width - 1) // spacing + 1):
+            first = i * spacing
+            count = min(spacing, width - first)
+            _along(nodes[j, i], nodes[j, i + 1], nodes[j + 1, i], nodes[j + 1, i + 1], fy, begin, grow)
+            _along(samples[j, i], samples[j, i + 1], samples[j + 1, i], samples[j + 1, i + 1], fy, place, way)
+            # Simple loops over pixels, one after the other, are faster than all at once.
+            _scaled_heights(lattice, heights.dem, place, way, ticks, scaled, count)
             for f in range(_FIELDS):
-                value[f] = 0.0
-                for k in range(nodes.shape[2] - 1, -1, -1):
-                    value[f] = value[f] * t + (begin[k, f] + grow[k, f] * fx)
-            if not (0.0 <= value[8] <= size[0] and 0.0 <= value[9] <= size[1]):
-                continue
-            deviation = constant
-            if constant < 0.0:
-                u, v = place[0, 1] + way[0, 1] * fx, place[1, 1] + way[1, 1] * fx
-                deviation = dem_height_at(sigma.heights, u, v, sigma.left, sigma.top, False)
-            _count(
-                value, deviation * deviation + datum, even, radii, covariance[row, column], bands, row, column, totals
-            )
+                _quadratic(begin, grow, f, ticks, scaled, values[f], count)
+            for c in range(count):
+                if 0.0 <= values[8, c] <= size[0] and 0.0 <= values[9, c] <= size[1]:
+                    variance = _height_variance(heights, place, way, ticks[c])
+                    _count(values, c, variance, even, radii, bands, row, first + c, totals)
 
 
 @inlined
@@ -97,19 +84,46 @@ def _along(northwest, northeast, southwest, southeast, fy, begin, grow):
 
 
 @inlined
-def _count(value, variance, even, radii, covariance, bands, row, column, totals):
+def _scaled_heights(lattice, dem, place, way, ticks, scaled, count):
+    """Fill the normalised heights of a row of a cell."""
+    for c in range(count):
+        u, v = place[0, 0] + way[0, 0] * ticks[c], place[1, 0] + way[1, 0] * ticks[c]
+        scaled[c] = (dem_height_at(dem.heights, u, v, dem.left, dem.top, False) - lattice.middle) / lattice.half
+
+
+@inlined
+def _quadratic(begin, grow, f, ticks, scaled, out, count):
+    """Fill a field along a row of a cell."""
+    b0, b1, b2, g0, g1, g2 = begin[0, f], begin[1, f], begin[2, f], grow[0, f], grow[1, f], grow[2, f]
+    for c in range(count):
+        fx, t = ticks[c], scaled[c]
+        out[c] = ((b2 + g2 * fx) * t + (b1 + g1 * fx)) * t + (b0 + g0 * fx)
+
+
+@inlined
+def _height_variance(heights, place, way, fx):
+    """Return the variance of a height, its datum included; NaN where it is not known."""
+    sigma, deviation = heights.sigma, heights.constant
+    if deviation < 0.0:
+        u, v = place[0, 1] + way[0, 1] * fx, place[1, 1] + way[1, 1] * fx
+        deviation = dem_height_at(sigma.heights, u, v, sigma.left, sigma.top, False)
+    return deviation * deviation + heights.datum
+
+
+@inlined
+def _count(values, c, variance, even, radii, bands, row, column, totals):
     """Put the accuracy of a pixel into the bands and into what they come to together."""
     totals[7] += 1.0
-    ee = value[0] + value[3] * value[3] * variance + even + value[5]
-    nn = value[1] + value[4] * value[4] * variance + even + value[6]
-    en = value[2] + value[3] * value[4] * variance + value[7]
+    east, north = values[3, c], values[4, c]
+    ee = values[0, c] + east * east * variance + even + values[5, c]
+    nn = values[1, c] + north * north * variance + even + values[6, c]
+    en = values[2, c] + east * north * variance + values[7, c]
     if ee + nn + en < np.inf:
-        covariance[0], covariance[1], covariance[2] = ee, nn, en
         _put(ee, nn, en, radii, radii.size - 1, bands, row, column)
-        totals[0] += value[0] + value[1]
-        totals[1] += (value[3] * value[3] + value[4] * value[4]) * variance
+        totals[0] += values[0, c] + values[1, c]
+        totals[1] += (east * east + north * north) * variance
         totals[2] += 2.0 * even
-        totals[3] += value[5] + value[6]
+        totals[3] += values[5, c] + values[6, c]
         totals[4] += ee
         totals[5] += nn
         totals[6] += 1.0

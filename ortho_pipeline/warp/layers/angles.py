@@ -24,7 +24,8 @@ from ortho_pipeline.raster.ortho import Profile, RasterWriter
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import levels, polynomials
-from ortho_pipeline.warp.layers.accuracy import layer_grid, tiles
+from ortho_pipeline.warp.layers.accuracy import layer_grid, overviews, tiles
+from ortho_pipeline.warp.layers.hiding import of_classes
 from ortho_pipeline.warp.layers.sight import Sight
 from ortho_pipeline.warp.layers.visibility import Visibility
 from ortho_pipeline.warp.layers.visibility_kernel import HIDDEN, VOID
@@ -121,13 +122,13 @@ def write_angles(
         Pixels of the ortho to one of the layer, per side.
     """
     grid = layer_grid(sight.grid, step)
-    own, names = Sight(sight.model, grid), ["view_zenith", "view_azimuth", *(["sun_incidence"] if sun else [])]
+    own, names = sight.on(grid), ["view_zenith", "view_azimuth", *(["sun_incidence"] if sun else [])]
     profile = Profile(
         count=len(names), dtype=np.dtype(np.float32), validity="nodata", nodata=math.nan, descriptions=tuple(names),
         interpretations=(0,) * len(names), scales=((1.0, 0.0, "degree"),) * len(names), metadata=_metadata(sun),
     )  # fmt: skip
     low, high = math.inf, -math.inf
-    options = {"LEVEL": "1", "OVERVIEW_RESAMPLING": "NEAREST"}
+    options = {"LEVEL": "1", **overviews(grid)}
     threads = (resources or Resources()).threads or 1
     with RasterWriter(path, grid, profile, creation_options=options, threads=threads) as writer:
         for left, top, width, height in tiles(grid, _TILE):
@@ -227,6 +228,7 @@ def write_shadows(
     *,
     heights: tuple[float, float],
     resources: Resources | None = None,
+    driver: str = "COG",
 ) -> float:
     """Write which pixels of the ortho lie in shadow, their own or that of other terrain; return the share of shadow.
 
@@ -242,9 +244,9 @@ def write_shadows(
         metadata={f"CLASS_{LIT}": "in the sun", f"CLASS_{SHADED}": "in shadow", f"CLASS_{WITHOUT}": "without a height",
                   **_metadata(sun)},
     )  # fmt: skip
-    options = {"LEVEL": "1", "OVERVIEW_RESAMPLING": "NEAREST"}
     counts = np.zeros(5, dtype=np.int64)
-    with RasterWriter(path, grid, profile, creation_options=options, threads=resources.threads or 1) as writer:
+    options, threads = of_classes(driver), resources.threads or 1
+    with RasterWriter(path, grid, profile, driver=driver, creation_options=options, threads=threads) as writer:
         for left, top, width, height in tiles(grid, _MASK_TILE):
             classes = _classes(looking.look(left, top, width, height))
             counts += np.bincount(classes.ravel(), minlength=5)

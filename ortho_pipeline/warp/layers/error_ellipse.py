@@ -15,6 +15,7 @@ from __future__ import annotations
 import functools
 
 import numpy as np
+from scipy.optimize import brentq
 
 from ortho_pipeline.models.base import Array
 
@@ -69,12 +70,10 @@ def circular_error(covariance: Array, share: float = 0.9) -> Array:
 def circular_error_of_all(covariance: Array, share: float = 0.9) -> float:
     """Return the radius that holds a share of the errors of all places together, of covariances ``(n, 3)``."""
     larger, smaller = principal(covariance)
-    high = float(circular_error(covariance, share).max())
-    low = 0.0
-    for _ in range(20):
-        middle = (low + high) / 2
-        if share_beyond(np.array(middle), larger, smaller).mean() > 1.0 - share:
-            low = middle
-        else:
-            high = middle
-    return high
+    low, high = float(circular_error(covariance, share).min()), float(circular_error(covariance, share).max())
+
+    def beyond(radius: float) -> float:
+        return float(share_beyond(np.array(radius), larger, smaller).mean()) - (1.0 - share)
+
+    # Where all places are alike rounding decides on which side the root lies.
+    return float(brentq(beyond, low, high, rtol=1e-6)) if low < high and beyond(low) > 0.0 > beyond(high) else high

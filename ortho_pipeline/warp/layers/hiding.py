@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 from dataclasses import dataclass, field
@@ -121,23 +122,33 @@ class Looked:
         with self._lock:
             self._filled += int(np.count_nonzero(new.any(axis=0)))
 
-    def writer(self, threads: int) -> Any:
-        """Return the writer of the mask as a context; of nothing where none is wanted."""
-        import contextlib
-
+    def writer(self, driver: str, threads: int) -> Any:
+        """Return the writer of the mask by a driver of GDAL as a context; of nothing where none is wanted."""
         if self.hiding.mask is None:
             return contextlib.nullcontext()
         profile = Profile(
             count=1, dtype=np.dtype(np.uint8), validity="nodata", nodata=0.0, descriptions=("visibility",),
             interpretations=(0,), metadata={f"CLASS_{value}": name for value, name in enumerate(NAMES) if name},
         )  # fmt: skip
-        options = {"LEVEL": "1", "OVERVIEW_RESAMPLING": "NEAREST"}
-        return RasterWriter(self.hiding.mask, self.grid, profile, creation_options=options, threads=threads)
+        return RasterWriter(
+            self.hiding.mask, self.grid, profile, driver=driver, creation_options=of_classes(driver), threads=threads
+        )
+
+
+def of_classes(driver: str) -> dict[str, str]:
+    """Return the creation options of a raster of classes, which is made of large parts that are all the same.
+
+    Runs are counted four times as fast as they are deflated, and everything reads them; COGs have no such compression.
+    """
+    if driver == "GTiff":
+        return {"COMPRESS": "PACKBITS"}
+    return {"LEVEL": "1", "PREDICTOR": "NO", "OVERVIEW_RESAMPLING": "NEAREST"}
 
 
 def _classes(found: NDArray[np.uint8], shown: NDArray[np.bool_], hidden: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
-    classes = np.full(shown.shape, OUTSIDE, dtype=np.uint8)
-    classes[shown] = VISIBLE
+    # Two simple passes: the one through an index of booleans takes ten times as long.
+    classes = np.left_shift(shown.view(np.uint8), 1)
+    np.subtract(OUTSIDE, classes, out=classes)
     if hidden is not None:
         classes[hidden] = BEHIND
         classes[(found == VOID) & ~shown] = WITHOUT

@@ -9,6 +9,7 @@ between ray and vertical.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +51,12 @@ class Sight:
     def __init__(self, model: SensorModel, grid: Grid) -> None:
         self.model, self.grid = model, grid
         self._to_model = GroundTransform(grid.crs, model.crs)
+
+    def on(self, grid: Grid) -> Sight:
+        """Return the same for another grid in the same CRS."""
+        other = copy.copy(self)
+        other.grid = grid
+        return other
 
     def ground(self, columns: Array, rows: Array, heights: Array) -> Array:
         """Return ground ``(n, 3)`` in the model's CRS at output positions (corner convention) and heights (m)."""
