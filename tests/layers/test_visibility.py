@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.writing import write_dem
+from ortho_pipeline.warp.layers import visibility
 from ortho_pipeline.warp.layers.sight import Sight
 from ortho_pipeline.warp.layers.visibility import Visibility
 from ortho_pipeline.warp.layers.visibility_kernel import HIDDEN, VOID
@@ -129,6 +130,20 @@ def test_a_void_is_told_and_hides_nothing(tmp_path):
     own = surface.heights(np.stack([part.ravel() for part in grid.xy(columns, rows)], axis=1)).reshape(256, 256)
     np.testing.assert_array_equal(found == VOID, np.isnan(own))
     assert (found == HIDDEN).any()
+
+
+@pytest.mark.parametrize("azimuth", [8, 52, 99, 171, 233, 304])
+def test_lines_that_end_early_miss_nothing(azimuth, tmp_path, monkeypatch):
+    """Spikes all over, seen flat and in every direction: what is hidden is what it is if no line may end early."""
+    heights = FLOOR + gaussian_filter(np.random.default_rng(azimuth).normal(0, 20, (200, 200)), 2.5)
+    heights[::17, ::13] += np.random.default_rng(3).uniform(3, 40, heights[::17, ::13].shape)
+    write_dem(tmp_path / "dem.tif", heights, (WEST - 72.3, NORTH + 72.1), 2.0, f"EPSG:{ZONE}")
+    surface, grid = Surface.open(tmp_path / "dem.tif", "ellipsoid"), City(()).grid(1.0)
+    sight = Sight(Parallel(*towards(62, azimuth), 1.0, 256.0), grid)
+    found = Visibility(sight, surface, (60.0, 180.0), 2**30).look(0, 0, 256, 256)
+    monkeypatch.setattr(visibility, "_bounds", lambda squares, ends: np.full(squares.shape, np.inf))
+    np.testing.assert_array_equal(found, Visibility(sight, surface, (60.0, 180.0), 2**30).look(0, 0, 256, 256))
+    assert 0.1 < (found == HIDDEN).mean() < 0.9
 
 
 @pytest.mark.slow

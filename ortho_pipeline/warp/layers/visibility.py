@@ -179,10 +179,36 @@ def _relief(heights: Array, window: Window, ends: tuple[Array, Array]) -> kernel
     steep = np.empty((heights.shape[0] - 1, heights.shape[1] - 1), dtype=np.bool_)
     squares = np.empty(tuple(-(-side // (1 << kernel.SQUARE_BITS)) for side in steep.shape))
     highest = kernel.find_steep(heights, ends[0], ends[1], steep, squares)
-    return kernel.Relief(heights, window[0], window[1], steep, squares, float(highest))
+    return kernel.Relief(heights, window[0], window[1], steep, squares, _bounds(squares, ends), float(highest))
+
+
+def _bounds(squares: Array, ends: tuple[Array, Array]) -> Array:
+    """Return the heights from which on lines of sight in a square meet nothing any more.
+
+    Lines go along the axis in which they move most; where they may go either way, only the highest of all bounds them.
+    """
+    low, high = ends
+    least, most = (
+        np.where(low * high > 0, np.minimum(np.abs(low), np.abs(high)), 0.0),
+        np.maximum(np.abs(low), np.abs(high)),
+    )
+    axis = int(np.argmax(least))
+    if least[axis] == 0.0:
+        return np.full(squares.shape, squares.max())
+    # Rows or columns of squares that a line may move sideways while it crosses one.
+    aside = np.sort([low[1 - axis] / least[axis], high[1 - axis] / least[axis]])
+    first, last = min(0, int(np.floor(aside[0]))), max(0, int(np.ceil(aside[1])))
+    along = np.ascontiguousarray(squares if axis == 0 else squares.T)
+    bounds = np.empty_like(along)
+    forward = 1 if low[axis] > 0 else -1
+    rise = (1 << kernel.SQUARE_BITS) / most[axis]
+    kernel.find_bounds(along, forward, float(rise), first, last, np.empty_like(along), bounds)
+    return np.ascontiguousarray(bounds if axis == 0 else bounds.T)
 
 
 def _empty() -> kernel.Relief:
     """Return terrain that is void."""
     none: Any = np.zeros((1, 1), dtype=np.bool_)
-    return kernel.Relief(np.full((2, 2), np.nan), 0, 0, none, np.full((1, 1), -np.inf), -np.inf)
+    return kernel.Relief(
+        np.full((2, 2), np.nan), 0, 0, none, np.full((1, 1), -np.inf), np.full((1, 1), -np.inf), -np.inf
+    )

@@ -3,8 +3,9 @@
 A line of sight is straight: it begins on the terrain, bilinear between samples, and goes on by so many samples per
 metre that it rises. Within a cell of four samples the terrain along it is a quadratic function, so that whether it
 rises above the line is known, not sampled. Terrain can rise above a line only in a cell that is *steep*: where it
-climbs faster than the line does. All other cells are passed unseen, and so are squares of 8 of them whose steep cells
-all lie below the line.
+climbs faster than the line does. All other cells are passed unseen, and so are squares of them whose steep cells all
+lie below the line. A line ends where it is above all steep cells that it could still meet: `find_bounds` takes from
+square to square what stands in the way of lines farther on, less what they rise until then.
 """
 
 from __future__ import annotations
@@ -47,13 +48,17 @@ class Rays(NamedTuple):
 
 
 class Relief(NamedTuple):
-    """Heights ``(rows, columns)`` from sample (left, top) on; which cells are steep, and the highest of each square."""
+    """Heights ``(rows, columns)`` from sample (left, top) on; which cells are steep, and the highest of each square.
+
+    A line that is at `bounds` or above somewhere in a square meets no steep cell any more; nor does one at `highest`.
+    """
 
     heights: Any
     left: int
     top: int
     steep: Any
     squares: Any
+    bounds: Any
     highest: float
 
 
@@ -83,6 +88,26 @@ def find_steep(heights: Any, low: Any, high: Any, steep: Any, squares: Any) -> f
     return highest
 
 
+@compiled
+def find_bounds(squares: Any, forward: int, rise: float, first: int, last: int, entered: Any, bounds: Any) -> None:
+    """Fill heights from which on a line in a square ``(rows, columns)`` meets no steep cell any more.
+
+    Lines go from column to column, `forward` (1 or -1), rise at least `rise` (m) over each, and by then are between
+    `first` and `last` rows farther. `entered` becomes the same for lines that enter the square from the column before.
+    """
+    rows, columns = squares.shape
+    for step in range(columns):
+        i = columns - 1 - step if forward > 0 else step
+        for j in range(rows):
+            here, farther = -np.inf, -np.inf
+            for row in range(max(j + first, 0), min(j + last, rows - 1) + 1):
+                here = max(here, squares[row, i])
+                if step > 0:
+                    farther = max(farther, entered[row, i + forward])
+            bounds[j, i] = max(here, farther)
+            entered[j, i] = max(here, farther - rise)
+
+
 @inlined
 def _rises_above(heights, i, j, x, y, h, across, down, bend, start, end):
     """Tell whether the terrain of a cell rises above a line between two of its heights over its beginning."""
@@ -100,7 +125,7 @@ def _rises_above(heights, i, j, x, y, h, across, down, bend, start, end):
 
 
 @inlined
-def _is_hidden(heights, steep, squares, highest, x, y, h, across, down, bend):
+def _is_hidden(heights, steep, squares, bounds, x, y, h, across, down, bend):
     """Tell whether terrain stands in the way of the line from (x, y) in the window, at the height h.
 
     It goes `across` and `down` samples per metre upwards.
@@ -131,7 +156,8 @@ def _is_hidden(heights, steep, squares, highest, x, y, h, across, down, bend):
             if whole:
                 i = min(max(int(x + across * stop), first), last - 1)
         rise = max(rise, stop)
-        going = not hidden and 0 <= i < columns and 0 <= j < rows and h + rise < highest
+        going = not hidden and 0 <= i < columns and 0 <= j < rows
+        going = going and h + rise < bounds[j >> SQUARE_BITS, i >> SQUARE_BITS]
     return hidden
 
 
@@ -156,7 +182,7 @@ def _height(heights, x, y):
 def look(rays: Rays, relief: Relief, first_row: int, first_column: int, out: Any) -> None:
     """Fill `out` ``(h, w)``, which begins with a row and a column of the tile, with `CLEAR`, `HIDDEN` or `VOID`."""
     samples, near, slopes, far, middle, half, bend = rays
-    heights, west, north, steep, squares, highest = relief
+    heights, west, north, steep, squares, bounds, highest = relief
     height, width = out.shape
     count = slopes.shape[2]
     begin, grow = np.empty((count, 2)), np.empty((count, 2))
@@ -184,11 +210,16 @@ def look(rays: Rays, relief: Relief, first_row: int, first_column: int, out: Any
                 h = _height(heights, x, y)
                 found = VOID
                 if h < highest:
+                    found = CLEAR
+                    i, j = min(int(x), steep.shape[1] - 1), min(int(y), steep.shape[0] - 1)
+                    if not h < bounds[j >> SQUARE_BITS, i >> SQUARE_BITS]:
+                        out[line, c - first_column] = found
+                        continue
                     t, at, across, down = (h - middle) / half, c - rx * far, 0.0, 0.0
                     for k in range(count - 1, -1, -1):
                         across = across * t + (begin[k, 0] + grow[k, 0] * at)
                         down = down * t + (begin[k, 1] + grow[k, 1] * at)
-                    hidden = _is_hidden(heights, steep, squares, highest, x, y, h, across, down, bend)
+                    hidden = _is_hidden(heights, steep, squares, bounds, x, y, h, across, down, bend)
                     found = HIDDEN if hidden else CLEAR
                 elif h < np.inf:
                     found = CLEAR
