@@ -38,7 +38,7 @@ from ortho_pipeline.surface.mosaic import matching_files
 STATE = ".run"
 #: Files of a run beside the folders of the scenes, by what they are.
 RUN_FILES = {"log": "run.jsonl", "summary": "run.json", "catalog": "catalog.json", "seams": "mosaic.json",
-             "page": "mosaic.html"}  # fmt: skip
+             "page": "mosaic.html", "index": "index.html"}  # fmt: skip
 _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _NAME_BYTES = 150
 _WALKS, _PATTERN_BYTES = 2, 1000

@@ -29,6 +29,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.mosaic.assembly import assemble
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
+from ortho_pipeline.report.page.run import write_run_page
 from ortho_pipeline.report.stac import write_catalog
 from ortho_pipeline.warp.mosaic import Ortho, Overlap, measure_seam
 
@@ -376,13 +377,14 @@ class _Run:
             files["catalog"] = self.planned.output / RUN_FILES["catalog"]
             write_catalog(files["catalog"], items, self.planned.path.stem)
         if not self.part:
-            files["summary"] = self.planned.output / RUN_FILES["summary"]
+            files |= {kind: self.planned.output / RUN_FILES[kind] for kind in ("summary", "index")}
         if made is not None and "file" in made:
             files |= {"mosaic": Path(made["file"]), "seams": self.planned.output / RUN_FILES["seams"],
                       "mosaic page": self.planned.output / RUN_FILES["page"]}  # fmt: skip
         result = BatchResult(ordered, files, time.monotonic() - self.begin, made)
         if not self.part:
             write_json(files["summary"], result.to_json())
+            write_run_page(files["index"], self.planned.path.stem, result.to_json()["scenes"])
         self.log("run finished", counts=result.to_json()["counts"], seconds=result.seconds)
         return result
 

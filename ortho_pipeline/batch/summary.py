@@ -10,6 +10,7 @@ from ortho_pipeline.batch.records import Record
 from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.run import SharedFolder, summary_of
 from ortho_pipeline.files import write_json
+from ortho_pipeline.report.page.run import write_run_page
 
 
 def summarise(config: str | os.PathLike[str] | Plan, store: SharedFolder | None = None) -> BatchResult:
@@ -29,9 +30,10 @@ def summarise(config: str | os.PathLike[str] | Plan, store: SharedFolder | None 
             found.append(Outcome(job.name, "failed", record.seconds, error=record.error))
         else:
             found.append(Outcome(job.name, "done", record.seconds, paths_of(record, job), record.facts))
-    files = {"summary": planned.output / RUN_FILES["summary"]}
+    files = {kind: planned.output / RUN_FILES[kind] for kind in ("summary", "index")}
     result = BatchResult(tuple(found), files, time.monotonic() - begin)
     write_json(files["summary"], result.to_json())
+    write_run_page(files["index"], planned.path.stem, result.to_json()["scenes"])
     return result
 
 

@@ -1,0 +1,109 @@
+"""The page of a run: every scene with a thumbnail, what failed first, then the least accurate."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from ortho_pipeline.display.pages import render
+from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.files import write_text
+from ortho_pipeline.raster.quicklook import preview_png
+from ortho_pipeline.report.page.behaviour import policy, script
+
+#: Longer side of a thumbnail, px, and how many scenes have one: a page of thousands would be no page.
+_SIDE, _MOST = 88, 300
+#: Of a scene that no run has finished.
+_NOT_MADE = {"message": "nobody has made this scene yet", "file": None, "field": None, "remedy": "run it"}
+#: The evidence that scenes are ordered by, the best first.
+_EVIDENCE = ("check", "matched", "loo", "control")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A scene of the page; `page` is the address of its report from here, `rmse` px of the best `evidence` there is."""
+
+    name: str
+    error: Mapping[str, Any] | None
+    facts: Mapping[str, Any]
+    page: str | None
+    evidence: str | None
+    rmse: float | None
+    metres: float | None
+    thumbnail: str | None = None
+
+
+def write_run_page(path: str | os.PathLike[str], title: str, scenes: Sequence[Mapping[str, Any]]) -> None:
+    """Write the page of a run, unless it is there and of the same scenes and results.
+
+    Parameters
+    ----------
+    scenes : sequence of mapping
+        As in ``run.json``: name, files (paths), facts, error. What differs between runs of one result (seconds, and
+        whether a scene was made or found) is no part of the page.
+    """
+    folder = Path(path).parent
+    rows = sorted((_row(one, folder) for one in scenes), key=_order)
+    told = [[row.name, row.error, row.facts, row.page] for row in rows]
+    key = hashlib.sha256(json.dumps([title, told, script()], sort_keys=True, default=str).encode()).hexdigest()
+    if _is_of(Path(path), key):
+        return
+    orthos = {one["name"]: one["files"].get("ortho") for one in scenes}
+    shown = [_with_thumbnail(row, orthos[row.name]) if k < _MOST else row for k, row in enumerate(rows)]
+    code = script()
+    page = render(
+        "report/run.html.j2", title=title, rows=shown, key=key, script=code, policy=policy(code), thumbnails=_MOST,
+        failed=sum(row.error is not None for row in rows),
+    )  # fmt: skip
+    write_text(path, page)
+
+
+def _is_of(path: Path, key: str) -> bool:
+    try:
+        with open(path, encoding="utf-8") as file:
+            return f'content="{key}"' in file.read(2000)
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _row(scene: Mapping[str, Any], folder: Path) -> Row:
+    facts, error, found = scene["facts"], scene["error"], None
+    if not error and not facts:
+        error = _NOT_MADE
+    rmses, metres = facts.get("rmse_px") or {}, facts.get("rmse_m") or {}
+    if not error:
+        found = next((kind for kind in _EVIDENCE if rmses.get(kind) is not None), None)
+    page = scene["files"].get("html")
+    return Row(
+        name=scene["name"],
+        error=error,
+        facts={} if error else facts,
+        page=None if page is None or error else quote(os.path.relpath(page, folder)),
+        evidence=found,
+        rmse=None if found is None else rmses[found],
+        metres=None if found is None else metres.get(found),
+    )
+
+
+def _order(row: Row) -> tuple[Any, ...]:
+    """Failed scenes first, then those of unknown accuracy, then the largest RMSE."""
+    if row.error is not None:
+        return 0, 0.0, row.name
+    return (1, 0.0, row.name) if row.rmse is None else (2, -row.rmse, row.name)
+
+
+def _with_thumbnail(row: Row, ortho: str | None) -> Row:
+    if ortho is None or row.error is not None:
+        return row
+    try:
+        picture = base64.b64encode(preview_png(ortho, side=_SIDE)).decode()
+    except OrthoError:
+        return row
+    return Row(**{**vars(row), "thumbnail": picture})

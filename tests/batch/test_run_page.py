@@ -1,0 +1,67 @@
+"""The page of a run: what failed first, then the least accurate; the same bytes for the same results."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.report.page.run import write_run_page
+
+HOSTILE = '<script>alert("x")</script>'
+
+
+def scene(
+    name: str, rmse: float | None = None, *, error: str | None = None, ortho: Path | None = None
+) -> dict[str, Any]:
+    files = {} if ortho is None else {"ortho": str(ortho), "html": str(ortho.with_name("a b_report.html"))}
+    facts = {
+        "sensor": "rpc", "model": "rpc+shift", "rmse_px": {"check": rmse, "loo": 9.0 if rmse is None else None},
+        "rmse_m": {"check": None if rmse is None else 2 * rmse}, "warnings": ["look"],
+    }  # fmt: skip
+    failed = None if error is None else {"message": error, "file": "x.tif", "field": None, "remedy": "give a DEM"}
+    return {"name": name, "status": "done", "seconds": 1.0, "files": files, "facts": facts, "error": failed}
+
+
+@pytest.fixture
+def ortho(tmp_path: Path) -> Path:
+    path = tmp_path / "scenes" / "ortho.tif"
+    path.parent.mkdir()
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), 64, 32, 1)
+    dataset.WriteArray(np.arange(64 * 32, dtype=np.uint8).reshape(32, 64))
+    del dataset
+    return path
+
+
+def test_what_failed_stands_first_and_then_the_least_accurate(tmp_path, ortho):
+    scenes = [scene("good", 0.2, ortho=ortho), scene("bad", 3.0), scene(HOSTILE, error=f"{HOSTILE} is no DEM")]
+    untested = scene("untested")
+    untested["facts"]["rmse_px"]["loo"] = None
+    write_run_page(tmp_path / "index.html", "june", [*scenes, untested])
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    rows = re.findall(r"<tr[ >].*?</tr>", page.split("<tbody>")[1], re.DOTALL)
+    assert ["Failed" in rows[0], "untested" in rows[1], "bad" in rows[2], "good" in rows[3]] == [True] * 4
+    assert "1 of 4 scenes failed" in page
+    write_run_page(tmp_path / "part.html", "june", [{**scene("late"), "status": "missing", "facts": {}}])
+    assert "nobody has made this scene yet" in (tmp_path / "part.html").read_text(encoding="utf-8")
+    assert "Give a DEM." in rows[0]
+    assert page.count("<script") == 1
+    assert 'href="scenes/a%20b_report.html"' in rows[3]
+    assert rows[3].count("data:image/png;base64,") == 1
+
+
+def test_the_same_results_are_the_same_page_and_cost_no_pixel(tmp_path, ortho, monkeypatch):
+    page = tmp_path / "index.html"
+    write_run_page(page, "june", [scene("one", 0.2, ortho=ortho)])
+    first, made = page.read_bytes(), page.stat().st_mtime_ns
+    found = {**scene("one", 0.2, ortho=ortho), "status": "unchanged", "seconds": 0.0}
+    monkeypatch.setattr("ortho_pipeline.report.page.run.preview_png", pytest.fail)
+    write_run_page(page, "june", [found])
+    assert (page.read_bytes(), page.stat().st_mtime_ns) == (first, made)
+    monkeypatch.undo()
+    write_run_page(page, "june", [scene("one", 0.3, ortho=ortho)])
+    assert page.read_bytes() != first
