@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.block.point_files import read_block_points as read_block_points
     from ortho_pipeline.block.points import BlockPoints as BlockPoints
     from ortho_pipeline.commands import rectify as rectify
+    from ortho_pipeline.commands.arrays.lazy import ortho_array as ortho_array
     from ortho_pipeline.commands.control.matching import match_scene as match_scene
     from ortho_pipeline.display.notices import Notice as Notice
     from ortho_pipeline.errors import OrthoError as OrthoError
@@ -88,6 +89,7 @@ _HOMES = {
     "load_model": "exchange.model_file",
     "match_scene": "commands.control.matching",
     "open_scene": "plugins",
+    "ortho_array": "commands.arrays.lazy",
     "read_block_points": "block.point_files",
     "read_points": "points",
     "read_rpc": "exchange.rpc",

@@ -135,7 +135,7 @@ def rectify(
     other = path.other.block if isinstance(path, Hiding) and path.other is not None else 0
     threads = limit_cache(memory, _threads(resources), source.block, surface.block, other)
     profile = profile or Profile.of(source)
-    job = _Job(
+    job = TileMaker(
         model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, memory // (4 * threads),
         profile,
     )  # fmt: skip
@@ -166,6 +166,33 @@ def rectify(
         hidden_share=None if job.looked is None else job.looked.hidden_share,
         filled_share=None if job.looked is None else job.looked.filled_share,
     )
+
+
+def tile_maker(
+    model: SensorModel,
+    source: RasterSource,
+    surface: Surface,
+    grid: Grid,
+    *,
+    profile: Profile,
+    resampling: str = "bilinear",
+    dem_interpolation: str = "bilinear",
+    tolerance: float = 0.01,
+    memory: int = 512_000_000,
+) -> TileMaker:
+    """Return what makes the tiles of an ortho one by one, those that `rectify` writes; its threads share `memory`.
+
+    Raises
+    ------
+    InputError
+        As `rectify`.
+    """
+    _check(source, resampling, dem_interpolation, tolerance)
+    threads = os.cpu_count() or 1
+    return TileMaker(
+        model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, memory // (4 * threads),
+        profile,
+    )  # fmt: skip
 
 
 def rectify_gdal(
@@ -280,8 +307,8 @@ def _in_order(threads: int, work: Callable[[Any], Any], items: list[Any]) -> Ite
                 future.cancel()
 
 
-class _Job:
-    """The work on one output raster, shared by its threads."""
+class TileMaker:
+    """The work on one output raster, shared by its threads: see `tile_maker`."""
 
     def __init__(
         self,

@@ -1,0 +1,179 @@
+"""An ortho as an xarray DataArray whose blocks dask makes on demand, with the pixels that the file would have."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+import threading
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
+from ortho_pipeline.commands.placement import Placement, place_scene, source_of
+from ortho_pipeline.commands.scene_fit import open_adjustable
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.models import SensorModel
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.points import Points
+from ortho_pipeline.raster.ortho import Profile
+from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.surface.base import Surface
+
+if TYPE_CHECKING:
+    import xarray
+
+    from ortho_pipeline.warp.engine import TileMaker
+
+#: Options of files, and of rasters besides the ortho.
+_IDLE = ("accuracy_raster", "visibility", "angles", "stac", "fill_from")
+
+
+def ortho_array(
+    image: str | os.PathLike[str] | Scene,
+    dem: str | os.PathLike[str] | SurfaceOptions,
+    *,
+    chunks: int | None = None,
+    scene: SceneOptions = SceneOptions(),
+    points: PointOptions | Points = PointOptions(),
+    match: MatchOptions = MatchOptions(),
+    output: OutputOptions = OutputOptions(),
+) -> xarray.DataArray:
+    """Return the orthoimage of a scene as an array of which only those blocks are made that are asked for.
+
+    The model is adjusted and the scene laid on its surface now; pixels are read and warped by dask, in threads, in
+    processes or on a cluster. They are those of the file that `rectify` writes with the same options, bit by bit.
+
+    Parameters
+    ----------
+    dem : path or SurfaceOptions
+        A DEM that says its height datum, or all that there is to say of heights.
+    chunks : int, optional
+        Side of a block in pixels, a multiple of `warp.lattice.BLOCK`.
+
+    Returns
+    -------
+    xarray.DataArray
+        ``(band, y, x)``, with the coordinates of pixel centres, `spatial_ref` as CF has it (read by rioxarray and
+        odc-geo), and, where there is no nodata value, `valid` ``(y, x)``.
+
+    Raises
+    ------
+    InputError
+        As `rectify`; for chunks that are no multiple, options that mean further files, and without xarray and dask.
+    """
+    side = _side(chunks)
+    for field in _IDLE:
+        if getattr(output, field) != getattr(OutputOptions(), field):
+            raise InputError("an array is the ortho alone", field=f"output.{field}", remedy="leave it out")
+    if output.engine != "ortho":
+        raise InputError("GDAL's warper makes files", field="output.engine", remedy="leave out `output.engine`")
+    surface = dem if isinstance(dem, SurfaceOptions) else SurfaceOptions(dem=dem)
+    require_heights(surface)
+    given = PointOptions(gcps=points) if isinstance(points, Points) else points
+    opened = open_adjustable(image, scene, given, match)
+    heights = open_surface(surface, scene, output.memory, [opened])
+    placed = place_scene(opened, given, scene, heights, output, match)
+    path = opened.path if isinstance(image, Scene) else image
+    opening = functools.partial(source_of, placed.scene, path, scene, output)
+    made = Tiles(placed.model, opening, placed.surface, placed.grid, dataclasses.replace(output, extent=None))
+    return _array(placed, made, side)
+
+
+def _side(chunks: int | None) -> int:
+    from ortho_pipeline.warp.engine import TILE
+    from ortho_pipeline.warp.lattice import BLOCK
+
+    side = TILE if chunks is None else chunks
+    if not isinstance(side, int) or side < BLOCK or side % BLOCK:
+        raise InputError(
+            f"blocks of {chunks} pixels are not made", field="chunks", remedy=f"a multiple of {BLOCK}, such as {TILE}"
+        )
+    return side
+
+
+class Tiles:
+    """What makes tiles of an ortho; it may be sent to other processes, where it opens its files again."""
+
+    def __init__(
+        self,
+        model: SensorModel,
+        opening: Callable[[], RasterSource],
+        surface: Surface,
+        grid: Grid,
+        output: OutputOptions,
+    ) -> None:
+        self._parts = model, opening, surface, grid, output
+        self._source = opening()
+        self.profile = Profile.of(self._source, output.dtype, output.nodata)
+        self._lock = threading.Lock()
+        self._maker: TileMaker | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Tiles, self._parts
+
+    def __call__(self, top: int, left: int, height: int, width: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """Return pixels ``(bands, height, width)`` of a tile, and which of them ``(height, width)`` are valid."""
+        _, _, pixels, valid, _ = self._ready().make((top, left, height, width))
+        return pixels, valid
+
+    def _ready(self) -> TileMaker:
+        from ortho_pipeline.warp.engine import tile_maker
+
+        with self._lock:
+            if self._maker is None:
+                model, _, surface, grid, output = self._parts
+                self._maker = tile_maker(
+                    model, self._source, surface, grid, profile=self.profile, resampling=output.resampling,
+                    dem_interpolation=output.dem_interpolation, tolerance=output.tolerance, memory=output.memory,
+                )  # fmt: skip
+            return self._maker
+
+
+def _array(placed: Placement, tiles: Tiles, side: int) -> xarray.DataArray:
+    try:
+        import dask
+        import dask.array as da
+        import xarray
+    except ImportError as error:
+        raise InputError(
+            f"lazy arrays need {error.name}, which is not installed", field="ortho_array",
+            remedy="pip install 'ortho-pipeline[xarray]'",
+        ) from error  # fmt: skip
+    grid, profile = placed.grid, tiles.profile
+    maker = dask.delayed(tiles, traverse=False)
+    pixels: list[list[Any]] = []
+    valid: list[list[Any]] = []
+    for top in range(0, grid.height, side):
+        pixels.append([])
+        valid.append([])
+        for left in range(0, grid.width, side):
+            shape = min(side, grid.height - top), min(side, grid.width - left)
+            made = maker(top, left, *shape)
+            pixels[-1].append(da.from_delayed(made[0], (profile.count, *shape), dtype=profile.dtype))
+            valid[-1].append(da.from_delayed(made[1], shape, dtype=bool))
+    coordinates: dict[str, Any] = {
+        "band": np.arange(1, profile.count + 1),
+        "y": grid.top - grid.dy * (np.arange(grid.height) + 0.5),
+        "x": grid.left + grid.dx * (np.arange(grid.width) + 0.5),
+        "spatial_ref": ((), 0, _reference(grid)),
+    }
+    if profile.validity == "mask":
+        coordinates["valid"] = (("y", "x"), da.block(valid))
+    nodata = {} if profile.nodata is None else {"_FillValue": profile.dtype.type(profile.nodata)}
+    attributes = {**nodata, "grid_mapping": "spatial_ref", "long_name": _names(profile.descriptions)}
+    return xarray.DataArray(da.block(pixels), coordinates, ("band", "y", "x"), "ortho", attributes)
+
+
+def _reference(grid: Grid) -> dict[str, Any]:
+    """Return the attributes of a CF grid mapping, with the geotransform as GDAL writes it there."""
+    transform = " ".join(repr(float(value)) for value in grid.geotransform)
+    return {**grid.crs.to_cf(), "spatial_ref": grid.crs.to_wkt(), "GeoTransform": transform}
+
+
+def _names(descriptions: Sequence[str]) -> tuple[str, ...]:
+    return tuple(one or f"band {number}" for number, one in enumerate(descriptions, start=1))
