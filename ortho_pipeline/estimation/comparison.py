@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from ortho_pipeline.display.charts import rmse_axes
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, OrthoError, counted
 from ortho_pipeline.estimation.family_fit import OWN, fit_family, fit_own
@@ -106,6 +107,15 @@ class Comparison:
     def best(self) -> Row | None:
         """The recommended row."""
         return next((row for row in self.rows if row.model == self.recommended), None)
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw the RMSE of every model that could be fitted with matplotlib, on `axes` if given; return the axes."""
+        rmses = {
+            row.model: {kind: float(found["total"]) for kind, found in row.fit.rmses.items() if found}
+            for row in self.rows
+            if row.fit is not None
+        }
+        return rmse_axes(rmses, self.recommended, axes)
 
     def to_json(self) -> dict[str, Any]:
         """Return the part of ``ortho compare --json`` that is about models."""
