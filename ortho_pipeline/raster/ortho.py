@@ -105,6 +105,21 @@ def _kept_nodata(value: float | None, dtype: np.dtype[Any], source: RasterSource
     return value
 
 
+def classes_profile(name: str, classes: Mapping[int, tuple[str, str]], metadata: Mapping[str, str]) -> Profile:
+    """Return the profile of a raster of classes (Byte, 0 for nothing): its value -> its name and colour (#rrggbb).
+
+    The colours are in the file, so that a GIS shows classes as such; the names are metadata items.
+    """
+    table = gdal.ColorTable()
+    for value, (_, colour) in classes.items():
+        table.SetColorEntry(value, (*bytes.fromhex(colour.removeprefix("#")), 255))
+    return Profile(
+        count=1, dtype=np.dtype(np.uint8), validity="nodata", nodata=0.0, descriptions=(name,),
+        interpretations=(gdal.GCI_PaletteIndex,), color_table=table,
+        metadata={**{f"CLASS_{value}": text for value, (text, _) in classes.items()}, **metadata},
+    )  # fmt: skip
+
+
 def as_written(pixels: NDArray[Any], valid: NDArray[np.bool_], dtype: np.dtype[Any], fill: float) -> NDArray[Any]:
     """Return pixels ``(count, h, w)`` in the type of the output: rounded and clamped, `fill` where not valid."""
     if pixels.dtype == dtype:

@@ -66,15 +66,29 @@ def rough(path, slope: float, seed: int = 2) -> Surface:
     return Surface.open(path, "ellipsoid")
 
 
-def along(surface: Surface, x: np.ndarray, y: np.ndarray, east: float, north: float) -> np.ndarray:
-    """Return how far (m) the terrain rises at most above lines of sight, looked at every 0.1 m upwards."""
+def along(surface: Surface, x: np.ndarray, y: np.ndarray, east: float, north: float, step: float = 0.1) -> np.ndarray:
+    """Return how far (m) the terrain rises at most above lines of sight, looked at every so many metres upwards."""
     base = surface.heights(np.stack([x, y], axis=1))
-    rises = np.arange(0.1, surface.height_range[1] - base.min(), 0.1)
+    rises = np.arange(step, surface.height_range[1] - base.min(), step)
     most = np.full(len(x), -np.inf)
     for rise in rises:
         there = surface.heights(np.stack([x + east * rise, y + north * rise], axis=1))
         most = np.fmax(most, there - base - rise)
     return most
+
+
+@pytest.mark.parametrize(("off_nadir", "azimuth"), [(10, 75), (45, 128)])
+def test_where_the_mask_is_not_that_of_the_boxes_their_samples_are_not_the_boxes(off_nadir, azimuth, tmp_path):
+    """Of the surface between the samples it is the shadow, by a walk along each ray that differs."""
+    east, north = towards(off_nadir, azimuth)
+    found = looked(TOWN, tmp_path / "dsm.tif", off_nadir, azimuth) == HIDDEN
+    wrong = np.argwhere(found != TOWN.hidden(*TOWN.places(TOWN.grid()), east, north))
+    rows, columns = wrong[:: max(1, len(wrong) // 150)].T
+    x, y = TOWN.grid().xy(columns + 0.5, rows + 0.5)
+    above = along(Surface.open(tmp_path / "dsm.tif", "ellipsoid"), x, y, east, north, step=0.02)
+    clear = np.abs(above) > 0.03  # the walk steps over what rises by less
+    assert clear.sum() > 20
+    np.testing.assert_array_equal(found[rows, columns][clear], (above > 0)[clear])
 
 
 @pytest.mark.parametrize("azimuth", [0, 61])

@@ -47,6 +47,10 @@ def test_a_mask_has_the_classes_and_nodata_leaves_them_empty(town, tmp_path):
     wanted = TOWN.hidden(x, y, *towards(30, 270))
     assert f1(classes == 2, wanted) > 0.95
     assert set(np.unique(classes)) == {1, 2}
+    # A GIS that opens it shows classes in their colours.
+    mask = gdal.Open(str(tmp_path / "mask.tif"))
+    colours = mask.GetRasterBand(1).GetColorTable()
+    assert len({colours.GetColorEntry(value) for value in (1, 2, 3, 4)}) == 4
     assert result.hidden_share == pytest.approx((classes == 2).mean())
     empty = warped(town, Hiding(tmp_path / "true.tif", heights))
     assert empty.hidden_share == result.hidden_share

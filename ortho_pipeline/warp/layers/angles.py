@@ -20,7 +20,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.geodesy.crs import GroundTransform
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.raster.ortho import Profile, RasterWriter
+from ortho_pipeline.raster.ortho import Profile, RasterWriter, classes_profile
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import levels, polynomials
@@ -238,12 +238,8 @@ def write_shadows(
     resources = resources or Resources()
     grid = sight.grid
     looking = Visibility(sight, surface, heights, resources.memory // 4, way=sun.way(grid))
-    profile = Profile(
-        count=1, dtype=np.dtype(np.uint8), validity="nodata", nodata=0.0, descriptions=("shadow",),
-        interpretations=(0,),
-        metadata={f"CLASS_{LIT}": "in the sun", f"CLASS_{SHADED}": "in shadow", f"CLASS_{WITHOUT}": "without a height",
-                  **_metadata(sun)},
-    )  # fmt: skip
+    names = {LIT: ("in the sun", "#f7ecc9"), SHADED: ("in shadow", "#34506e"), WITHOUT: ("without a height", "#6b6b6b")}
+    profile = classes_profile("shadow", names, _metadata(sun))
     counts = np.zeros(5, dtype=np.int64)
     options, threads = of_classes(driver), resources.threads or 1
     with RasterWriter(path, grid, profile, driver=driver, creation_options=options, threads=threads) as writer:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.models.base import SensorModel
-from ortho_pipeline.raster.ortho import Profile, RasterWriter
+from ortho_pipeline.raster.ortho import RasterWriter, classes_profile
 from ortho_pipeline.raster.regridded import Regridded
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
@@ -20,8 +20,11 @@ from ortho_pipeline.warp.layers.sight import Sight
 from ortho_pipeline.warp.layers.visibility import Visibility
 from ortho_pipeline.warp.layers.visibility_kernel import HIDDEN, VOID
 
-#: Classes of the mask, by their values; 0 stands for nothing.
-NAMES = ("", "visible", "hidden", "outside of the image", "without a height")
+#: Classes of the mask, by their values, with their names and colours; 0 stands for nothing.
+CLASSES = {
+    1: ("visible", "#d9e8d0"), 2: ("hidden", "#b4500b"), 3: ("outside of the image", "#e6e6e6"),
+    4: ("without a height", "#6b6b6b"),
+}  # fmt: skip
 VISIBLE, BEHIND, OUTSIDE, WITHOUT = 1, 2, 3, 4
 
 
@@ -126,10 +129,7 @@ class Looked:
         """Return the writer of the mask by a driver of GDAL as a context; of nothing where none is wanted."""
         if self.hiding.mask is None:
             return contextlib.nullcontext()
-        profile = Profile(
-            count=1, dtype=np.dtype(np.uint8), validity="nodata", nodata=0.0, descriptions=("visibility",),
-            interpretations=(0,), metadata={f"CLASS_{value}": name for value, name in enumerate(NAMES) if name},
-        )  # fmt: skip
+        profile = classes_profile("visibility", CLASSES, {})
         return RasterWriter(
             self.hiding.mask, self.grid, profile, driver=driver, creation_options=of_classes(driver), threads=threads
         )
