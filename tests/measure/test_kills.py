@@ -1,0 +1,77 @@
+"""The real server, killed at random moments while a client acts: no more than the action under way is lost."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from urllib import error, request
+
+import pytest
+
+pytest.importorskip("uvicorn", reason="the extra 'measure' is not installed")
+
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
+WINDOW = "window-of-tests"
+
+
+def started(output: Path, reference: Path) -> tuple[subprocess.Popen[str], str]:
+    """Start the server, and return it with its address."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ortho_pipeline", "measure", str(SAMPLE / "scene.tif"), "--reference", str(reference),
+         "--dem", str(SAMPLE / "dem.tif"), "-o", str(output), "--no-browser"],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    return process, process.stdout.readline().split()[-1]
+
+
+def ask(address: str, what: str, **given: object) -> dict:
+    """Ask the server as the page does."""
+    body = json.dumps({"window": WINDOW, **given}).encode()
+    asked = request.Request(f"{address}api/{what}", body, {"content-type": "application/json"})
+    with request.urlopen(asked, timeout=60) as answer:
+        return json.loads(answer.read())
+
+
+def put(number: int) -> dict:
+    place = [100.0 + 37 * number % 800, 120.0 + 53 * number % 760]
+    mark = {"id": f"P{number}", "image": place, "ground": [33.35 + 1e-5 * number, 37.25, 900.0], "role": "control"}
+    return {"do": "put", "mark": {**mark, "how": "manual", "ground_from": "typed"}}
+
+
+def check_kills(folder: Path, reference: Path, count: int) -> None:
+    chosen, output, least, most = random.Random(5), folder / "p.geojson", 0, 0
+    for turn in range(count + 1):
+        process, address = started(output, reference)
+        try:
+            names = [mark["id"] for mark in ask(address, "begin")["state"]["marks"]]
+            assert least <= len(names) <= most, "an action that was answered is lost, or one was made up"
+            assert names == [f"P{number}" for number in range(len(names))]
+            if output.exists():
+                assert len(json.loads(output.read_text())["features"]) <= len(names)
+            if turn == count:
+                return
+            least = most = len(names)
+            threading.Timer(chosen.uniform(0.0, 1.0), process.send_signal, [signal.SIGKILL]).start()
+            try:
+                while True:
+                    most += 1  # sent, and not yet answered
+                    ask(address, "act", action=put(most - 1))
+                    least += 1
+            except (error.URLError, OSError):
+                pass
+        finally:
+            process.kill()
+            process.wait()
+            time.sleep(0.01)
+
+
+@pytest.mark.slow
+def test_killed_fifty_times_no_answered_action_is_lost(reference: Path, tmp_path: Path) -> None:
+    check_kills(tmp_path, reference, 50)
