@@ -77,10 +77,11 @@ def adjust(
         raise InputError(f"there is no point {unknown[0]!r} to leave out", field="exclude")
     problem, state, selection, notes = _prepared(chosen, points, priors or {}, exclude)
     problem, gauge = with_datum(problem, state, selection, hold)
+    begun = selection
     refuse_too_few(problem, selection)
     if problem.unstated.any():
         problem = _started(problem, state, selection)
-    solved = _solved(problem, state, selection)
+    solved, selection = _solved(problem, state, selection)
     if problem.unstated.any():
         solved = reweighed(solved, selection, estimate(solved))
     rejected: tuple[Rejected, ...] = ()
@@ -90,9 +91,10 @@ def adjust(
         if blunders.undecided:
             notes.append(_undecided(blunders.undecided))
         if rejected:
-            gauge = gauge.replace(by_control(problem, selection), by_control(problem, blunders.kept))
-            selection = blunders.kept
-            solved = _solved(solved.problem, solved.state, selection)
+            solved, selection = _solved(solved.problem, solved.state, blunders.kept)
+    gauge = gauge.replace(by_control(problem, begun), by_control(problem, selection))
+    judged = np.isin(np.array(points.ids, dtype=object), [one.point for one in rejected])
+    notes += _without(points, problem.active(begun) & ~problem.active(selection) & ~judged)
     solved, found = _weighed(solved, selection)
     notes += found.variances.notes()
     notes += marks_warning(points.select(problem.active(selection) & selection.ground))
@@ -126,8 +128,13 @@ def _prepared(
     local = _at_known(problem, local, rays)
     rays &= np.isfinite(points.measured - predict(frame, models, points, local)).all(axis=1)
     selection = Selection.of(rays, points.control & takes_part)
+    notes = _without(points, takes_part & ~problem.active(selection))
+    return problem, State(models, local), selection, notes
+
+
+def _without(points: BlockPoints, lost: Mask) -> list[Notice]:
+    """Return notices of points that take no part, by their roles."""
     notes = []
-    lost = takes_part & ~problem.active(selection)
     for role in ("control", "check", "tie"):
         names = [points.ids[i] for i in np.flatnonzero(lost & (points.roles == role))]
         if names:
@@ -138,7 +145,7 @@ def _prepared(
                 f"models): {some}" + ("; whether their known ground is right is not tested" if role == "check" else "")
             )
             notes.append(Notice("takes-no-part", text, role=role, count=len(names), points=names[:10]))
-    return problem, State(models, local), selection, notes
+    return notes
 
 
 def _at_known(problem: BlockProblem, local: Array, rays: Mask) -> Array:
@@ -201,8 +208,15 @@ def _weighed(solved: Solved, selection: Selection) -> tuple[Solved, Posterior]:
     return solved, found
 
 
-def _solved(problem: BlockProblem, state: State, selection: Selection) -> Solved:
-    """Return the solution; refuse a block whose points leave parameters open, also where that is why none is found."""
+def _solved(problem: BlockProblem, state: State, selection: Selection) -> tuple[Solved, Selection]:
+    """Return the solution and what takes part in it: not points whose rays lead out of the models.
+
+    Raises
+    ------
+    DegeneratePoints
+        If the points leave parameters open, also where that is why no solution is found.
+    NotConverged
+    """
     solved = attempt(problem, state, selection)
     refuse_undetermined(solved)
     if not solved.converged:
@@ -211,7 +225,10 @@ def _solved(problem: BlockProblem, state: State, selection: Selection) -> Solved
             "the adjustment did not converge", file=problem.points.source or None,
             remedy="give more control points, spread in plan and height, or a simpler model or correction",
         )  # fmt: skip
-    return solved
+    if solved.astray is None:
+        return solved, selection
+    rays, ground = selection.rays & ~solved.astray[problem.points.point], selection.ground & ~solved.astray
+    return _solved(problem, solved.state, replace(selection, rays=rays, ground=ground))
 
 
 def _result(

@@ -794,6 +794,28 @@ def test_an_affine_pair_with_misfits_as_large_as_its_relief_converges(crs: str) 
     assert found.iterations <= 10
 
 
+def test_a_point_that_an_error_leads_out_of_the_models_does_not_keep_the_others(rpcs: dict[str, RPC]) -> None:
+    # Two looks that differ by 1.5 degrees: an error of a pixel moves a point by 100 m along them. What starts inside of
+    # the RPCs' heights leaves them when the images come right, and has no place there.
+    near = export_rpc(camera(16.5)).rpc
+    truth = biased({"left": rpcs["left"], "near": near, "right": rpcs["right"]}, "affine", size=4.0)
+    points = measured(truth, places(140), roles_of(9, 6, 125), noise=0.3)
+    weak = np.arange(100, 140)
+    wrong = np.random.default_rng(3).uniform(-14, 14, (len(weak), 2))
+    rays = ~((points.image == 2) & np.isin(points.point, weak))
+    seen = points.measured.copy()
+    seen[np.isin(points.point, weak) & (points.image == 1)] += wrong
+    points = replace(points, point=points.point[rays], image=points.image[rays], measured=seen[rays],
+                     sigma_image=points.sigma_image[rays])  # fmt: skip
+    found = adjust(starts(truth), points, robust=False)
+    gone = [one.fields["count"] for one in found.warnings if one.code == "takes-no-part"]
+    lost = [name for name, place in zip(points.ids, found.ground, strict=True) if np.isnan(place[0])]
+    assert 1 <= sum(gone) == len(lost) < len(weak)
+    left = adjust(starts(truth), points, robust=False, exclude=lost)
+    for name in truth:
+        assert found.models[name].params == pytest.approx(left.models[name].params, rel=1e-6, abs=1e-9)
+
+
 def test_what_does_not_converge_because_it_is_not_determined_says_so(
     rpcs: dict[str, RPC], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from http.client import HTTPException
 from pathlib import Path
 from urllib import error, request
 
@@ -64,7 +65,7 @@ def check_kills(folder: Path, reference: Path, count: int) -> None:
                     most += 1  # sent, and not yet answered
                     ask(address, "act", action=put(most - 1))
                     least += 1
-            except (error.URLError, OSError):
+            except (error.URLError, OSError, HTTPException, ValueError):
                 pass
         finally:
             process.kill()

@@ -11,6 +11,7 @@ from ortho_pipeline.block.equations.elimination import Eliminated, Step, step_of
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Selection, State
 from ortho_pipeline.block.equations.steps import Steps
+from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.errors import InputError, NotConverged
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 from ortho_pipeline.models.base import Array
@@ -22,7 +23,8 @@ _STEPS = 50
 class Solved:
     """The observation equations at a minimum (or after one step), factored, with the cofactors of the parameters.
 
-    Not `converged`: at the place where the iteration ended without one.
+    Not `converged`: at the place where the iteration ended without one. `astray` ``(N,)`` are points that were held
+    where they were, because their next steps lead out of the models; all else is to be solved for without them.
     """
 
     linear: Linear
@@ -31,6 +33,7 @@ class Solved:
     condition: float
     iterations: int = 0
     converged: bool = True
+    astray: Mask | None = None
 
     @property
     def problem(self) -> BlockProblem:
@@ -85,7 +88,7 @@ def solve(problem: BlockProblem, start: State, selection: Selection) -> Solved:
         If no minimum is found.
     """
     found = attempt(problem, start, selection)
-    if not found.converged:
+    if not found.converged or found.astray is not None:
         raise NotConverged("the adjustment did not converge", remedy="give more control points or a simpler model")
     return found
 
@@ -99,7 +102,7 @@ def attempt(problem: BlockProblem, start: State, selection: Selection) -> Solved
         If nothing can be computed at the start.
     """
     ordering = problem.ordering(selection)
-    state, damping, steps = start, 0.0, Steps()
+    state, damping, steps, held = start, 0.0, Steps(), None
     square = problem.misfits(state, ordering, selection).square
     if not math.isfinite(square):
         raise NotConverged("the start values put points outside of the models", remedy="give better start values")
@@ -109,60 +112,104 @@ def attempt(problem: BlockProblem, start: State, selection: Selection) -> Solved
         if not step.finite or (iteration == 1 and step.condition > CONDITION_LIMIT):
             # In a valley without a bottom the iteration would only wander: the caller says what is undetermined.
             return replace(_solved(linear, step), condition=max(step.condition, CONDITION_LIMIT * 1.01))
-        change, before = step.change.vector, steps.length
+        change, before = _change(step, held), steps.length
         promised = float(np.linalg.norm(change))
         length = math.sqrt(square) + math.sqrt(ordering.observations)
         # Close to the minimum steps are rounding: they do not get shorter any more, or do not descend.
         small = promised <= 1e-8 * length or (promised <= 1e-6 * length and promised > before / 4)
         if small and not damping:
-            return _solved(linear, step, iteration)
+            return _solved(linear, step, iteration, held)
         whole = step.whole
         further = None if damping else steps.extrapolated(change, whole)
-        ahead, after, move = _descent(linear, whole, further, square)
+        ahead = _descent(linear, whole, further, square)
         if ahead is not None:
             if damping:
                 steps = Steps()
             else:
-                steps.made(change, whole, move)
-            state, square = ahead, after
+                steps.made(change, whole, ahead.move)
+            state, square, before_that, held = ahead.state, ahead.square, held, ahead.held
+            if held is not None and before_that is not None and (held & before_that).any():
+                # The step reckons with them where they cannot go: the others have to be solved for without them.
+                linear = Linear.at(problem, state, selection, ordering)
+                return _solved(linear, step_of(linear), iteration, held & before_that)
             damping = damping / 10 if damping > 1e-6 else 0.0
             continue
         steps = Steps()
         if damping:
             step = step_of(linear)
-            promised = float(np.linalg.norm(step.change.vector))
+            promised = float(np.linalg.norm(_change(step, held)))
         if promised <= 1e-4 * length:
             # Rounding of the ground hides what so small a step would gain.
-            return _solved(linear, step, iteration)
+            return _solved(linear, step, iteration, held)
         damping = max(10 * damping, 1e-3)
         if damping > 1e8:
             break
     return replace(_solved(linear, step_of(linear), iteration), converged=False)
 
 
+def _change(step: Step, held: Mask | None) -> Array:
+    """Return what a step promises to take off, as one vector; nothing of points that are held."""
+    change = step.change
+    if held is not None:
+        change.rays[held[step.linear.problem.points.point]] = 0.0
+        change.ground[held] = 0.0
+    return change.vector
+
+
 def once(problem: BlockProblem, state: State, selection: Selection) -> tuple[Solved, State]:
-    """Return one step's solution, with the misfits that it leaves to first order, and the state after it."""
+    """Return one step's solution, with the misfits that it leaves to first order, and the state after it.
+
+    Points that it leads out of the models stay where they were.
+    """
     linear = Linear.at(problem, state, selection)
     step = step_of(linear)
     left = replace(linear, misfits=linear.misfits.minus(step.change))
-    return _solved(left, step), state.moved(step.solution.values, step.shift)
+    ahead = _moved(linear, step.whole)
+    return _solved(left, step), state if ahead is None else ahead.state
 
 
-def _solved(linear: Linear, step: Step, iterations: int = 0) -> Solved:
-    return Solved(linear, step.eliminated, step.solution.cofactors, step.condition, iterations)
+def _solved(linear: Linear, step: Step, iterations: int = 0, held: Mask | None = None) -> Solved:
+    return Solved(linear, step.eliminated, step.solution.cofactors, step.condition, iterations, astray=held)
 
 
-def _descent(linear: Linear, whole: Array, further: Array | None, square: float) -> tuple[State | None, float, Array]:
+@dataclass(frozen=True, eq=False)
+class _Ahead:
+    """A state with smaller squares, the move that led there, and the points ``(N,)`` that were held, if any."""
+
+    state: State
+    square: float
+    move: Array
+    held: Mask | None
+
+
+def _descent(linear: Linear, whole: Array, further: Array | None, square: float) -> _Ahead | None:
     """Return the state after a move that descends: further than the step, the step, or a part of it."""
-    problem, state = linear.problem, linear.state
     moves = [] if further is None else [further]
     for move in (*moves, *(whole / 2.0**k for k in range(10))):
+        ahead = _moved(linear, move)
+        # Coordinates are rounded to a billionth of a metre: what is added to a square by that is not an ascent.
+        if ahead is not None and ahead.square <= square * (1 + 1e-8):
+            return ahead
+    return None
+
+
+def _moved(linear: Linear, move: Array) -> _Ahead | None:
+    """Return the state after a move; points that it leads out of their models stay where they are.
+
+    A gross error sends a point whose rays are nearly parallel kilometres up or down. Nothing is known of it there, and
+    it must not keep all others from where they belong.
+    """
+    problem, state, held = linear.problem, linear.state, None
+    for _ in range(2):
         try:
             ahead = state.moved(move[: problem.size], move[problem.size :].reshape(-1, 3))
-            after = problem.misfits(ahead, linear.ordering, linear.weights).square
+            misfits = problem.misfits(ahead, linear.ordering, linear.weights)
         except InputError:  # a correction that cannot be inverted
-            after = math.nan
-        # Coordinates are rounded to a billionth of a metre: what is added to a square by that is not an ascent.
-        if math.isfinite(after) and after <= square * (1 + 1e-8):
-            return ahead, after, move
-    return None, square, whole
+            return None
+        if math.isfinite(misfits.square):
+            return _Ahead(ahead, misfits.square, move, held)
+        held = np.zeros(len(problem.points), dtype=bool)
+        held[problem.points.point[~np.isfinite(misfits.rays).all(axis=1)]] = True
+        move = move.copy()
+        move[problem.size :].reshape(-1, 3)[held] = 0.0
+    return None
