@@ -8,7 +8,7 @@
 #   make fuzz     read damaged files with every reader (N=100000 of each, READER=name for one, KEEP=folder for results)
 #   make bench    speed and memory against gdalwarp, speed of adjustments and of many scenes
 #   make docs     the documentation as a site in out/site, links checked
-#   make images   draw the pictures of README.md and of docs/measure.md again (Chromium)
+#   make images   draw the pictures of README.md, docs/measure.md and docs/report.md again (Chromium)
 #   make clean    remove .venv, caches and out/
 #
 # PYTHON=python3.12     the interpreter that .venv is made from (3.11 or newer)
@@ -85,6 +85,7 @@ docs: setup
 images: setup
 	@$(BIN)/python docs/make_images.py
 	$(BIN)/python docs/make_measure_images.py
+	$(BIN)/python docs/make_report_images.py
 
 clean:
 	rm -rf $(VENV) out build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache

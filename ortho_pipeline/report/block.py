@@ -27,6 +27,8 @@ from ortho_pipeline.report.block_records import (
     VariancesRecord,
     merged,
 )
+from ortho_pipeline.report.page.advice import WORDS, signals
+from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.records import RpcRecord
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, FEW
 
@@ -173,6 +175,10 @@ def page(report: BlockReport) -> str:
         plan=None if plan is None else plan.svg(),
         plot_style=style_sheet(),
         provenance=list(flat(provenance)),
+        signals=signals(report.warnings, report.notices),
+        levels=WORDS,
+        script=script(),
+        policy=policy(script()),
     )
 
 

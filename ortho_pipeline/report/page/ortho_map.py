@@ -166,7 +166,7 @@ def _line_label(drawing: Drawing, line: Array, axis: int, text: str) -> None:
     if not along[order[0]] <= edge <= along[order[-1]]:
         return
     at = float(np.interp(edge, along[order], across[order]))
-    if axis == 0 and 90 < at < drawing.width - 180:
+    if axis == 0 and 90 < at < drawing.width - 260:
         drawing.text(at + 3, edge, text, quiet=True)
     elif axis == 1 and 24 < at < drawing.height - 60:
         drawing.text(edge, at - 3, text, quiet=True)

@@ -1,0 +1,35 @@
+"""Draw the pictures of docs/report.md from a run on the sample scene: ``make images`` (Chromium)."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+from playwright.sync_api import sync_playwright
+
+from ortho_pipeline import commands
+from ortho_pipeline.options import PointOptions, SurfaceOptions
+
+ROOT = Path(__file__).resolve().parent.parent
+SAMPLE, IMAGES = ROOT / "sample_data", ROOT / "docs" / "images"
+
+
+def main() -> None:
+    """Rectify the sample scene and take pictures of its report: the first screen, dark, and the chips."""
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as started:
+        points, surface = PointOptions(gcps=SAMPLE / "gcps.geojson"), SurfaceOptions(dem=SAMPLE / "dem.tif")
+        made = commands.rectify(SAMPLE / "scene.tif", folder, points=points, surface=surface)
+        browser = started.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        for name, scheme in (("report", "light"), ("report-dark", "dark")):
+            page = browser.new_page(viewport={"width": 1280, "height": 760}, color_scheme=scheme)  # type: ignore[arg-type]
+            page.goto(made.files["html"].resolve().as_uri())
+            page.screenshot(path=IMAGES / f"{name}.jpg", type="jpeg", quality=80)
+            if scheme == "light":
+                page.locator(".measured").screenshot(path=IMAGES / "report-chips.jpg", type="jpeg", quality=80)
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()
