@@ -45,6 +45,7 @@ ENDINGS = {
     "overview": "_overview.png",
     "visibility": "_visibility.tif",
     "angles": "_angles.tif",
+    "angles_style": "_angles.qml",
     "shadow": "_shadow.tif",
     "accuracy": "_accuracy.tif",
     "accuracy_style": "_accuracy.qml",
@@ -54,7 +55,7 @@ _ASKED = {
     "stac": ("stac", "thumbnail", "overview"),
     "accuracy_raster": ("accuracy", "accuracy_style"),
     "visibility": ("visibility",),
-    "angles": ("angles", "shadow"),
+    "angles": ("angles", "angles_style", "shadow"),
 }
 
 _P = ParamSpec("_P")

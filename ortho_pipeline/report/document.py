@@ -35,6 +35,7 @@ from ortho_pipeline.report.adjustment_records import Adjustment, RmseOfView, Rms
 from ortho_pipeline.report.delivered import accuracy_before
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.report.layers.angles import AnglesLayer
+from ortho_pipeline.report.layers.styles import raster_style
 from ortho_pipeline.report.map_scale import map_scale
 from ortho_pipeline.report.matching import matching_record
 from ortho_pipeline.report.page.scene import write_report_html
@@ -318,12 +319,7 @@ def residuals_geojson(fit: Fit) -> dict[str, Any]:
 
 def accuracy_style(layer: AccuracyLayer) -> str:
     """Return a QGIS style (QML) for the raster of accuracy: ce90 in five steps of colour."""
-    low, _, high = layer.range_m
-    high = max(high, 1.01 * low)
-    colours = ("#2563a8", "#7fb3d5", "#f4f1de", "#e59866", "#b4500b")
-    values = [low + (high - low) * k / (len(colours) - 1) for k in range(len(colours))]
-    stops = [(f"{value:.6g}", metres(value), colour) for value, colour in zip(values, colours, strict=True)]
-    return render("report/accuracy.qml.j2", low=stops[0][0], high=stops[-1][0], stops=stops)
+    return raster_style(4, layer.range_m[0], layer.range_m[2], metres)
 
 
 def residuals_style(report: SceneReport) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from xml.etree import ElementTree
+
 import numpy as np
 import pyproj
 import pytest
@@ -115,6 +117,11 @@ def test_rectify_writes_angles_and_shadows_with_the_ortho(tiny, tmp_path):
     bands = gdal.Open(str(result.files["angles"]))
     names = [bands.GetRasterBand(k + 1).GetDescription() for k in range(bands.RasterCount)]
     assert names == ["view_zenith", "view_azimuth", "sun_incidence"]
+    style = ElementTree.parse(result.files["angles_style"]).getroot()
+    low, high = (float(style.find(".//rasterrenderer").get(f"classification{end}")) for end in ("Min", "Max"))
+    zenith = bands.GetRasterBand(1).ReadAsArray()
+    assert low == pytest.approx(np.nanmin(zenith), rel=1e-4)
+    assert high >= np.nanmax(zenith) * (1 - 1e-4)
     report = read_report(result.files["report"])
     assert report.angles.sun_deg == (60.0, 3.0)
     # Waves of 20 m over 300 m throw shadows where the sun is so low.

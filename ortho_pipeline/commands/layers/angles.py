@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from ortho_pipeline.commands.placement import Placement
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import write_text
 from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.options import OutputOptions
-from ortho_pipeline.report.layers.angles import AnglesLayer
+from ortho_pipeline.report.layers.angles import AnglesLayer, angles_style
 
 if TYPE_CHECKING:
     from ortho_pipeline.warp.layers.angles import Sun
@@ -61,9 +62,11 @@ def write_angles(
         sight, placed.surface, size, files["angles"], heights=heights, step=output.layer_step, sun=sun,
         resources=resources,
     )  # fmt: skip
+    layer = AnglesLayer(view_zenith_deg=found.view_zenith_deg, sun_deg=None, shadow_share=None)
+    write_text(files["angles_style"], angles_style(layer))
     if sun is None:
         del files["shadow"]
-        return AnglesLayer(view_zenith_deg=found.view_zenith_deg, sun_deg=None, shadow_share=None)
+        return layer
     share = angles.write_shadows(sight, placed.surface, sun, files["shadow"], heights=heights, resources=resources,
                                  driver=output.format)  # fmt: skip
     return AnglesLayer(

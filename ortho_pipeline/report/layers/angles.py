@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ortho_pipeline.display.numbers import share
 from ortho_pipeline.files.documents import record
+from ortho_pipeline.report.layers.styles import raster_style
 
 
 @record
@@ -26,3 +27,8 @@ class AnglesLayer:
             return f"{said}; where the sun stood is not known"
         azimuth, elevation = self.sun_deg
         return f"{said}; the sun at {azimuth:.1f}°, {elevation:.1f}° high, {share(self.shadow_share)} in shadow"
+
+
+def angles_style(layer: AnglesLayer) -> str:
+    """Return a QGIS style (QML) for the raster of angles: the zenith angle of view in five steps of colour."""
+    return raster_style(1, *layer.view_zenith_deg, lambda angle: f"{angle:.2f}°")
