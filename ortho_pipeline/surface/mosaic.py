@@ -21,7 +21,7 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import CrsError, DatumError, InputError
+from ortho_pipeline.errors import CrsError, DatumError, InputError, counted
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
 from ortho_pipeline.surface.base import Array
 from ortho_pipeline.surface.dem_file import DemFile, SampleGrid
@@ -80,7 +80,7 @@ def matching_files(pattern: str | os.PathLike[str]) -> list[str] | None:
     found = sorted(path for path in glob.iglob(text) if os.path.isfile(path))
     if not 0 < len(found) <= _MOST_FILES:
         raise InputError(
-            f"{len(found)} files have a name of this pattern", file=text, field="surface.dem",
+            f"{counted(len(found), 'file')} of this pattern", file=text, field="surface.dem",
             remedy="give a DEM, or a pattern of the files that make one",
         )  # fmt: skip
     return found

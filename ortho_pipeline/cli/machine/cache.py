@@ -9,6 +9,7 @@ import click
 from ortho_pipeline.cli.options import json_option
 from ortho_pipeline.cli.parsing import Group
 from ortho_pipeline.cli.printing import print_json
+from ortho_pipeline.errors import counted
 
 _FAILED = 1
 
@@ -49,7 +50,9 @@ def clear(as_json: bool) -> None:
     document = commands.forget_kept_files()
     if as_json:
         return print_json(document)
-    click.echo(f"Removed {document['files']} files of {document['bytes'] / 1e6:.1f} MB from {document['folder']}")
+    click.echo(
+        f"Removed {counted(document['files'], 'file')} of {document['bytes'] / 1e6:.1f} MB from {document['folder']}"
+    )
     return None
 
 
@@ -59,5 +62,5 @@ def _print(document: dict[str, Any], as_json: bool) -> None:
     for one in document["files"]:
         click.echo(f"{one.get('state', ''):<8} {one['bytes'] / 1e6:9.1f} MB  {one['address']}".lstrip())
     total = sum(one["bytes"] for one in document["files"])
-    click.echo(f"{len(document['files'])} files, {total / 1e6:.1f} MB, in {document['folder']}")
+    click.echo(f"{counted(len(document['files']), 'file')}, {total / 1e6:.1f} MB, in {document['folder']}")
     return None
