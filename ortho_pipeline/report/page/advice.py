@@ -21,9 +21,9 @@ _STOP: dict[str, str] = {
     "metadata-contradict": "Find out which of the two is right before the ortho is used; ask who delivered the scene.",
 }
 _LOOK: dict[str, str] = {
-    "left-out": "Look at its chip and its coordinates: measure it again, or leave it out of the file.",
+    "left-out": "Look at it in the image and at its coordinates: measure it again, or leave it out of the file.",
     "more-left-out": "So many gross errors mean that the points or the model do not suit the scene: see both.",
-    "contradicting-point": "Look at its chip and its coordinates: measure it again, or take it out with a reason.",
+    "contradicting-point": "Look at it in the image and at its coordinates: measure it again, or take it out.",
     "no-projection": "Give the points a height, and check their CRS.",
     "takes-no-part": "Measure these points in one more image.",
     "outside-of-image": "Check whether these were measured in another image or in a crop of this one.",
