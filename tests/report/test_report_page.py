@@ -134,6 +134,7 @@ def test_without_a_script_nothing_essential_is_missing(made, browser):
     page.context.close()
 
 
+@pytest.mark.slow
 def test_page_can_be_used_by_everybody(made, browser):
     axe = (ROOT / "tests" / "measure" / "axe" / "axe.min.js").read_text(encoding="utf-8")
     for scheme, rules in (("light", "{}"), ("dark", "{runOnly: ['color-contrast']}")):
