@@ -15,7 +15,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import points_of_images
 from ortho_pipeline.commands.control.matching import match_scene
 from ortho_pipeline.commands.control.ties import tie_scenes
-from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
+from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface, require_heights
 from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
@@ -70,6 +70,7 @@ def gather(
         tables.append(table)
         notices += notes
     if matched:
+        require_heights(surface)
         alone = [inputs.open_scene(image, scene) for image, scene in zip(images, scenes, strict=True)]
         heights = open_surface(surface, scenes[0], under=alone)
         opened = {label: on_surface(scene, heights) for label, scene in zip(labels, alone, strict=True)}

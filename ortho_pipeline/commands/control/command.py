@@ -9,7 +9,7 @@ from typing import Any
 
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.matching import match_scene
-from ortho_pipeline.commands.heights.surfaces import open_surface
+from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust, on_surface
 from ortho_pipeline.display.notices import to_document
@@ -58,6 +58,7 @@ def match(
             remedy=f"one of {', '.join(_SUFFIXES)}",
         )  # fmt: skip
     files |= _page(report)
+    require_heights(surface)
     inputs.check_paths(files, image, scene, PointOptions(), surface, match)
     opened = inputs.open_scene(image, scene)
     heights = open_surface(surface, scene, under=[opened])

@@ -17,7 +17,7 @@ from ortho_pipeline.block.points import BlockPoints, shape_of
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of
 from ortho_pipeline.commands.control.matching import search_of
-from ortho_pipeline.commands.heights.surfaces import open_surface
+from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.display.notices import Notice, to_document
@@ -203,6 +203,7 @@ def ties(
     files = {"ties": Path(output)}
     if files["ties"].suffix.lower() != ".csv":
         raise InputError("ties are not written in this format", file=output, field="output", remedy="give a .csv file")
+    require_heights(surface)
     for image in images:
         inputs.check_paths(files, image, scene, PointOptions(), surface)
     scenes = {name: inputs.open_scene(image, scene) for name, image in zip(names, images, strict=True)}

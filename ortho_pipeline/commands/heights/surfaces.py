@@ -110,7 +110,7 @@ def require_heights(options: SurfaceOptions) -> None:
     """Raise an `InputError` if there are no heights."""
     if not has_surface(options):
         raise InputError(
-            "an orthoimage needs heights", field="surface.dem",
+            "there are no heights of the ground", field="surface.dem",
             remedy="give `surface.dem=FILE`, or `surface.height=METRES` above the ellipsoid for flat ground",
         )  # fmt: skip
 
