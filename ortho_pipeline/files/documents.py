@@ -127,7 +127,8 @@ def record_of(kind: type[_T], document: Any) -> _T:
         found: _T = _adapter(kind).validate_python(document)  # type: ignore[arg-type]
     except pydantic.ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
-        raise DocumentError(".".join(map(str, first["loc"]))[:200], first["msg"][:200]) from error
+        place = ".".join(str(part) or "''" for part in first["loc"])  # a member's name may be empty
+        raise DocumentError(place[:200], first["msg"][:200]) from error
     return found
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from ortho_pipeline.files.documents import json_position, json_value
+from ortho_pipeline.files.documents import DocumentError, json_position, json_value, record, record_of
 
 
 @dataclasses.dataclass
@@ -39,3 +39,16 @@ def test_values_are_what_json_holds(value, expected):
 def test_half_a_place_is_none():
     assert json_position(np.array([1.0, 2.0])) == [1.0, 2.0]
     assert json_position(np.array([1.0, np.nan])) is None
+
+
+@record
+class One:
+    """A record."""
+
+    number: int
+
+
+def test_a_member_without_a_name_is_named() -> None:
+    with pytest.raises(DocumentError) as caught:
+        record_of(One, {"number": 1, "": 2})
+    assert caught.value.place == "''"
