@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 from osgeo import gdal
-from servers import bucket_at, on_a_faulty_way
+from servers import moto_server, on_a_faulty_way
 
 from ortho_pipeline.batch.executors import Sequential
 from ortho_pipeline.batch.plan import STATE, Job, Plan
@@ -34,12 +34,8 @@ gdal.UseExceptions()
 
 @pytest.fixture(scope="module")
 def moto() -> Iterator[tuple[str, int]]:
-    server = pytest.importorskip("moto.server").ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    bucket_at(f"http://{host}:{port}", "runs")
-    yield host, port
-    server.stop()
+    with moto_server("runs") as address:
+        yield address
 
 
 @pytest.fixture

@@ -15,6 +15,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 
 class PublicFolder:
     """A folder behind HTTP: ranges, ETags that are MD5, and what is asked for, counted.
@@ -200,6 +202,19 @@ def on_a_faulty_way(target: tuple[str, int], seed: int, share: float = 0.3) -> I
     """Run a `FaultyWay` for the length of a block."""
     with _running(FaultyWay(target, seed, share)) as way:
         yield way
+
+
+@contextmanager
+def moto_server(bucket: str) -> Iterator[tuple[str, int]]:
+    """Serve S3 by moto, with a bucket, and yield host and port; the test is skipped without moto."""
+    server = pytest.importorskip("moto.server").ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    try:
+        bucket_at(f"http://{host}:{port}", bucket)
+        yield host, port
+    finally:
+        server.stop()
 
 
 def bucket_at(address: str, name: str) -> None:

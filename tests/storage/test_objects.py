@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from osgeo import gdal
-from servers import FaultyWay, bucket_at, on_a_faulty_way, serving
+from servers import FaultyWay, moto_server, on_a_faulty_way, serving
 
 from ortho_pipeline.commands import export, rectify
 from ortho_pipeline.errors import InputError, OrthoError, StorageError
@@ -37,12 +37,8 @@ Address = tuple[str, int]
 
 @pytest.fixture(scope="module")
 def moto() -> Iterator[Address]:
-    server = pytest.importorskip("moto.server").ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    bucket_at(f"http://{host}:{port}", "bucket")
-    yield host, port
-    server.stop()
+    with moto_server("bucket") as address:
+        yield address
 
 
 @pytest.fixture(scope="module")

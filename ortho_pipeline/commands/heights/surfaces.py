@@ -43,10 +43,7 @@ def open_surface(
         raise InputError(
             "`surface.dem` and `surface.height` exclude each other", field="surface.height", remedy="give one of them"
         )
-    if options.dem is None and options.height is None:
-        raise InputError(
-            "there are no heights", field="surface.dem", remedy="give `surface.dem=FILE` or `surface.height=METRES`"
-        )
+    require_heights(options)
     sigma = open_sigma(options, scene, memory)
     if options.height is not None:
         return Surface.constant(options.height).with_sigma(sigma)
