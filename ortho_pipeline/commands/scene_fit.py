@@ -20,8 +20,10 @@ from ortho_pipeline.estimation import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import OWN, Removed, fit_family, fit_own, prune, restricted, ridge_of
 from ortho_pipeline.estimation.fit import Fit, fit
+from ortho_pipeline.estimation.ground_residuals import in_metres
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
+from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions
 from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.points.control_hull import uncovered
@@ -31,6 +33,8 @@ from ortho_pipeline.surface.footprint import lay
 
 #: A delivered model that is so many image sizes off belongs to another place, or reads its metadata wrongly.
 _ELSEWHERE = 3.0
+#: Measured points that together say where a reference lies, and by how many sigmas of their mean they have to.
+_AGREE, _SIGMAS = 3, 4.0
 #: How far (in parts of their own extent) beyond the points the DEM is asked for its range of heights.
 _MARGIN = 0.25
 
@@ -257,12 +261,31 @@ def relative_to_reference(adjusted: Fit, match: MatchOptions) -> list[Notice]:
     if common is not None and common.value.any():
         east, north = common.value * common.sigma
         text += f"; the other points put the reference {east:+.2f} m along x and {north:+.2f} m along y"
+    off = _reference_off(adjusted) if count == control else None
+    if off is not None:
+        east, north = off.mean(axis=0)
+        text += (
+            f"; {counted(len(off), 'measured point')} that took no part put the reference {east:+.2f} m along x and "
+            f"{north:+.2f} m along y: they correct it with `match.gcps_as=control` and a `match.reference_sigma`"
+        )
     return [
         Notice(
             "relative-to-reference", text, reference_sigma_m=sigma, matched=count, control=control,
-            in_sigmas=common is not None,
+            in_sigmas=common is not None, reference_off_m=None if off is None else off.mean(axis=0).tolist(),
         )
     ]  # fmt: skip
+
+
+def _reference_off(adjusted: Fit) -> Array | None:
+    """Return by how much (m, x and y) each measured check point puts the reference off, if they agree that it is."""
+    points = adjusted.points
+    measured = points.tests & (points.groups < 0) & ~np.isin(points.ids, [one.id for one in adjusted.outlying])
+    shifts = in_metres(adjusted, adjusted.residuals)[measured]
+    shifts = shifts[np.isfinite(shifts).all(axis=1)]
+    if len(shifts) < _AGREE:
+        return None
+    scatter = shifts.std(axis=0, ddof=1) / np.sqrt(len(shifts))
+    return shifts if (abs(shifts.mean(axis=0)) > _SIGMAS * scatter).any() else None
 
 
 def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:

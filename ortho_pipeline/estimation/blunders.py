@@ -32,6 +32,8 @@ BLUNDER_RISK = 0.001
 OUTLYING_RISK = 0.01
 #: From so many check points on their own scatter counts, where it is larger than that of the control points.
 _OWN_SCATTER = 5
+#: Measured check points that show where they lie together beside matches.
+_OWN_PLACE = 3
 #: Median of a chi-squared variable of two degrees of freedom.
 _MEDIAN_OF_TWO = 2 * math.log(2)
 #: More than this share of rejected control points is an error, not a clean-up.
@@ -258,13 +260,14 @@ def outlying(solution: Solution, points: Points, used: np.ndarray, common: Array
     (median) scatter is the scale where it is larger than sigma0, so that a model that is poor everywhere makes none of
     them an outlier. A control point is tested by its residual had it taken no part, against the sigma0 of the others.
     `common` ``(P, P)`` is what the error that control points have in common leaves in the parameters: check points that
-    do not share it may lie off by it.
+    do not share it may lie off by it. Where all control was matched and nobody states that error, measured check points
+    are held against each other: all of them being off alike is the reference's fault.
     """
     if solution.sigma0 is None:
         return ()
     return (
         *_outlying_control(solution, points, used),
-        *_outlying_checks(solution, points, float(solution.sigma0), common),
+        *_outlying_checks(solution, points, used, float(solution.sigma0), common),
     )
 
 
@@ -297,7 +300,9 @@ def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> l
     return found
 
 
-def _outlying_checks(solution: Solution, points: Points, sigma0: float, common: Array | None) -> list[Outlying]:
+def _outlying_checks(
+    solution: Solution, points: Points, used: np.ndarray, sigma0: float, common: Array | None
+) -> list[Outlying]:
     from scipy.special import fdtrc
 
     usable = points.check & np.isfinite(solution.model.ground_to_image(points.ground)).all(axis=1)
@@ -305,6 +310,9 @@ def _outlying_checks(solution: Solution, points: Points, sigma0: float, common: 
         return []
     problem = Problem.of(solution.model, points, usable, {})
     miss = problem.image - solution.model.ground_to_image(problem.ground)
+    measured = problem.points.groups < 0
+    if common is None and measured.sum() >= _OWN_PLACE and (points.groups[used] >= 0).all():
+        miss[measured] -= np.median(miss[measured], axis=0)
     if len(solution.model.params):
         jacobian = problem.errors.whitened(solution.model.param_partials(problem.ground))
     else:

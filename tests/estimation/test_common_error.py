@@ -140,8 +140,16 @@ def test_what_is_known_of_the_model_tells_of_it(rpc: RPC) -> None:
 
 
 def test_surveyed_check_points_may_lie_off_by_it(rpc: RPC) -> None:
-    """They are named where they contradict the fit; an error that was stated is no contradiction."""
-    points = scene(rpc, np.random.default_rng(6), 80, 3, sigma=4.0, off=np.array([4.0, -2.0]))
+    """An error that was stated is no contradiction, and one that all of them show is the reference's.
+
+    Two cannot tell which of them, or the reference, is wrong; of four the one that contradicts the others is named.
+    """
+    points = scene(rpc, np.random.default_rng(6), 80, 4, sigma=4.0, off=np.array([4.0, -2.0]))
     points = points.with_roles(np.where(points.groups < 0, "check", "control"))
     assert not adjusted(rpc, points).outlying
-    assert len(adjusted(rpc, replace(points, sigma_common=None)).outlying) == 3
+    unstated = replace(points, sigma_common=None)
+    assert not adjusted(rpc, unstated).outlying
+    assert len(adjusted(rpc, unstated.select(np.arange(82))).outlying) == 2
+    image = unstated.image.copy()
+    image[81] += (5.0, 0.0)
+    assert [one.id for one in adjusted(rpc, replace(unstated, image=image)).outlying] == ["81"]

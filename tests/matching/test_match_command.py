@@ -202,6 +202,20 @@ def test_measured_points_control_if_the_user_says_so(moved: Case, tmp_path: Path
     )  # those that contradict the many are left out, and named
 
 
+def test_measured_points_that_only_check_say_where_the_reference_lies(moved: Case, tmp_path: Path) -> None:
+    """They agree with each other: the reference is off, and none of them is to be measured again; a bad one is."""
+    points = surveyed(moved)
+    image = points.image.copy()
+    image[2] += (6.0, 0.0)
+    op.write_points(replace(points, image=image), tmp_path / "survey.csv")
+    found = document(matched(moved, "fit", "--gcps", tmp_path / "survey.csv", "--json"))
+    notice = next(one for one in found["notices"] if one["code"] == "relative-to-reference")
+    np.testing.assert_allclose(notice["reference_off_m"], (5.0, -3.0), atol=0.2)
+    assert "measured points that took no part put the reference +" in notice["text"]
+    suspects = {one["id"] for one in found["outlying"]}
+    assert suspects & set(points.ids) == {points.ids[2]}
+
+
 def test_measured_points_say_where_a_reference_lies_whose_sigma_is_stated(moved: Case, tmp_path: Path) -> None:
     op.write_points(surveyed(moved), tmp_path / "survey.csv")
     words = ("--gcps", tmp_path / "survey.csv", "--gcps-as", "control", "--select", "even:4", "--json")
