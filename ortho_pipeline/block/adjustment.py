@@ -8,7 +8,7 @@ sigmas of the observations, `reliability` the search for gross errors, `intersec
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -93,13 +93,18 @@ def adjust(
         if rejected:
             solved, selection = _solved(solved.problem, solved.state, blunders.kept)
     gauge = gauge.replace(by_control(problem, begun), by_control(problem, selection))
-    judged = np.isin(np.array(points.ids, dtype=object), [one.point for one in rejected])
+    judged = _among(points, {one.point for one in rejected})
     notes += _without(points, problem.active(begun) & ~problem.active(selection) & ~judged)
     solved, found = _weighed(solved, selection)
     notes += found.variances.notes()
     notes += marks_warning(points.select(problem.active(selection) & selection.ground))
     notes += uncertain_images(solved, points)
     return _result(solved, found, selection, points, chosen, gauge, rejected, notes)
+
+
+def _among(points: BlockPoints, ids: Set[str]) -> Mask:
+    """Return which points ``(N,)`` have one of these ids."""
+    return np.fromiter((one in ids for one in points.ids), dtype=bool, count=len(points))
 
 
 def _undecided(points: Sequence[str]) -> Notice:
@@ -121,7 +126,7 @@ def _prepared(
     plan[flat, 2] = 0.0
     known[points.control] = ground_transform(points.crs, GEODETIC)(plan[points.control])
     known[flat, 2] = np.nan
-    takes_part = ~np.isin(np.array(points.ids, dtype=object), list(exclude))
+    takes_part = ~_among(points, set(exclude))
     rays = takes_part[points.point]
     local = meet(frame, models, points, rays)
     problem = BlockProblem(points, models, frame, known, _priors(models, points, priors))

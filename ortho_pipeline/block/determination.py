@@ -25,10 +25,11 @@ def refuse_too_few(problem: BlockProblem, selection: Selection) -> None:
             "no point was measured in two images, or in one with known ground", file=points.source or None,
             remedy="points of one id are one point: check the ids and the names of the images",
         )  # fmt: skip
+    priors = problem.columns.counts_by_image([one.column for one in problem.pseudo])
     for image, model in enumerate(problem.models):
         columns = problem.columns.of_image(image)
-        measured = int((rays & (points.image == image)).sum())
-        known = len(model.constraints()) + sum(int(one.column) in columns for one in problem.pseudo)
+        measured = int(rays[points.rays_of_images[image]].sum())
+        known = len(model.constraints()) + int(priors[image])
         least = math.ceil((len(columns) - known) / 2)
         if 2 * measured + known < len(columns):
             raise TooFewPoints(
@@ -81,7 +82,7 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         if not len(columns) or not len(used):
             continue
         cofactors = solved.cofactors[np.ix_(columns, columns)]
-        of_image = problem.points.image == image
+        of_image = problem.points.rays_of_images[image]
         measured = float(np.median(problem.points.sigma_image[of_image]))
         sigma = max(measured, float(np.median(stated.sigma_image[of_image])))
         inside = float(np.sqrt(np.median(((partials @ cofactors) * partials).sum(axis=2)))) * measured / sigma

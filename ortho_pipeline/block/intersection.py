@@ -153,8 +153,7 @@ def predict(frame: GroundFrame, models: Sequence[SensorModel], points: BlockPoin
     """Return the image points ``(M, 2)`` at which points ``(N, 3)`` of the frame are seen by their rays' images."""
     places = frame.places(local)
     predicted = np.full((points.rays, 2), np.nan)
-    for number, model in enumerate(models):
-        rays = np.flatnonzero(points.image == number)
+    for model, rays in zip(models, points.rays_of_images, strict=True):
         if len(rays):
             predicted[rays] = places.project(model, points.point[rays])
     return predicted
@@ -218,8 +217,8 @@ def _solved(normal: Array, right: Array) -> tuple[Array, np.ndarray]:
 def _first(frame: GroundFrame, models: Sequence[SensorModel], points: BlockPoints, used: np.ndarray) -> Array:
     """Return the mean of where the rays of each point pass the reference heights of their models."""
     total, count = np.zeros((len(points), 3)), np.zeros(len(points))
-    for number, model in enumerate(models):
-        rays = np.flatnonzero(used & (points.image == number))
+    for model, rays_of in zip(models, points.rays_of_images, strict=True):
+        rays = rays_of[used[rays_of]]
         if not len(rays):
             continue
         ground = model.image_to_ground(points.measured[rays], model.reference_height)
@@ -237,8 +236,8 @@ def _equations(
     """Return misfits ``(M, 2)`` over sigma and their partials by the points ``(M, 2, 3)``; zero for rays not used."""
     places = frame.places(local)
     misfit, rows = np.zeros((points.rays, 2)), np.zeros((points.rays, 2, 3))
-    for number, model in enumerate(models):
-        rays = np.flatnonzero(used & (points.image == number))
+    for model, rays_of in zip(models, points.rays_of_images, strict=True):
+        rays = rays_of[used[rays_of]]
         if not len(rays):
             continue
         of = points.point[rays]

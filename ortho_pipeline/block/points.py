@@ -6,8 +6,10 @@ ground, one role and one identity however many images show it.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -195,6 +197,13 @@ class BlockPoints:
     def rays(self) -> int:
         """Number of measurements M."""
         return len(self.point)
+
+    @cached_property
+    def rays_of_images(self) -> tuple[Index, ...]:
+        """Rays of each image, in the order of their points."""
+        order = np.lexsort((self.point, self.image))
+        ends = np.searchsorted(self.image[order], np.arange(len(self.images) + 1))
+        return tuple(order[a:b] for a, b in itertools.pairwise(ends))
 
     def with_roles(self, roles: ArrayLike) -> BlockPoints:
         """Return these points with other roles ``(N,)``."""

@@ -68,18 +68,17 @@ def rpc_terms(lon: Array, lat: Array, h: Array) -> Array:
     return terms
 
 
-def rpc_term_partials(lon: Array, lat: Array, h: Array) -> Array:
-    """Return d(terms)/d(L, P, H) as ``(3, 20, N)``."""
-    powers = [np.stack([np.ones_like(v), v, v * v, v * v * v]) for v in (lon, lat, h)]
-    partials = np.zeros((3, 20, lon.size))
+def _slopes_of_terms() -> Array:
+    """Return what d(terms)/d(L, P, H) has of the first ten terms ``(3, 20, 10)``, which are all quadratic ones."""
+    found = np.zeros((3, 20, 10))
     for axis in range(3):
-        for term, powers_of_term in enumerate(RPC_TERMS):
-            if powers_of_term[axis]:
-                lowered = powers_of_term.copy()
-                lowered[axis] -= 1
-                value = float(powers_of_term[axis]) * powers[0][lowered[0]]
-                partials[axis, term] = value * powers[1][lowered[1]] * powers[2][lowered[2]]
-    return partials
+        for term, powers in enumerate(RPC_TERMS):
+            lowered = powers - np.eye(3, dtype=np.int64)[axis]
+            found[axis, term, (RPC_TERMS[:10] == lowered).all(axis=1)] = powers[axis]
+    return found
+
+
+_SLOPES = _slopes_of_terms()
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +136,7 @@ class RPC(SensorModel):
     def _reach(self) -> tuple[float, float]:
         """Normalised heights up to which the model projects."""
         numbers = {name: getattr(self, name) for name in _NUMBERS}
-        low, high = sound_heights(numbers, np.stack([self.col_num, self.col_den, self.row_num, self.row_den]))
+        low, high = sound_heights(numbers, self._polynomials)
         # Sound up to the end of the box: beyond it as far as in plan.
         return low if low > -1.0 else -DOMAIN_LIMIT, high if high < 1.0 else DOMAIN_LIMIT
 
@@ -203,7 +202,7 @@ class RPC(SensorModel):
         """Return offsets and scales of lon, lat, h, column, row, and the coefficients, for the compiled kernels."""
         offsets = np.array([self.lon_off, self.lat_off, self.h_off, self.col_off, self.row_off])
         scales = np.array([self.lon_scale, self.lat_scale, self.h_scale, self.col_scale, self.row_scale])
-        coefficients = np.stack([self.col_num, self.col_den, self.row_num, self.row_den])
+        coefficients = self._polynomials
         # With positive denominators at the centre: where one is not, there is a pole in between.
         return offsets, scales, coefficients * np.repeat(np.sign(coefficients[1::2, :1]), 2, axis=0)
 
@@ -220,31 +219,31 @@ class RPC(SensorModel):
         design = np.stack([np.ones_like(col), col, row, h, col * h, row * h], axis=1)
         return np.linalg.lstsq(design, np.stack([lon[good], lat[good]], axis=1))[0].T.copy()
 
+    @cached_property
+    def _polynomials(self) -> Array:
+        """Coefficients ``(4, 20)``: column numerator and denominator, row numerator and denominator."""
+        return np.stack([self.col_num, self.col_den, self.row_num, self.row_den])
+
     def _project(self, ground: Array) -> Array:
         terms = rpc_terms(*self.normalise(ground))
         with np.errstate(divide="ignore", invalid="ignore"):
-            col_den, row_den = self.col_den @ terms, self.row_den @ terms
-            col = (self.col_num @ terms) / col_den * self.col_scale + self.col_off
-            row = (self.row_num @ terms) / row_den * self.row_scale + self.row_off
+            col_num, col_den, row_num, row_den = self._polynomials @ terms
+            col = col_num / col_den * self.col_scale + self.col_off
+            row = row_num / row_den * self.row_scale + self.row_off
             before_poles = (col_den * self.col_den[0] > 0) & (row_den * self.row_den[0] > 0)
         image = np.stack([col, row], axis=1)
         image[~(np.isfinite(image).all(axis=1) & before_poles)] = np.nan
         return image
 
     def ground_partials(self, ground: ArrayLike) -> Array:
-        normalised = self.normalise(ground)
-        terms = rpc_terms(*normalised)
-        dterms = rpc_term_partials(*normalised)
-        scales = (self.lon_scale, self.lat_scale, self.h_scale)
-        partials = np.empty((terms.shape[1], 2, 3))
-        sides = ((self.col_num, self.col_den, self.col_scale), (self.row_num, self.row_den, self.row_scale))
+        terms = rpc_terms(*self.normalise(ground))
+        sums = self._polynomials @ terms
+        slopes = (self._polynomials @ _SLOPES).reshape(12, 10) @ terms[:10]
+        by_axis = slopes.reshape(3, 4, -1)
+        scale = np.divide.outer((self.col_scale, self.row_scale), (self.lon_scale, self.lat_scale, self.h_scale)).T
         with np.errstate(divide="ignore", invalid="ignore"):
-            for side, (num, den, scale) in enumerate(sides):
-                n, d = num @ terms, den @ terms
-                for axis in range(3):
-                    slope = (num @ dterms[axis]) - (n / d) * (den @ dterms[axis])
-                    partials[:, side, axis] = slope / d * (scale / scales[axis])
-        return partials
+            found = (by_axis[:, ::2] - sums[::2] / sums[1::2] * by_axis[:, 1::2]) / sums[1::2] * scale[:, :, None]
+        return np.ascontiguousarray(found.transpose(2, 1, 0))
 
     def shifted(self, columns: float, rows: float) -> RPC:
         """Return the model of a crop whose first pixel is (columns, rows) of this image."""

@@ -50,6 +50,11 @@ class Columns:
         """Return the columns of the parameters of an image."""
         return np.arange(self.offsets[image], self.offsets[image + 1])
 
+    def counts_by_image(self, columns: Sequence[int]) -> Index:
+        """Return how many of some columns are of each image ``(images,)``."""
+        images = np.searchsorted(self.offsets, np.asarray(columns, dtype=np.int64), side="right") - 1
+        return np.bincount(images, minlength=len(self.padded))
+
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
@@ -101,7 +106,7 @@ class Ordering:
                     part = order[begin : begin + _CHUNK]
                     images = points.image[table[part]]
                     chunks.append(Chunk(rows[part], table[part], images, ground, _groups(images)))
-        of_image = tuple(rays[points.image[rays] == image] for image in range(len(points.images)))
+        of_image = tuple(rays_of[taking_part[rays_of]] for rays_of in points.rays_of_images)
         return cls(tuple(chunks), of_image, np.flatnonzero((counts > 0) & grounded))
 
     @property
