@@ -52,6 +52,7 @@ LINE = {name: number for number, line in enumerate(ROOMS.split("\n")) for name i
 #: Where GDAL, numba and matplotlib are imported.
 GDAL_MODULES = {
     "files.locations",
+    "files.traffic",
     "raster.gate",
     "raster.references",
     "raster.block_cache",

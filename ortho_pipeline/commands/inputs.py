@@ -23,6 +23,7 @@ from ortho_pipeline.exchange.rpc import files_of
 from ortho_pipeline.files import sha256, states
 from ortho_pipeline.files.locations import archive_of, located
 from ortho_pipeline.files.process_limits import startable_threads
+from ortho_pipeline.files.traffic import bytes_read
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
@@ -354,6 +355,12 @@ def provenance(
             "proj": pyproj.proj_version_str,
         },
     }
+
+
+def read_since(before: int) -> dict[str, Any]:
+    """Return how much was read over the network since `before` (`bytes_read`), for the provenance; nothing if none."""
+    read = bytes_read() - before
+    return {"network_bytes": read} if read else {}
 
 
 def _as_asked(options: Any) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import retire, sha256, states
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.process_limits import Resources
+from ortho_pipeline.files.traffic import bytes_read
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
@@ -81,7 +82,7 @@ def rectify(
         For whatever the user can correct: no heights, a DEM that does not cover the scene, a path that is read and
         written, an old side-car that would attach to the ortho.
     """
-    stem = Path(image).stem
+    stem, before = Path(image).stem, bytes_read()
     files = outputs(folder, stem, output)
     points = inputs.point_options(points)
     inputs.check_paths(files, image, scene, points, surface, match, overwrite, fill_from=output.fill_from)
@@ -111,7 +112,7 @@ def rectify(
     _write_models(model, exported, opened, whole, files, {**record, "adjustment": adjusted.record()})
     made = report.build_report(
         scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
-        warp=warped, near=points.near, provenance=record, matching=adjusted.matching,
+        warp=warped, near=points.near, provenance=record | inputs.read_since(before), matching=adjusted.matching,
         warnings=[*adjusted.warnings(heights), *found.notes(), *placed.sparse(warped.valid_pixels), *complaints,
                   *notes, *warped.notes(output.memory)],
     )  # fmt: skip

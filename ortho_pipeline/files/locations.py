@@ -19,6 +19,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.traffic import COUNTING
 
 #: Kinds of URL and GDAL's name for the file system that reads them.
 SCHEMES = {"http": "/vsicurl/http://", "https": "/vsicurl/https://", "s3": "/vsis3/", "gs": "/vsigs/", "az": "/vsiaz/"}
@@ -220,7 +221,7 @@ _CLOSED = {
 }  # fmt: skip
 _closed_with: dict[str, str | None] = {}
 #: A request that fails in passing (429, 502, 503, 504, no answer) is repeated by GDAL too, if nobody says otherwise.
-_PATIENT = {"GDAL_HTTP_MAX_RETRY": "5", "GDAL_HTTP_RETRY_DELAY": "0.2", "GDAL_HTTP_CONNECTTIMEOUT": "10"}
+_PATIENT = {"GDAL_HTTP_MAX_RETRY": "5", "GDAL_HTTP_RETRY_DELAY": "0.2", "GDAL_HTTP_CONNECTTIMEOUT": "10", **COUNTING}
 
 
 def close_network() -> None:
@@ -331,6 +332,15 @@ def within(path: Path, roots: Iterable[AnyPath]) -> bool:
     """Tell whether a path lies in one of the folders, wherever links lead."""
     resolved = path.resolve()
     return any(resolved.is_relative_to(Path(root).resolve()) for root in roots)
+
+
+def is_far(name: AnyPath) -> bool:
+    """Tell whether a file lies on another machine, where each request to it takes its time."""
+    text = os.fspath(name)
+    url = _URL.match(text)
+    if url is not None:
+        return url[1].lower() in SCHEMES
+    return text.startswith("/vsi") and not in_local_archive(text) and not text.startswith("/vsimem")
 
 
 def archive_of(name: str) -> Path | None:

@@ -23,6 +23,7 @@ from typing import Any
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.beside import ask_beside
 from ortho_pipeline.files.locations import AnyPath, VsiPath, in_local_archive, network_is_closed, place, within
 from ortho_pipeline.raster.references import NAMES_OF, PLAIN_VRT, Named
 
@@ -78,6 +79,8 @@ def open_seen(
         If GDAL cannot open the file.
     """
     _without_fetching_drivers()
+    if siblings:
+        ask_beside(path, allow_network=True)
     gate = _Gate(path, roots)
     dataset = gate.open(path, drivers, siblings)
     return dataset, gate.block

@@ -59,6 +59,7 @@ class Provenance:
     surface: dict[str, Any] | None = None
     options: dict[str, dict[str, Any]] | None = None
     software: dict[str, str] | None = None
+    network_bytes: int | None = None
 
 
 @record

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ortho_pipeline.display.notices import Notice, texts_but
-from ortho_pipeline.display.numbers import metres, px, share, short, signed, size_text
+from ortho_pipeline.display.numbers import metres, plain_size, px, share, short, signed, size_text
 from ortho_pipeline.errors import counted
 from ortho_pipeline.report.adjustment_records import Adjustment, Bias, Parameter, Rmse, RmseOnGround, RmsesOnGround
 from ortho_pipeline.report.matching import MatchingRecord, Tested, is_relative
@@ -181,6 +181,8 @@ def summary_text(report: SceneReport) -> str:
         if warp.hidden_share is not None:
             filled = "" if warp.filled_share is None else f"; {share(warp.filled_share)} from another ortho"
             rows.append(("visible", f"{share(1.0 - warp.hidden_share)} of what the image reaches{filled}"))
+    if read := report.provenance.network_bytes:
+        rows.append(("network", f"{plain_size(read)} read"))
     # The headline and the rows above have said these already.
     others = texts_but(report.warnings, report.notices, "left-out", "no-redundancy", "few-check-points")
     rows += [("warning", text) for text in others]

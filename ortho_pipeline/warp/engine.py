@@ -12,7 +12,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +26,7 @@ from ortho_pipeline.exchange.rpc_fit import RpcExport
 from ortho_pipeline.files.process_limits import Resources, require_memory, startable_threads
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.raster.far.ahead import AHEAD, ReadAhead, read_ahead
 from ortho_pipeline.raster.ortho import (
     Profile,
     RasterWriter,
@@ -135,19 +136,21 @@ def rectify(
     other = path.other.block if isinstance(path, Hiding) and path.other is not None else 0
     threads = limit_cache(memory, _threads(resources), source.block, surface.block, other)
     profile = profile or Profile.of(source)
-    job = TileMaker(
-        model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, memory // (4 * threads),
-        profile,
-    )  # fmt: skip
-    if isinstance(path, Hiding):
-        job.looked, path = path.begun(model, surface, grid, memory // (4 * threads)), path.ortho
     with contextlib.ExitStack() as stack:
+        source = stack.enter_context(read_ahead(source, memory // 4))
+        ahead = AHEAD if isinstance(source, ReadAhead) else 0
+        window = memory // (4 * (threads + ahead))
+        job = TileMaker(
+            model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, window, profile
+        )
+        if isinstance(path, Hiding):
+            job.looked, path = path.begun(model, surface, grid, window), path.ortho
         writer = stack.enter_context(
             RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads)
         )
         mask = None if job.looked is None else stack.enter_context(job.looked.writer(driver, threads))
         tiles = list(_tiles(grid, TILE))
-        for done, (left, top, pixels, valid, classes) in enumerate(_in_order(threads, job.make, tiles), start=1):
+        for done, (left, top, pixels, valid, classes) in enumerate(_in_order(threads, job, tiles, ahead), start=1):
             writer.write(left, top, pixels, valid)
             if mask is not None:
                 mask.write(left, top, classes[None], None)
@@ -291,19 +294,27 @@ def _tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
             yield top, left, min(side, grid.height - top), min(side, grid.width - left)
 
 
-def _in_order(threads: int, work: Callable[[Any], Any], items: list[Any]) -> Iterator[Any]:
-    """Yield results of `work` over `items` in their order, so that equal orthos are equal files; few are ahead."""
+def _in_order(
+    threads: int, job: TileMaker, tiles: list[tuple[int, int, int, int]], ahead: int
+) -> Iterator[tuple[int, int, NDArray[Any], NDArray[np.bool_], Any]]:
+    """Yield tiles in their order, so that equal orthos are equal files; few are made, and `ahead` prepared, before.
+
+    Threads begin work in the order in which it is handed to them: what a tile waits for has begun.
+    """
     with ThreadPoolExecutor(threads, thread_name_prefix="warp") as pool:
+        prepared = deque(pool.submit(job.prepare, tile) for tile in tiles[:ahead])
         pending: deque[Future[Any]] = deque()
         try:
-            for item in items:
-                pending.append(pool.submit(work, item))
+            for number, tile in enumerate(tiles):
+                if ahead and number + ahead < len(tiles):
+                    prepared.append(pool.submit(job.prepare, tiles[number + ahead]))
+                pending.append(pool.submit(job.make, tile, prepared.popleft() if ahead else None))
                 if len(pending) > threads + 1:
                     yield pending.popleft().result()
             while pending:
                 yield pending.popleft().result()
         finally:
-            for future in pending:
+            for future in (*prepared, *pending):
                 future.cancel()
 
 
@@ -338,11 +349,9 @@ class TileMaker:
 
     # -- a tile ------------------------------------------------------------------------------------------------------
 
-    def make(self, part: tuple[int, int, int, int]) -> tuple[int, int, NDArray[Any], NDArray[np.bool_], Any]:
-        """Compute one tile (top, left, height, width): left, top, pixels, which are valid, their classes."""
+    def prepare(self, part: tuple[int, int, int, int]) -> tuple[Terrain, list[OutputBlock]]:
+        """Find where the pixels of a tile (top, left, height, width) come from, and begin to read them if far away."""
         top, left, height, width = part
-        pixels = np.full((self.source.count, height, width), self.resampling.fill, dtype=self.source.dtype)
-        tile = _Tile(top, left, pixels, np.zeros(pixels.shape, dtype=bool))
         blocks = [
             OutputBlock(row, column)
             for row in range(top // BLOCK, -(-(top + height) // BLOCK))
@@ -350,6 +359,21 @@ class TileMaker:
         ]
         terrain = Terrain(self.surface, self.cubic_dem, self.window_bytes)
         seen = self.lattices.build(blocks, terrain)
+        if isinstance(self.source, ReadAhead) and seen:
+            together = self._together(seen)
+            for window in [block.window for block in seen] if together is None else [together]:
+                assert window is not None
+                self.source.expect(*(int(side) for side in window))
+        return terrain, seen
+
+    def make(
+        self, part: tuple[int, int, int, int], prepared: Future[tuple[Terrain, list[OutputBlock]]] | None = None
+    ) -> tuple[int, int, NDArray[Any], NDArray[np.bool_], Any]:
+        """Compute one tile (top, left, height, width): left, top, pixels, which are valid, their classes."""
+        top, left, height, width = part
+        pixels = np.full((self.source.count, height, width), self.resampling.fill, dtype=self.source.dtype)
+        tile = _Tile(top, left, pixels, np.zeros(pixels.shape, dtype=bool))
+        terrain, seen = self.prepare(part) if prepared is None else prepared.result()
         for group, dem, area in terrain.groups(seen):
             self._warp(group, dem, area, tile)
         classes, hidden = None, None
@@ -371,19 +395,25 @@ class TileMaker:
     # -- pixels ------------------------------------------------------------------------------------------------------
 
     def _warp(self, blocks: list[OutputBlock], dem: DemWindow, area: tuple[int, int, int, int], tile: _Tile) -> None:
-        windows = np.array([block.window for block in blocks])
-        left, top = windows[:, :2].min(axis=0)
-        right, bottom = windows[:, 2:].max(axis=0)
-        if (right - left) * (bottom - top) * self.source.count * self.source.dtype.itemsize > self.window_bytes:
+        together = self._together(blocks)
+        if together is None:
             for block in blocks:
                 if len(blocks) > 1:
                     self._warp([block], dem, area, tile)
                 else:
                     self._warp_cells(block, dem, area, tile)
             return
-        window = _window(self.source, int(left), int(top), int(right), int(bottom))
+        window = _window(self.source, *together)
         for block in blocks:
             self._warp_block(block, window, dem, tile.target(block, area))
+
+    def _together(self, blocks: list[OutputBlock]) -> tuple[int, int, int, int] | None:
+        """Return the window of the source under some blocks; None where it is too large for the memory."""
+        windows = np.array([block.window for block in blocks])
+        left, top = (int(side) for side in windows[:, :2].min(axis=0))
+        right, bottom = (int(side) for side in windows[:, 2:].max(axis=0))
+        size = (right - left) * (bottom - top) * self.source.count * self.source.dtype.itemsize
+        return (left, top, right, bottom) if size <= self.window_bytes else None
 
     def _warp_cells(self, block: OutputBlock, dem: DemWindow, area: tuple[int, int, int, int], tile: _Tile) -> None:
         """Make a block whose window of the source is too large for the memory, one cell of its lattice at a time."""

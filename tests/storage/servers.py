@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import http.client
 import http.server
 import random
 import threading
 import time
+import urllib.parse
 import urllib.request
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -19,27 +21,44 @@ import pytest
 
 
 class PublicFolder:
-    """A folder behind HTTP: ranges, ETags that are MD5, and what is asked for, counted.
+    """A folder behind HTTP: ranges, ETags that are MD5, and what is asked for, counted; for reading also a store of S3.
 
-    `faults` maps a path to a function (content, number of the request) -> content, status or None for the true answer.
+    `faults` maps a path to a function (content, number of the request) -> content, status or None for the true answer;
+    every answer takes `delay` seconds more.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, delay: float = 0.0) -> None:
+        self.folder, self.delay = folder, delay
         self.asked: Counter[str] = Counter()
         self.sent = 0
+        self.times: list[tuple[float, float]] = []
         self.faults: dict[str, Callable[[bytes, int], bytes | int | None]] = {}
+        self._content = functools.cache(_content_of)
 
     address = ""
 
+    @property
+    def rounds(self) -> float:
+        """How often somebody waited for an answer: the time in which one was under way, in delays."""
+        busy = until = 0.0
+        for begin, end in sorted(self.times):
+            busy += max(0.0, end - max(begin, until))
+            until = max(until, end)
+        return busy / self.delay
+
     def answer(self, handler: http.server.BaseHTTPRequestHandler) -> None:
-        name = handler.path.lstrip("/").partition("?")[0]
+        begin = time.monotonic()
+        time.sleep(self.delay)
+        self.times.append((begin, time.monotonic()))
+        name, _, query = handler.path.lstrip("/").partition("?")
         self.asked[name] += 1
+        asked_for = urllib.parse.parse_qs(query)
+        if "list-type" in asked_for or "delimiter" in asked_for:
+            return self._say(handler, 200, self._listing(name.strip("/"), asked_for.get("prefix", [""])[0]))
         path = self.folder / name
         if not path.is_file():
             return self._say(handler, 404, b"")
-        data = path.read_bytes()
-        tag = hashlib.md5(data).hexdigest()
+        data, tag = self._content(path, path.stat().st_mtime_ns)
         fault = self.faults.get(name)
         changed = fault(data, self.asked[name]) if fault is not None else None
         if isinstance(changed, int):
@@ -56,6 +75,21 @@ class PublicFolder:
             extra["Content-Range"] = f"bytes {begin}-{end}/{len(data)}"
             status, data = 206, data[begin : end + 1]
         self._say(handler, status, data, extra)
+
+    def _listing(self, bucket: str, prefix: str) -> bytes:
+        """Return what S3 says of the objects in a folder."""
+        folder = self.folder / bucket / prefix
+        objects = [path for path in sorted(folder.iterdir()) if path.is_file()] if folder.is_dir() else []
+        contents = "".join(
+            f"<Contents><Key>{prefix}{path.name}</Key><Size>{path.stat().st_size}</Size>"
+            "<LastModified>2015-10-21T07:28:00.000Z</LastModified></Contents>"
+            for path in objects
+        )
+        return (
+            '<ListBucketResult xmlns="http://s3.amazonaws.com/doc/2006-03-01/">'
+            f"<Name>{bucket}</Name><Prefix>{prefix}</Prefix><IsTruncated>false</IsTruncated>{contents}"
+            "</ListBucketResult>"
+        ).encode()
 
     def _say(
         self, handler: http.server.BaseHTTPRequestHandler, status: int, data: bytes, extra: dict[str, str] | None = None
@@ -90,6 +124,7 @@ def _running(served: Any) -> Iterator[Any]:
 
     class Server(http.server.ThreadingHTTPServer):
         daemon_threads = True
+        request_queue_size = 128  # who finds no place in it tries again after a second
 
         def handle_error(self, *_: Any) -> None:
             """A client that has gone, or a connection that was cut on purpose."""
@@ -105,10 +140,15 @@ def _running(served: Any) -> Iterator[Any]:
             thread.join()
 
 
+def _content_of(path: Path, _: int) -> tuple[bytes, str]:
+    data = path.read_bytes()
+    return data, hashlib.md5(data).hexdigest()
+
+
 @contextmanager
-def serving(folder: Path) -> Iterator[PublicFolder]:
+def serving(folder: Path, delay: float = 0.0) -> Iterator[PublicFolder]:
     """Serve a folder on the loopback for the length of a block."""
-    with _running(PublicFolder(folder)) as public:
+    with _running(PublicFolder(folder, delay)) as public:
         yield public
 
 

@@ -21,6 +21,7 @@ from typing import Any
 
 from ortho_pipeline.errors import InputError, StorageError
 from ortho_pipeline.files.locations import require_network
+from ortho_pipeline.files.traffic import count
 
 #: Kinds of address.
 SCHEMES = ("https", "http", "s3", "gs", "az")
@@ -134,6 +135,7 @@ class Objects:
                 digests = _Digests()
                 taken = take(digests.through(result.stream(min_chunk_size=_CHUNK), limit))
                 content = digests.content(result.meta["e_tag"])
+                count(content.size)
                 wrong = _difference(content, result.meta)
             if not wrong:
                 return taken, content

@@ -1,0 +1,1 @@
+"""Rasters on other machines: their windows are read before their turn."""
