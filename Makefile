@@ -7,8 +7,8 @@
 #   make check    formatting, lint, types, tests
 #   make fuzz     read damaged files with every reader (N=100000 of each, READER=name for one, KEEP=folder for results)
 #   make bench    speed and memory against gdalwarp, speed of adjustments and of many scenes
-#   make docs     the documentation as a site in out/site, links checked
-#   make images   draw the pictures of README.md, docs/measure.md and docs/report.md again (Chromium)
+#   make docs     do the tutorials and draw their pictures, then the documentation as a site in out/site, links checked
+#   make images   draw all pictures again: README.md, docs/measure.md, docs/report.md, the tutorials (Chromium)
 #   make clean    remove .venv, caches and out/
 #
 # PYTHON=python3.12     the interpreter that .venv is made from (3.11 or newer)
@@ -79,13 +79,15 @@ bench: setup
 	$(BIN)/python benchmarks/measure.py
 
 docs: setup
-	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@$(BIN)/python docs/make_tutorial_images.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	echo "Site:    $(CURDIR)/out/site/index.html"
 
 images: setup
 	@$(BIN)/python docs/make_images.py
 	$(BIN)/python docs/make_measure_images.py
 	$(BIN)/python docs/make_report_images.py
+	$(BIN)/python docs/make_tutorial_images.py
 
 clean:
 	rm -rf $(VENV) out build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache

@@ -45,12 +45,15 @@ HEIGHTS = (650.0, 1350.0)
 #: Ellipsoidal height of the lake and rise of the hills, metres.
 LAKE_LEVEL = 700.0
 RELIEF = 420.0
-SEEDS = {"terrain": 1, "landscape": 7, "image noise": 11, "points": 5}
+SEEDS = {"terrain": 1, "landscape": 7, "image noise": 11, "points": 5, "reference noise": 13}
 #: Measured minus predicted by the delivered RPC, in the middle of the image, pixels; and its growth per row.
 BIAS = {"col": 6.3, "row": -4.1, "col_per_row": 2.0e-4, "row_per_row": -1.2e-4}
 SIGMA_IMAGE = 0.15
 SIGMA_GROUND = 0.10
 NOISE_DN = 4.0
+#: The orthoimage that somebody else made: its pixel and by how far it lies off (east, north), metres; its own sun.
+REFERENCE_PIXEL, REFERENCE_OFF = 5.0, (3.0, -2.0)
+REFERENCE_SUN = {"sun_azimuth_deg": 158.0, "sun_elevation_deg": 38.0}
 DEM_STEP = 20.0
 DEM_MARGIN = 400.0
 EGM96 = "EPSG:5773"
@@ -81,6 +84,7 @@ def main(folder: Path) -> None:
     delivered = vendor_rpc(camera)
     write_rpc_txt(delivered.rpc, folder / "scene_RPC.TXT")
     write_dem(camera, terrain, folder / "dem.tif")
+    write_reference(camera, terrain, folder / "reference.tif")
     points = simulate_points(camera, terrain, sigma_image=SIGMA_IMAGE, sigma_ground=SIGMA_GROUND, seed=SEEDS["points"])
     delivered_points = as_delivered(points.measured)
     write_points(delivered_points, folder / "gcps.geojson")
@@ -124,15 +128,43 @@ def write_scene(image: np.ndarray, path: Path) -> None:
         dataset = None
 
 
-def write_dem(camera: LineScanner, terrain: Terrain, path: Path) -> None:
-    """Write the terrain as a DEM of heights above the EGM96 geoid, which its compound CRS declares."""
+def write_reference(camera: LineScanner, terrain: Terrain, path: Path) -> None:
+    """Write an orthoimage of the place with another sun, contrast and pixel, that lies off by `REFERENCE_OFF`."""
+    west, north, cols, rows = grid_over(camera, terrain, 100.0, REFERENCE_PIXEL)
+    landscape = Landscape(terrain, REFERENCE_PIXEL, seed=SEEDS["landscape"], **REFERENCE_SUN)
+    x, y = centres(west, north, cols, rows, REFERENCE_PIXEL)
+    # What it shows at a place lies elsewhere in truth.
+    brightness = landscape(np.stack([x.ravel() - REFERENCE_OFF[0], y.ravel() - REFERENCE_OFF[1]], axis=1))
+    noise = np.random.default_rng(SEEDS["reference noise"]).normal(0.0, 3.0, x.shape)
+    values = np.clip(np.round(255 * np.sqrt(brightness.reshape(x.shape)) + noise), 1, 255).astype(np.uint8)
+    with whole_or_nothing(path) as temporary:
+        options = ["COMPRESS=DEFLATE", "ZLEVEL=9", "TILED=YES"]
+        dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), cols, rows, 1, gdal.GDT_Byte, options)
+        dataset.SetGeoTransform((west, REFERENCE_PIXEL, 0.0, north, 0.0, -REFERENCE_PIXEL))
+        dataset.SetProjection(pyproj.CRS(MAP_CRS).to_wkt())
+        dataset.GetRasterBand(1).WriteArray(values)
+        dataset = None
+
+
+def grid_over(camera: LineScanner, terrain: Terrain, margin: float, step: float) -> tuple[float, float, int, int]:
+    """Return west, north, columns and rows of a grid over what the camera is meant for, and a margin in metres."""
     centre, half = camera.domain
     corners = [centre[:2] + half[:2] * (sx, sy) for sx in (-1, 1) for sy in (-1, 1)]
     xy = terrain.xy(*np.array(corners).T)
-    west, south = np.floor((xy.min(axis=0) - DEM_MARGIN) / DEM_STEP) * DEM_STEP
-    cols, rows = np.ceil((xy.max(axis=0) + DEM_MARGIN - (west, south)) / DEM_STEP).astype(int).tolist()
-    north = south + rows * DEM_STEP
-    x, y = np.meshgrid(west + DEM_STEP * (np.arange(cols) + 0.5), north - DEM_STEP * (np.arange(rows) + 0.5))
+    west, south = (np.floor((xy.min(axis=0) - margin) / step) * step).tolist()
+    cols, rows = np.ceil((xy.max(axis=0) + margin - (west, south)) / step).astype(int).tolist()
+    return west, south + rows * step, cols, rows
+
+
+def centres(west: float, north: float, cols: int, rows: int, step: float) -> list[np.ndarray]:
+    """Return map coordinates of the centres of a grid's pixels."""
+    return np.meshgrid(west + step * (np.arange(cols) + 0.5), north - step * (np.arange(rows) + 0.5))
+
+
+def write_dem(camera: LineScanner, terrain: Terrain, path: Path) -> None:
+    """Write the terrain as a DEM of heights above the EGM96 geoid, which its compound CRS declares."""
+    west, north, cols, rows = grid_over(camera, terrain, DEM_MARGIN, DEM_STEP)
+    x, y = centres(west, north, cols, rows, DEM_STEP)
     posts = np.stack([x.ravel(), y.ravel()], axis=1)
     lon, lat = pyproj.Transformer.from_crs(MAP_CRS, "EPSG:4326", always_xy=True).transform(*posts.T)
     heights = terrain.heights(posts) - Vertical.parse("egm96").undulation(lon, lat)

@@ -21,7 +21,11 @@ PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("samp
 OPTIONS = doctest.NORMALIZE_WHITESPACE
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if ">>> " in page.read_text()], ids=lambda page: page.name)
+#: Tutorials are run by tests/test_tutorials.py.
+WITH_PYTHON = [page for page in PAGES if ">>> " in page.read_text() and page.parent.name != "tutorials"]
+
+
+@pytest.mark.parametrize("page", WITH_PYTHON, ids=lambda page: page.name)
 def test_python_examples(page, tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     done = doctest.testfile(str(page), module_relative=False, globs={"out": tmp_path}, optionflags=OPTIONS)
@@ -36,9 +40,10 @@ def test_every_public_name_is_on_the_page():
 
 
 def commands(page: Path) -> list[str]:
-    """Return the lines of code blocks that start with `ortho`, continued lines joined."""
+    """Return the lines of code blocks that start with `ortho`, continued lines joined; sessions are run elsewhere."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
-    blocks = re.findall(r"^```(?:\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    found = re.findall(r"^```([^\n`]*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    blocks = [block for language, block in found if language != "console"]
     return [line.strip() for block in blocks for line in block.splitlines() if line.strip().startswith("ortho ")]
 
 

@@ -133,6 +133,33 @@ class Points:
             twice = sorted({name for name in self.ids if self.ids.count(name) > 1})
             raise InputError(f"the id {twice[0]!r} stands twice", file=self.source or None, field="id")
 
+    @classmethod
+    def of(
+        cls, image: ArrayLike, ground: ArrayLike, crs: str | pyproj.CRS, *, ids: Sequence[str] | None = None,
+        roles: str | ArrayLike = "control", sigma_image: ArrayLike = DEFAULT_SIGMA_IMAGE, sigma_ground: ArrayLike = 0.0,
+    ) -> Points:  # fmt: skip
+        """Make points of arrays: `image` ``(N, 2)`` from the outer corner of the first pixel, `ground` ``(N, 3)``.
+
+        The rest is one value for all points or one for each; without `ids` points are numbered from 1.
+
+        Raises
+        ------
+        InputError
+            If the shapes do not agree, or `crs` is none.
+        """
+        image = np.asarray(image, dtype=float)
+        count = len(image)
+        return cls(
+            ids=tuple(ids) if ids is not None else tuple(str(k + 1) for k in range(count)),
+            image=image,
+            ground=np.asarray(ground, dtype=float),
+            roles=np.broadcast_to(np.asarray(roles), (count,)),
+            sigma_image=np.broadcast_to(np.asarray(sigma_image, dtype=float), (count,)),
+            sigma_ground=np.broadcast_to(np.asarray(sigma_ground, dtype=float), (count, 3)),
+            crs=parse_crs(crs),
+            source="arrays",
+        )
+
     def __repr__(self) -> str:
         roles = ", ".join(f"{(self.roles == role).sum()} {role}" for role in ROLES if (self.roles == role).any())
         return f"<{counted(len(self.ids), 'point')}: {roles or 'none'}; {self.crs.name}; {self.source}>"

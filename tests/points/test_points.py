@@ -454,3 +454,17 @@ def test_real_quickbird_points(real: Path) -> None:
     # Points outside of the image are legal.
     assert (points.image < 0).any()
     assert read_table(real / "orthority/rpc/gcps.geojson").format == "GeoJSON"
+
+
+def test_points_of_arrays_are_those_of_a_file(tmp_path):
+    image, ground = [[10.5, 20.25], [30.0, 40.0]], [[33.0, 39.0, 850.0], [33.1, 39.1, np.nan]]
+    points = Points.of(image, ground, "EPSG:4979", roles=["control", "check"], sigma_image=0.3, sigma_ground=0.2)
+    assert points.ids == ("1", "2")
+    write_points(points, tmp_path / "points.csv")
+    again = read_points(tmp_path / "points.csv")
+    for name in ("image", "ground", "roles", "sigma_image", "sigma_ground"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(points, name))
+    with pytest.raises(InputError, match="shape"):
+        Points.of(image, ground[:1], "EPSG:4979")
+    with pytest.raises(InputError, match="twice"):
+        Points.of(image, ground, "EPSG:4979", ids=["a", "a"])
