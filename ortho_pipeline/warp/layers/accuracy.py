@@ -46,7 +46,9 @@ BANDS = ("sigma_e", "sigma_n", "rho", "ce90")
 #: Output pixels per pixel of the layer, per side.
 STEP = 16
 #: Side of a tile of the layer, and spacings of its nodes, tried one after the other (pixels of the layer).
-_TILE, _SPACINGS = 256, (64, 16, 4)
+_TILE, _SPACINGS = 512, (64, 16, 4)
+#: Side of a tile whose every pixel is a node.
+_EXACT_TILE = 128
 #: A standard deviation is interpolated to this part of itself, at so many places that are tried.
 _TOLERANCE, _PROBES = 0.005, 200
 #: Heights at which a node is exact.
@@ -250,8 +252,12 @@ def write_accuracy(
 
 
 def overviews(grid: Grid) -> dict[str, str]:
-    """Return creation options of a layer: a small one needs no overviews, which take as long as the pixels."""
-    return {"OVERVIEWS": "NONE"} if max(grid.width, grid.height) <= _SMALL else {"OVERVIEW_RESAMPLING": "NEAREST"}
+    """Return creation options of a layer: a small one needs no overviews, which take as long as the pixels.
+
+    Nor has it large blocks, which reach beyond its sides.
+    """
+    small = max(grid.width, grid.height) <= _SMALL
+    return {"OVERVIEWS": "NONE", "BLOCKSIZE": "128"} if small else {"OVERVIEW_RESAMPLING": "NEAREST"}
 
 
 def tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
@@ -342,13 +348,25 @@ class _Layer:
 
     def make(self, left: int, top: int, width: int, height: int) -> NDArray[np.float32]:
         """Return the bands ``(4, height, width)`` of a tile, and count it in."""
-        spacing = self.spacing
-        nodes, samples = self._nodes(left, top, width, height, spacing)
-        if not np.isfinite(nodes).all():
-            # Where the model ends between nodes, every pixel is one.
-            spacing = 1
-            nodes, samples = self._nodes(left, top, width, height, spacing)
         bands = np.full((len(BANDS), height, width), np.nan, dtype=np.float32)
+        self._fill(left, top, self.spacing, bands)
+        self._count(left, top, bands)
+        return _rounded(bands)
+
+    def _fill(self, left: int, top: int, spacing: int, bands: NDArray[np.float32]) -> None:
+        """Fill the bands ``(4, height, width)`` of a tile."""
+        _, height, width = bands.shape
+        if spacing == 1 and max(width, height) > _EXACT_TILE:
+            for column in range(0, width, _EXACT_TILE):
+                for row in range(0, height, _EXACT_TILE):
+                    part = bands[:, row : row + _EXACT_TILE, column : column + _EXACT_TILE]
+                    self._fill(left + column, top + row, spacing, part)
+            return
+        nodes, samples = self._nodes(left, top, width, height, spacing)
+        if spacing > 1 and not np.isfinite(nodes).all():
+            # Where the model ends between nodes, every pixel is one.
+            self._fill(left, top, 1, bands)
+            return
         for row, column, nj, ni in self._pieces(samples, height, width, spacing):
             j, i = row // spacing, column // spacing
             part = (slice(j, j + -(-nj // spacing) + 1), slice(i, i + -(-ni // spacing) + 1))
@@ -358,8 +376,6 @@ class _Layer:
                 self.budget.even, (float(self.size[0]), float(self.size[1])), radii(), bands[(slice(None), *here)],
                 self.totals,
             )  # fmt: skip
-        self._count(left, top, bands)
-        return _rounded(bands)
 
     def _pieces(self, samples: Array, height: int, width: int, spacing: int) -> Iterator[tuple[int, int, int, int]]:
         """Yield the pieces (row, column, rows, columns) of a tile whose windows of heights fit into the memory."""

@@ -54,6 +54,7 @@ def fill(lattice: Nodes, heights: Heights, even: float, size: Any, radii: Any, b
     begin, grow = np.empty((3, _FIELDS)), np.empty((3, _FIELDS))
     place, way = np.empty(samples.shape[2:]), np.empty(samples.shape[2:])
     values, ticks, scaled = np.empty((_FIELDS, spacing)), np.arange(spacing) / spacing, np.empty(spacing)
+    variances, ellipses = np.zeros(spacing), np.empty((5, spacing))
     for row in range(height):
         j, fy = row // spacing, (row % spacing) / spacing
         for i in range((width - 1) // spacing + 1):
@@ -65,10 +66,14 @@ def fill(lattice: Nodes, heights: Heights, even: float, size: Any, radii: Any, b
             _scaled_heights(lattice, heights.dem, place, way, ticks, scaled, count)
             for f in range(_FIELDS):
                 _quadratic(begin, grow, f, ticks, scaled, values[f], count)
+            _height_variances(heights, place, way, ticks, variances, count)
+            _ellipses(values, variances, even, ellipses, count)
             for c in range(count):
                 if 0.0 <= values[8, c] <= size[0] and 0.0 <= values[9, c] <= size[1]:
-                    variance = _height_variance(heights, place, way, ticks[c])
-                    _count(values, c, variance, even, radii, bands, row, first + c, totals)
+                    totals[7] += 1.0
+                    if ellipses[0, c] + ellipses[1, c] + ellipses[2, c] < np.inf:
+                        _put(ellipses, c, radii, bands, row, first + c)
+                        _count(values, c, variances[c], even, totals)
 
 
 @inlined
@@ -101,44 +106,53 @@ def _quadratic(begin, grow, f, ticks, scaled, out, count):
 
 
 @inlined
-def _height_variance(heights, place, way, fx):
-    """Return the variance of a height, its datum included; NaN where it is not known."""
+def _height_variances(heights, place, way, ticks, out, count):
+    """Fill the variances of the heights of a row of a cell, their datum included; NaN where one is not known."""
     sigma, deviation = heights.sigma, heights.constant
-    if deviation < 0.0:
-        u, v = place[0, 1] + way[0, 1] * fx, place[1, 1] + way[1, 1] * fx
-        deviation = dem_height_at(sigma.heights, u, v, sigma.left, sigma.top, False)
-    return deviation * deviation + heights.datum
+    for c in range(count):
+        if heights.constant < 0.0:
+            u, v = place[0, 1] + way[0, 1] * ticks[c], place[1, 1] + way[1, 1] * ticks[c]
+            deviation = dem_height_at(sigma.heights, u, v, sigma.left, sigma.top, False)
+        out[c] = deviation * deviation + heights.datum
 
 
 @inlined
-def _count(values, c, variance, even, radii, bands, row, column, totals):
-    """Put the accuracy of a pixel into the bands and into what they come to together."""
-    totals[7] += 1.0
-    east, north = values[3, c], values[4, c]
-    ee = values[0, c] + east * east * variance + even + values[5, c]
-    nn = values[1, c] + north * north * variance + even + values[6, c]
-    en = values[2, c] + east * north * variance + values[7, c]
-    if ee + nn + en < np.inf:
-        _put(ee, nn, en, radii, radii.size - 1, bands, row, column)
-        totals[0] += values[0, c] + values[1, c]
-        totals[1] += (east * east + north * north) * variance
-        totals[2] += 2.0 * even
-        totals[3] += values[5, c] + values[6, c]
-        totals[4] += ee
-        totals[5] += nn
-        totals[6] += 1.0
+def _ellipses(values, variances, even, out, count):
+    """Fill ee, nn, en, the larger half axis and the smaller in parts of it, of a row of a cell; without a branch."""
+    for c in range(count):
+        east, north, variance = values[3, c], values[4, c], variances[c]
+        ee = values[0, c] + east * east * variance + even + values[5, c]
+        nn = values[1, c] + north * north * variance + even + values[6, c]
+        en = values[2, c] + east * north * variance + values[7, c]
+        middle, half = 0.5 * (ee + nn), np.sqrt(0.25 * (ee - nn) * (ee - nn) + en * en)
+        large = middle + half
+        out[0, c], out[1, c], out[2, c] = ee, nn, en
+        out[3, c], out[4, c] = np.sqrt(large), np.sqrt(max(middle - half, 0.0) / max(large, 1e-300))
 
 
 @inlined
-def _put(ee, nn, en, radii, last, bands, row, column):
-    middle = 0.5 * (ee + nn)
-    half = np.sqrt(0.25 * (ee - nn) * (ee - nn) + en * en)
-    larger, smaller = np.sqrt(middle + half), np.sqrt(max(middle - half, 0.0))
-    place = last * (smaller / larger if larger > 0.0 else 1.0)
+def _put(ellipses, c, radii, bands, row, column):
+    """Put the accuracy of a pixel into the bands."""
+    east, north, covariance = np.sqrt(ellipses[0, c]), np.sqrt(ellipses[1, c]), ellipses[2, c]
+    last = radii.size - 1
+    place = last * (ellipses[4, c] if ellipses[3, c] > 0.0 else 1.0)
     k = min(int(place), last - 1)
-    bands[0, row, column], bands[1, row, column] = np.sqrt(ee), np.sqrt(nn)
-    bands[2, row, column] = en / np.sqrt(ee * nn) if ee * nn > 0.0 else 0.0
-    bands[3, row, column] = larger * (radii[k] + (radii[k + 1] - radii[k]) * (place - k))
+    bands[0, row, column], bands[1, row, column] = east, north
+    bands[2, row, column] = covariance / (east * north) if east * north > 0.0 else 0.0
+    bands[3, row, column] = ellipses[3, c] * (radii[k] + (radii[k + 1] - radii[k]) * (place - k))
+
+
+@inlined
+def _count(values, c, variance, even, totals):
+    """Count the variances of a pixel into what all come to together."""
+    east, north = values[3, c] * values[3, c] * variance, values[4, c] * values[4, c] * variance
+    totals[0] += values[0, c] + values[1, c]
+    totals[1] += east + north
+    totals[2] += 2.0 * even
+    totals[3] += values[5, c] + values[6, c]
+    totals[4] += values[0, c] + east + even + values[5, c]
+    totals[5] += values[1, c] + north + even + values[6, c]
+    totals[6] += 1.0
 
 
 @compiled
