@@ -224,7 +224,9 @@ class DemFile:
                 remedy="copy the DEM again: it is damaged",
             ) from error
         scale, offset = (1.0 if band.GetScale() is None else band.GetScale()), band.GetOffset() or 0.0
-        heights = raw.astype(float) * (scale * metres_per_unit) + offset * metres_per_unit
+        heights = raw.astype(float)
+        if (scale * metres_per_unit, offset) != (1.0, 0.0):
+            heights = heights * (scale * metres_per_unit) + offset * metres_per_unit
         with np.errstate(invalid="ignore"):
             void = ~((heights >= SANE_HEIGHTS[0]) & (heights <= SANE_HEIGHTS[1]))
         nodata = band.GetNoDataValue()

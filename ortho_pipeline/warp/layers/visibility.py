@@ -11,8 +11,9 @@ With cubic interpolation of the heights of an ortho, the surface looked over is 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,13 @@ _EARTH = 6_371_000.0
 _PIECE = 64
 #: So often the window of a piece grows, because higher terrain was found in it.
 _WIDER = 12
+#: Memory (B) per sample of the terrain that is looked over.
+_CELL_BYTES = 48
+#: Side (px) of the regions of an ortho that are first asked whether anything in them is steep, if so many pixels or
+#: more come to a sample.
+_REGION, _PIXELS_PER_SAMPLE = 4096, 16
+#: Lines count as below terrain only where they are by more than rounding (m).
+_SLACK = 1e-3
 
 Classes = NDArray[np.uint8]
 
@@ -67,6 +75,8 @@ class Visibility:
         low, high = heights
         self._middle, self._half = (low + high) / 2, max((high - low) / 2, 1.0)
         self._sampler = surface.sampler(sight.grid.crs)
+        self._range = 0.0
+        self._calm: dict[tuple[int, int], bool] = {}
 
     def look(self, left: int, top: int, width: int, height: int) -> Classes:
         """Return `CLEAR`, `HIDDEN` or `VOID` (no height) of a window of the ortho ``(height, width)``.
@@ -74,9 +84,28 @@ class Visibility:
         A window begins at a multiple of `FAR`.
         """
         out = np.zeros((height, width), dtype=np.uint8)
-        if isinstance(self._surface, DemSurface):
+        if isinstance(self._surface, DemSurface) and not self._is_calm(left // _REGION, top // _REGION):
             self._part(self._rays(left, top, width, height), 0, 0, out)
         return out
+
+    def _is_calm(self, column: int, row: int) -> bool:
+        """Tell whether nothing in a region of the ortho has terrain as steep as a line, nor a void.
+
+        It is the cheapest look at the tiles of most terrain. Samples that are nearly as dense as pixels are not looked
+        at twice.
+        """
+        known = self._calm.get((column, row))
+        if known is None:
+            grid, left, top = self._sight.grid, column * _REGION, row * _REGION
+            width, height = min(_REGION, grid.width - left), min(_REGION, grid.height - top)
+            rays = self._rays(left, top, width, height)
+            ends = _extremes(rays.slopes)
+            most = min(self._bytes / _CELL_BYTES, width * height / _PIXELS_PER_SAMPLE)
+            terrain = self._terrain(rays.samples.reshape(-1, 2), ends, most)
+            known = terrain is not None and not terrain.void and not kernel.is_steep(terrain.heights, *ends)
+            # Two threads that ask at once both find out.
+            self._calm[column, row] = known
+        return known
 
     # -- lines of sight ----------------------------------------------------------------------------------------------
 
@@ -124,45 +153,89 @@ class Visibility:
     def _part(self, rays: kernel.Rays, row: int, column: int, out: Classes) -> None:
         """Fill a part of a tile, which begins with a row and a column of it; in halves where memory is short."""
         height, width = out.shape
-        relief = self._relief(rays, row, column, height, width, least=max(height, width) <= _PIECE)
-        if relief is not None:
-            if relief.highest > -np.inf or np.isnan(relief.heights).any():
-                kernel.look(rays, relief, row, column, out)
-            return
-        half = max(_PIECE, max(height, width) // 2 // _PIECE * _PIECE)
-        for j in range(0, height, half):
-            for i in range(0, width, half):
-                self._part(rays, row + j, column + i, out[j : j + half, i : i + half])
-
-    def _relief(
-        self, rays: kernel.Rays, row: int, column: int, height: int, width: int, *, least: bool
-    ) -> kernel.Relief | None:
-        """Return the terrain that lines from a part of a tile may meet; None if that is too much for the memory."""
         near, far = (
             tuple(slice(at // step, -(-(at + side) // step) + 1) for at, side in ((row, height), (column, width)))
             for step in (NEAR, FAR)
         )
-        places, ends = rays.samples[near].reshape(-1, 2), _extremes(rays.slopes[far])
-        rise, heights, window = 0.0, None, None
+        slopes = rays.slopes[far]
+        ends = _extremes(slopes)
+        most = math.inf if max(height, width) <= _PIECE else self._bytes / _CELL_BYTES
+        terrain = self._terrain(rays.samples[near].reshape(-1, 2), ends, most)
+        if terrain is None:
+            half = max(_PIECE, max(height, width) // 2 // _PIECE * _PIECE)
+            for j in range(0, height, half):
+                for i in range(0, width, half):
+                    self._part(rays, row + j, column + i, out[j : j + half, i : i + half])
+        elif terrain.high < terrain.low:
+            out[:] = kernel.VOID
+        else:
+            _look(rays, terrain, ends, row, column, out)
+
+    def _terrain(self, places: Array, ends: tuple[Array, Array], most: float) -> _Terrain | None:
+        """Return the terrain that lines from samples ``(n, 2)`` may meet; None if that is more samples than `most`.
+
+        It begins with the range of heights that was found last: the result is the same, but heights are mostly read
+        once.
+        """
+        rise, window, heights = self._range, None, np.empty((0, 0))
+        low, high, void = math.inf, -math.inf, 0
         for _ in range(_WIDER):
-            swept = np.concatenate([places, *(places + rise * end for end in ends)])
-            wanted = self._surface.window_under(swept)
+            wanted = self._surface.window_under(np.concatenate([places, *(places + rise * end for end in ends)]))
             if wanted is None:
-                return _empty()
+                return _Terrain(heights, (0, 0, 0, 0), math.inf, -math.inf, True)
             if wanted != window:
+                left, top, right, bottom = wanted
+                if (right - left) * (bottom - top) > most:
+                    if rise == 0.0 or window is not None:
+                        return None
+                    rise = self._range = 0.0
+                    continue
                 window = wanted
-                if not least and (window[2] - window[0]) * (window[3] - window[1]) * 8 > self._bytes:
-                    return None
-                heights = self._surface.window(window[0], window[1], window[2] - window[0], window[3] - window[1])
-            assert heights is not None
-            if np.isnan(heights).all():
-                return _empty()
-            range_here = float(np.nanmax(heights) - np.nanmin(heights))
-            if range_here <= rise:
+                heights = self._surface.window(left, top, right - left, bottom - top)
+                low, high, void = kernel.extremes(heights)
+            if high - low <= rise:
                 break
-            rise = range_here
+            rise = high - low
         assert window is not None
-        return _relief(np.ascontiguousarray(heights), window, ends)
+        self._range = max(high - low, 0.0)
+        inside = (places >= window[:2]).all() and (places <= np.subtract(window[2:], 1)).all()
+        return _Terrain(heights, window, low, high, void > 0 or not inside)
+
+
+class _Terrain(NamedTuple):
+    """Heights of a window, the least and the greatest, and whether places are without."""
+
+    heights: Array
+    window: Window
+    low: float
+    high: float
+    void: bool
+
+
+def _look(rays: kernel.Rays, terrain: _Terrain, ends: tuple[Array, Array], row: int, column: int, out: Classes) -> None:
+    """Fill a part of a tile, which begins with a row and a column of it, in a terrain that has heights."""
+    heights, (left, top, _, _), low, high, void = terrain
+    if _across(ends):
+        # Compiled code follows lines from row to row.
+        heights, left, top = heights.T, top, left
+        ends = ends[0][::-1], ends[1][::-1]
+        rays = rays._replace(
+            samples=np.ascontiguousarray(rays.samples[..., ::-1]), slopes=np.ascontiguousarray(rays.slopes[..., ::-1])
+        )
+    heights = np.ascontiguousarray(heights)
+    tops = np.empty((heights.shape[0] - 1, heights.shape[1] - 1))
+    squares = np.empty(tuple(-(-side // (1 << kernel.SQUARE_BITS)) for side in tops.shape))
+    highest = float(kernel.find_steep(heights, void, *ends, tops, squares))
+    if highest > -np.inf:
+        above, below = _bounds(heights, tops, highest, ends, high - low, rays.bend)
+    elif void:
+        above, below = np.full(tops.shape, -np.inf), np.full(tops.shape, -np.inf)
+    else:
+        return
+    known = np.empty(tops.shape, dtype=np.uint8)
+    kernel.find_known(heights, above, below, known)
+    relief = kernel.Relief(heights, left, top, tops, squares, above, below, known, highest)
+    kernel.look(rays, relief, row, column, out)
 
 
 def _extremes(slopes: Array) -> tuple[Array, Array]:
@@ -175,40 +248,31 @@ def _extremes(slopes: Array) -> tuple[Array, Array]:
     return low - margin, high + margin
 
 
-def _relief(heights: Array, window: Window, ends: tuple[Array, Array]) -> kernel.Relief:
-    steep = np.empty((heights.shape[0] - 1, heights.shape[1] - 1), dtype=np.bool_)
-    squares = np.empty(tuple(-(-side // (1 << kernel.SQUARE_BITS)) for side in steep.shape))
-    highest = kernel.find_steep(heights, ends[0], ends[1], steep, squares)
-    return kernel.Relief(heights, window[0], window[1], steep, squares, _bounds(squares, ends), float(highest))
+def _across(ends: tuple[Array, Array]) -> bool:
+    """Tell whether lines surely move more across the samples than down."""
+    least = np.where(ends[0] * ends[1] > 0, np.minimum(*np.abs(ends)), 0.0)
+    return bool(least[0] > least[1])
 
 
-def _bounds(squares: Array, ends: tuple[Array, Array]) -> Array:
-    """Return the heights from which on lines of sight in a square meet nothing any more.
+def _bounds(
+    heights: Array, tops: Array, highest: float, ends: tuple[Array, Array], relief: float, bend: float
+) -> tuple[Array, Array]:
+    """Return heights from which on lines of sight in a cell meet nothing any more, and up to which they meet something.
 
-    Lines go along the axis in which they move most; where they may go either way, only the highest of all bounds them.
+    Where lines may go down the rows or up, only the highest of all bounds them.
     """
-    low, high = ends
-    least, most = (
-        np.where(low * high > 0, np.minimum(np.abs(low), np.abs(high)), 0.0),
-        np.maximum(np.abs(low), np.abs(high)),
-    )
-    axis = int(np.argmax(least))
-    if least[axis] == 0.0:
-        return np.full(squares.shape, squares.max())
-    # Rows or columns of squares that a line may move sideways while it crosses one.
-    aside = np.sort([low[1 - axis] / least[axis], high[1 - axis] / least[axis]])
-    first, last = min(0, int(np.floor(aside[0]))), max(0, int(np.ceil(aside[1])))
-    along = np.ascontiguousarray(squares if axis == 0 else squares.T)
-    bounds = np.empty_like(along)
-    forward = 1 if low[axis] > 0 else -1
-    rise = (1 << kernel.SQUARE_BITS) / most[axis]
-    kernel.find_bounds(along, forward, float(rise), first, last, np.empty_like(along), bounds)
-    return np.ascontiguousarray(bounds if axis == 0 else bounds.T)
-
-
-def _empty() -> kernel.Relief:
-    """Return terrain that is void."""
-    none: Any = np.zeros((1, 1), dtype=np.bool_)
-    return kernel.Relief(
-        np.full((2, 2), np.nan), 0, 0, none, np.full((1, 1), -np.inf), np.full((1, 1), -np.inf), -np.inf
-    )
+    (across, down), (across_end, down_end) = ends
+    if down * down_end > 0:
+        slow, fast = sorted((abs(down), abs(down_end)))
+        aside = np.outer([across, across_end], [1 / slow, 1 / fast])
+        middle, spread = (aside.max() + aside.min()) / 2, (aside.max() - aside.min()) / 2
+        if spread < 1.0:
+            forward = 1 if down > 0 else -1
+            slack = bend * relief**2 + _SLACK
+            course = kernel.Course(
+                forward, 1 / fast, 1 / slow, float(middle), float(spread), slack, math.ceil(relief * fast)
+            )
+            above, below = np.empty(tops.shape), np.empty(tops.shape)
+            kernel.find_bounds(course, heights, tops, above, below)
+            return above, below
+    return np.full(tops.shape, highest), np.full(tops.shape, -np.inf)

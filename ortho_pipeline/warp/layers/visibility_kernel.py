@@ -20,6 +20,8 @@ from ortho_pipeline.files.compiled import compiled, inlined
 CLEAR, HIDDEN, VOID = 0, 1, 2
 #: Cells per side of a square that is passed at once, as a power of two.
 SQUARE_BITS = 3
+#: Where cells are as many pixels wide as one in this, the pixels of one are filled at once.
+_WIDE = 0.125
 #: Terrain that rises above a line by less (m) is rounding.
 _ROUNDING = 1e-5
 
@@ -48,64 +50,195 @@ class Rays(NamedTuple):
 
 
 class Relief(NamedTuple):
-    """Heights ``(rows, columns)`` from sample (left, top) on; which cells are steep, and the highest of each square.
+    """Heights ``(rows, columns)`` from sample (left, top) on, and what is steep of their cells.
 
-    A line that is at `bounds` or above somewhere in a square meets no steep cell any more; nor does one at `highest`.
+    Parameters
+    ----------
+    tops : (rows - 1, columns - 1)
+        Highest corners of steep cells, -inf of others.
+    squares : (rows, columns)
+        The highest of the tops of each square.
+    above, below : (rows - 1, columns - 1)
+        Lines at the one height or above it somewhere in a cell meet no steep cell any more; lines at the other or below
+        it meet one.
+    known : (rows - 1, columns - 1)
+        `CLEAR` or `HIDDEN` where all lines from a cell are that; `VOID` where each has to be looked along.
+    highest : float
+        Of all tops.
     """
 
     heights: Any
     left: int
     top: int
-    steep: Any
+    tops: Any
     squares: Any
-    bounds: Any
+    above: Any
+    below: Any
+    known: Any
     highest: float
 
 
-@compiled
-def find_steep(heights: Any, low: Any, high: Any, steep: Any, squares: Any) -> float:
-    """Mark the cells ``(rows - 1, columns - 1)`` that climb faster than some line; return the highest corner of any.
+class Course(NamedTuple):
+    """How the lines of sight of a window go: from row to row, forward (1) or backward (-1).
 
-    The lines go `low` to `high` ``(2,)`` samples per metre upwards. `squares` become the highest corner of the steep
-    cells in each square, -inf where there are none, which is returned too where there is no steep cell. A cell beside
-    a void is not steep.
+    Over a row they rise by `least` to `most` (m), and go `aside` columns farther, or up to `spread` more or less;
+    `slack` (m) is more than what they bend upwards, and rounding. After `reach` rows they are above everything.
+    """
+
+    forward: int
+    least: float
+    most: float
+    aside: float
+    spread: float
+    slack: float
+    reach: float
+
+
+@compiled
+def extremes(heights: Any) -> tuple[float, float, int]:
+    """Return the least and the greatest of heights, infinite where there are none, and how many are void."""
+    least, greatest, void = np.inf, -np.inf, 0
+    for j in range(heights.shape[0]):
+        for i in range(heights.shape[1]):
+            least, greatest = min(least, heights[j, i]), max(greatest, heights[j, i])
+            void += heights[j, i] != heights[j, i]
+    return least, greatest, void
+
+
+@compiled
+def find_steep(heights: Any, void: bool, low: Any, high: Any, tops: Any, squares: Any) -> float:
+    """Find the cells ``(rows - 1, columns - 1)`` that climb faster than some line; return the highest corner of any.
+
+    The lines go `low` to `high` ``(2,)`` samples per metre upwards. `tops` become the highest corners of the steep
+    cells and -inf of others, `squares` the highest of each square; -inf is returned where there is no steep cell.
+    Cells with a void corner are not steep, but those next to them are: a line may come out of a void below terrain.
     """
     squares[:] = -np.inf
     highest = -np.inf
-    for j in range(steep.shape[0]):
-        for i in range(steep.shape[1]):
-            h00, h10, h01, h11 = heights[j, i], heights[j, i + 1], heights[j + 1, i], heights[j + 1, i + 1]
-            across = max(low[0] * (h10 - h00), high[0] * (h10 - h00), low[0] * (h11 - h01), high[0] * (h11 - h01))
-            down = max(low[1] * (h01 - h00), high[1] * (h01 - h00), low[1] * (h11 - h10), high[1] * (h11 - h10))
-            # False beside a void, whichever corner it is.
-            climbs = across + down > 1.0 and h00 + h10 + h01 + h11 < np.inf
-            steep[j, i] = climbs
-            if climbs:
-                top = max(h00, h10, h01, h11)
-                highest = max(highest, top)
+    for j in range(tops.shape[0]):
+        for i in range(tops.shape[1]):
+            tops[j, i] = -np.inf
+            if _climbs(heights, j, i, low, high) or void and _is_beside_void(heights, j, i):
+                top = max(heights[j, i], heights[j, i + 1], heights[j + 1, i], heights[j + 1, i + 1])
+                highest, tops[j, i] = max(highest, top), top
                 square = squares[j >> SQUARE_BITS]
                 square[i >> SQUARE_BITS] = max(square[i >> SQUARE_BITS], top)
     return highest
 
 
-@compiled
-def find_bounds(squares: Any, forward: int, rise: float, first: int, last: int, entered: Any, bounds: Any) -> None:
-    """Fill heights from which on a line in a square ``(rows, columns)`` meets no steep cell any more.
+@inlined
+def _is_beside_void(heights, j, i):
+    """Tell whether a cell without a void corner has a neighbour with one."""
+    void = False
+    for row in range(max(j - 1, 0), min(j + 3, heights.shape[0])):
+        for column in range(max(i - 1, 0), min(i + 3, heights.shape[1])):
+            void |= heights[row, column] != heights[row, column]
+    total = heights[j, i] + heights[j, i + 1] + heights[j + 1, i] + heights[j + 1, i + 1]
+    return void and total < np.inf
 
-    Lines go from column to column, `forward` (1 or -1), rise at least `rise` (m) over each, and by then are between
-    `first` and `last` rows farther. `entered` becomes the same for lines that enter the square from the column before.
+
+@compiled
+def is_steep(heights: Any, low: Any, high: Any) -> bool:
+    """Tell whether any cell climbs faster than some line, as `find_steep` has it."""
+    found = False
+    for j in range(heights.shape[0] - 1):
+        for i in range(heights.shape[1] - 1):
+            found |= _climbs(heights, j, i, low, high)
+    return found
+
+
+@inlined
+def _climbs(heights, j, i, low, high):
+    """Tell whether a cell climbs faster than some line; false beside a void, whichever corner it is."""
+    h00, h10, h01, h11 = heights[j, i], heights[j, i + 1], heights[j + 1, i], heights[j + 1, i + 1]
+    across = max(low[0] * (h10 - h00), high[0] * (h10 - h00), low[0] * (h11 - h01), high[0] * (h11 - h01))
+    down = max(low[1] * (h01 - h00), high[1] * (h01 - h00), low[1] * (h11 - h10), high[1] * (h11 - h10))
+    return across + down > 1.0 and h00 + h10 + h01 + h11 < np.inf
+
+
+@compiled
+def find_bounds(course: Course, heights: Any, tops: Any, above: Any, below: Any) -> None:
+    """Fill the heights of cells from which on lines meet no steep cell any more, and those up to which they meet one.
+
+    What stands in the way is handed on from row to row along columns that move with the lines. A line that begins in a
+    cell of such a column stays within `pad` cells of it: what a column moves in whole cells differs from what a line
+    does by less than one, begin and end may be anywhere in their rows, and its direction may be another by the spread.
+    Where that comes to more than a cell, the neighbours are taken in each time it has come to one.
     """
-    rows, columns = squares.shape
-    for step in range(columns):
-        i = columns - 1 - step if forward > 0 else step
-        for j in range(rows):
-            here, farther = -np.inf, -np.inf
-            for row in range(max(j + first, 0), min(j + last, rows - 1) + 1):
-                here = max(here, squares[row, i])
-                if step > 0:
-                    farther = max(farther, entered[row, i + forward])
-            bounds[j, i] = max(here, farther)
-            entered[j, i] = max(here, farther - rise)
+    rows, columns = tops.shape
+    forward, least, most, aside, spread, slack, reach = course
+    drift = spread * (reach + 2.0)
+    if drift > 1.0:
+        drift = 1.0 + 2.0 * spread
+    else:
+        spread = 0.0
+    pad = int(np.ceil(1.0 + abs(aside) + drift))
+    moved = int(np.ceil(abs(aside) * rows)) + 1
+    size = columns + 2 * moved
+    high, low, here = np.full(size, -np.inf), np.full(size, -np.inf), np.empty(size)
+    floors = np.empty(columns)
+    for step in range(rows):
+        j = rows - 1 - step if forward > 0 else step
+        # The column of this row that the first one handed on is.
+        offset = int(np.floor(-aside * step)) - moved
+        if step > 0 and int(spread * step) > int(spread * (step - 1)):
+            _take_in_neighbours(high, low, here)
+        _widest(tops[j], offset, pad, here)
+        for i in range(columns):
+            above[j, i] = max(here[i - offset], high[i - offset])
+            below[j, i] = low[i - offset] - most - slack
+        for k in range(size):
+            high[k] = max(here[k], high[k] - least)
+        for i in range(columns):
+            h00, h10, h01, h11 = heights[j, i], heights[j, i + 1], heights[j + 1, i], heights[j + 1, i + 1]
+            floors[i] = min(h00, h10, h01, h11) if h00 + h10 + h01 + h11 < np.inf else -np.inf
+        _lowest(floors, offset, pad, here)
+        for k in range(size):
+            low[k] = max(here[k], low[k]) - most
+
+
+@inlined
+def _take_in_neighbours(high, low, scratch):
+    last = len(high) - 1
+    for k in range(last + 1):
+        scratch[k] = max(high[max(k - 1, 0)], high[k], high[min(k + 1, last)])
+    high[:] = scratch
+    for k in range(last + 1):
+        scratch[k] = min(low[max(k - 1, 0)], low[k], low[min(k + 1, last)])
+    low[:] = scratch
+
+
+@inlined
+def _widest(tops, offset, pad, out):
+    """Fill the highest of the tops within `pad` of each place; the first place is the column `offset`."""
+    out[:] = -np.inf
+    for i in range(len(tops)):
+        if tops[i] > -np.inf:
+            for k in range(max(i - offset - pad, 0), min(i - offset + pad + 1, len(out))):
+                out[k] = max(out[k], tops[i])
+
+
+@inlined
+def _lowest(floors, offset, pad, out):
+    """Fill the lowest of the floors within `pad` of each place, -inf where it is partly outside."""
+    out[:] = -np.inf
+    begin = -offset
+    for i in range(pad, len(floors) - pad):
+        out[begin + i] = floors[i - pad]
+    for shift in range(1 - pad, pad + 1):
+        for i in range(pad, len(floors) - pad):
+            out[begin + i] = min(out[begin + i], floors[i + shift])
+
+
+@compiled
+def find_known(heights: Any, above: Any, below: Any, known: Any) -> None:
+    """Fill `Relief.known`."""
+    for j in range(known.shape[0]):
+        for i in range(known.shape[1]):
+            h00, h10, h01, h11 = heights[j, i], heights[j, i + 1], heights[j + 1, i], heights[j + 1, i + 1]
+            least, most = min(h00, h10, h01, h11), max(h00, h10, h01, h11)
+            found = CLEAR if least >= above[j, i] else (HIDDEN if most <= below[j, i] else VOID)
+            known[j, i] = found if h00 + h10 + h01 + h11 < np.inf else VOID
 
 
 @inlined
@@ -125,12 +258,12 @@ def _rises_above(heights, i, j, x, y, h, across, down, bend, start, end):
 
 
 @inlined
-def _is_hidden(heights, steep, squares, bounds, x, y, h, across, down, bend):
+def _is_hidden(heights, tops, squares, above, below, x, y, h, across, down, bend):
     """Tell whether terrain stands in the way of the line from (x, y) in the window, at the height h.
 
     It goes `across` and `down` samples per metre upwards.
     """
-    rows, columns = steep.shape
+    rows, columns = tops.shape
     i, j, rise = min(int(x), columns - 1), min(int(y), rows - 1), 0.0
     per_column, per_row = 1.0 / across, 1.0 / down
     hidden, going = False, True
@@ -139,25 +272,27 @@ def _is_hidden(heights, steep, squares, bounds, x, y, h, across, down, bend):
         whole = squares[bj, bi] <= h + rise
         first = bi << SQUARE_BITS if whole else i
         last = (bi + 1) << SQUARE_BITS if whole else i + 1
-        above = bj << SQUARE_BITS if whole else j
-        below = (bj + 1) << SQUARE_BITS if whole else j + 1
+        upper = bj << SQUARE_BITS if whole else j
+        lower = (bj + 1) << SQUARE_BITS if whole else j + 1
         side = ((last if across > 0.0 else first) - x) * per_column if across != 0.0 else np.inf
-        end = ((below if down > 0.0 else above) - y) * per_row if down != 0.0 else np.inf
+        end = ((lower if down > 0.0 else upper) - y) * per_row if down != 0.0 else np.inf
         sideways = side <= end
         stop = side if sideways else end
-        if not whole and steep[j, i]:
+        if not whole and tops[j, i] > h + rise:
             hidden = _rises_above(heights, i, j, x, y, h, across, down, bend, rise, stop)
         if sideways:
             i = last if across > 0.0 else first - 1
             if whole:
-                j = min(max(int(y + down * stop), above), below - 1)
+                j = min(max(int(y + down * stop), upper), lower - 1)
         else:
-            j = below if down > 0.0 else above - 1
+            j = lower if down > 0.0 else upper - 1
             if whole:
                 i = min(max(int(x + across * stop), first), last - 1)
         rise = max(rise, stop)
         going = not hidden and 0 <= i < columns and 0 <= j < rows
-        going = going and h + rise < bounds[j >> SQUARE_BITS, i >> SQUARE_BITS]
+        if going:
+            hidden = h + rise <= below[j, i]
+            going = not hidden and h + rise < above[j, i]
     return hidden
 
 
@@ -182,8 +317,9 @@ def _height(heights, x, y):
 def look(rays: Rays, relief: Relief, first_row: int, first_column: int, out: Any) -> None:
     """Fill `out` ``(h, w)``, which begins with a row and a column of the tile, with `CLEAR`, `HIDDEN` or `VOID`."""
     samples, near, slopes, far, middle, half, bend = rays
-    heights, west, north, steep, squares, bounds, highest = relief
+    heights, west, north, tops, squares, above, below, known, highest = relief
     height, width = out.shape
+    rows, columns = tops.shape
     count = slopes.shape[2]
     begin, grow = np.empty((count, 2)), np.empty((count, 2))
     for line in range(height):
@@ -205,23 +341,41 @@ def look(rays: Rays, relief: Relief, first_row: int, first_column: int, out: Any
             u0, u1 = u0 + (samples[ny + 1, nx, 0] - u0) * fy, u1 + (samples[ny + 1, nx + 1, 0] - u1) * fy
             v0, v1 = v0 + (samples[ny + 1, nx, 1] - v0) * fy, v1 + (samples[ny + 1, nx + 1, 1] - v1) * fy
             du, dv = (u1 - u0) / near, (v1 - v0) / near
-            for c in range(column, stop):
+            wide = max(abs(du), abs(dv)) < _WIDE
+            c = column
+            while c < stop:
                 x, y = u0 + du * (c - nx * near) - west, v0 + dv * (c - nx * near) - north
-                h = _height(heights, x, y)
+                i, j = int(x), int(y)
                 found = VOID
-                if h < highest:
-                    found = CLEAR
-                    i, j = min(int(x), steep.shape[1] - 1), min(int(y), steep.shape[0] - 1)
-                    if not h < bounds[j >> SQUARE_BITS, i >> SQUARE_BITS]:
-                        out[line, c - first_column] = found
-                        continue
-                    t, at, across, down = (h - middle) / half, c - rx * far, 0.0, 0.0
-                    for k in range(count - 1, -1, -1):
-                        across = across * t + (begin[k, 0] + grow[k, 0] * at)
-                        down = down * t + (begin[k, 1] + grow[k, 1] * at)
-                    hidden = _is_hidden(heights, steep, squares, bounds, x, y, h, across, down, bend)
-                    found = HIDDEN if hidden else CLEAR
-                elif h < np.inf:
-                    found = CLEAR
+                if 0.0 <= x < columns and 0.0 <= y < rows:
+                    found = known[j, i]
+                    if wide and found != VOID:
+                        end = min(c + int(_pixels_within(x, y, i, j, du, dv)), stop - 1)
+                        while c < end:
+                            out[line, c - first_column] = found
+                            c += 1
+                if found == VOID:
+                    h = _height(heights, x, y)
+                    found = CLEAR if h < np.inf else VOID
+                    if h < highest:
+                        i, j = min(i, columns - 1), min(j, rows - 1)
+                        if h <= below[j, i]:
+                            found = HIDDEN
+                        elif h < above[j, i]:
+                            t, at, across, down = (h - middle) / half, c - rx * far, 0.0, 0.0
+                            for k in range(count - 1, -1, -1):
+                                across = across * t + (begin[k, 0] + grow[k, 0] * at)
+                                down = down * t + (begin[k, 1] + grow[k, 1] * at)
+                            if _is_hidden(heights, tops, squares, above, below, x, y, h, across, down, bend):
+                                found = HIDDEN
                 out[line, c - first_column] = found
+                c += 1
             column = stop
+
+
+@inlined
+def _pixels_within(x, y, i, j, du, dv):
+    """Return how many more pixels of a row surely are in a cell."""
+    across = ((i + 1 - x) / du if du > 0.0 else (i - x) / du) if du != 0.0 else 1e6
+    down = ((j + 1 - y) / dv if dv > 0.0 else (j - y) / dv) if dv != 0.0 else 1e6
+    return max(min(across, down, 1e6) - 1.0, 0.0)
