@@ -306,12 +306,10 @@ class DemSurface(Surface):
         rows, columns = self.shape
         left, top = max(u0, 0), max(v0, 0)
         right, bottom = min(u0 + nu, columns), min(v0 + nv, rows)
-        if (right - left, bottom - top) == (nu, nv):
-            out = self._read(left, top, nu, nv)
-        else:
-            out = np.full((nv, nu), np.nan)
-            if right > left and bottom > top:
-                out[top - v0 : bottom - v0, left - u0 : right - u0] = self._read(left, top, right - left, bottom - top)
+        some = self._read(left, top, right - left, bottom - top) if right > left and bottom > top else None
+        out = some if some is not None and some.shape == (nv, nu) else np.full((nv, nu), np.nan)
+        if some is not None and out is not some:
+            out[top - v0 : bottom - v0, left - u0 : right - u0] = some
         if filled and isinstance(self.fill, float):
             out[np.isnan(out)] = self.fill
         return out

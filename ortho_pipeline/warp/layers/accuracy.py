@@ -359,8 +359,8 @@ class _Layer:
         if spacing == 1 and max(width, height) > _EXACT_TILE:
             for column in range(0, width, _EXACT_TILE):
                 for row in range(0, height, _EXACT_TILE):
-                    part = bands[:, row : row + _EXACT_TILE, column : column + _EXACT_TILE]
-                    self._fill(left + column, top + row, spacing, part)
+                    tile = bands[:, row : row + _EXACT_TILE, column : column + _EXACT_TILE]
+                    self._fill(left + column, top + row, spacing, tile)
             return
         nodes, samples = self._nodes(left, top, width, height, spacing)
         if spacing > 1 and not np.isfinite(nodes).all():

@@ -118,7 +118,7 @@ def find_steep(heights: Any, void: bool, low: Any, high: Any, tops: Any, squares
     for j in range(tops.shape[0]):
         for i in range(tops.shape[1]):
             tops[j, i] = -np.inf
-            if _climbs(heights, j, i, low, high) or void and _is_beside_void(heights, j, i):
+            if _climbs(heights, j, i, low, high) or (void and _is_beside_void(heights, j, i)):
                 top = max(heights[j, i], heights[j, i + 1], heights[j + 1, i], heights[j + 1, i + 1])
                 highest, tops[j, i] = max(highest, top), top
                 square = squares[j >> SQUARE_BITS]
@@ -317,9 +317,9 @@ def _height(heights, x, y):
 def look(rays: Rays, relief: Relief, first_row: int, first_column: int, out: Any) -> None:
     """Fill `out` ``(h, w)``, which begins with a row and a column of the tile, with `CLEAR`, `HIDDEN` or `VOID`."""
     samples, near, slopes, far, middle, half, bend = rays
-    heights, west, north, tops, squares, above, below, known, highest = relief
+    _, west, north, _, _, _, _, known, _ = relief
     height, width = out.shape
-    rows, columns = tops.shape
+    rows, columns = known.shape
     count = slopes.shape[2]
     begin, grow = np.empty((count, 2)), np.empty((count, 2))
     for line in range(height):
@@ -355,22 +355,30 @@ def look(rays: Rays, relief: Relief, first_row: int, first_column: int, out: Any
                             out[line, c - first_column] = found
                             c += 1
                 if found == VOID:
-                    h = _height(heights, x, y)
-                    found = CLEAR if h < np.inf else VOID
-                    if h < highest:
-                        i, j = min(i, columns - 1), min(j, rows - 1)
-                        if h <= below[j, i]:
-                            found = HIDDEN
-                        elif h < above[j, i]:
-                            t, at, across, down = (h - middle) / half, c - rx * far, 0.0, 0.0
-                            for k in range(count - 1, -1, -1):
-                                across = across * t + (begin[k, 0] + grow[k, 0] * at)
-                                down = down * t + (begin[k, 1] + grow[k, 1] * at)
-                            if _is_hidden(heights, tops, squares, above, below, x, y, h, across, down, bend):
-                                found = HIDDEN
+                    found = _looked_along(relief, begin, grow, c - rx * far, middle, half, bend, x, y)
                 out[line, c - first_column] = found
                 c += 1
             column = stop
+
+
+@inlined
+def _looked_along(relief, begin, grow, at, middle, half, bend, x, y):
+    """Return the class of the place (x, y) in the window, where directions have grown over so many pixels."""
+    heights, _, _, tops, squares, above, below, _, highest = relief
+    h = _height(heights, x, y)
+    found = CLEAR if h < np.inf else VOID
+    if h < highest:
+        i, j = min(int(x), tops.shape[1] - 1), min(int(y), tops.shape[0] - 1)
+        if h <= below[j, i]:
+            found = HIDDEN
+        elif h < above[j, i]:
+            t, across, down = (h - middle) / half, 0.0, 0.0
+            for k in range(begin.shape[0] - 1, -1, -1):
+                across = across * t + (begin[k, 0] + grow[k, 0] * at)
+                down = down * t + (begin[k, 1] + grow[k, 1] * at)
+            if _is_hidden(heights, tops, squares, above, below, x, y, h, across, down, bend):
+                found = HIDDEN
+    return found
 
 
 @inlined
