@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ortho_pipeline.block.common_error import CommonError
 from ortho_pipeline.block.datum import by_control, with_datum
 from ortho_pipeline.block.determination import refuse_too_few, refuse_undetermined, uncertain_images
 from ortho_pipeline.block.equations.linear import Linear
@@ -81,6 +82,9 @@ def adjust(
     refuse_too_few(problem, selection)
     if problem.unstated.any():
         problem = _started(problem, state, selection)
+    common = CommonError.of(problem, state, selection)
+    if common is not None:
+        problem = common.applied(problem)
     solved, selection = _solved(problem, state, selection)
     if problem.unstated.any():
         solved = reweighed(solved, selection, estimate(solved))
@@ -95,11 +99,11 @@ def adjust(
     gauge = gauge.replace(by_control(problem, begun), by_control(problem, selection))
     judged = _among(points, {one.point for one in rejected})
     notes += _without(points, problem.active(begun) & ~problem.active(selection) & ~judged)
-    solved, found = _weighed(solved, selection)
+    solved, found, common = _weighed(solved, selection, common)
     notes += found.variances.notes()
     notes += marks_warning(points.select(problem.active(selection) & selection.ground))
     notes += uncertain_images(solved, points)
-    return _result(solved, found, selection, points, chosen, gauge, rejected, notes)
+    return _result(solved, found, common, selection, points, chosen, gauge, rejected, notes)
 
 
 def _among(points: BlockPoints, ids: Set[str]) -> Mask:
@@ -199,8 +203,12 @@ def _started(problem: BlockProblem, state: State, selection: Selection) -> Block
     return replace(problem, assumed=(float(sigma), float(sigma)))
 
 
-def _weighed(solved: Solved, selection: Selection) -> tuple[Solved, Posterior]:
-    """Return the solution with the sigmas that the observations have, and what is known of these."""
+def _weighed(
+    solved: Solved, selection: Selection, common: CommonError | None
+) -> tuple[Solved, Posterior, CommonError | None]:
+    """Return the solution with the sigmas that the observations have, what is known of these, and the common error."""
+    if common is not None:
+        solved, common = common.settled(solved, selection)
     found = posterior(solved)
     for _ in range(_WEIGHINGS):
         if found.moved <= _MOVED:
@@ -210,7 +218,11 @@ def _weighed(solved: Solved, selection: Selection) -> tuple[Solved, Posterior]:
         if solved is before:
             break
         found = posterior(solved)
-    return solved, found
+    if common is not None:
+        before = solved
+        solved, common = common.settled(solved, selection)
+        found = found if solved is before else posterior(solved)
+    return solved, found, common
 
 
 def _solved(problem: BlockProblem, state: State, selection: Selection) -> tuple[Solved, Selection]:
@@ -239,6 +251,7 @@ def _solved(problem: BlockProblem, state: State, selection: Selection) -> tuple[
 def _result(
     solved: Solved,
     found: Posterior,
+    common: CommonError | None,
     selection: Selection,
     points: BlockPoints,
     start: tuple[SensorModel, ...],
@@ -257,19 +270,23 @@ def _result(
     local = np.where(active[:, None], state.local, np.nan)
     ground = problem.frame.geodetic(local)
     # What is a tie is not compared with anything, whatever the file says of its ground.
-    known = np.where(points.tie[:, None], np.nan, points.known_in(GEODETIC))
+    stated = np.where(points.tie[:, None], np.nan, points.known_in(GEODETIC))
+    known = stated if common is None else common.corrected(stated)
     object_residuals = problem.frame.apart(known, local)
     used_ground = selection.ground & active
-    doubts = outlying(solved, variances, object_residuals, ground_covariance, used_ground)
+    of_params, of_points = (0.0, 0.0) if common is None else (common.of_params, common.of_points)
+    # Points that share an error lie to each other as if there were none.
+    apart = (points.sigma_common == 0)[:, None, None]
+    doubts = outlying(solved, variances, object_residuals, ground_covariance + apart * of_points, used_ground)
     return BlockFit(
         models=dict(zip(points.images, state.models, strict=True)),
         start=dict(zip(points.images, start, strict=True)),
         points=points,
         ground=ground,
-        ground_covariance=ground_covariance,
+        ground_covariance=ground_covariance + of_points,
         residuals=points.measured - predict(problem.frame, state.models, points, local),
         back_projected=_reprojected(problem, state.models, known),
-        raw_residuals=_reprojected(problem, start, known),
+        raw_residuals=_reprojected(problem, start, stated),
         object_residuals=object_residuals,
         used_rays=used,
         used_ground=used_ground,
@@ -278,12 +295,13 @@ def _result(
             for image, model in zip(points.images, state.models, strict=True)
             for name in model.param_names
         ),
-        covariance=found.covariance,
+        covariance=found.covariance + of_params,
         redundancy=math.floor(freedom + 1e-6),
         degrees_of_freedom=freedom,
         sigma0=None if sigma0 is None else variances.image,
         variances=variances,
         gauge=gauge,
+        common_error=common,
         rejected=rejected,
         outlying=doubts,
         warnings=(*(one.notice() for one in doubts), *notes),

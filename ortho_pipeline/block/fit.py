@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pyproj
 
+from ortho_pipeline.block.common_error import CommonError
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.intersection import sigmas_of
 from ortho_pipeline.block.local_frame import GEODETIC
@@ -37,7 +38,9 @@ class BlockFit:
     `parameters` are (image, name) in the order of `covariance` ``(P, P)``. `sigma0` is the factor of the stated sigmas
     of measurements (None without redundancy), `variances` has it beside the sigmas of ground that states none.
     Covariances contain that these are uncertain, so that 1.96 sigmas are right 95 times of 100 with few points too.
-    `outlying` are known points that the block contradicts and that were left as they are.
+    `outlying` are known points that the block contradicts and that were left as they are. Where points have an error in
+    common, `common_error` is that, covariances have its part, and residuals of known ground are what is left beside its
+    estimate.
     """
 
     models: dict[str, SensorModel]
@@ -61,6 +64,7 @@ class BlockFit:
     rejected: tuple[Rejected, ...] = ()
     outlying: tuple[Outlying, ...] = ()
     warnings: tuple[Notice, ...] = ()
+    common_error: CommonError | None = None
     condition: float = 1.0
     iterations: int = 0
 
@@ -141,6 +145,7 @@ class BlockFit:
             "condition": json_value(self.condition),
             "iterations": self.iterations,
             "variances": self.variances.to_json(),
+            **({} if self.common_error is None else {"common_error": self.common_error.to_json()}),
             "images": {
                 image: {
                     "parameters": {

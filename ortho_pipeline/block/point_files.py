@@ -125,7 +125,8 @@ class _Joined:
             x, y, h = ground[place[id(row)]].tolist()
             where = f"{os.fspath(path)}, {row.where}"
             said = {
-                "x": x, "y": y, "h": h, "role": row.role or None, "sigma_xy": _plan(row), "sigma_h": row.sigma_h,
+                "x": x, "y": y, "h": h, "role": row.role or None, "sigma_xy": row.sigma_xy, "sigma_h": row.sigma_h,
+                "sigma_common": row.sigma_common,
             }  # fmt: skip
             for name, value in said.items():
                 if value is None or (isinstance(value, float) and math.isnan(value)):
@@ -157,12 +158,8 @@ class _Joined:
             crs=crs, images=images, point=point, image=image, measured=measured,
             sigma_image=(sigma := sigmas_of(rows, DEFAULT_SIGMA_IMAGE)), source=os.fspath(path),
             shape_image=shape_of(covariance_of(rows, sigma)),
+            sigma_common=np.array([one.get("sigma_common", 0.0) for one in said]),
         )  # fmt: skip
-
-
-def _plan(row: Row) -> float | None:
-    """Return the standard deviation in plan, with what points have in common: a block weighs each by itself."""
-    return math.hypot(row.sigma_xy or 0.0, row.sigma_common) if row.sigma_common else row.sigma_xy
 
 
 def _refuse_same(

@@ -22,6 +22,7 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import is_usable
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.image_errors import (
+    checked_common,
     checked_covariance,
     says_more,
     sigma_of_covariance,
@@ -62,6 +63,8 @@ class BlockPoints:
     shape_image : ndarray (M, 2, 2), optional
         Covariance of the measurement over the square of `sigma_image`, which is its root mean square per axis. If not
         given, measurements are as certain in all directions; other values of `sigma_image` change the scale alone.
+    sigma_common : ndarray (N,), optional
+        As in `Points`: standard deviation (m, per axis in plan) of what the ground of points with one has in common.
     """
 
     ids: tuple[str, ...]
@@ -76,6 +79,7 @@ class BlockPoints:
     sigma_image: Array
     source: str = ""
     shape_image: Array | None = None
+    sigma_common: Array = None  # type: ignore[assignment]  # filled below
     _whitening: Array | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
@@ -91,6 +95,7 @@ class BlockPoints:
             object.__setattr__(self, name, array)
         object.__setattr__(self, "ids", tuple(self.ids))
         object.__setattr__(self, "images", tuple(self.images))
+        object.__setattr__(self, "sigma_common", checked_common(self.sigma_common, count))
         self._check_values()
         self._check_identity()
         if self.shape_image is not None:
@@ -152,30 +157,29 @@ class BlockPoints:
         if not tables:
             raise InputError("a block has images with points", field="points")
         crs = next(iter(tables.values())).crs
-        index: dict[str, int] = {}
-        ground: list[Array] = []
-        sigma_ground: list[Array] = []
-        roles: list[str] = []
-        rays: list[tuple[int, int]] = []
+        index, first, rays = dict[str, int](), list[tuple[Points, int]](), list[tuple[int, int]]()
         for number, (name, table) in enumerate(tables.items()):
             moved = table if same_crs(table.crs, crs) else table.to_crs(crs)
             for k, one in enumerate(moved.ids):
                 row = index.setdefault(one, len(index))
-                if row == len(ground):
-                    ground.append(moved.ground[k])
-                    sigma_ground.append(moved.sigma_ground[k])
-                    roles.append(str(moved.roles[k]))
+                if row == len(first):
+                    first.append((moved, k))
                 else:
-                    _agree(one, name, roles[row], str(moved.roles[k]), ground[row], moved.ground[k], table.source)
+                    _agree(one, name, *first[row], moved, k)
                 rays.append((row, number))
+
+        def stated(what: str) -> Any:
+            return [getattr(of, what)[k] for of, k in first]
+
         places = np.array(rays, dtype=np.int64).reshape(-1, 2)
         return cls(
-            ids=tuple(index), ground=np.array(ground).reshape(-1, 3), roles=np.array(roles, dtype="<U7"),
-            sigma_ground=np.array(sigma_ground).reshape(-1, 3), crs=crs, images=tuple(tables), point=places[:, 0],
+            ids=tuple(index), ground=np.reshape(stated("ground"), (-1, 3)), roles=np.array(stated("roles"), "<U7"),
+            sigma_ground=np.reshape(stated("sigma_ground"), (-1, 3)), crs=crs, images=tuple(tables), point=places[:, 0],
             image=places[:, 1], measured=np.concatenate([table.image for table in tables.values()]),
             sigma_image=np.concatenate([table.sigma_image for table in tables.values()]),
             source=", ".join(dict.fromkeys(table.source for table in tables.values() if table.source)),
             shape_image=shape_of(np.concatenate([table.covariance_image for table in tables.values()])),
+            sigma_common=np.array(stated("sigma_common")),
         )  # fmt: skip
 
     @property
@@ -226,9 +230,9 @@ class BlockPoints:
         place[chosen] = np.arange(len(chosen))
         rays = place[self.point] >= 0
         return replace(
-            self, ids=tuple(self.ids[i] for i in chosen), ground=self.ground[chosen], roles=self.roles[chosen],
-            sigma_ground=self.sigma_ground[chosen], point=place[self.point[rays]], image=self.image[rays],
-            measured=self.measured[rays], sigma_image=self.sigma_image[rays], shape_image=self._shape_of(rays),
+            self.of_rays(rays), ids=tuple(self.ids[i] for i in chosen), ground=self.ground[chosen],
+            roles=self.roles[chosen], sigma_ground=self.sigma_ground[chosen], point=place[self.point[rays]],
+            sigma_common=self.sigma_common[chosen],
         )  # fmt: skip
 
     def of_rays(self, rays: ArrayLike) -> BlockPoints:
@@ -273,7 +277,7 @@ class BlockPoints:
             ids=tuple(self.ids[i] for i in rows), image=self.measured[rays], ground=self.ground[rows],
             roles=self.roles[rows], sigma_image=self.sigma_image[rays], sigma_ground=self.sigma_ground[rows],
             crs=self.crs, source=self.source,
-            covariance_image=self.covariance_image[rays],
+            covariance_image=self.covariance_image[rays], sigma_common=self.sigma_common[rows],
         )  # fmt: skip
 
     def known_in(self, crs: str | pyproj.CRS) -> Array:
@@ -308,21 +312,19 @@ def joined(images: Sequence[str], tables: Sequence[BlockPoints]) -> BlockPoints:
         crs=crs, images=tuple(images), point=np.concatenate(points), image=np.concatenate(places),
         measured=all_of("measured"), sigma_image=all_of("sigma_image"),
         source=", ".join(dict.fromkeys(table.source for table in tables if table.source)),
-        shape_image=shape_of(all_of("covariance_image")),
+        shape_image=shape_of(all_of("covariance_image")), sigma_common=all_of("sigma_common"),
     )  # fmt: skip
 
 
-def _agree(
-    one: str, name: str, role: str, other_role: str, ground: Array, other: Array, source: str
-) -> None:  # fmt: skip
-    """Refuse two statements of one point that differ."""
+def _agree(one: str, name: str, first: Points, row: int, table: Points, k: int) -> None:
+    """Refuse two statements of one point, in rows of two tables, that differ."""
     for what, same in (
-        ("role", role == other_role),
-        ("ground", np.allclose(ground, other, rtol=0, atol=SAME_PLACE, equal_nan=True)),
+        ("role", first.roles[row] == table.roles[k]),
+        ("ground", np.allclose(first.ground[row], table.ground[k], rtol=0, atol=SAME_PLACE, equal_nan=True)),
     ):
         if not same:
             raise InputError(
-                f"the {what} of the point {one!r} is another one in the image {name!r}", file=source or None,
+                f"the {what} of the point {one!r} is another one in the image {name!r}", file=table.source or None,
                 field="role" if what == "role" else "x, y, h", remedy="points of one id are one point on the ground",
             )  # fmt: skip
 

@@ -22,7 +22,7 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, start_of
-from ortho_pipeline.commands.control.block_points import gather, read_points
+from ortho_pipeline.commands.control.block_points import gather, read_points, relative_to_reference
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, counted
@@ -92,6 +92,7 @@ def adjust(
         {label: start.model for label, start in starts.items()}, table,
         priors={label: start.priors for label, start in starts.items()}, hold=points.hold,
     )  # fmt: skip
+    notes += relative_to_reference(fit, points, match)
     exported: dict[str, rpc.RpcExport] = {}
     for label in labels:
         try:

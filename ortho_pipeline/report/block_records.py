@@ -10,7 +10,15 @@ import math
 from typing import Any, Literal
 
 from ortho_pipeline.files.documents import record
-from ortho_pipeline.report.adjustment_records import Count, NoticeDocument, Parameter, Residual, Rmse, Role
+from ortho_pipeline.report.adjustment_records import (
+    CommonError,
+    Count,
+    NoticeDocument,
+    Parameter,
+    Residual,
+    Rmse,
+    Role,
+)
 from ortho_pipeline.report.records import InputFile, RpcRecord, Size
 
 Triple = tuple[float, float, float]
@@ -182,6 +190,7 @@ class BlockAdjustment:
     outlying: tuple[ContradictedPoint, ...]
     warnings: tuple[str, ...]
     notices: tuple[NoticeDocument, ...]
+    common_error: CommonError | None = None
 
 
 @record

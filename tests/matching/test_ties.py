@@ -241,7 +241,7 @@ def test_an_adjustment_finds_ties_and_control_by_itself(tmp_path):
     images = [scene.scene_file for scene in scenes]
     heights = "--dem", scenes[0].dem_file, "--dem-vertical", "ellipsoid", "--dem-sigma", 2
     run("adjust", *images, "--ties", "auto", "--reference", scenes[0].reference_file, *heights, "--search", 25,
-        "--match-points", 60, "--correction", "affine", "-o", tmp_path / "out")  # fmt: skip
+        "--reference-sigma", 2, "--match-points", 60, "--correction", "affine", "-o", tmp_path / "out")  # fmt: skip
     before, after = [], []
     for scene in scenes:
         model = load_model(tmp_path / "out" / f"{scene.scene_file.stem}_model.json")
@@ -255,6 +255,15 @@ def test_an_adjustment_finds_ties_and_control_by_itself(tmp_path):
         "relative-to-reference"
     }
     assert {one["role"] for one in report["provenance"]["inputs"]} >= {"reference", "DEM"}
+    # Pixels are 1 m: however many matches, the images lie as well as the reference does.
+    adjustment = report["adjustment"]
+    for image in adjustment["images"].values():
+        shifts = [image["parameters"][name]["sigma"] for name in ("col_shift", "row_shift")]
+        assert np.hypot(*shifts) == pytest.approx(np.hypot(2, 2), rel=0.2)
+    ties = [point["sigma"] for point in adjustment["points"] if point["role"] == "tie" and point["sigma"][0]]
+    assert np.min(ties, axis=0)[:2] == pytest.approx([2, 2], rel=0.1)
+    assert adjustment["common_error"]["estimate_sigma_m"] == [2, 2]
+    assert 0.4 < adjustment["sigma0"] < 2.5
 
 
 @pytest.mark.parametrize(

@@ -221,10 +221,12 @@ def test_a_block_takes_the_scalar_of_a_covariance(tmp_path: Path) -> None:
     assert points.sigma_image == pytest.approx([np.sqrt(0.375), 0.3])
 
 
-def test_a_block_weighs_each_point_by_what_it_has_in_common_with_others(tmp_path: Path) -> None:
+def test_a_block_takes_what_points_have_in_common(tmp_path: Path) -> None:
     path = tmp_path / "rays.csv"
     path.write_text(
         "id,image,col,row,x,y,h,sigma_xy,sigma_common\na,one.tif,1,2,24,-33,100,0.3,0.4\nb,one.tif,3,2,24,-33.1,100,,2\n"
+        "a,two.tif,1,2,24,-33,100,0.3,0.4\nc,two.tif,4,4,24,-33.2,100,0.5,\n"
     )
     points = read_block_points(path, crs="EPSG:4326", vertical="ellipsoid")
-    np.testing.assert_allclose(points.sigma_ground[:, :2], [[0.5, 0.5], [2, 2]])
+    np.testing.assert_array_equal(points.sigma_ground[:, 0], [0.3, 0.0, 0.5])
+    np.testing.assert_array_equal(points.sigma_common, [0.4, 2.0, 0.0])

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.block.points import BlockPoints, joined
 from ortho_pipeline.commands import inputs
@@ -20,7 +21,6 @@ from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import InputError, counted
-from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import Vertical, parse_crs
 from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, SurfaceOptions, numbers_of
@@ -86,8 +86,6 @@ def gather(
             notices += found.notices
             document |= found.document
             text += found.text
-            if options.points is None:
-                notices.append(_relative(match.reference_sigma))
     return Gathered(joined(labels, tables), notices, document, text)
 
 
@@ -124,15 +122,24 @@ def _refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: 
         )  # fmt: skip
 
 
-def _relative(sigma: float | None) -> Notice:
-    floor = "how accurate that is was not stated"
-    if sigma:
-        floor = f"its own {metres(sigma)} per axis are the floor of that"
+def relative_to_reference(fit: BlockFit, options: BlockOptions, match: MatchOptions) -> list[Notice]:
+    """Return a notice if control of a block was matched: it does not say where the reference lies."""
+    common = fit.common_error
+    if not match.reference and common is None:
+        return []
+    floor, beside = "how accurate that is was not stated", ""
+    sigma = None if common is None else float(common.sigmas.max())
+    if common is not None and sigma:
+        floor = f"its own {metres(sigma)} per axis, common to all matches, are the floor of that, and in the sigmas"
+        if common.value.any():
+            east, north = common.value * sigma
+            beside = f"; the rest of the block puts it {east:+.2f} m to the east and {north:+.2f} m to the north"
+    part = "all control was matched" if options.points is None else "control was matched"
     text = (
-        f"all control was matched: accuracy is relative to the reference, and {floor}; an error that images and "
-        "reference have in common is not seen, and the sigmas know nothing of errors that neighbouring matches share"
+        f"{part}: accuracy is relative to the reference, and {floor}{beside}; an error that images and reference have "
+        "in common is not seen, and the sigmas know nothing of errors that neighbouring matches share"
     )
-    return Notice("relative-to-reference", text, reference_sigma_m=sigma)
+    return [Notice("relative-to-reference", text, reference_sigma_m=sigma, in_sigmas=common is not None)]
 
 
 def _matches(scenes: Any, match: MatchOptions, surface: Any, opened: SceneOptions) -> Gathered:
@@ -148,12 +155,9 @@ def _matches(scenes: Any, match: MatchOptions, surface: Any, opened: SceneOption
             notices.append(Notice("no-matches", f"not matched with the reference: {error.message}").in_image(label))
             continue
         points = found.matches.points
-        # A block weighs each match by all that it may be off by; it knows of nothing that points have in common.
-        plan = metre_partials(scene.model, points.ground)[0] * points.sigma_common[:, None, None]
         tables[label] = replace(
-            points.with_covariance_image(points.covariance_image + plan @ plan.transpose(0, 2, 1)),
-            ids=tuple(f"{label} {name}" for name in points.ids), sigma_ground=np.full((len(points), 3), _EXACT),
-        )  # fmt: skip
+            points, ids=tuple(f"{label} {name}" for name in points.ids), sigma_ground=np.full((len(points), 3), _EXACT)
+        )
         notices += [notice.in_image(label) for notice in found.notices]
         document[label] = found.to_json()
         text.append(f"{label}: {counted(len(points), 'match', 'matches')} with the reference")

@@ -1,0 +1,200 @@
+r"""An error that the ground of many points of a block has in common, as matches have that of their reference.
+
+Their known ground is off by one unknown vector in plan, :math:`c \sim N(0, I)` in units of its standard deviation. By
+itself it is seen by nothing: images, ties and matches all move with it. Other control, and prior knowledge of the
+parameters, tell of it. So it is one more pair of unknowns of the block, solved for beside the others: with misfits
+:math:`r` (over their sigmas) at a minimum, and :math:`U` what one sigma of it takes off them, a step of all other
+unknowns takes :math:`H U` off and leaves :math:`V = (I - H) U`, and
+
+.. math::
+    (I + V^T V)\, dc = V^T r - c, \quad C = C_{\mathrm{rest}} + S (I + V^T V)^{-1} S^T
+
+with :math:`S` the step of parameters and points that goes with :math:`U`. Where nothing tells of it, :math:`V = 0`, and
+the whole of it stands in the covariances of parameters and ground, whatever the number of points; what is estimated of
+the measurements' own sigmas does not scale it.
+
+Source: Koch 1999, section 3.2 (elimination of unknowns) and 3.6 (mixed model); as `estimation.spatial.common_error` of
+one image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.block.equations.elimination import step_of
+from ortho_pipeline.block.equations.linear import Linear
+from ortho_pipeline.block.equations.problem import BlockProblem, Misfits, Selection, State
+from ortho_pipeline.block.equations.solver import Solved, attempt, solve
+from ortho_pipeline.block.equations.unknowns import Mask
+from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.estimation.problem import CONDITION_LIMIT
+from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
+from ortho_pipeline.models.base import Array, solve_2x2
+
+#: The estimate stands when it moves by less than this (standard deviations); the models are nearly linear in it.
+_STANDS, _ROUNDS = 1e-3, 5
+#: Other points that put the reference farther off than so many of its sigmas contradict it: they do not correct it.
+_BELIEVED = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class CommonError:
+    """What known ground has in common, and what a block tells of it.
+
+    Parameters
+    ----------
+    sigmas : ndarray (N,)
+        Its standard deviation at each point, m per axis; 0 for those that do not share it.
+    known : ndarray (N, 3)
+        Lon, lat, h of the ground as it was stated.
+    points : int
+        Points whose ground was used that share it.
+    value : ndarray (2,)
+        Its estimate, east and north, in standard deviations: how far that ground lies from the truth.
+    told : ndarray (2, 2)
+        Information of the block on it; that of its own standard deviation is I.
+    by_params, by_points : ndarray (P, 2), (N, 3, 2)
+        How one standard deviation of it moves parameters, and points in their east, north, up.
+    """
+
+    sigmas: Array
+    known: Array
+    points: int
+    value: Array
+    told: Array
+    by_params: Array
+    by_points: Array
+
+    @classmethod
+    def of(cls, problem: BlockProblem, state: State, selection: Selection) -> CommonError | None:
+        """Return that of the ground that a selection uses, as other ground sees it first; None without."""
+        sigmas = problem.points.sigma_common
+        used = selection.ground & problem.active(selection)
+        shared = int((used & (sigmas > 0)).sum())
+        if not shared or not problem.size:
+            return None
+        nothing = np.zeros((problem.size, 2)), np.zeros((len(sigmas), 3, 2))
+        found = cls(sigmas, problem.known, shared, np.zeros(2), np.zeros((2, 2)), *nothing)
+        return found._seen_by(problem, state, selection) if (used & (sigmas == 0)).any() else found
+
+    def corrected(self, known: Array) -> Array:
+        """Return ground ``(N, 3)`` lon, lat, h as it lies without the estimate."""
+        found = known.copy()
+        moved = self.sigmas > 0
+        metres = self.sigmas[moved, None] * self.value
+        found[moved, :2] -= metres / metres_per_degree(np.nan_to_num(known[moved]))
+        return found
+
+    def applied(self, problem: BlockProblem) -> BlockProblem:
+        """Return the problem with the known ground as it lies without the estimate."""
+        return replace(problem, known=self.corrected(self.known)) if self.value.any() else problem
+
+    def settled(self, solved: Solved, selection: Selection) -> tuple[Solved, CommonError]:
+        """Return the solution with it as an unknown, from one with its present value."""
+        problem = solved.problem
+        shared = selection.ground & problem.active(selection) & (self.sigmas > 0)
+        found = replace(self, points=int(shared.sum()))
+        for _ in range(_ROUNDS):
+            found, left = found._moving(solved)
+            # Without anything else only rounding, and the bending of the models, would tell of it.
+            told = left.T @ left if found._is_told(solved, selection) else np.zeros((2, 2))
+            found = replace(found, told=told)
+            slope = left.T @ solved.linear.misfits.vector if told.any() else np.zeros(2)
+            step = np.linalg.solve(np.eye(2) + told, slope - found.value)
+            if np.abs(step).max() < _STANDS:
+                break
+            found = replace(found, value=found.value + step)
+            solved = solve(found.applied(problem), solved.state, selection)
+        return solved, found
+
+    def _is_told(self, solved: Solved, selection: Selection) -> bool:
+        """Tell whether control without it, or knowledge of parameters, takes part."""
+        others = selection.ground & solved.problem.active(selection) & (self.sigmas == 0)
+        return bool(others.any() or len(solved.linear.misfits.pseudo))
+
+    def _moving(self, solved: Solved) -> tuple[CommonError, Array]:
+        """Return it with what it moves, and what one sigma along each axis leaves of misfits ``(m, 2)``."""
+        linear, problem = solved.linear, solved.problem
+        by_params, by_points, left = [], [], []
+        for misfits in self._misfits(linear):
+            step = step_of(replace(linear, misfits=misfits))
+            # A misfit of known ground that is taken off the ground moves all the other way.
+            by_params.append(-step.solution.values)
+            turned = problem.frame.enu_at(problem.frame.geodetic(linear.state.local))
+            by_points.append(-(turned @ step.shift[:, :, None])[:, :, 0])
+            left.append(misfits.minus(step.change).vector)
+        moved = replace(self, by_params=np.stack(by_params, axis=-1), by_points=np.stack(by_points, axis=-1))
+        return moved, np.stack(left, axis=-1)
+
+    def _misfits(self, linear: Linear) -> list[Misfits]:
+        """Return what one sigma of it, east and north, takes off the misfits."""
+        problem, rows = linear.problem, linear.ordering.grounded
+        found = []
+        for axis in range(2):
+            ground = np.zeros((len(problem.points), 3))
+            root = np.sqrt(linear.weights.ground_weights[rows])
+            ground[rows, axis] = self.sigmas[rows] / problem.ground_sigmas[rows, axis] * root
+            found.append(Misfits(np.zeros_like(linear.misfits.rays), ground, np.zeros_like(linear.misfits.pseudo)))
+        return found
+
+    def _seen_by(self, problem: BlockProblem, state: State, selection: Selection) -> CommonError:
+        """Return it as known ground without it sees it, by the median of its rays, from a block without that ground.
+
+        For a start that gross errors do not spoil. If they put it beyond what its sigma allows, it stays 0.
+        """
+        alone = replace(selection, ground=selection.ground & (self.sigmas > 0))
+        try:
+            solved = attempt(problem, state, alone)
+        except OrthoError:
+            return self
+        if not solved.converged or solved.condition > CONDITION_LIMIT:
+            return self
+        moved, _ = self._moving(solved)
+        others = selection.ground & (self.sigmas == 0) & np.isfinite(problem.known).all(axis=1)
+        value = moved._median(solved, others, selection.rays)
+        return replace(self, value=value) if (np.abs(value) < _BELIEVED).all() else self
+
+    def _median(self, solved: Solved, others: Mask, rays: Mask) -> Array:
+        """Return the median of what rays ``(M,)`` of known ground ``(N,)`` say of it by themselves."""
+        problem, points = solved.problem, solved.problem.points
+        places = problem.frame.places(problem.target)
+        each = [np.zeros((0, 2))]
+        for image, model in enumerate(solved.state.models):
+            used = np.flatnonzero(rays & (points.image == image) & others[points.point])
+            rows = points.point[used]
+            if not len(used) or not len(model.params):
+                continue
+            miss = points.measured[used] - places.project(model, rows)
+            partials = model.param_partials(places.in_crs(model.crs)[rows])
+            each.append(solve_2x2(partials @ self.by_params[problem.columns.of_image(image)], miss))
+        found = np.concatenate(each)
+        found = found[np.isfinite(found).all(axis=1)]
+        return np.median(found, axis=0) if len(found) else np.zeros(2)
+
+    # -- what it leaves ------------------------------------------------------------------------------------------------
+
+    @property
+    def left(self) -> Array:
+        """Covariance ``(2, 2)`` of its estimate, in standard deviations."""
+        return np.asarray(np.linalg.inv(np.eye(2) + self.told))
+
+    @property
+    def of_params(self) -> Array:
+        """Its part ``(P, P)`` of the covariance of the parameters."""
+        return np.asarray(self.by_params @ self.left @ self.by_params.T)
+
+    @property
+    def of_points(self) -> Array:
+        """Its part ``(N, 3, 3)`` of the covariance of the ground, m²."""
+        return np.asarray(self.by_points @ self.left @ self.by_points.swapaxes(1, 2))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the section ``common_error`` of the block's document: sigmas and estimate per axis in metres."""
+        sigma = float(self.sigmas.max())
+        return {
+            "points": self.points, "sigma_m": sigma, "estimate_m": (self.value * sigma).tolist(),
+            "estimate_sigma_m": (np.sqrt(np.diag(self.left)) * sigma).tolist(),
+        }  # fmt: skip
