@@ -24,6 +24,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, start_of
 from ortho_pipeline.commands.control.block_points import gather, read_points, relative_to_reference
 from ortho_pipeline.commands.results import Result
+from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.exchange import rpc
@@ -39,6 +40,7 @@ from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
 
 
+@with_items
 def adjust(
     images: Sequence[str | os.PathLike[str]],
     folder: str | os.PathLike[str],
@@ -111,6 +113,7 @@ def adjust(
     return Result(files, {"report": json_value(made), **gathered.document}, text)
 
 
+@with_items
 def intersect(
     images: Sequence[str | os.PathLike[str]],
     points: BlockOptions,

@@ -20,6 +20,7 @@ from ortho_pipeline.commands.scene_fit import (
     open_adjustable,
     relative_to_reference,
 )
+from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
@@ -29,6 +30,7 @@ from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, Sc
 from ortho_pipeline.report import document as report
 
 
+@with_items
 def fit(
     image: str | os.PathLike[str],
     points: PointOptions,
@@ -53,6 +55,7 @@ def fit(
     )  # fmt: skip
 
 
+@with_items
 @outputs_together
 def compare(
     image: str | os.PathLike[str],

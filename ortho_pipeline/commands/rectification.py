@@ -17,6 +17,7 @@ from ortho_pipeline.commands.layers.filling import other_of
 from ortho_pipeline.commands.placement import place_scene, source_of
 from ortho_pipeline.commands.results import ENDINGS, Result, outputs, outputs_together, write_report
 from ortho_pipeline.commands.scene_fit import adjust, open_adjustable
+from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.exchange import export as formats_of_models
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
 # -- commands --------------------------------------------------------------------------------------------------------
 
 
+@with_items
 @outputs_together
 def rectify(
     image: str | os.PathLike[str] | Scene,
@@ -125,6 +127,7 @@ def rectify(
     return Result(files, {"report": json_value(made)}, report.summary_text(made))
 
 
+@with_items
 def check(
     image: str | os.PathLike[str],
     *,
@@ -156,6 +159,7 @@ def check(
     return placed.to_json()
 
 
+@with_items
 @outputs_together
 def export(
     image: str | os.PathLike[str],

@@ -13,6 +13,7 @@ from ortho_pipeline import plugins
 from ortho_pipeline.commands.heights.surfaces import open_dem
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION, Result, outputs_together
+from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError, completed, counted
 from ortho_pipeline.estimation.ground_residuals import viewing
@@ -46,6 +47,7 @@ def sensors() -> dict[str, Any]:
     return {"schema_version": SCHEMA_VERSION, "sensors": listed, "broken": [entry.to_json() for entry in host.broken]}
 
 
+@with_items
 def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> dict[str, Any]:
     """Describe a scene: sensor, size, models and their source, facts, position and ground sample distance."""
     scene = open_scene(image, options)

@@ -297,3 +297,13 @@ def capella_text() -> str:
         },
     }  # fmt: skip
     return json.dumps(document, indent=1)
+
+
+#: A STAC item of an image whose RPC lies in another folder.
+STAC_ITEM = """{"type": "Feature", "stac_version": "1.0.0", "id": "S", "geometry": null,
+ "properties": {"datetime": "2024-01-01T00:00:00Z"}, "links": [{"rel": "self", "href": "./one.json"}],
+ "assets": {"image": {"href": "./scene.tif", "type": "image/tiff; application=geotiff", "roles": ["data"]},
+  "rpc": {"href": "./meta/scene_RPC.TXT", "type": "text/plain", "roles": ["metadata"]},
+  "points": {"href": "./points.csv", "type": "text/csv"},
+  "small": {"href": "https://host/small.png", "type": "image/png", "roles": ["thumbnail"]}}}
+"""

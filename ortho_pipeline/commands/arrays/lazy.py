@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
 from ortho_pipeline.commands.placement import Placement, place_scene, source_of
 from ortho_pipeline.commands.scene_fit import open_adjustable
+from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 _IDLE = ("accuracy_raster", "visibility", "angles", "stac", "fill_from")
 
 
+@with_items
 def ortho_array(
     image: str | os.PathLike[str] | Scene,
     dem: str | os.PathLike[str] | SurfaceOptions,

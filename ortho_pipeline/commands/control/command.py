@@ -12,6 +12,7 @@ from ortho_pipeline.commands.control.matching import match_scene
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust, on_surface
+from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
@@ -23,6 +24,7 @@ from ortho_pipeline.surface.base import Surface
 _SUFFIXES = (".geojson", ".csv", ".tsv")
 
 
+@with_items
 def match(
     image: str | os.PathLike[str],
     output: str | os.PathLike[str],

@@ -20,6 +20,7 @@ from ortho_pipeline.commands.control.matching import search_of
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.scene_fit import on_surface
+from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError, counted
@@ -179,6 +180,7 @@ def _few(ties: Ties, names: tuple[str, ...]) -> list[Notice]:
     return found
 
 
+@with_items
 def ties(
     images: Sequence[str | os.PathLike[str]],
     output: str | os.PathLike[str],

@@ -1,0 +1,1 @@
+"""STAC items in place of the files of a command."""

@@ -1,0 +1,135 @@
+"""What a command was given, with the files in place of STAC items, and what lies elsewhere asked for at once."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, ParamSpec, TypeVar, cast
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import read_bounded
+from ortho_pipeline.files.beside import ask_beside
+from ortho_pipeline.files.locations import is_far
+from ortho_pipeline.files.stac.item import Asset, is_item, read_item, split
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+_IMAGE, _IMAGES, _DEM = "image", "images", "dem"
+#: A table of points is no larger.
+_TABLE_BYTES = 50_000_000
+
+
+def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Let STAC items stand where a command takes images, DEMs, references and points.
+
+    The command has a parameter `image` or `images`, and options. An RPC that is an asset of its own becomes the option
+    `scene.rpc`, unless another model is given. Files on other machines are asked for together.
+    """
+    signature = inspect.signature(command)
+
+    @functools.wraps(command)
+    def wrapper(*args: _P.args, **named: _P.kwargs) -> _R:
+        bound = signature.bind(*args, **named)
+        bound.apply_defaults()
+        given = bound.arguments
+        place = next((name for name, value in given.items() if isinstance(value, SceneOptions)), None)
+        scene = SceneOptions() if place is None else cast(SceneOptions, given[place])
+        for name, value in given.items():
+            if name == _IMAGE:
+                given[name], scene = resolved(value, scene)
+            elif name == _IMAGES:
+                given[name] = [_one_of_several(image, scene) for image in value]
+            elif name == _DEM and is_item(value):
+                given[name] = _assets(value, scene)[0].href
+            else:
+                given[name] = _in_options(value, scene)
+        if place is not None:
+            given[place] = scene
+        if scene.allow_network:
+            ask_beside(*_far(given), allow_network=True)
+        return command(*bound.args, **bound.kwargs)
+
+    return wrapper
+
+
+def resolved(image: Any, scene: SceneOptions) -> tuple[Any, SceneOptions]:
+    """Return the image that a STAC item stands for, and the options with its RPC; anything else as it is.
+
+    Raises
+    ------
+    InputError
+        If it is no item, or its asset is not known.
+    """
+    if not is_item(image):
+        return image, scene
+    chosen, rpc = _assets(image, scene)
+    if rpc is None or scene.rpc is not None or scene.model is not None or "rpc" in scene.sensor_options:
+        return chosen.href, scene
+    return chosen.href, replace(scene, rpc=rpc.href)
+
+
+def _assets(image: Any, scene: SceneOptions) -> tuple[Asset, Asset | None]:
+    address, key = split(image)
+    item = read_item(address, allow_network=scene.allow_network, roots=tuple(scene.roots))
+    chosen = item.image(key)
+    return chosen, item.rpc_of(chosen)
+
+
+def _one_of_several(image: Any, scene: SceneOptions) -> Any:
+    if not is_item(image):
+        return image
+    chosen, rpc = _assets(image, scene)
+    if rpc is not None:
+        raise InputError(
+            f"the RPC of this image lies elsewhere ({rpc.name}), and several images have no option for it", file=image,
+            remedy="put it beside the image, under its name",
+        )  # fmt: skip
+    return chosen.href
+
+
+def _in_options(value: Any, scene: SceneOptions) -> Any:
+    """Return options with the files in place of items."""
+
+    def raster(path: Any) -> Any:
+        return _assets(path, scene)[0].href if is_item(path) else path
+
+    if isinstance(value, SurfaceOptions):
+        return replace(value, dem=raster(value.dem), sigma=raster(value.sigma))
+    if isinstance(value, MatchOptions):
+        return replace(value, reference=tuple(map(raster, value.reference)))
+    if isinstance(value, OutputOptions):
+        return replace(value, fill_from=raster(value.fill_from))
+    if isinstance(value, PointOptions) and is_item(value.gcps):
+        return replace(value, gcps=_points(cast(str, value.gcps), scene))
+    return value
+
+
+def _points(path: str | os.PathLike[str], scene: SceneOptions) -> str | os.PathLike[str]:
+    """Return the table of an item; a GeoJSON file that is no item is a table itself."""
+    address, key = split(path)
+    if not key and not is_far(address) and b'"stac_version"' not in read_bounded(address, _TABLE_BYTES):
+        return path
+    try:
+        item = read_item(address, allow_network=scene.allow_network, roots=tuple(scene.roots))
+    except InputError:
+        if key:
+            raise
+        return path
+    return item.table(key).href
+
+
+def _far(given: dict[str, Any]) -> list[Any]:
+    """Return the files on other machines that a command is about to open."""
+    images = [given.get(_IMAGE), *(given.get(_IMAGES) or ())]
+    for value in given.values():
+        if isinstance(value, SurfaceOptions):
+            images.append(value.dem)
+        elif isinstance(value, MatchOptions):
+            images += value.reference
+        elif isinstance(value, OutputOptions):
+            images.append(value.fill_from)
+    return [path for path in images if isinstance(path, str | os.PathLike) and is_far(path)]

@@ -1,0 +1,180 @@
+"""STAC items in place of images, DEMs and tables: which of their assets is meant, by its role."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import Any
+
+from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.files.locations import AnyPath
+from ortho_pipeline.files.stac.documents import REMEDY, read_document, target
+from ortho_pipeline.files.storage.objects import is_address
+
+#: Roles of what an image or a DEM is read from, the first first.
+_ROLES = ("data", "visual")
+_NO_RASTER = ("thumbnail", "overview", "metadata")
+_RASTER_TYPE = re.compile(r"image/(?!png|jpeg|webp|svg|gif)|application/(x-hdf5?|x-erdas-hfa|gml\+xml)")
+_RASTER_NAME = re.compile(r"\.(tiff?|jp2|ntf|nitf|img|vrt|dt[0-2]|hgt)$", re.IGNORECASE)
+_TABLE_TYPE = re.compile(r"application/geo\+json|text/csv")
+_TABLE_NAME = re.compile(r"\.(csv|geojson|points|pts)$", re.IGNORECASE)
+_RPC_NAME = re.compile(r"rpc[^/]*\.(txt|xml)$|\.rpb$|\.rpc$", re.IGNORECASE)
+_ITEMS = re.compile(r"https?://[^?]*/collections/[^/?]+/items/[^/?#]+$")
+_SHOWN = 12
+
+
+@dataclass(frozen=True)
+class Asset:
+    """A file of an item: its key there, where it lies, its roles, its media type (empty where none is said)."""
+
+    key: str
+    href: str
+    roles: tuple[str, ...]
+    type: str
+
+    @property
+    def name(self) -> str:
+        """The name of the file."""
+        return PurePosixPath(self.href.partition("?")[0]).name
+
+    @property
+    def is_raster(self) -> bool:
+        """Whether it may be an image or a DEM."""
+        named = bool(_RASTER_NAME.search(self.name))
+        typed = bool(_RASTER_TYPE.match(self.type)) if self.type else named
+        return typed and not set(_NO_RASTER) & set(self.roles)
+
+    @property
+    def is_rpc(self) -> bool:
+        """Whether it is a side-car with an RPC."""
+        return bool(_RPC_NAME.search(self.name)) or (self.key.lower() == "rpc" and not self.is_raster)
+
+    @property
+    def is_table(self) -> bool:
+        """Whether it may hold points."""
+        return bool(_TABLE_TYPE.match(self.type) or _TABLE_NAME.search(self.name))
+
+
+@dataclass(frozen=True)
+class Item:
+    """A STAC item: where it lies, its id, and its assets."""
+
+    address: str
+    id: str
+    assets: tuple[Asset, ...]
+
+    def image(self, key: str = "") -> Asset:
+        """Return the raster that an image, a DEM or a reference is read from.
+
+        Raises
+        ------
+        InputError
+            If there is none, or several stand beside each other.
+        """
+        rasters = [asset for asset in self.assets if asset.is_raster]
+        groups = [[asset for asset in rasters if role in asset.roles] for role in _ROLES]
+        groups.append(rasters)
+        return self._chosen(key, groups, "raster")
+
+    def table(self, key: str = "") -> Asset:
+        """Return the table that points are read from; see `image`."""
+        return self._chosen(key, [[asset for asset in self.assets if asset.is_table]], "table of points")
+
+    def rpc_of(self, image: Asset) -> Asset | None:
+        """Return the side-car with the RPC of an image; None where there is none, or where GDAL finds it by itself."""
+        found = [asset for asset in self.assets if asset.is_rpc]
+        if len(found) > 1:
+            stem = PurePosixPath(image.name).stem
+            found = [asset for asset in found if asset.name.startswith(stem)] or found[:1]
+        if not found:
+            return None
+        beside = found[0].href.rpartition("/")[0] == image.href.rpartition("/")[0]
+        ours = {f"{PurePosixPath(image.name).stem}{end}".lower() for end in ("_rpc.txt", ".rpb", ".rpc")}
+        return None if beside and found[0].name.lower() in ours else found[0]
+
+    def _chosen(self, key: str, groups: Iterable[list[Asset]], what: str) -> Asset:
+        if key:
+            for asset in self.assets:
+                if asset.key == key:
+                    return asset
+            raise InputError(f"there is no asset {key!r}", file=self.address, remedy=f"one of {self._keys()}")
+        several: list[Asset] = []
+        for group in groups:
+            if len(group) == 1:
+                return group[0]
+            several = several or group
+        if several:
+            raise InputError(
+                f"several assets may be meant: {self._keys(several)}", file=self.address,
+                remedy=f"name one, for example {self.address}#{several[0].key}",
+            )  # fmt: skip
+        raise InputError(
+            f"no asset is a {what}",
+            file=self.address,
+            remedy=f"name one after a #, of {self._keys() or 'another item'}",
+        )
+
+    def _keys(self, assets: Iterable[Asset] | None = None) -> str:
+        return ", ".join(asset.key for asset in list(self.assets if assets is None else assets)[:_SHOWN])
+
+
+def is_item(path: object) -> bool:
+    """Tell by its name whether something may be a STAC item: a JSON file, or an address of an API's items."""
+    if not isinstance(path, str | os.PathLike):
+        return False
+    text = split(path)[0]
+    return text.lower().partition("?")[0].endswith((".json", ".geojson")) or bool(_ITEMS.match(text))
+
+
+def split(path: AnyPath) -> tuple[str, str]:
+    """Return an item's address and the key of the asset after its ``#``; empty where there is none."""
+    text = os.fspath(path)
+    address, _, key = text.partition("#") if is_address(text) or ".json#" in text.lower() else (text, "", "")
+    return address, key
+
+
+@reads(REMEDY)
+def read_item(path: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPath, ...] = ()) -> Item:
+    """Read a STAC item.
+
+    Parameters
+    ----------
+    path : path or address
+    roots : sequence of path
+        Folders on this machine that its assets may lie in, besides its own.
+
+    Raises
+    ------
+    InputError
+        If it is none, or names files elsewhere on this machine.
+    """
+    return item_of(read_document(path, allow_network=allow_network), path, roots)
+
+
+def item_of(document: Mapping[str, Any], address: AnyPath, roots: tuple[AnyPath, ...] = ()) -> Item:
+    """Return the item that a JSON object is; see `read_item`."""
+    if document.get("type") != "Feature" or not isinstance(document.get("stac_version"), str):
+        raise InputError("this is no STAC item", file=address, field="stac_version", remedy=REMEDY)
+    assets = document.get("assets")
+    if not isinstance(assets, dict):
+        raise InputError("a STAC item has assets", file=address, field="assets", remedy=REMEDY)
+    own = next(
+        (link["href"] for link in _list(document.get("links")) if isinstance(link, dict) and link.get("rel") == "self"
+         and isinstance(link.get("href"), str) and is_address(link["href"]) and is_address(address)),
+        os.fspath(address),
+    )  # fmt: skip
+    found = []
+    for key, asset in assets.items():
+        if not isinstance(asset, dict) or not isinstance(asset.get("href"), str):
+            raise InputError("an asset has an href", file=address, field=f"assets.{key[:60]}", remedy=REMEDY)
+        roles = tuple(role for role in _list(asset.get("roles")) if isinstance(role, str))
+        kind = asset.get("type") if isinstance(asset.get("type"), str) else ""
+        found.append(Asset(key, target(asset["href"], own, roots), roles, kind or ""))
+    return Item(os.fspath(address), str(document.get("id", "")), tuple(found))
+
+
+def _list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
