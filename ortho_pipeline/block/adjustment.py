@@ -16,6 +16,7 @@ import numpy as np
 from ortho_pipeline.block.common_error import CommonError
 from ortho_pipeline.block.datum import by_control, with_datum
 from ortho_pipeline.block.determination import refuse_too_few, refuse_undetermined, uncertain_images
+from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
 from ortho_pipeline.block.equations.solver import Solved, attempt
@@ -274,7 +275,7 @@ def _result(
     known = stated if common is None else common.corrected(stated)
     object_residuals = problem.frame.apart(known, local)
     used_ground = selection.ground & active
-    of_params, of_points = (0.0, 0.0) if common is None else (common.of_params, common.of_points)
+    covariance, of_points = _with_common(found.covariance, common)
     # Points that share an error lie to each other as if there were none.
     apart = (points.sigma_common == 0)[:, None, None]
     doubts = outlying(solved, variances, object_residuals, ground_covariance + apart * of_points, used_ground)
@@ -295,7 +296,7 @@ def _result(
             for image, model in zip(points.images, state.models, strict=True)
             for name in model.param_names
         ),
-        covariance=found.covariance + of_params,
+        cofactors=covariance,
         redundancy=math.floor(freedom + 1e-6),
         degrees_of_freedom=freedom,
         sigma0=None if sigma0 is None else variances.image,
@@ -308,6 +309,13 @@ def _result(
         condition=solved.condition,
         iterations=solved.iterations,
     )
+
+
+def _with_common(covariance: Cofactors, common: CommonError | None) -> tuple[Cofactors, Array]:
+    """Return the covariance of the parameters with the part of a common error, and its part in that of the ground."""
+    if common is None:
+        return covariance, np.zeros((1, 3, 3))
+    return covariance.mixed(1.0, common.by_params, common.left), common.of_points
 
 
 def _reprojected(problem: BlockProblem, models: Sequence[SensorModel], ground: Array) -> Array:

@@ -182,11 +182,6 @@ class CommonError:
         return np.asarray(np.linalg.inv(np.eye(2) + self.told))
 
     @property
-    def of_params(self) -> Array:
-        """Its part ``(P, P)`` of the covariance of the parameters."""
-        return np.asarray(self.by_params @ self.left @ self.by_params.T)
-
-    @property
     def of_points(self) -> Array:
         """Its part ``(N, 3, 3)`` of the covariance of the ground, m²."""
         return np.asarray(self.by_points @ self.left @ self.by_points.swapaxes(1, 2))

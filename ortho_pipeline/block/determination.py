@@ -25,7 +25,8 @@ def refuse_too_few(problem: BlockProblem, selection: Selection) -> None:
             "no point was measured in two images, or in one with known ground", file=points.source or None,
             remedy="points of one id are one point: check the ids and the names of the images",
         )  # fmt: skip
-    priors = problem.columns.counts_by_image([one.column for one in problem.pseudo])
+    of_priors, _ = problem.columns.image_and_place([one.column for one in problem.pseudo])
+    priors = np.bincount(of_priors, minlength=len(problem.models))
     for image, model in enumerate(problem.models):
         columns = problem.columns.of_image(image)
         measured = int(rays[points.rays_of_images[image]].sum())
@@ -76,12 +77,11 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
     problem = solved.problem
     found, held = [], any(one.held for one in problem.pseudo)
     for image, model in enumerate(solved.state.models):
-        columns = problem.columns.of_image(image)
         used = solved.linear.ordering.rays_of_image[image]
-        partials = solved.linear.by_params[used][:, :, : len(columns)]
-        if not len(columns) or not len(used):
+        if not len(model.params) or not len(used):
             continue
-        cofactors = solved.cofactors[np.ix_(columns, columns)]
+        partials = solved.linear.by_params[used][:, :, : len(model.params)]
+        cofactors = solved.cofactors.of_images([image])
         of_image = problem.points.rays_of_images[image]
         measured = float(np.median(problem.points.sigma_image[of_image]))
         sigma = max(measured, float(np.median(stated.sigma_image[of_image])))

@@ -10,6 +10,7 @@ import numpy as np
 import pyproj
 
 from ortho_pipeline.block.common_error import CommonError
+from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.intersection import sigmas_of
 from ortho_pipeline.block.local_frame import GEODETIC
@@ -35,9 +36,10 @@ class BlockFit:
     `back_projected` those of the known ground (NaN for ties), `raw_residuals` the same with the models as they were.
     `object_residuals` ``(N, 3)`` are known minus adjusted ground in metres east, north, up. `ground` is lon, lat, h
     (EPSG:4979), NaN where the rays do not determine it; `ground_covariance` ``(N, 3, 3)`` m², east, north, up.
-    `parameters` are (image, name) in the order of `covariance` ``(P, P)``. `sigma0` is the factor of the stated sigmas
-    of measurements (None without redundancy), `variances` has it beside the sigmas of ground that states none.
-    Covariances contain that these are uncertain, so that 1.96 sigmas are right 95 times of 100 with few points too.
+    `parameters` are (image, name) in the order of `covariance` ``(P, P)``, which `cofactors` has in parts. `sigma0` is
+    the factor of the stated sigmas of measurements (None without redundancy), `variances` has it beside the sigmas of
+    ground that states none. Covariances contain that these are uncertain, so that 1.96 sigmas are right 95 times of
+    100 with few points too.
     `outlying` are known points that the block contradicts and that were left as they are. Where points have an error in
     common, `common_error` is that, covariances have its part, and residuals of known ground are what is left beside its
     estimate.
@@ -55,7 +57,7 @@ class BlockFit:
     used_rays: Mask
     used_ground: Mask
     parameters: tuple[tuple[str, str], ...]
-    covariance: Array
+    cofactors: Cofactors
     redundancy: int
     degrees_of_freedom: float
     sigma0: float | None
@@ -86,9 +88,14 @@ class BlockFit:
         return np.concatenate([np.zeros(0), *(model.params for model in self.models.values())])
 
     @property
+    def covariance(self) -> Array:
+        """Covariance of the parameters ``(P, P)``; of a large block it is made when it is asked for."""
+        return self.cofactors.matrix
+
+    @property
     def sigmas(self) -> Array:
         """Standard deviations of the parameters ``(P,)``."""
-        return np.sqrt(np.diag(self.covariance))
+        return np.sqrt(self.cofactors.variances)
 
     @property
     def ground_sigmas(self) -> Array:

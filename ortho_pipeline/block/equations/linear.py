@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from ortho_pipeline.block.equations.problem import BlockProblem, Misfits, Selection, State
+from ortho_pipeline.block.equations.problem import BlockProblem, Misfits, PseudoEquations, Selection, State
 from ortho_pipeline.block.equations.unknowns import Mask, Ordering
 from ortho_pipeline.models.base import Array
 
@@ -26,8 +27,7 @@ class Linear:
     by_params: Array  # (M, 2, p)
     by_point: Array  # (M, 2, 3)
     ground_by_point: Array  # (N, 3, 3)
-    pseudo_rows: Array  # (k, P)
-    pseudo_true: Mask  # (k,) observations; the others hold a datum or are fictitious
+    pseudo: PseudoEquations
 
     @classmethod
     def at(cls, problem: BlockProblem, state: State, weights: Selection, ordering: Ordering | None = None) -> Linear:
@@ -49,15 +49,27 @@ class Linear:
         ground_by_point, rows = np.zeros((len(points), 3, 3)), ordering.grounded
         scale = np.sqrt(weights.ground_weights[rows])[:, None] / problem.ground_sigmas[rows]
         ground_by_point[rows] = problem.enu[rows] * scale[:, :, None]
-        return cls(
-            problem, state, ordering, weights, misfits, by_params, by_point, ground_by_point, pseudo.rows, pseudo.true
-        )
+        return cls(problem, state, ordering, weights, misfits, by_params, by_point, ground_by_point, pseudo)
+
+    @property
+    def pseudo_design(self) -> Array:
+        """Rows ``(k, P)`` of the pseudo-observations."""
+        size, pseudo = self.problem.size, self.pseudo
+        found = np.zeros((len(pseudo.rows), size + 1))
+        found[np.arange(len(found))[:, None], self.problem.columns.padded[pseudo.image]] = pseudo.rows
+        return found[:, :size]
+
+    def pseudo_by_image(self, of: Mask) -> Iterator[tuple[int, Array]]:
+        """Yield images with the rows ``(k, p)`` by their own parameters of some of their pseudo-observations."""
+        counts = np.diff(self.problem.columns.offsets)
+        for image in np.unique(self.pseudo.image[of]).tolist():
+            yield image, self.pseudo.rows[of & (self.pseudo.image == image), : counts[image]]
 
     def changes(self, step: Array, shift: Array) -> Misfits:
         """Return what a step of the parameters ``(P,)`` and of the points ``(N, 3)`` takes off, to first order."""
         points = self.problem.points
-        padded = np.append(step, 0.0)[self.problem.columns.padded[points.image]]
-        rays = (self.by_params @ padded[:, :, None])[:, :, 0]
-        rays += (self.by_point @ shift[points.point][:, :, None])[:, :, 0]
-        ground = (self.ground_by_point @ shift[:, :, None])[:, :, 0]
-        return Misfits(rays, ground, self.pseudo_rows @ step)
+        of_image = np.append(step, 0.0)[self.problem.columns.padded]
+        rays = np.einsum("nij,nj->ni", self.by_params, of_image[points.image])
+        rays += np.einsum("nij,nj->ni", self.by_point, shift[points.point])
+        ground = np.einsum("nij,nj->ni", self.ground_by_point, shift)
+        return Misfits(rays, ground, (self.pseudo.rows * of_image[self.pseudo.image]).sum(axis=1))

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
+from ortho_pipeline.block.equations.image_pairs import ImagePairs, Levels
 from ortho_pipeline.block.equations.unknowns import Columns, Mask, Ordering
 from ortho_pipeline.block.local_frame import GroundFrame
-from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.models.base import Array, SensorModel
 
 #: Ground is never weighted with less than this sigma (m): far below any pixel, far above rounding.
@@ -92,12 +94,13 @@ class Misfits:
 
 @dataclass(frozen=True, eq=False)
 class PseudoEquations:
-    """Equations of priors, datum and the models' constraints: misfits ``(k,)``, rows ``(k, P)``.
+    """Equations of priors, datum and the models' constraints: misfits ``(k,)``, rows ``(k, p)`` of one `image` each.
 
     `true` ``(k,)`` are observations; the others hold a datum or are fictitious.
     """
 
     misfit: Array
+    image: Index
     rows: Array
     true: Mask
 
@@ -131,6 +134,11 @@ class BlockProblem:
     def size(self) -> int:
         """Number of parameters P."""
         return self.columns.size
+
+    @cached_property
+    def levels(self) -> Levels:
+        """The parameters in an order in which the normal equations of many images are solved."""
+        return Levels(ImagePairs.of(self.points), self.columns)
 
     def with_pseudo(self, more: Sequence[Pseudo]) -> BlockProblem:
         """Return this problem with further pseudo-observations."""
@@ -188,21 +196,23 @@ class BlockProblem:
     def pseudo_equations(self, state: State) -> PseudoEquations:
         """Return the equations of priors, datum and the models' constraints at a state."""
         params = state.params
-        rows = np.zeros((len(self.pseudo), self.size))
-        for k, one in enumerate(self.pseudo):
-            rows[k, one.column] = 1.0 / one.sigma
+        images, places = self.columns.image_and_place([one.column for one in self.pseudo])
+        rows = np.zeros((len(self.pseudo), self.columns.widest))
+        rows[np.arange(len(rows)), places] = [1.0 / one.sigma for one in self.pseudo]
         parts, true = [rows], [np.array([not one.held for one in self.pseudo], dtype=bool)]
         values = [np.array([(one.mean - params[one.column]) / one.sigma for one in self.pseudo], dtype=float)]
+        of = [images]
         for image, model in enumerate(state.models):
             known = model.constraints()
             if not len(known):
                 continue
-            wide = np.zeros((len(known), self.size))
-            wide[:, self.columns.of_image(image)] = known.jacobian / known.sigma[:, None]
+            wide = np.zeros((len(known), self.columns.widest))
+            wide[:, : known.jacobian.shape[1]] = known.jacobian / known.sigma[:, None]
             parts.append(wide)
+            of.append(np.full(len(known), image))
             values.append(known.residuals / known.sigma)
             true.append(~known.fictitious)
-        return PseudoEquations(np.concatenate(values), np.vstack(parts), np.concatenate(true))
+        return PseudoEquations(np.concatenate(values), np.concatenate(of), np.vstack(parts), np.concatenate(true))
 
     def square(self, state: State, selection: Selection) -> float:
         """Return the sum of the squared misfits at a state; infinite where something cannot be computed."""

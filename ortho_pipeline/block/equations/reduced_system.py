@@ -6,19 +6,46 @@ Source: Golub 1965 (Householder triangulation).
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from ortho_pipeline.block.equations.cofactors import Cofactors, DenseCofactors, LevelCofactors
+from ortho_pipeline.block.equations.image_pairs import Levels
+from ortho_pipeline.block.equations.level_factor import LevelFactor, LevelMatrix, lengths_of
+from ortho_pipeline.block.equations.unknowns import Columns
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.estimation.least_squares import LinearSolution, solve_linear
 from ortho_pipeline.models.base import Array
 
 
+@dataclass(frozen=True, eq=False)
+class DenseSolution:
+    """Values ``(P,)`` of a system that was triangulated."""
+
+    found: LinearSolution
+    columns: Columns
+
+    @property
+    def values(self) -> Array:
+        return self.found.values
+
+    @property
+    def cofactors(self) -> Cofactors:
+        return DenseCofactors(self.found.cofactors, self.columns)
+
+    @property
+    def condition(self) -> float:
+        return self.found.condition
+
+
 class OrthogonalSystem:
     """The rows of the parameters alone, to be triangulated."""
 
-    def __init__(self, rows: int, columns: int) -> None:
-        self.filled, self.design, self.right = 0, np.zeros((rows, columns)), np.zeros(rows)
+    def __init__(self, rows: int, columns: Columns) -> None:
+        self.columns = columns
+        self.filled, self.design, self.right = 0, np.zeros((rows, columns.size)), np.zeros(rows)
 
     def add(self, columns: Index, design: Array, right: Array) -> None:
         """Add rows ``(n, p)`` of some columns."""
@@ -27,59 +54,67 @@ class OrthogonalSystem:
         self.right[rows] = right
         self.filled += len(design)
 
-    @property
     def scaled(self) -> Array:
-        """Normal equations with a diagonal of ones."""
-        design = self.design / _lengths(np.linalg.norm(self.design, axis=0))
+        """Return normal equations ``(P, P)`` with a diagonal of ones."""
+        design = self.design / lengths_of(np.linalg.norm(self.design, axis=0))
         return np.asarray(design.T @ design)
 
-    def solve(self, damping: float) -> LinearSolution:
+    def solve(self, damping: float) -> DenseSolution:
         """Return the solution; with `damping`, steps are shortened relative to the length of the columns."""
         design, right = self.design, self.right
         if damping:
             design = np.vstack([design, math.sqrt(damping) * np.diag(np.linalg.norm(design, axis=0))])
             right = np.concatenate([right, np.zeros(design.shape[1])])
-        return solve_linear(design, right, refine=False)
+        return DenseSolution(solve_linear(design, right, refine=False), self.columns)
+
+
+@dataclass(frozen=True, eq=False)
+class LevelSolution:
+    """Values ``(P,)`` of normal equations; NaN where these are not positive definite (no `factor`)."""
+
+    values: Array
+    levels: Levels
+    factor: LevelFactor | None
+
+    @property
+    def cofactors(self) -> Cofactors:
+        if self.factor is None:
+            size = self.levels.columns.size
+            return DenseCofactors(np.full((size, size), np.nan), self.levels.columns)
+        return LevelCofactors(self.levels, self.factor)
+
+    @cached_property
+    def condition(self) -> float:
+        return math.inf if self.factor is None else self.factor.condition()
 
 
 class NormalSystem:
-    """The normal equations of the parameters alone, for many rows."""
+    """The normal equations of the parameters alone: blocks ``(S, p, p)`` of pairs of images, right ``(images, p)``."""
 
-    def __init__(self, columns: int) -> None:
-        self.matrix, self.right = np.zeros((columns, columns)), np.zeros(columns)
+    def __init__(self, levels: Levels) -> None:
+        images, wide = levels.columns.padded.shape
+        self.levels = levels
+        self.blocks, self.right = np.zeros((len(levels.pairs.first), wide, wide)), np.zeros((images, wide))
 
-    def add(self, columns: Index, design: Array, right: Array, *, sign: float = 1.0) -> None:
-        """Add (or subtract) the products of rows ``(n, p)`` of some columns."""
-        self.matrix[columns[:, None], columns] += sign * (design.T @ design)
-        self.right[columns] += sign * (design.T @ right)
+    def add(self, image: Index, design: Array, right: Array) -> None:
+        """Add rows ``(k, p)`` of the parameters of one image ``(k,)`` each."""
+        np.add.at(self.blocks, self.levels.pairs.slot[image, image], design[:, :, None] * design[:, None, :])
+        np.add.at(self.right, image, design * right[:, None])
 
-    @property
     def scaled(self) -> Array:
-        """Normal equations with a diagonal of ones."""
-        lengths = _lengths(np.sqrt(np.maximum(np.diag(self.matrix), 0.0)))
-        return np.asarray(self.matrix / np.outer(lengths, lengths))
+        """Return normal equations ``(P, P)`` with a diagonal of ones."""
+        return LevelMatrix(self.levels, self.blocks).dense()
 
-    def solve(self, damping: float) -> LinearSolution:
+    def solve(self, damping: float) -> LevelSolution:
         """Return the solution; with `damping`, steps are shortened relative to the diagonal."""
-        from scipy.linalg import LinAlgError, cho_factor, cho_solve
+        from scipy.linalg import LinAlgError
 
-        count = len(self.right)
-        lengths = _lengths(np.sqrt(np.maximum(np.diag(self.matrix), 0.0)))
-        scaled = self.scaled + damping * np.eye(count)
+        right = self.right[self.levels.columns.padded >= 0]
         try:
-            factor = cho_factor(scaled)
-        except LinAlgError:
-            left_open = np.full(count, np.nan)
-            return LinearSolution(left_open, left_open, np.full_like(scaled, np.nan), math.inf)
-        inverse = cho_solve(factor, np.eye(count))
-        spectrum = np.linalg.eigvalsh(scaled)
-        condition = math.sqrt(spectrum[-1] / spectrum[0]) if spectrum[0] > 0 else math.inf
-        values = inverse @ (self.right / lengths) / lengths
-        return LinearSolution(values, np.zeros(0), inverse / np.outer(lengths, lengths), condition)
-
-
-def _lengths(lengths: Array) -> Array:
-    return np.where(lengths > 0, lengths, 1.0)
+            factor = LevelFactor(self.levels, self.blocks, damping)
+        except (LinAlgError, ValueError):  # a ValueError says that something is not finite
+            return LevelSolution(np.full_like(right, np.nan), self.levels, None)
+        return LevelSolution(factor.solve(right), self.levels, factor)
 
 
 def solve_triangular(r: Array, right: Array) -> Array:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from ortho_pipeline.block.equations.elimination import Eliminated, Step, step_of
+from ortho_pipeline.block.equations.cofactors import Cofactors
+from ortho_pipeline.block.equations.elimination import Elimination, Step, step_of
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Selection, State
 from ortho_pipeline.block.equations.steps import Steps
@@ -21,19 +23,34 @@ _STEPS = 50
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The observation equations at a minimum (or after one step), factored, with the cofactors of the parameters.
+    """The observation equations at a minimum (or after one step), their points factored out, and the step there.
 
-    Not `converged`: at the place where the iteration ended without one. `astray` ``(N,)`` are points that were held
-    where they were, because their next steps lead out of the models; all else is to be solved for without them.
+    `undetermined`: the points leave parameters open, whatever the condition of the step's equations is. Not
+    `converged`: at the place where the iteration ended without one. `astray` ``(N,)`` are points that were held where
+    they were, because their next steps lead out of the models; all else is to be solved for without them.
     """
 
     linear: Linear
-    eliminated: tuple[Eliminated, ...]
-    cofactors: Array
-    condition: float
+    step: Step
     iterations: int = 0
     converged: bool = True
     astray: Mask | None = None
+    undetermined: bool = False
+
+    @property
+    def points(self) -> Elimination:
+        """The points, factored out."""
+        return self.step.points
+
+    @cached_property
+    def cofactors(self) -> Cofactors:
+        """Those of the parameters."""
+        return self.step.solution.cofactors
+
+    @property
+    def condition(self) -> float:
+        """Condition of the reduced system."""
+        return max(self.step.condition, 1.01 * CONDITION_LIMIT) if self.undetermined else self.step.condition
 
     @property
     def problem(self) -> BlockProblem:
@@ -49,9 +66,11 @@ class Solved:
         What holds the datum, or is fictitious, is not an observation; nor are the parameters that it decides unknown.
         """
         linear, ordering, misfits = self.linear, self.linear.ordering, self.linear.misfits
-        true = linear.pseudo_true
-        rows = linear.pseudo_rows[~true]
-        effective = self.problem.size - float(((rows @ self.cofactors) * rows).sum())
+        true = linear.pseudo.true
+        effective = self.problem.size - sum(
+            float(((rows @ self.cofactors.of_images([image])) * rows).sum())
+            for image, rows in linear.pseudo_by_image(~true)
+        )
         known = int(np.isfinite(self.problem.known[ordering.grounded]).sum())
         freedom = ordering.observations + known + int(true.sum()) - (effective + 3 * ordering.points)
         square = sum(float((part**2).sum()) for part in (misfits.rays, misfits.ground))
@@ -59,21 +78,17 @@ class Solved:
         # The effective number of parameters is a fraction; below half an observation there is no redundancy.
         return (math.sqrt(square / freedom) if freedom > 0.5 else None), freedom
 
-    def ground_covariance(self, covariance: Array, factor: float) -> Array:
+    def ground_covariance(self, covariance: Cofactors, factor: float) -> Array:
         """Return that of the points ``(N, 3, 3)``, east, north, up, NaN for those that take no part.
 
         Parameters
         ----------
-        covariance : ndarray (P, P)
+        covariance : Cofactors
             Of the parameters.
         factor : float
             Square of the factor of the sigmas of measurements.
         """
-        found = np.full((len(self.problem.points), 3, 3), np.nan)
-        for rows in self.eliminated:
-            root = np.linalg.inv(rows.r)
-            inner = factor * np.eye(3) + rows.taken(covariance)[1]
-            found[rows.chunk.points] = root @ inner @ root.swapaxes(1, 2)
+        found = self.points.ground(covariance, factor)
         frame = self.problem.frame
         axes = frame.enu_at(frame.geodetic(self.state.local))
         return axes @ found @ axes.swapaxes(1, 2)
@@ -111,14 +126,14 @@ def attempt(problem: BlockProblem, start: State, selection: Selection) -> Solved
         step = step_of(linear, damping)
         if not step.finite or (iteration == 1 and step.condition > CONDITION_LIMIT):
             # In a valley without a bottom the iteration would only wander: the caller says what is undetermined.
-            return replace(_solved(linear, step), condition=max(step.condition, CONDITION_LIMIT * 1.01))
+            return Solved(linear, step, undetermined=True)
         change, before = _change(step, held), steps.length
         promised = float(np.linalg.norm(change))
         length = math.sqrt(square) + math.sqrt(ordering.observations)
         # Close to the minimum steps are rounding: they do not get shorter any more, or do not descend.
         small = promised <= 1e-8 * length or (promised <= 1e-6 * length and promised > before / 4)
         if small and not damping:
-            return _solved(linear, step, iteration, held)
+            return Solved(linear, step, iteration, astray=held)
         whole = step.whole
         further = None if damping else steps.extrapolated(change, whole)
         ahead = _descent(linear, whole, further, square)
@@ -131,7 +146,7 @@ def attempt(problem: BlockProblem, start: State, selection: Selection) -> Solved
             if held is not None and before_that is not None and (held & before_that).any():
                 # The step reckons with them where they cannot go: the others have to be solved for without them.
                 linear = Linear.at(problem, state, selection, ordering)
-                return _solved(linear, step_of(linear), iteration, held & before_that)
+                return Solved(linear, step_of(linear), iteration, astray=held & before_that)
             damping = damping / 10 if damping > 1e-6 else 0.0
             continue
         steps = Steps()
@@ -140,11 +155,11 @@ def attempt(problem: BlockProblem, start: State, selection: Selection) -> Solved
             promised = float(np.linalg.norm(_change(step, held)))
         if promised <= 1e-4 * length:
             # Rounding of the ground hides what so small a step would gain.
-            return _solved(linear, step, iteration, held)
+            return Solved(linear, step, iteration, astray=held)
         damping = max(10 * damping, 1e-3)
         if damping > 1e8:
             break
-    return replace(_solved(linear, step_of(linear), iteration), converged=False)
+    return Solved(linear, step_of(linear), iteration, converged=False)
 
 
 def _change(step: Step, held: Mask | None) -> Array:
@@ -165,11 +180,7 @@ def once(problem: BlockProblem, state: State, selection: Selection) -> tuple[Sol
     step = step_of(linear)
     left = replace(linear, misfits=linear.misfits.minus(step.change))
     ahead = _moved(linear, step.whole)
-    return _solved(left, step), state if ahead is None else ahead.state
-
-
-def _solved(linear: Linear, step: Step, iterations: int = 0, held: Mask | None = None) -> Solved:
-    return Solved(linear, step.eliminated, step.solution.cofactors, step.condition, iterations, astray=held)
+    return Solved(left, step), state if ahead is None else ahead.state
 
 
 @dataclass(frozen=True, eq=False)

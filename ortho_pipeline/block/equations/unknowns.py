@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,10 +51,11 @@ class Columns:
         """Return the columns of the parameters of an image."""
         return np.arange(self.offsets[image], self.offsets[image + 1])
 
-    def counts_by_image(self, columns: Sequence[int]) -> Index:
-        """Return how many of some columns are of each image ``(images,)``."""
-        images = np.searchsorted(self.offsets, np.asarray(columns, dtype=np.int64), side="right") - 1
-        return np.bincount(images, minlength=len(self.padded))
+    def image_and_place(self, columns: Sequence[int]) -> tuple[Index, Index]:
+        """Return the images ``(k,)`` that some columns are of, and their places among the parameters of these."""
+        given = np.asarray(columns, dtype=np.int64)
+        images = np.searchsorted(self.offsets, given, side="right") - 1
+        return images, given - self.offsets[images]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,14 +74,18 @@ class Chunk:
 
 @dataclass(frozen=True, eq=False)
 class Ordering:
-    """Order in which the unknowns are eliminated: points in chunks, then the parameters of all images.
+    """Order in which the unknowns are eliminated: point by point, or points in chunks, then the parameters.
 
-    `rays_of_image` are the rays of each image that take part, `grounded` the points whose known ground weighs in.
+    `rays` ``(K,)`` that take part stand by point and image, those of the n `numbers` of points between `starts`
+    ``(n + 1,)``; `known` ``(n,)`` says whose known ground weighs in. `rays_of_image` are the rays of each image.
     """
 
-    chunks: tuple[Chunk, ...]
+    image: Index
+    rays: Index
+    starts: Index
+    numbers: Index
+    known: Mask
     rays_of_image: tuple[Index, ...]
-    grounded: Index
 
     @classmethod
     def of(cls, points: BlockPoints, taking_part: Mask, grounded: Mask) -> Ordering:
@@ -95,29 +101,41 @@ class Ordering:
         rays = np.flatnonzero(taking_part)
         rays = rays[np.lexsort((points.image[rays], points.point[rays]))]
         counts = np.bincount(points.point[rays], minlength=len(points))
-        starts = np.concatenate([[0], np.cumsum(counts)])
+        numbers = np.flatnonzero(counts)
+        starts = np.concatenate([[0], np.cumsum(counts[numbers])])
+        of_image = tuple(rays_of[taking_part[rays_of]] for rays_of in points.rays_of_images)
+        return cls(points.image, rays, starts, numbers, grounded[numbers], of_image)
+
+    @cached_property
+    def chunks(self) -> tuple[Chunk, ...]:
+        """Points with the same number of rays."""
+        counts = np.diff(self.starts)
         chunks = []
-        for count in np.unique(counts[counts > 0]):
+        for count in np.unique(counts):
             for ground in (False, True):
-                rows = np.flatnonzero((counts == count) & (grounded == ground))
-                table = rays[starts[rows][:, None] + np.arange(count)]
-                order = np.lexsort(points.image[table].T[::-1])
+                rows = np.flatnonzero((counts == count) & (self.known == ground))
+                table = self.rays[self.starts[rows][:, None] + np.arange(count)]
+                order = np.lexsort(self.image[table].T[::-1])
                 for begin in range(0, len(order), _CHUNK):
                     part = order[begin : begin + _CHUNK]
-                    images = points.image[table[part]]
-                    chunks.append(Chunk(rows[part], table[part], images, ground, _groups(images)))
-        of_image = tuple(rays_of[taking_part[rays_of]] for rays_of in points.rays_of_images)
-        return cls(tuple(chunks), of_image, np.flatnonzero((counts > 0) & grounded))
+                    images = self.image[table[part]]
+                    chunks.append(Chunk(self.numbers[rows[part]], table[part], images, ground, _groups(images)))
+        return tuple(chunks)
+
+    @property
+    def grounded(self) -> Index:
+        """Points whose known ground weighs in."""
+        return self.numbers[self.known]
 
     @property
     def observations(self) -> int:
         """Number of image coordinates."""
-        return 2 * sum(len(rays) for rays in self.rays_of_image)
+        return 2 * len(self.rays)
 
     @property
     def points(self) -> int:
         """Number of points that take part."""
-        return sum(len(chunk.points) for chunk in self.chunks)
+        return len(self.numbers)
 
 
 def _groups(images: Index) -> tuple[slice, ...]:

@@ -12,7 +12,6 @@ Source: Baarda 1968 (data snooping); Huber 1981, Geman and McClure 1985 (weights
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -132,7 +131,7 @@ def _robust(
             rays, ground = tests.sizes(estimated)
             weights = replace(selection, ray_weights=weigh(rays), ground_weights=weigh(ground))
             found, ahead = once(problem, state, weights)
-            if not (math.isfinite(found.condition) and np.isfinite(found.linear.misfits.rays).all()):
+            if not np.isfinite(found.linear.misfits.rays).all():
                 return problem, replace(solved, linear=replace(solved.linear, state=state))
             solved, state = found, ahead
             tests = standardise(solved)

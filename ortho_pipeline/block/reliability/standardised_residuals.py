@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ortho_pipeline.block.equations.elimination import Eliminated
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.points import Index
@@ -54,57 +53,41 @@ def _root_median(ratio: Array) -> float:
 
 def standardise(solved: Solved) -> StandardisedResiduals:
     """Standardise the residuals of everything that takes part, one by one."""
-    points, linear = solved.problem.points, solved.linear
-    rays, ray_rank = np.zeros(points.rays), np.zeros(points.rays, dtype=np.int64)
-    ground, ground_rank = np.zeros(len(points)), np.zeros(len(points), dtype=np.int64)
-    for rows in solved.eliminated:
-        product, inner = rows.taken(solved.cofactors)
-        wide = linear.by_params.shape[2]
-        core = np.eye(3) + inner
-        for c in range(rows.chunk.rays.shape[1]):
-            used, q = rows.chunk.rays[:, c], rows.q[:, 2 * c : 2 * c + 2]
-            own = linear.by_params[used]
-            cross = own @ product[:, c * wide : (c + 1) * wide] @ q.swapaxes(1, 2)
-            own = own @ _of_images(solved, rows.chunk.images[:, c]) @ own.swapaxes(1, 2)
-            hat = q @ core @ q.swapaxes(1, 2) + own - cross - cross.swapaxes(1, 2)
-            rays[used], ray_rank[used] = _standardise(hat, linear.misfits.rays[used])
-        if rows.chunk.ground:
-            used = rows.chunk.points
-            ground[used], ground_rank[used] = _of_ground(solved, rows, core)
-    weights = linear.weights
+    linear, weights = solved.linear, solved.linear.weights
+    of_rays, of_ground = solved.points.hats(solved.cofactors)
+    rays, ray_rank = _standardised(linear.ordering.rays, of_rays, linear.misfits.rays)
+    ground, ground_rank = _standardised(linear.ordering.grounded, of_ground, linear.misfits.ground)
     return StandardisedResiduals(rays / weights.ray_weights, ray_rank, ground / weights.ground_weights, ground_rank)
 
 
 def standardise_ground(solved: Solved) -> tuple[Array, Index]:
     """Return squared standardised residuals ``(N,)`` of known ground alone, and their degrees of freedom."""
-    count = len(solved.problem.points)
-    ground, rank = np.zeros(count), np.zeros(count, dtype=np.int64)
-    for rows in solved.eliminated:
-        if rows.chunk.ground:
-            core = np.eye(3) + rows.taken(solved.cofactors)[1]
-            ground[rows.chunk.points], rank[rows.chunk.points] = _of_ground(solved, rows, core)
-    return ground, rank
+    hats = solved.points.hats(solved.cofactors)[1]
+    return _standardised(solved.linear.ordering.grounded, hats, solved.linear.misfits.ground)
 
 
-def _of_ground(solved: Solved, rows: Eliminated, core: Array) -> tuple[Array, Index]:
-    q = rows.q[:, -3:]
-    # What is left after a step, as of the rays: the rows themselves have the misfits that it was taken from.
-    return _standardise(q @ core @ q.swapaxes(1, 2), solved.linear.misfits.ground[rows.chunk.points])
+def _standardised(used: Index, hats: Array, misfits: Array) -> tuple[Array, Index]:
+    """Return squared standardised residuals ``(n,)`` of parts with a hat matrix, and their degrees of freedom.
 
-
-def _of_images(solved: Solved, images: Index) -> Array:
-    """Return the cofactors ``(n, p, p)`` of the parameters of some images."""
-    columns = solved.problem.columns.padded
-    table = solved.cofactors[columns[:, :, None], columns[:, None, :]]
-    real = columns >= 0
-    found: Array = np.where(real[:, :, None] & real[:, None, :], table, 0.0)[images]
-    return found
-
-
-def _standardise(hat: Array, misfit: Array) -> tuple[Array, Index]:
-    """Return squared standardised residuals ``(n,)`` of parts with a hat matrix, and their degrees of freedom."""
-    redundancy, axes = np.linalg.eigh(np.eye(hat.shape[1]) - hat)
-    turned = (axes.swapaxes(1, 2) @ misfit[:, :, None])[:, :, 0]
+    Zero for parts that are not `used`. Misfits are those that are left after a step; the rows themselves have those
+    that it was taken from.
+    """
+    squares, rank = np.zeros(len(hats)), np.zeros(len(hats), dtype=np.int64)
+    redundancy, axes = _axes_of(np.eye(hats.shape[1]) - hats[used])
+    turned = np.einsum("nij,ni->nj", axes, misfits[used])
     testable = redundancy > _TESTABLE
-    squares = np.where(testable, turned**2 / np.where(testable, redundancy, 1.0), 0.0).sum(axis=1)
-    return squares, testable.sum(axis=1)
+    squares[used] = np.where(testable, turned**2 / np.where(testable, redundancy, 1.0), 0.0).sum(axis=1)
+    rank[used] = testable.sum(axis=1)
+    return squares, rank
+
+
+def _axes_of(matrices: Array) -> tuple[Array, Array]:
+    """Return eigenvalues ``(n, k)`` and eigenvectors ``(n, k, k)`` of symmetric matrices; of 2 x 2 in closed form."""
+    if matrices.shape[1] != 2:
+        return np.linalg.eigh(matrices)
+    a, b, c = matrices[:, 0, 0], matrices[:, 1, 0], matrices[:, 1, 1]
+    angle = 0.5 * np.arctan2(2.0 * b, a - c)
+    cos, sin = np.cos(angle), np.sin(angle)
+    half, spread = 0.5 * (a + c), np.hypot(0.5 * (a - c), b)
+    axes = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
+    return np.stack([half + spread, half - spread], axis=1), axes

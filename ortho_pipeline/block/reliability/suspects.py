@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.elimination import Eliminated, eliminate
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import Selection
@@ -140,7 +141,7 @@ class _Limits:
 class _Suspects:
     """The rows of points of a chunk; their parts are their rays, and their ground if that is known."""
 
-    def __init__(self, rows: Eliminated, cofactors: Array) -> None:
+    def __init__(self, rows: Eliminated, cofactors: Cofactors) -> None:
         self.problem, self.rows = rows.linear.problem, rows
         self.design, self.misfit = rows.q @ rows.r, rows.misfit
         self.parts = {c: np.arange(2 * c, 2 * c + 2) for c in range(rows.chunk.rays.shape[1])}
@@ -148,9 +149,10 @@ class _Suspects:
             self.parts[_GROUND] = np.arange(self.misfit.shape[1] - 3, self.misfit.shape[1])
         self.spread = np.tile(np.eye(self.misfit.shape[1]), (len(self.misfit), 1, 1))
         for group in rows.chunk.groups:
-            columns, real = rows.columns(group)
+            _, real = rows.columns(group)
             by_params = rows.design(group)[:, :, real]
-            self.spread[group] += by_params @ cofactors[columns[:, None], columns] @ by_params.swapaxes(1, 2)
+            own = cofactors.of_images(rows.chunk.images[group.start])
+            self.spread[group] += by_params @ own @ by_params.swapaxes(1, 2)
 
     def contradictions(self, without: int | None) -> tuple[Array, int]:
         """Return the squares ``(n,)`` by which all parts but one miss each other and the block, and their freedom."""

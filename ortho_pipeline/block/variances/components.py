@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.problem import PERFECT_GROUND, BlockProblem
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.points import Index
@@ -117,14 +118,14 @@ class Variances:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Variance components, the covariance ``(P, P)`` with their uncertainty, and that of the grounded points.
+    """Variance components, the covariance of the parameters with their uncertainty, and that of the grounded points.
 
     `image_square` is the mean square of the factor of measurements; `ground` ``(n, 3, 3)`` of the points `rows`, m²
     east, north, up; `moved` is how far (sigmas) the parameters are from those of the solution.
     """
 
     variances: Variances
-    covariance: Array
+    covariance: Cofactors
     image_square: float
     rows: Index
     ground: Array

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.block.equations.elimination import Eliminated
+from ortho_pipeline.block.equations.cofactors import Cofactors
+from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.variances.components import diagonal
 from ortho_pipeline.models.base import Array
 
 #: No measurement is taken as better than this (px), whatever residuals say: those of simulations may be rounding alone.
 _FINEST = 1e-4
+#: Below this part of the parameters, those that control tells of are taken alone; what is told less than this part of
+#: what is known counts as nothing.
+_FAR_LESS, _TOLD = 0.5, 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,34 +36,31 @@ class Node:
 class ControlEquations:
     """Normal equations with everything but control eliminated, in parameters z with unit cofactors.
 
-    Per control point of n, in its local ENU frame: `u` ``(n, 3, 3)``, `k` ``(n, 3, P)``, `ue` ``(n, 3)`` are B'B, B'A,
-    B'e of its rays, `d` ``(n, 3)`` its ground's misfit in metres.
+    Per control point of n, in its local ENU frame: `u` ``(n, 3, 3)``, `k` ``(n, 3, m)``, `ue` ``(n, 3)`` are B'B, B'A,
+    B'e of its rays, `d` ``(n, 3)`` its ground's misfit in metres. Parameters are `root` ``(P, m)`` z, and `rest` others
+    on which neither control nor pseudo-observations have any influence.
     """
 
     def __init__(self, solved: Solved) -> None:
-        problem, linear, size = solved.problem, solved.linear, solved.problem.size
-        self.size, self.root = size, _root(solved.cofactors)
-        parts = [self._control(rows) for rows in solved.eliminated if rows.chunk.ground]
-        if parts:
-            joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
-        else:
-            joined = [np.zeros(shape) for shape in ((0,), (0, 3, 3), (0, 3, size), (0, 3), (0, 3))]
-        self.rows = joined[0].astype(np.int64)
-        self.u: Array = joined[1]
-        self.k: Array = joined[2]
-        self.ue: Array = joined[3]
-        self.d: Array = joined[4]
+        problem, linear = solved.problem, solved.linear
+        self.size = problem.size
+        self.rows = linear.ordering.grounded
+        self.u, by_params, self.ue, self.d = self._control(linear)
         self.observed = np.isfinite(problem.known[self.rows])
         self.unstated = self.observed & (problem.points.sigma_ground[self.rows] == 0)
         with np.errstate(divide="ignore"):
             self.weights = np.where(self.observed, problem.ground_sigmas[self.rows] ** -2.0, 0.0)
-        pseudo = linear.pseudo_rows @ self.root
+        own = self.u + diagonal(self.weights)
+        self.root = _root(solved.cofactors, own, by_params, linear.pseudo_design)
+        self.rest = self.size - self.root.shape[1]
+        self.k: Array = by_params @ self.root
+        pseudo = linear.pseudo_design @ self.root
         self.pseudo, self.pseudo_right = pseudo.T @ pseudo, pseudo.T @ linear.misfits.pseudo
-        inverse = np.linalg.inv(self.u + diagonal(self.weights))
+        inverse = np.linalg.inv(own)
         taken = inverse @ self.k
-        flat = self.k.reshape(3 * len(self.rows), size)
+        flat = self.k.reshape(3 * len(self.rows), self.rank)
         # The normal matrix of the solution is the unit matrix, its gradient zero: what is not control is the rest.
-        self.image = np.eye(size) - self.pseudo + flat.T @ taken.reshape(flat.shape)
+        self.image = np.eye(self.rank) - self.pseudo + flat.T @ taken.reshape(flat.shape)
         right = (inverse @ (self.ue + self.weights * self.d)[:, :, None])[:, :, 0]
         self.image_right = flat.T @ right.ravel() - self.pseudo_right
         self.square = float((linear.misfits.rays**2).sum())
@@ -71,21 +71,29 @@ class ControlEquations:
         self.finest = math.log(_FINEST / sigma)
         self.pixel = 1.0 / max(float(np.median(pixel)) * sigma, 1e-12) if len(pixel) else 1.0
 
-    def _control(self, rows: Eliminated) -> tuple[Any, ...]:
-        """Return the points of a chunk, and their parts of `u`, `k`, `ue` and `d`."""
-        linear, chunk, problem = rows.linear, rows.chunk, rows.linear.problem
-        n, k = chunk.rays.shape
-        design = np.zeros((n, 2 * k, self.size))
-        for group in chunk.groups:
-            columns, real = rows.columns(group)
-            design[group] = rows.design(group)[:, : 2 * k, real] @ self.root[columns]
-        enu = problem.enu[chunk.points]
-        by_point = linear.by_point[chunk.rays].reshape(n, 2 * k, 3) @ enu.swapaxes(1, 2)
-        turned = by_point.swapaxes(1, 2)
-        misfit = linear.misfits.rays[chunk.rays].reshape(n, 2 * k, 1)
-        apart = (enu @ (problem.target[chunk.points] - linear.state.local[chunk.points])[:, :, None])[:, :, 0]
-        apart = np.where(np.isfinite(problem.known[chunk.points]), apart, 0.0)
-        return chunk.points, turned @ by_point, turned @ design, (turned @ misfit)[:, :, 0], apart
+    @property
+    def rank(self) -> int:
+        """Number m of the parameters z."""
+        return self.root.shape[1]
+
+    def _control(self, linear: Linear) -> tuple[Array, Array, Array, Array]:
+        """Return `u`, B'A ``(n, 3, P)``, `ue` and `d`."""
+        problem, ordering, points = linear.problem, linear.ordering, linear.problem.points
+        place = np.full(len(points), -1)
+        place[self.rows] = np.arange(len(self.rows))
+        rays = ordering.rays[place[points.point[ordering.rays]] >= 0]
+        of = place[points.point[rays]]
+        enu = problem.enu[self.rows]
+        turned = (linear.by_point[rays] @ enu[of].swapaxes(1, 2)).swapaxes(1, 2)
+        u, ue = np.zeros((len(self.rows), 3, 3)), np.zeros((len(self.rows), 3))
+        np.add.at(u, of, turned @ turned.swapaxes(1, 2))
+        np.add.at(ue, of, (turned @ linear.misfits.rays[rays][:, :, None])[:, :, 0])
+        by_params = np.zeros((len(self.rows), 3, self.size + 1))
+        columns = problem.columns.padded[points.image[rays]]
+        by_params[of[:, None, None], np.arange(3)[:, None], columns[:, None]] = turned @ linear.by_params[rays]
+        apart = (enu @ (problem.target[self.rows] - linear.state.local[self.rows])[:, :, None])[:, :, 0]
+        apart = np.where(np.isfinite(problem.known[self.rows]), apart, 0.0)
+        return u, by_params[:, :, : self.size], ue, apart
 
     def weights_at(self, nodes: Array) -> Array:
         """Return the weights ``(b, n, 3)`` of the ground with variances ``(b, 3)`` of image, plan and height."""
@@ -94,7 +102,7 @@ class ControlEquations:
 
     def at(self, nodes: Array) -> Node:
         """Return the solutions with variances ``(b, 3)`` of image, plan and height."""
-        size, scale = self.size, nodes[:, 0]
+        size, scale = self.rank, nodes[:, 0]
         weights = self.weights_at(nodes)
         m = self.u / scale[:, None, None, None] + diagonal(weights)
         inverse = np.asarray(np.linalg.inv(m), dtype=float)
@@ -114,7 +122,7 @@ class ControlEquations:
         ties = self.points - len(self.rows)
         spread = (self.observations - 3 * ties) * np.log(scale) + np.linalg.slogdet(m)[1].sum(axis=1)
         of_ground = np.log(np.where(self.unstated, weights, 1.0)).sum(axis=(1, 2))
-        spread += (np.linalg.slogdet(normal)[1] if size else 0.0) - of_ground
+        spread += (np.linalg.slogdet(normal)[1] if size else 0.0) - self.rest * np.log(scale) - of_ground
         return Node(-0.5 * (spread + square), z, cofactors, shift, inverse, taken, weights)
 
     def redundancy(self, node: Node) -> tuple[float, float, float]:
@@ -132,10 +140,24 @@ class ControlEquations:
         return np.asarray(node.inverse + taken @ node.cofactors[:, None] @ taken.swapaxes(2, 3))
 
 
-def _root(cofactors: Array) -> Array:
-    """Return L with L L' the cofactors ``(P, P)``."""
-    if not len(cofactors):
+def _root(cofactors: Cofactors, own: Array, by_params: Array, pseudo: Array) -> Array:
+    """Return a root R ``(P, m)`` of the cofactors C: R R' is C, or if that is far less, its part that control tells of.
+
+    Control points with normal matrices `own` ``(n, 3, 3)`` and B'A `by_params` ``(n, 3, P)``, and rows of
+    pseudo-observations ``(k, P)``, tell nothing of parameters without a part in the span of C times these.
+    """
+    size = pseudo.shape[1]
+    if not size:
         return np.zeros((0, 0))
-    scale = np.sqrt(np.diag(cofactors))
-    root: Array = np.linalg.cholesky(cofactors / np.outer(scale, scale)) * scale[:, None]
-    return root
+    if 3 * len(own) + len(pseudo) > _FAR_LESS * size:
+        matrix = cofactors.matrix
+        scale = np.sqrt(np.diag(matrix))
+        root: Array = np.linalg.cholesky(matrix / np.outer(scale, scale)) * scale[:, None]
+        return root
+    # Over the root of their own normal matrices, no control point tells more than the unit matrix.
+    values, vectors = np.linalg.eigh(own)
+    whitened = vectors.swapaxes(1, 2) @ by_params / np.sqrt(np.maximum(values, 1e-300))[:, :, None]
+    rows = np.vstack([whitened.reshape(-1, size), pseudo])
+    product = cofactors.times(rows.T)
+    told, axes = np.linalg.eigh(rows @ product)
+    return np.asarray(product @ axes[:, told > _TOLD] / np.sqrt(told[told > _TOLD]))

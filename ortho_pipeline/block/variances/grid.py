@@ -55,12 +55,12 @@ _SAME = 0.03
 
 def estimate(solved: Solved) -> Variances:
     """Return the variance components at a solution, which was found with sigmas near enough to linearise there."""
-    return _Grid(ControlEquations(solved)).variances()
+    return _Grid(solved).variances()
 
 
 def posterior(solved: Solved) -> Posterior:
     """Return the variance components at a solution, and covariances with their uncertainty."""
-    grid = _Grid(ControlEquations(solved))
+    grid = _Grid(solved)
     return grid.posterior(grid.variances())
 
 
@@ -81,8 +81,9 @@ def reweighed(solved: Solved, selection: Selection, variances: Variances) -> Sol
 class _Grid:
     """The nodes at which the components are tried: logs of the standard deviations of image, plan and height."""
 
-    def __init__(self, equations: ControlEquations) -> None:
-        self.equations = equations
+    def __init__(self, solved: Solved) -> None:
+        self.cofactors = solved.cofactors
+        self.equations = equations = ControlEquations(solved)
         self.free = [bool(equations.unstated[:, :2].any()), bool(equations.unstated[:, 2].any())]
         self.separable = True
         far = np.log([[1.0, 1e3 * equations.pixel, 1e3 * equations.pixel]])
@@ -120,7 +121,7 @@ class _Grid:
 
     def passes(self, logs: Array) -> Iterator[tuple[slice, Node]]:
         """Solve at nodes ``(b, 3)``, some at a time."""
-        step = max(1, min(_PASS, int(4e6 / (max(len(self.equations.rows), 1) * 3 * (self.equations.size + 3)))))
+        step = max(1, min(_PASS, int(4e6 / (max(len(self.equations.rows), 1) * 3 * (self.equations.rank + 3)))))
         for begin in range(0, len(logs), step):
             part = slice(begin, min(begin + step, len(logs)))
             yield part, self._at(logs[part])
@@ -163,7 +164,7 @@ class _Grid:
         total = equations.square / scale + float((node.weights[0] * equations.d**2).sum())
         b = equations.ue / scale + node.weights[0] * equations.d
         met = (node.inverse[0] @ b[:, :, None])[:, :, 0]
-        flat = equations.k.reshape(met.size, equations.size)
+        flat = equations.k.reshape(met.size, equations.rank)
         right = (equations.image_right - met.ravel() @ flat) / scale + equations.pseudo_right
         total -= float((b * met).sum()) + float(right @ z)
         pseudo = float(z @ equations.pseudo @ z) - 2.0 * float(z @ equations.pseudo_right)
@@ -247,7 +248,7 @@ class _Grid:
         equations = self.equations
         middle = self._at(self.mean[None])
         # About the solution itself, not about the mean: what is added is how far that may be from the best.
-        cofactors = np.zeros((equations.size, equations.size))
+        cofactors = np.zeros((equations.rank, equations.rank))
         ground = np.zeros((len(equations.rows), 3, 3))
         counts = self.chance > 1e-6
         logs, chance = self.logs[counts], self.chance[counts] / self.chance[counts].sum()
@@ -256,7 +257,10 @@ class _Grid:
             apart, shift = node.z, node.shift
             cofactors += np.tensordot(w, node.cofactors, 1) + (apart * w[:, None]).T @ apart
             ground += np.tensordot(w, equations.ground(node) + shift[..., None] * shift[..., None, :], 1)
+        image_square = float(chance @ np.exp(2.0 * logs[:, 0]))
+        # Of what control tells nothing, the measurements tell all.
+        others = image_square if equations.rest else 0.0
+        covariance = self.cofactors.mixed(others, equations.root, cofactors - others * np.eye(equations.rank))
         return Posterior(
-            variances, equations.root @ cofactors @ equations.root.T, float(chance @ np.exp(2.0 * logs[:, 0])),
-            equations.rows, ground, float(np.abs(middle.z).max(initial=0.0)),
-        )  # fmt: skip
+            variances, covariance, image_square, equations.rows, ground, float(np.abs(middle.z).max(initial=0.0))
+        )

@@ -1,0 +1,215 @@
+"""Equations of large blocks: compiled elimination, normal equations in levels, and what is taken of their inverse."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pyproj
+import pytest
+
+from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.equations import elimination
+from ortho_pipeline.block.equations.cofactors import LevelCofactors
+from ortho_pipeline.block.equations.elimination import StackedElimination, StreamedElimination
+from ortho_pipeline.block.equations.image_pairs import ImagePairs, Levels
+from ortho_pipeline.block.equations.level_factor import LevelFactor
+from ortho_pipeline.block.equations.linear import Linear
+from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
+from ortho_pipeline.block.equations.unknowns import Columns
+from ortho_pipeline.block.intersection import frame_of, meet
+from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.block.variances import control_equations
+from ortho_pipeline.models import ImageCorrection, SensorModel
+from ortho_pipeline.models.base import as_ground
+
+LON, LAT, METRES = 33.0, 37.0, 111_000.0
+SIZE = 2000
+
+
+class Parallel(SensorModel):
+    """An image with parallel rays: metres east and north of a place, plus heights times a slope, as pixels."""
+
+    kind = "parallel"
+
+    def __init__(self, east: float, slope: float, aslant: float) -> None:
+        self.east, self.slope, self.aslant = east, slope, aslant
+
+    @property
+    def crs(self) -> str:
+        return "EPSG:4979"
+
+    @property
+    def domain(self) -> tuple[np.ndarray, np.ndarray]:
+        middle = LON + (self.east + SIZE / 2) / METRES
+        return np.array([middle, LAT, 500.0]), np.array([0.03, 0.03, 600.0])
+
+    def ground_to_image(self, ground: object) -> np.ndarray:
+        lon, lat, h = as_ground(ground).T
+        column = (lon - LON) * METRES - self.east + self.slope * h
+        return np.stack([column, SIZE / 2 - (lat - LAT) * METRES + self.aslant * h], axis=1)
+
+
+def strip(images: int, points: int, seed: int = 0) -> tuple[dict[str, SensorModel], BlockPoints]:
+    """Return start models and points of a strip in which each image overlaps two on either side."""
+    random = np.random.default_rng(seed)
+    east = 0.4 * SIZE * np.arange(images)
+    cameras = [Parallel(e, s, a) for e, s, a in zip(east, *random.uniform(-0.7, 0.7, (2, images)), strict=True)]
+    plan = random.uniform((0.0, -SIZE / 2), (east[-1] + SIZE, SIZE / 2), (points, 2)) / METRES
+    ground = np.column_stack([LON + plan[:, 0], LAT + plan[:, 1], random.uniform(100, 900, points)])
+    kinds = ["affine", "shift", "shift-drift", "none"]
+    models, point, image, measured = {}, [], [], []
+    for k, camera in enumerate(cameras):
+        start = ImageCorrection.identity(camera, kinds[k % 4], (SIZE / 2, SIZE / 2))
+        scale = [5.0 if name.endswith("shift") else 1e-3 for name in start.param_names]
+        seen = start.with_params(random.normal(0, 1, len(scale)) * scale).ground_to_image(ground)
+        inside = np.flatnonzero(((seen >= 0) & (seen <= SIZE)).all(axis=1))
+        models[f"i{k}"] = start
+        point.append(inside)
+        image.append(np.full(len(inside), k))
+        measured.append(seen[inside] + random.normal(0, 0.3, (len(inside), 2)))
+    control = np.arange(points) % 8 == 0
+    some = random.random((points, 3)) < 0.5
+    return models, BlockPoints(
+        ids=tuple(f"p{k}" for k in range(points)), ground=np.where(control[:, None], ground, np.nan),
+        roles=np.where(control, "control", "tie"), sigma_ground=np.where(some, 0.5, 0.2), crs=pyproj.CRS("EPSG:4326"),
+        images=tuple(models), point=np.concatenate(point), image=np.concatenate(image),
+        measured=np.concatenate(measured), sigma_image=np.full(sum(map(len, point)), 0.3),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def linear() -> Linear:
+    """Equations of a strip whose images have 6, 2, 4 and no parameters, with weights, known plan and priors."""
+    models, points = strip(9, 160)
+    ordered = tuple(models.values())
+    known = points.ground.copy()
+    known[np.flatnonzero(points.control)[::3], 2] = np.nan
+    frame = frame_of(ordered, points)
+    pseudo = (Pseudo(0, 1.0, 4.0), Pseudo(7, 0.5, 2.0), Pseudo(9, 0.5, 2.0, held=True))
+    problem = BlockProblem(points, ordered, frame, known, pseudo)
+    rays = np.ones(points.rays, dtype=bool)
+    local = meet(frame, ordered, points, rays)
+    rays &= np.isfinite(local).all(axis=1)[points.point]
+    random = np.random.default_rng(1)
+    weights = replace(
+        Selection.of(rays, points.control), ray_weights=random.uniform(1e-8, 1, points.rays),
+        ground_weights=random.uniform(1e-8, 1, len(points)),
+    )  # fmt: skip
+    return Linear.at(problem, State(ordered, local), weights)
+
+
+def test_compiled_elimination_is_that_of_the_stacks(linear: Linear) -> None:
+    stacked, streamed = StackedElimination(linear), StreamedElimination(linear)
+    wanted, found = stacked.system().solve(0.0), streamed.system().solve(0.0)
+    sigmas = np.sqrt(wanted.cofactors.variances)
+    assert wanted.condition == pytest.approx(found.condition, rel=1e-8)
+    np.testing.assert_allclose(found.values / sigmas, wanted.values / sigmas, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(streamed.system().scaled(), stacked.system().scaled(), rtol=0, atol=1e-12)
+    shifts = stacked.shifts(wanted.values)
+    np.testing.assert_allclose(streamed.shifts(wanted.values), shifts, rtol=0, atol=1e-9 * np.abs(shifts).max())
+    for one, other in zip(stacked.hats(wanted.cofactors), streamed.hats(found.cofactors), strict=True):
+        np.testing.assert_allclose(other, one, rtol=0, atol=1e-9)
+    covariances = stacked.ground(wanted.cofactors, 1.7)
+    np.testing.assert_allclose(streamed.ground(found.cofactors, 1.7), covariances, rtol=1e-6, equal_nan=True)
+
+
+def test_damped_steps_are_the_same(linear: Linear) -> None:
+    wanted = StackedElimination(linear).system().solve(0.3).values
+    found = StreamedElimination(linear).system().solve(0.3).values
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
+
+
+def test_parts_of_the_inverse_are_those_of_the_whole(linear: Linear) -> None:
+    system = StreamedElimination(linear).system()
+    found = system.solve(0.0).cofactors
+    assert isinstance(found, LevelCofactors)
+    assert len(found.levels.of_level) > 2
+    lengths = np.sqrt(np.abs(np.diag(np.linalg.inv(system.scaled()))))
+    scale = np.sqrt(found.variances) / lengths
+    whole = np.linalg.inv(system.scaled()) * np.outer(scale, scale)
+    sigmas = np.sqrt(np.diag(whole))
+    np.testing.assert_allclose(found.matrix / np.outer(sigmas, sigmas), whole / np.outer(sigmas, sigmas), atol=1e-9)
+    columns, points = linear.problem.columns, linear.problem.points
+    of_points = [points.image[points.point == k].tolist() for k in range(len(points))]
+    longest = max(of_points, key=len)
+    assert len(longest) > 2
+    for images in ([4], longest, longest[::-1]):
+        of = np.concatenate([columns.of_image(image) for image in images])
+        wanted = whole[np.ix_(of, of)]
+        np.testing.assert_allclose(found.of_images(images), wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
+    random = np.random.default_rng(2)
+    root, inner = random.normal(0, 1, (columns.size, 3)) * sigmas[:, None], np.diag([1.0, 2.0, 3.0])
+    mixed = found.mixed(2.0, root, inner)
+    np.testing.assert_allclose(mixed.variances, np.diag(2.0 * whole + root @ inner @ root.T), rtol=1e-8)
+    np.testing.assert_allclose(mixed.matrix @ root, mixed.times(root), rtol=0, atol=1e-9 * np.abs(mixed.matrix).max())
+    again = mixed.mixed(0.5, root[:, :1], np.eye(1))
+    wanted = 0.5 * (2.0 * whole + root @ inner @ root.T) + root[:, :1] @ root[:, :1].T
+    np.testing.assert_allclose(again.variances, np.diag(wanted), rtol=1e-8)
+
+
+def test_the_condition_of_many_parameters_is_iterated_for(linear: Linear, monkeypatch: pytest.MonkeyPatch) -> None:
+    system = StreamedElimination(linear).system()
+    wanted = system.solve(0.0).condition
+    monkeypatch.setattr("ortho_pipeline.block.equations.level_factor._FEW", 0)
+    assert system.solve(0.0).condition == pytest.approx(wanted, rel=1e-8)
+
+
+def test_images_without_common_points_are_levels_of_their_own() -> None:
+    """Two strips that nothing ties, and an image that nothing shows."""
+    points = BlockPoints(
+        ids=("a", "b", "c", "d"), ground=np.full((4, 3), np.nan), roles=np.full(4, "tie"),
+        sigma_ground=np.zeros((4, 3)), crs=pyproj.CRS("EPSG:4326"), images=tuple("uvwxyz"),
+        point=np.array([0, 0, 1, 1, 2, 2, 3]), image=np.array([0, 2, 2, 4, 1, 3, 1]), measured=np.zeros((7, 2)),
+        sigma_image=np.ones(7),
+    )  # fmt: skip
+    pairs = ImagePairs.of(points)
+    place = {image: k for k, level in enumerate(pairs.levels) for image in level.tolist()}
+    assert sorted(place) == list(range(6))
+    assert all(abs(place[a] - place[b]) <= 1 for a, b in zip(pairs.first, pairs.second, strict=True))
+    levels = Levels(pairs, Columns.of([2, 1, 0, 2, 3, 1]))
+    random = np.random.default_rng(3)
+    blocks = random.normal(0, 0.1, (len(pairs.first), 3, 3))
+    own = pairs.slot[np.arange(6), np.arange(6)]
+    blocks[own] = blocks[own] + blocks[own].swapaxes(1, 2) + 2 * np.eye(3)
+    factor = LevelFactor(levels, blocks)
+    dense = factor.dense() * np.outer(
+        factor.lengths[levels.columns.padded >= 0], factor.lengths[levels.columns.padded >= 0]
+    )
+    np.testing.assert_allclose(factor.solve(np.eye(9)), np.linalg.inv(dense), rtol=0, atol=1e-12)
+
+
+def test_a_large_block_is_adjusted_as_a_small_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same by compiled elimination and levels, without any matrix of all parameters by all, from first to last."""
+    models, points = strip(12, 320)
+    points = replace(points, measured=points.measured + 30.0 * (np.arange(points.rays) % 41 == 7)[:, None])
+    wanted = adjust(models, points)
+    monkeypatch.setattr(elimination, "_ORTHOGONAL_LIMIT", 0.0)
+    monkeypatch.setattr(control_equations, "_FAR_LESS", np.inf)
+    monkeypatch.setattr(LevelCofactors, "matrix", property(lambda self: pytest.fail("the whole inverse was made")))
+    found = adjust(models, points)
+    assert wanted.rejected == found.rejected
+    assert len(found.rejected) > 10
+    np.testing.assert_allclose((found.values - wanted.values) / wanted.sigmas, 0.0, atol=1e-6)
+    np.testing.assert_allclose(found.sigmas, wanted.sigmas, rtol=1e-7)
+    np.testing.assert_allclose(found.ground_covariance, wanted.ground_covariance, rtol=1e-5, equal_nan=True)
+    assert found.sigma0 == pytest.approx(wanted.sigma0, rel=1e-8)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_what_control_tells_nothing_of_needs_no_part_in_the_grid(monkeypatch: pytest.MonkeyPatch, stated: bool) -> None:
+    models, points = strip(12, 200)
+    if not stated:
+        points = replace(points, sigma_ground=np.zeros((len(points), 3)))
+    points = points.with_roles(np.where(np.arange(len(points)) % 32 == 0, "control", "tie"))
+    monkeypatch.setattr(control_equations, "_FAR_LESS", 0.0)
+    wanted = adjust(models, points, robust=False)
+    monkeypatch.setattr(control_equations, "_FAR_LESS", 1.0)
+    found = adjust(models, points, robust=False)
+    np.testing.assert_allclose(found.sigmas, wanted.sigmas, rtol=1e-8)
+    np.testing.assert_allclose(found.ground_covariance, wanted.ground_covariance, rtol=1e-6, equal_nan=True)
+    one, other = found.variances, wanted.variances
+    assert (one.sigma_xy is None) == stated
+    np.testing.assert_allclose((one.image, *one.redundancy), (other.image, *other.redundancy), rtol=1e-8)
+    if not stated:
+        np.testing.assert_allclose((one.sigma_xy, one.sigma_h), (other.sigma_xy, other.sigma_h), rtol=1e-8)
