@@ -307,3 +307,7 @@ STAC_ITEM = """{"type": "Feature", "stac_version": "1.0.0", "id": "S", "geometry
   "points": {"href": "./points.csv", "type": "text/csv"},
   "small": {"href": "https://host/small.png", "type": "image/png", "roles": ["thumbnail"]}}}
 """
+#: A static collection with an item in it, and the way to one beside it that is not there.
+STAC_COLLECTION = f"""{{"type": "Collection", "stac_version": "1.0.0", "id": "C", "features": [{STAC_ITEM}],
+ "links": [{{"rel": "item", "href": "./items/T.json"}}, {{"rel": "root", "href": "../catalog.json"}}]}}
+"""

@@ -37,6 +37,7 @@ from ortho_pipeline.exchange.model_file import read_model_file, save_model
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpb
 from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.stac.collection import Collection
 from ortho_pipeline.files.stac.item import read_item as read_stac_item
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.imaging.matching import open_references
@@ -329,6 +330,11 @@ def _stac_item(path: Path) -> Any:
     return [str(item.rpc_of(item.image())), found, item.id]
 
 
+def _stac_collection(path: Path) -> Any:
+    collection = Collection(path)
+    return [[asset.name for item in collection.items((0.0, 0.0, 1.0, 1.0), "S") for asset in item.assets]]
+
+
 def _csm_seed(folder: Path) -> bytes:
     (folder / "METADATA.DIM").write_text(products.spot_text())
     return csm_text(read_spot(folder / "METADATA.DIM", heights=(0.0, 300.0)).model)[0].encode()
@@ -410,6 +416,7 @@ READERS = (
     Reader("asp-aster", "xml", "one.xml", _text(products.aster_text()), read_aster),
     Reader("enmap-metadata", "xml", "one-METADATA.XML", _enmap_seed, _enmap),
     Reader("stac-item", "json", "one.json", _text(products.STAC_ITEM), _stac_item),
+    Reader("stac-collection", "json", "one.json", _text(products.STAC_COLLECTION), _stac_collection),
     Reader("planet-item", "json", "one_metadata.json", _text(products.PLANET), read_item),
     Reader("sar-extended", "json", "one_extended.json", _text(products.capella_text()), read_extended),
     Reader("maxar-isd", "xml", "one.XML", _maxar_seed, _maxar),

@@ -27,6 +27,7 @@ from ortho_pipeline.files.storage import kept, objects
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
 from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.cells import sources
 from ortho_pipeline.surface.cells.assembled import open_cells
 from ortho_pipeline.surface.cells.copernicus import Cell, Extent, cells_of_list, columns_at, extent_of
 from ortho_pipeline.surface.cells.sources import source_of
@@ -186,6 +187,74 @@ def test_cells_on_both_sides_of_the_antimeridian_and_around_a_pole(tmp_path: Pat
     assert pole.shape == (ROWS, 360 * around[0].columns)
     ring = np.column_stack([np.linspace(-180, 180, 1000), np.full(1000, 89.95)])
     assert not np.isnan(pole.around(0.0).heights(ring)).any()
+
+
+# -- STAC --------------------------------------------------------------------------------------------------------------
+
+
+def cell_item(cell: Cell, href: str) -> dict[str, Any]:
+    data = {"href": href, "roles": ["data"], "type": "image/tiff"}
+    return {"type": "Feature", "stac_version": "1.0.0", "id": cell.name.removesuffix("_DEM"), "assets": {"data": data}}
+
+
+def collection(bucket: PublicFolder, kind: str) -> str:
+    """Describe the cells of a bucket: in a static collection, a list of items, or by an API; return its address."""
+    folder, links = bucket.folder, []
+    for cell in HERE:
+        name = f"items/{cell.name.removesuffix('_DEM')}.json"
+        (folder / "items").mkdir(exist_ok=True)
+        (folder / name).write_text(json.dumps(cell_item(cell, f"../{cell.name}/{cell.name}.tif")))
+        links.append({"rel": "item", "href": f"./{name}"})
+    if kind == "static":
+        document: dict[str, Any] = {"type": "Collection", "links": links}
+    elif kind == "list":
+        features = [cell_item(cell, f"{bucket.address}/{cell.name}/{cell.name}.tif") for cell in HERE]
+        document = {"type": "FeatureCollection", "features": features}
+    else:
+        document = {"type": "Collection", "links": [{"rel": "items", "href": f"{bucket.address}/page/1"}]}
+        (folder / "page").mkdir()
+        for number, cells in ((1, HERE[:2]), (2, HERE[2:])):
+            features = [cell_item(cell, f"../{cell.name}/{cell.name}.tif") for cell in cells]
+            follows = [{"rel": "next", "href": f"{bucket.address}/page/2?token=x"}] if number == 1 else []
+            (folder / "page" / str(number)).write_text(json.dumps({"features": features, "links": follows}))
+    (folder / "collection.json").write_text(json.dumps(document))
+    return f"{bucket.address}/collection.json"
+
+
+@pytest.mark.parametrize("kind", ["static", "list", "api"])
+def test_cells_of_a_stac_collection_are_those_of_the_bucket(
+    kind: str, bucket: PublicFolder, geoid: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    extent = Extent(19.5, -30.5, 20.5, -29.5)
+    truth = found(bucket.address, extent, geoid)
+    address = collection(bucket, kind)
+    dem = found(address, extent, geoid)
+    window = 0, 0, *truth.shape[::-1]
+    np.testing.assert_array_equal(dem.window(*window), truth.window(*window))
+    assert dem.provenance["path"] == address
+    with pytest.raises(InputError, match="not opened unasked"):
+        source_of(address, allow_network=False)
+    # What a collection does not hold is sea where the list of the public bucket has no land either.
+    monkeypatch.setattr(sources, "PUBLIC", bucket.address)
+    monkeypatch.setattr(sources, "PUBLIC_LAND", bucket.address)
+    assert found(address, Extent(20.5, -29.5, 21.5, -29.4), geoid).provenance["sea_cells"] == [Cell(21, -30).name]
+
+
+def test_a_collection_on_disk_says_nothing_of_the_sea(bucket: PublicFolder, geoid: str, tmp_path: Path) -> None:
+    collection(bucket, "static")
+    path = str(bucket.folder / "collection.json")
+    for cell in HERE:
+        # An item leads to files below its own folder.
+        write_cell(bucket.folder / "items", cell)
+        named = cell_item(cell, f"{cell.name}/{cell.name}.tif")
+        (bucket.folder / "items" / f"{cell.name.removesuffix('_DEM')}.json").write_text(json.dumps(named))
+    dem = found(path, Extent(19.5, -30.5, 20.5, -29.5), geoid)
+    assert dem.shape == (2 * ROWS, 2 * ROWS)
+    with pytest.raises(CoverageError, match=r"nobody says.*sea"):
+        found(path, Extent(20.5, -29.5, 21.5, -29.4), geoid)
+    (tmp_path / "other.json").write_text('{"type": "Feature"}')
+    with pytest.raises(InputError, match="no STAC collection"):
+        source_of(str(tmp_path / "other.json"), allow_network=False)
 
 
 # -- what may go wrong -------------------------------------------------------------------------------------------------

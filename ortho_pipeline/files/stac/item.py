@@ -100,7 +100,9 @@ class Item:
             for asset in self.assets:
                 if asset.key == key:
                     return asset
-            raise InputError(f"there is no asset {key!r}", file=self.address, remedy=f"one of {self._keys()}")
+            raise InputError(
+                f"there is no asset {key!r}", file=self.address, field="assets", remedy=f"one of {self._keys()}"
+            )
         several: list[Asset] = []
         for group in groups:
             if len(group) == 1:
@@ -108,12 +110,13 @@ class Item:
             several = several or group
         if several:
             raise InputError(
-                f"several assets may be meant: {self._keys(several)}", file=self.address,
+                f"several assets may be meant: {self._keys(several)}", file=self.address, field="assets",
                 remedy=f"name one, for example {self.address}#{several[0].key}",
             )  # fmt: skip
         raise InputError(
             f"no asset is a {what}",
             file=self.address,
+            field="assets",
             remedy=f"name one after a #, of {self._keys() or 'another item'}",
         )
 

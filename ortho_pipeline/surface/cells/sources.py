@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.process_limits import startable_threads
+from ortho_pipeline.files.stac.collection import Collection, is_collection
 from ortho_pipeline.files.storage.kept import kept
 from ortho_pipeline.files.storage.objects import Objects, is_address
 from ortho_pipeline.raster.source import open_pixels
@@ -51,12 +52,15 @@ def source_of(given: str | os.PathLike[str] | None, *, allow_network: bool) -> S
         If there is no such folder, or the network is not allowed.
     """
     text = os.fspath(given or os.environ.get(VARIABLE) or PUBLIC)
+    if is_collection(text):
+        return _Catalogue(text, allow_network)
     if is_address(text):
         return _Bucket(text, allow_network)
     if not Path(text).is_dir():
         raise InputError(
             "there is no such folder of cells", file=text, field="surface.source",
-            remedy="give a folder that holds cells by their names in the public bucket, or an address",
+            remedy="give a folder that holds cells by their names in the public bucket, a STAC collection of them, or "
+            "an address",
         )  # fmt: skip
     return _Folder(text)
 
@@ -112,6 +116,57 @@ class _Bucket(Source):
             return cells_of_list(kept("dem", objects.of(LIST), fetch).read_text("latin-1"))
         except FileNotFoundError:
             return None
+
+
+class _Catalogue(Source):
+    """A STAC collection, whose assets are told by the names that cells have in the public bucket."""
+
+    def __init__(self, address: str, allow_network: bool) -> None:
+        self._collection = Collection(address, allow_network=allow_network)
+        self.address, self._allow_network = address, allow_network
+
+    def files(self, cells: list[Cell]) -> dict[Cell, str]:
+        found = {cell: self._asset(cell) for cell in cells}
+        startable_threads(_AT_ONCE)
+        with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="cells") as pool:
+            there = [cell for cell, href in found.items() if href is not None]
+            return dict(zip(there, pool.map(self._kept, there, [found[cell] for cell in there]), strict=True))
+
+    def land(self) -> frozenset[Cell] | None:
+        # A collection may hold some cells only, and says nothing of the others: the list of the public bucket does.
+        if not is_address(self.address):
+            return None
+        try:
+            return _Bucket(PUBLIC, self._allow_network).land()
+        except OrthoError:
+            return None
+
+    def _asset(self, cell: Cell) -> str | None:
+        middle = (cell.lon + 0.4, cell.lat + 0.4, cell.lon + 0.6, cell.lat + 0.6)
+        for item in self._collection.items(middle, cell.name.removesuffix("_DEM")):
+            for asset in item.assets:
+                if asset.name == f"{cell.name}.tif":
+                    return asset.href
+        return None
+
+    def _kept(self, cell: Cell, href: str | None) -> str:
+        assert href is not None
+        if not is_address(href):
+            return href
+        folder, _, name = href.rpartition("/")
+        if "?" in name:
+            raise InputError(
+                "an address with a signature is not read", file=href.partition("?")[0], field="surface.source",
+                remedy="give a collection whose assets are open, or the store itself with your credentials",
+            )  # fmt: skip
+        fetch = functools.partial(Objects(folder, allow_network=self._allow_network).fetch, name, limit=LARGEST)
+        try:
+            return str(kept("dem", href, fetch, fault=functools.partial(fault_of, cell)))
+        except FileNotFoundError as error:
+            raise InputError(
+                "a collection names this cell, and it is not there", file=href, field="surface.source",
+                remedy="check the collection, or take another source",
+            ) from error  # fmt: skip
 
 
 def fault_of(cell: Cell, path: Path | str) -> str:
