@@ -19,6 +19,9 @@ from scipy.ndimage import uniform_filter
 from sessions import run
 
 import ortho_pipeline as op
+from ortho_pipeline.files.documents import record_of
+from ortho_pipeline.report.block_records import BlockReport
+from ortho_pipeline.report.network.drawing import plot_network
 from ortho_pipeline.simulation.terrain import Landscape, Terrain
 
 matplotlib.use("Agg")
@@ -196,6 +199,14 @@ def compared(path: Path) -> None:
 # -- stereo ----------------------------------------------------------------------------------------------------------
 
 
+def network(path: Path) -> None:
+    """Draw the network as the page of the block does."""
+    report = record_of(BlockReport, json.loads(Path("block/block_report.json").read_text()))
+    drawing = plot_network(report)
+    assert drawing is not None
+    path.write_bytes(drawing.png(scale=1.2))
+
+
 def heights(path: Path) -> None:
     """Draw the DEM minus the heights of intersected ties."""
     points = np.genfromtxt("heights.csv", delimiter=",", names=True, skip_header=2, usecols=(1, 2, 3))
@@ -317,7 +328,7 @@ FIGURES: dict[str, dict[str, Callable[[Path], None]]] = {
     "first-ortho.md": {"first-residuals.jpg": first_residuals, "first-ortho.jpg": first_ortho},
     "without-control.md": {"matches.jpg": matches, "reference-off.jpg": reference_off},
     "which-model.md": {"compared.png": compared},
-    "stereo-and-blocks.md": {"heights.png": heights},
+    "stereo-and-blocks.md": {"block.png": network, "heights.png": heights},
     "sensor-of-your-own.md": {"panoramic.png": panoramic},
     "many-scenes.md": {"run.jpg": run_page, "mosaic.jpg": mosaic},
 }

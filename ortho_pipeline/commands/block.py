@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import os
@@ -26,7 +27,7 @@ from ortho_pipeline.commands.control.block_points import gather, read_points, re
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
-from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.errors import InputError, OrthoError, counted
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
 from ortho_pipeline.files import json_text, together, write_json, write_text
@@ -35,9 +36,14 @@ from ortho_pipeline.files.locations import located
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report import block as block_report
 from ortho_pipeline.report.block_records import BlockReport
+from ortho_pipeline.report.network.cards import PICTURES, SIDE
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
+
+#: Pixels of an image of which a picture is made: without overviews nearly all of it has to be read.
+_PICTURED = 400_000_000
 
 
 @with_items
@@ -107,8 +113,9 @@ def adjust(
     made = block_report.build_report(
         fit=fit, starts=starts, exported=exported, provenance=record, warnings=[*_warnings(fit, starts), *notes]
     )
+    pictures = _pictures(starts, scene)
     with together(folder, "block"):
-        _write(files, made, fit, starts, exported, record)
+        _write(files, made, fit, starts, exported, record, pictures)
     text = "\n".join([*gathered.text, block_report.summary_text(made)])
     return Result(files, {"report": json_value(made), **gathered.document}, text)
 
@@ -285,6 +292,17 @@ def _check_rms(fit: BlockFit) -> list[Mapping[str, Any] | None]:
     return [fit.object_rms(), *(fit.image_rms(image, "check") for image in fit.points.images)]
 
 
+def _pictures(starts: Mapping[str, Start], options: SceneOptions) -> dict[str, bytes]:
+    """Return small pictures of the first images, of those that are read at once: a page can do without."""
+    found = {}
+    for label, start in list(starts.items())[:PICTURES]:
+        if start.scene.width * start.scene.height > _PICTURED:
+            continue
+        with contextlib.suppress(OrthoError):
+            found[label] = preview_png(start.scene.path, side=SIDE, allow_network=False, roots=options.roots)
+    return found
+
+
 def _write(
     files: Mapping[str, Path],
     made: BlockReport,
@@ -292,6 +310,7 @@ def _write(
     starts: Mapping[str, Start],
     exported: Mapping[str, rpc.RpcExport],
     record: Mapping[str, Any],
+    pictures: Mapping[str, bytes],
 ) -> None:
     rows = _ground_rows(fit.points, fit.ground, fit.ground_sigmas, fit.object_residuals)
     write_text(files["points"], _geojson(rows))
@@ -307,7 +326,7 @@ def _write(
         if label in exported:
             rpc.write_rpc_txt(exported[label].rpc, files[f"{label} rpc"])
     write_json(files["report"], json_value(made), ascii_only=False)
-    write_text(files["html"], block_report.page(made))
+    write_text(files["html"], block_report.page(made, pictures))
 
 
 def _ground_rows(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from typing import Any
@@ -16,12 +17,18 @@ from ortho_pipeline.raster.source import Grid, open_pixels
 _AVERAGE = 5
 
 
-def preview_png(path: str | PathLike[str], *, side: int = 800) -> bytes:
+def preview_png(
+    path: str | PathLike[str],
+    *,
+    side: int = 800,
+    allow_network: bool = False,
+    roots: Sequence[str | PathLike[str]] = (),
+) -> bytes:
     """Return a reduced, contrast-stretched copy of a raster as PNG, transparent where it has no value.
 
     Three bands or more give colours (the first three in their order), fewer give grey.
     """
-    dataset = open_pixels(path)[0]
+    dataset = open_pixels(path, allow_network=allow_network, roots=roots)[0]
     size = _reduced(dataset.RasterXSize, dataset.RasterYSize, side)
     reading = {"buf_xsize": size[0], "buf_ysize": size[1]}
     bands = [dataset.GetRasterBand(k + 1) for k in range(3 if dataset.RasterCount >= 3 else 1)]

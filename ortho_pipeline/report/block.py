@@ -24,20 +24,25 @@ from ortho_pipeline.report.block_records import (
     BlockPoint,
     BlockProvenance,
     BlockReport,
+    Ray,
     VariancesRecord,
     merged,
 )
+from ortho_pipeline.report.network.cards import PICTURES, card, rays_by_image
+from ortho_pipeline.report.network.drawing import plot_network
+from ortho_pipeline.report.network.facts import found_network, network_record, placed, suffices_for, thinly_covered
 from ortho_pipeline.report.page.advice import WORDS, signals
 from ortho_pipeline.report.page.behaviour import policy, script
-from ortho_pipeline.report.records import RpcRecord
-from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, FEW
+from ortho_pipeline.report.page.locator import plot_locator
+from ortho_pipeline.report.records import MapScaleRecord, RpcRecord
+from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, FEW, fitness
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.start import Start
     from ortho_pipeline.exchange.rpc_fit import RpcExport
 
-#: Images whose residuals are drawn, rays that are drawn of each, points that are listed on the page.
-_DRAWN_IMAGES, _DRAWN_RAYS, _LISTED = 6, 400, 400
+#: Rays that are drawn of each image, points that are listed on the page.
+_DRAWN_RAYS, _LISTED = 400, 400
 #: A frame's side, the longest arrow in it, and the margin in which arrows of points at its edge end.
 _SIDE, _ARROW, _MARGIN = 420.0, 44.0, 48.0
 
@@ -51,6 +56,9 @@ def build_report(
     warnings: Sequence[Notice],
 ) -> BlockReport:
     """Collect everything that the report says (docs/formats/block-points.md)."""
+    places = placed(fit, starts)
+    network, parted = found_network(fit)
+    suffices = suffices_for(fit)
     images = {}
     for label, start in starts.items():
         found = exported.get(label)
@@ -62,8 +70,12 @@ def build_report(
             model_source=start.source,
             facts={str(key): str(value) for key, value in start.scene.facts.items()},
             rpc=None if found is None else RpcRecord(exact=found.exact, max_error_px=found.max_error_px),
+            **places[label],
         )
-    adjustment, noted = made_of(BlockAdjustment, json_value(fit.to_json())), to_document(warnings)
+    adjustment, noted = (
+        made_of(BlockAdjustment, json_value(fit.to_json())),
+        to_document([*warnings, *parted, *thinly_covered(places)]),
+    )
     return BlockReport(
         images=images,
         adjustment=adjustment,
@@ -71,6 +83,8 @@ def build_report(
         warnings=tuple(noted["warnings"]),
         notices=tuple(noted["notices"]),
         headline=headline(adjustment),
+        network=network_record(network),
+        map_scale=None if suffices is None else made_of(MapScaleRecord, suffices.to_json()),
     )
 
 
@@ -156,44 +170,64 @@ def _pair(rms: Rmse | None) -> str:
 # -- page ------------------------------------------------------------------------------------------------------------
 
 
-def page(report: BlockReport) -> str:
-    """Return the report as one page that needs no other file and no network."""
-    adjustment = report.adjustment
-    drawn = list(report.images)[:_DRAWN_IMAGES]
-    figures = {label: drawing.svg() for label in drawn if (drawing := plot_rays(report, label)) is not None}
-    plan = plot_ground(report)
+def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> str:
+    """Return the report as one page that needs no other file and no network; `pictures` are PNGs of its images."""
+    adjustment, rays = report.adjustment, rays_by_image(report)
+    shown = pictures or {}
+    plots = {label: plot_rays(report, label, rays[label]) for label in list(report.images)[:PICTURES]}
+    cards = [
+        card(report, label, shown.get(label), None if (plot := plots.get(label)) is None else plot.svg(),
+             _frame_in(report.images[label].size), rays[label])
+        for label in report.images
+    ]  # fmt: skip
+    plan, network = plot_ground(report), plot_network(report)
+    places = [place for image in report.images.values() for place in image.outline or ()]
+    where = plot_locator((places[0][0], places[0][1])) if places else None
     provenance = {key: value for key, value in json_value(report.provenance).items() if key != "inputs"}
+    said = signals(report.warnings, report.notices)
     return render(
         "report/block.html.j2",
         report=report,
         adjustment=adjustment,
         head=report.headline,
+        notes=[note for note in report.headline.notes if note != FEW or not said],
+        verdict=None if report.map_scale is None else fitness(report.map_scale),
         ground_sigmas=variance_lines(adjustment.variances),
         roles={role: sum(point.role == role for point in adjustment.points) for role in ROLES},
-        points=sorted(adjustment.points, key=lambda point: ROLES.index(point.role))[:_LISTED],
-        figures=figures,
+        points=sorted(
+            zip(adjustment.points, report.network.largest_deg, strict=True), key=lambda one: ROLES.index(one[0].role)
+        )[:_LISTED],
+        cards=cards,
+        network=None if network is None else network.svg(),
+        locator=None if where is None else where.svg(),
         plan=None if plan is None else plan.svg(),
         plot_style=style_sheet(),
         provenance=list(flat(provenance)),
-        signals=signals(report.warnings, report.notices),
+        signals=said,
         levels=WORDS,
         script=script(),
         policy=policy(script()),
     )
 
 
-def plot_rays(report: BlockReport, label: str) -> Drawing | None:
+def plot_rays(report: BlockReport, label: str, rays: Sequence[Ray]) -> Drawing | None:
     """Draw reprojection residuals of an image over its frame: those of known ground, of ties those of the adjusted."""
     roles = {point.id: point.role for point in report.adjustment.points}
     shown = []
-    for ray in report.adjustment.rays:
-        if ray.image == label:
-            role = roles[ray.id]
-            vector = ray.residual if role == "tie" else ray.back_projected
-            if is_known(vector) and is_known(ray.measured):
-                shown.append((ray.measured, vector, role if ray.used else "out", f"{ray.id} ({role})"))
+    for ray in rays:
+        role = roles[ray.id]
+        vector = ray.residual if role == "tie" else ray.back_projected
+        if is_known(vector) and is_known(ray.measured):
+            shown.append((ray.measured, vector, role if ray.used else "out", f"{ray.id} ({role})"))
     title = f"Residuals of {counted(len(shown), 'ray')} over the frame of {label}"
     return _vectors(title, shown[:: max(1, len(shown) // _DRAWN_RAYS)], report.images[label].size, "px")
+
+
+def _frame_in(size: Sequence[int]) -> tuple[float, float, float, float]:
+    """Return left, top, width and height of the frame of an image in its drawing, per cent."""
+    scale = _SIDE / max(size)
+    wide, tall = max(size[0] * scale, 300.0) + 2 * _MARGIN, size[1] * scale + 2 * _MARGIN + 30
+    return 100 * _MARGIN / wide, 100 * _MARGIN / tall, 100 * size[0] * scale / wide, 100 * size[1] * scale / tall
 
 
 def plot_ground(report: BlockReport) -> Drawing | None:

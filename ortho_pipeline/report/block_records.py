@@ -14,12 +14,13 @@ from ortho_pipeline.report.adjustment_records import (
     CommonError,
     Count,
     NoticeDocument,
+    Pair,
     Parameter,
     Residual,
     Rmse,
     Role,
 )
-from ortho_pipeline.report.records import InputFile, RpcRecord, Size
+from ortho_pipeline.report.records import InputFile, MapScaleRecord, RpcRecord, Size
 
 Triple = tuple[float, float, float]
 #: Of a point of which it may be unknown.
@@ -28,7 +29,13 @@ OnGround = tuple[float | None, float | None, float | None]
 
 @record
 class BlockImage:
-    """An image of the block, and the model that was adjusted."""
+    """An image of the block, and the model that was adjusted.
+
+    Where it lies is at the middle height of the points: `outline` has the longitudes and latitudes of its corners, from
+    the first pixel along the first row. `view` is the angle of the line of sight from the vertical and the azimuth in
+    which the sensor stands, degrees. `covered` is the share (0 to 1) that its points speak for: their hull and half the
+    distance between them.
+    """
 
     path: str
     size: Size
@@ -37,6 +44,10 @@ class BlockImage:
     model_source: str
     facts: dict[str, str]
     rpc: RpcRecord | None
+    outline: tuple[Pair, ...] | None
+    incidence_deg: float | None
+    sensor_azimuth_deg: float | None
+    covered: float
 
 
 @record
@@ -139,6 +150,39 @@ class BlockPoint:
 
 
 @record
+class ImagePairRecord:
+    """Two images, the number of points that both have rays of, and the median angle between these rays."""
+
+    first: str
+    second: str
+    points: Count
+    angle_deg: float
+
+
+@record
+class Angles:
+    """The largest angle between two rays of each point, degrees, over the points that have two."""
+
+    points: Count
+    least: float
+    median: float
+    greatest: float
+
+
+@record
+class NetworkRecord:
+    """What ties the images: pairs with points in common, the angles at which rays meet, parts that hang together.
+
+    `largest_deg` has the largest angle of each point, in the order of the adjustment's points.
+    """
+
+    pairs: tuple[ImagePairRecord, ...]
+    angles: Angles | None
+    parts: tuple[tuple[str, ...], ...]
+    largest_deg: tuple[float | None, ...]
+
+
+@record
 class Ray:
     """A point in an image: its residual at the adjusted ground, and at the known ground."""
 
@@ -225,6 +269,8 @@ class BlockReport:
     warnings: tuple[str, ...]
     notices: tuple[NoticeDocument, ...]
     headline: BlockHeadline
+    network: NetworkRecord
+    map_scale: MapScaleRecord | None
 
 
 def merged(*parts: Rmse | None) -> Rmse | None:

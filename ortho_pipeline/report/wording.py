@@ -10,7 +10,7 @@ from ortho_pipeline.display.numbers import metres, plain_size, px, share, short,
 from ortho_pipeline.errors import counted
 from ortho_pipeline.report.adjustment_records import Adjustment, Bias, Parameter, Rmse, RmseOnGround, RmsesOnGround
 from ortho_pipeline.report.matching import MatchingRecord, Tested, is_relative
-from ortho_pipeline.report.records import Dem, FlatGround, Headline, SceneReport
+from ortho_pipeline.report.records import Dem, FlatGround, Headline, MapScaleRecord, SceneReport
 
 #: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
 ENOUGH_CHECK_POINTS = 30
@@ -86,6 +86,11 @@ def verdict(report: SceneReport) -> str:
         if report.headline.figure == "Not tested":
             return "What it is fit for nobody can say: no point tests it."
         return "What it is fit for depends on the reference: no measured point tests it."
+    return fitness(found)
+
+
+def fitness(found: MapScaleRecord) -> str:
+    """Say in one sentence which map scales an accuracy suffices for, and by what evidence."""
     paper = "no usual map scale" if found.paper_scale is None else f"maps of 1 : {found.paper_scale:,}"
     nmas = "no usual scale" if found.nmas_scale is None else f"1 : {found.nmas_scale:,}"
     limit = "" if found.limited_by is None else f", limited by the {found.limited_by}"

@@ -225,6 +225,43 @@ def test_the_report_is_one_page_in_both_lights(stereo: Stereo, tmp_path: Path) -
     assert report["document"] == "ortho-pipeline block report"
     assert {entry["role"] for entry in report["provenance"]["inputs"]} >= {"image", "points"}
     assert any("ASPRS" in text for text in report["warnings"])
+    # The network of the images, and a card of each with its picture.
+    assert page.count('data-plot="network"') == 1
+    assert page.count('src="data:image/png;base64,') == 2
+    assert "aft_BAND – fore_BAND: 30 points in common, rays" in page
+    assert "Fit for maps of 1 :" in page
+    network = report["network"]
+    assert [(one["first"], one["second"], one["points"]) for one in network["pairs"]] == [("aft_BAND", "fore_BAND", 30)]
+    # The cameras look 12 and 16 degrees from the vertical to either side, a little more where the Earth is round.
+    assert 28.0 < network["angles"]["median"] < 32.0
+    assert [len(part) for part in network["parts"]] == [2]
+    for name in ("aft", "fore"):
+        outline = np.array(report["images"][f"{name}_BAND"]["outline"])
+        assert (
+            np.abs(
+                outline - stereo.rpcs[name].image_to_ground([[0, 0], [400, 0], [400, 400], [0, 400]], 500.0)[:, :2]
+            ).max()
+            < 2e-3
+        )
+        assert report["images"][f"{name}_BAND"]["covered"] == pytest.approx(0.5, abs=0.15)
+
+
+def test_empty_parts_of_images_are_said(stereo: Stereo, tmp_path: Path) -> None:
+    """Points in a corner of the images: what they do not hold is named, in each image."""
+    corner = [k for k in range(30) if (stereo.seen["aft"][k] < 260).all() and (stereo.seen["fore"][k] < 260).all()]
+    assert len(corner) >= 5
+    points = stereo.write()
+    kept = [
+        line for line in points.read_text().splitlines()
+        if line.startswith(("#", "id")) or line.split(",")[0] in {f"p{j}" for j in corner}
+    ]  # fmt: skip
+    points.write_text("\n".join(kept) + "\n")
+    run("adjust", *stereo.images, "--points", points, "-o", tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "block_report.json").read_text())
+    (notice,) = (one for one in report["notices"] if one["code"] == "points-cover-part")
+    assert set(notice["share"]) == {"aft_BAND", "fore_BAND"}
+    assert max(notice["share"].values()) < 0.7
+    assert "Add ties there" in (tmp_path / "out" / "block_report.html").read_text()
 
 
 def test_ties_alone_hold_the_datum_and_say_so(stereo: Stereo, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.gallery.points import SIDE, point_chips
 from ortho_pipeline.report.page.advice import WORDS, advised, signals
-from ortho_pipeline.report.page.locator import plot_locator
+from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import degrees, plot_ortho
 from ortho_pipeline.report.records import SceneReport
 from ortho_pipeline.report.wording import verdict
@@ -106,7 +106,7 @@ def test_degrees_are_written_as_far_as_they_are_not_zero():
 
 
 def test_locator_finds_land_where_there_is_land():
-    drawing = plot_locator(made(measured()))
+    drawing = plot_locator(place_of(made(measured())))
     (land,) = (given["lines"] for what, given in drawing.items if what == "path" and given["kind"] == "land")
     (mark,) = (given for what, given in drawing.items if what == "circle")
     from shapely.geometry import Point, Polygon

@@ -37,6 +37,8 @@ _LOOK: dict[str, str] = {
     "inseparable-parameters": "Take a correction with fewer parameters, or let prune remove them.",
     "unsuited-model": "Take a model that the sensor suggests, unless you know better.",
     "search-by-default": "State how accurate the delivered model is, if you know it.",
+    "points-cover-part": "Add ties there (they can be found by matching), and control near the corners of the block.",
+    "block-in-parts": "Measure points that images of both parts show, or adjust the parts by themselves.",
     "few-ties": "Measure some ties by hand between these images.",
     "no-matches": "Give this image control points, or a reference that resembles it more.",
     "dem-datum-by-name": "State the height datum of the DEM, so that nothing rests on its name.",

@@ -33,9 +33,8 @@ def place_of(report: SceneReport) -> Pair | None:
     return float(lon), float(lat)
 
 
-def plot_locator(report: SceneReport) -> Drawing | None:
-    """Draw the land of the world, and where the scene is."""
-    place = place_of(report)
+def plot_locator(place: Pair | None) -> Drawing | None:
+    """Draw the land of the world, and where a scene or a block is: longitude and latitude."""
     if place is None:
         return None
     scale = _WIDTH / 360.0
@@ -45,7 +44,7 @@ def plot_locator(report: SceneReport) -> Drawing | None:
 
     lon, lat = place
     said = f"{degrees(lat, 'NS')}, {degrees(lon, 'EW')}"
-    drawing = Drawing(_WIDTH, (_NORTH - _SOUTH) * scale, f"Map of the world: the scene is at {said}", "locator")
+    drawing = Drawing(_WIDTH, (_NORTH - _SOUTH) * scale, f"Map of the world, with a mark at {said}", "locator")
     drawing.path("land", *[[at(x / 10, y / 10) for x, y in ring] for ring in _land()], closed=True)
     x, y = at(lon, min(max(lat, _SOUTH), _NORTH))
     drawing.path("guide", [(x, 0.0), (x, drawing.height)], [(0.0, y), (drawing.width, y)])

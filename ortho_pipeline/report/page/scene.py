@@ -17,7 +17,7 @@ from ortho_pipeline.report.gallery.plots import residuals_by_axis
 from ortho_pipeline.report.gallery.points import point_chips
 from ortho_pipeline.report.page.advice import WORDS, signals
 from ortho_pipeline.report.page.behaviour import policy, script
-from ortho_pipeline.report.page.locator import plot_locator
+from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import plot_ortho
 from ortho_pipeline.report.plots import plots
 from ortho_pipeline.report.records import Provenance, SceneReport
@@ -52,7 +52,7 @@ def write_report_html(
     """
     png = ortho if isinstance(ortho, bytes) or ortho is None else preview_png(ortho, side=_SIDE)
     adjustment, code = report.adjustment, script()
-    over_ortho, where = plot_ortho(report) if png else None, plot_locator(report)
+    over_ortho, where = plot_ortho(report) if png else None, plot_locator(place_of(report))
     said = signals(report.warnings, report.notices)
     page = render(
         "report/report.html.j2",

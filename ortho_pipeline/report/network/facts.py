@@ -1,0 +1,89 @@
+"""What the report says of the network: outlines of images, pairs, angles, and which part of an image points cover."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.local_frame import GEODETIC
+from ortho_pipeline.block.network import Network, network_of
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.errors import counted
+from ortho_pipeline.estimation.ground_residuals import viewing
+from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.points.control_hull import COVERED, empty_parts
+from ortho_pipeline.report.block_records import Angles, ImagePairRecord, NetworkRecord
+from ortho_pipeline.report.map_scale import MapScale, judge
+
+if TYPE_CHECKING:
+    from ortho_pipeline.block.start import Start
+
+
+def network_record(network: Network) -> NetworkRecord:
+    """Return the network as the report has it."""
+    known = network.angles_deg[np.isfinite(network.angles_deg)]
+    angles = None
+    if len(known):
+        low, high = float(known.min()), float(known.max())
+        angles = Angles(points=len(known), least=low, median=float(np.median(known)), greatest=high)
+    pairs = [
+        ImagePairRecord(first=one.first, second=one.second, points=one.points, angle_deg=one.angle_deg)
+        for one in network.pairs
+    ]
+    return NetworkRecord(
+        pairs=tuple(pairs), angles=angles, parts=network.parts, largest_deg=tuple(json_value(network.angles_deg))
+    )
+
+
+def found_network(fit: BlockFit) -> tuple[Network, tuple[Notice, ...]]:
+    """Return the network of a block, and a notice if it falls into parts."""
+    network = network_of(fit)
+    if len(network.parts) < 2:
+        return network, ()
+    said = " and ".join(", ".join(part[:4]) + (" ..." if len(part) > 4 else "") for part in network.parts[:3])
+    text = f"the images fall into {len(network.parts)} parts without points in common: {said}"
+    return network, (Notice("block-in-parts", text, parts=[list(part) for part in network.parts]),)
+
+
+def thinly_covered(places: Mapping[str, Mapping[str, Any]]) -> tuple[Notice, ...]:
+    """Return a notice if the points of images speak for a part of them only."""
+    part = {label: float(place["covered"]) for label, place in places.items() if place["covered"] < COVERED}
+    if not part:
+        return ()
+    said = ", ".join(f"{100 * share:.0f} % of {label}" for label, share in list(part.items())[:6])
+    said += "" if len(part) <= 6 else f" and less of {counted(len(part) - 6, 'more image')}"
+    text = f"points cover {said} (their hull and half the distance between them): nothing holds or tests the rest"
+    return (Notice("points-cover-part", text, share=part),)
+
+
+def placed(fit: BlockFit, starts: Mapping[str, Start]) -> dict[str, dict[str, Any]]:
+    """Return of each image, by its adjusted model, `outline`, angles of view, and the share that its points cover."""
+    heights = fit.ground[np.isfinite(fit.ground).all(axis=1), 2]
+    found = {}
+    for k, (label, start) in enumerate(starts.items()):
+        model, size = fit.models[label], (start.scene.width, start.scene.height)
+        corners = np.array([(0, 0), (size[0], 0), size, (0, size[1])], dtype=float)
+        level = float(np.median(heights)) if len(heights) else model.reference_height
+        ground = ground_transform(model.crs, GEODETIC)(model.image_to_ground(corners, level))[:, :2]
+        view = viewing(model, *size)["view"] or {}
+        rays = np.asarray(fit.used_rays) & (fit.points.image == k)
+        found[label] = {
+            "outline": tuple(map(tuple, ground.tolist())) if np.isfinite(ground).all() else None,
+            "incidence_deg": view.get("incidence_deg"),
+            "sensor_azimuth_deg": view.get("sensor_azimuth_deg"),
+            "covered": empty_parts(fit.points.measured[rays], size)[0],
+        }
+    return found
+
+
+def suffices_for(fit: BlockFit) -> MapScale | None:
+    """Return the map scales that the check points of a block suffice for in plan; None without any."""
+    check = fit.points.check & np.isfinite(fit.object_residuals).all(axis=1)
+    if not check.any():
+        return None
+    survey = np.nan_to_num(fit.points.sigma_ground[check, :2])
+    return judge(fit.object_residuals[check, :2], "check", None, float(np.sqrt((survey**2).sum(axis=1).mean())))
