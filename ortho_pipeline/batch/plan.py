@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import glob
-import itertools
 import os
 import re
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
@@ -19,9 +17,13 @@ import pyproj
 
 from ortho_pipeline import plugins
 from ortho_pipeline.batch.config import Config, Entry, Settings, merged, read_config
+from ortho_pipeline.batch.places import Place, Places
 from ortho_pipeline.commands.heights.automatic import AUTO
 from ortho_pipeline.commands.inputs import OWN_POINTS
+from ortho_pipeline.commands.stac.given import resolved
 from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.files.locations import VsiPath, located, place
+from ortho_pipeline.files.stac.item import is_item
 from ortho_pipeline.files.storage.objects import is_address
 from ortho_pipeline.options import (
     MatchOptions,
@@ -41,7 +43,8 @@ RUN_FILES = {"log": "run.jsonl", "summary": "run.json", "catalog": "catalog.json
              "page": "mosaic.html", "index": "index.html"}  # fmt: skip
 _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _NAME_BYTES = 150
-_WALKS, _PATTERN_BYTES = 2, 1000
+#: How names of files end that are told from other words in a file on another machine.
+_SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,8}$")
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class Job:
     """
 
     name: str
-    image: Path
+    image: Place
     output: Path
     scene: SceneOptions = SceneOptions()
     points: PointOptions = PointOptions()
@@ -93,14 +96,16 @@ class Job:
         options["scene"]["allow_network"] = False  # leave to reach a file is no part of what is made of it
         if self.match.reference:
             options["match"] = dataclasses.asdict(self.match)
-        return {"name": self.name, "image": str(self.image), **options}
+        # Files on this machine are known by their content; of others there is the size.
+        far = {"image_bytes": self.image.size()} if isinstance(self.image, VsiPath) else {}
+        return {"name": self.name, "image": str(self.image), **far, **options}
 
 
 @dataclass(frozen=True)
 class Plan:
     """A pipeline file, worked out."""
 
-    path: Path
+    path: Place
     output: Path
     jobs: tuple[Job, ...]
     mosaic: MosaicOptions | None = None
@@ -128,21 +133,27 @@ class Plan:
 
 
 @reads("see docs/run.md for the form of the file")
-def plan(path: str | os.PathLike[str], root: str | os.PathLike[str] | None = None) -> Plan:
+def plan(
+    path: str | os.PathLike[str], root: str | os.PathLike[str] | None = None, *, allow_network: bool = False
+) -> Plan:
     """Read a pipeline file and work out its scenes.
 
     Parameters
     ----------
+    path : path or address
     root : path, optional
         Folder that every path has to lie in; that of the file without. The file's own ``root`` can only narrow it: who
         wrote the file is not who says what it may read.
+    allow_network : bool
+        Whether it may lie at an address, and name addresses.
 
     Raises
     ------
     InputError
         For a wrong file, a path outside of the root, a pattern without a match, or two scenes of one name.
     """
-    return _Planner(Path(path), read_config(path), root).plan()
+    file = place(located(path, allow_network=allow_network))
+    return _Planner(file, read_config(file), Places(path, root, allow_network)).plan()
 
 
 @functools.cache
@@ -158,19 +169,18 @@ def versions() -> dict[str, Any]:
 
 
 class _Planner:
-    def __init__(self, path: Path, config: Config, root: str | os.PathLike[str] | None) -> None:
-        self.path, self.config = path, config
-        self.base = Path(os.path.abspath(path)).parent
-        self.root = self.base.resolve() if root is None else Path(root).resolve()
+    def __init__(self, path: Place, config: Config, places: Places) -> None:
+        self.path, self.config, self.places = path, config, places
         if config.root is not None:
-            self.root = self._inside(config.root, "root of the file")
-        self.output = self._inside(config.output, "output")
+            places.root = places.inside(config.root, "root of the file")
+        # What another machine asks for is not written here: its outputs go to a store.
+        self.output = Path("nowhere") if places.far else places.inside(config.output, "output")
 
     def plan(self) -> Plan:
-        if self.output == self.base:
+        if self.output == self.places.base:
             raise InputError("the outputs would lie among the inputs", file=self.path, field="output",
                              remedy="choose a folder of their own, for example out")  # fmt: skip
-        found: dict[Path, list[tuple[int, Entry]]] = {}
+        found: dict[Place, list[tuple[int, Entry]]] = {}
         for number, entry in enumerate(self.config.scenes):
             for image in self._images(entry, number):
                 found.setdefault(image, []).append((number, entry))
@@ -182,10 +192,10 @@ class _Planner:
 
     # -- images ------------------------------------------------------------------------------------------------------
 
-    def _images(self, entry: Entry, number: int) -> list[Path]:
+    def _images(self, entry: Entry, number: int) -> list[Place]:
         if entry.image is not None:
-            return [self._inside(entry.image, f"scenes[{number}].image")]
-        found: dict[Path, None] = {}
+            return [self.places.of(entry.image, f"scenes[{number}].image")]
+        found: dict[Place, None] = {}
         excluded = {image for pattern in _listed(entry.exclude)
                     for image in self._matches(pattern, f"scenes[{number}].exclude")}  # fmt: skip
         for pattern in _listed(entry.images):
@@ -193,43 +203,36 @@ class _Planner:
             if not matches:
                 raise InputError(
                     f"nothing matches {pattern!r}", file=self.path, field=f"scenes[{number}].images",
-                    remedy=f"check the pattern, which is relative to {self.base}",
+                    remedy=f"check the pattern, which is relative to {self.places.address or self.places.base}",
                 )  # fmt: skip
             for image in matches:
-                found[self._inside(str(image), f"scenes[{number}].images")] = None
+                place = self.places.inside(str(image), f"scenes[{number}].images") if isinstance(image, Path) else image
+                found[place] = None
         return list(found)
 
-    def _matches(self, pattern: str, field: str) -> list[Path]:
-        parts = pattern.split("/")
-        # Every ** walks all folders below each that the one before it found.
-        if parts.count("**") > _WALKS or len(os.fsencode(pattern)) > _PATTERN_BYTES:
-            raise InputError(
-                f"{pattern[:60]!r} is too long a search", file=self.path, field=field,
-                remedy=f"at most {_WALKS} times ** and {_PATTERN_BYTES} bytes in a pattern",
-            )  # fmt: skip
-        # Nothing outside of the root is searched either.
-        fixed = "/".join(itertools.takewhile(lambda part: not glob.has_magic(part), parts))
-        self._inside(fixed or ("/" if pattern.startswith("/") else "."), field)
-        names = set(_found("/" if pattern.startswith("/") else str(self.base), [part for part in parts if part]))
-        paths = [Path(os.path.abspath(name)) for name in sorted(names) if os.path.isfile(name)]
+    def _matches(self, pattern: str, field: str) -> list[Place]:
         # A pattern with ** would take the orthos of the last run for scenes.
-        return [path for path in paths if not path.is_relative_to(self.output)]
+        found = self.places.matching(pattern, field)
+        return [path for path in found if not (isinstance(path, Path) and path.is_relative_to(self.output))]
 
     # -- one scene ---------------------------------------------------------------------------------------------------
 
-    def _job(self, image: Path, entries: Sequence[tuple[int, Entry]]) -> Job:
+    def _job(self, image: Place, entries: Sequence[tuple[int, Entry]]) -> Job:
         where = f"scenes[{entries[-1][0]}]"
         settings = merged(self.config.defaults, *(entry for _, entry in entries))
         names = [entry.name for _, entry in entries if entry.name is not None]
         name = self._filled(names[-1] if names else "{stem}", image, f"{where}.name")
+        scene, shown = self._scene(settings, image, where), image
+        if isinstance(image, Path) and is_item(image):
+            asset, scene = resolved(image, scene)
+            shown = self.places.of(str(asset), f"{where}.image")
         return Job(
-            name=self._checked_name(name, image, where), image=image, output=self.output,
-            scene=self._scene(settings, image, where), points=self._points(settings, image, where),
-            surface=self._surface(settings, image, where), match=self._match(settings, image, where),
-            ortho=self._ortho(settings, image, where), versions=versions(),
+            name=self._checked_name(name, image, where), image=shown, output=self.output, scene=scene,
+            points=self._points(settings, image, where), surface=self._surface(settings, image, where),
+            match=self._match(settings, image, where), ortho=self._ortho(settings, image, where), versions=versions(),
         )  # fmt: skip
 
-    def _scene(self, settings: Settings, image: Path, where: str) -> SceneOptions:
+    def _scene(self, settings: Settings, image: Place, where: str) -> SceneOptions:
         given: Any = settings.scene
         options = {}
         for key, value in given.sensor_options.items():
@@ -238,11 +241,11 @@ class _Planner:
         rpc = given.rpc if given.rpc in ("tag", "sidecar") else self._file(given.rpc, image, f"{where}.scene.rpc")
         model = self._file(given.model, image, f"{where}.scene.model")
         return SceneOptions(
-            sensor=given.sensor, rpc=rpc, model=model, roots=(str(self.root),), sensor_options=options,
-            crop_offset=given.crop_offset,
+            sensor=given.sensor, rpc=rpc, model=model, sensor_options=options, crop_offset=given.crop_offset,
+            roots=() if self.places.far else (str(self.places.root),), allow_network=self.places.allow_network,
         )  # fmt: skip
 
-    def _points(self, settings: Settings, image: Path, where: str) -> PointOptions:
+    def _points(self, settings: Settings, image: Place, where: str) -> PointOptions:
         values: dict[str, Any] = dict(settings.points)
         if values["gcps"] != OWN_POINTS:
             values["gcps"] = self._file(values["gcps"], image, f"{where}.points.gcps")
@@ -250,12 +253,12 @@ class _Planner:
             values["vertical"] = self._perhaps_file(values["vertical"], image, f"{where}.points.vertical")
         return PointOptions(**values)
 
-    def _surface(self, settings: Settings, image: Path, where: str) -> SurfaceOptions:
+    def _surface(self, settings: Settings, image: Place, where: str) -> SurfaceOptions:
         values: dict[str, Any] = dict(settings.surface)
         if values["dem"] != AUTO:
             values["dem"] = self._file(values["dem"], image, f"{where}.surface.dem")
         for cell in () if values["dem"] is None else matching_files(values["dem"]) or ():
-            self._inside(cell, f"{where}.surface.dem")
+            self.places.inside(cell, f"{where}.surface.dem")
         if values["source"] is not None and not is_address(values["source"]):
             values["source"] = self._file(values["source"], image, f"{where}.surface.source")
         values["fill"] = str(values["fill"])
@@ -265,13 +268,13 @@ class _Planner:
             values["vertical"] = self._perhaps_file(values["vertical"], image, f"{where}.surface.vertical")
         return SurfaceOptions(**values)
 
-    def _match(self, settings: Settings, image: Path, where: str) -> MatchOptions:
+    def _match(self, settings: Settings, image: Place, where: str) -> MatchOptions:
         values: dict[str, Any] = dict(settings.match)
         field = f"{where}.match.reference"
         values["reference"] = tuple(self._file(name, image, field) for name in _listed(values["reference"]))
         return MatchOptions(**values)
 
-    def _ortho(self, settings: Settings, image: Path, where: str) -> OutputOptions:
+    def _ortho(self, settings: Settings, image: Place, where: str) -> OutputOptions:
         values: dict[str, Any] = dict(settings.output)
         values["fill_from"] = self._file(values["fill_from"], image, f"{where}.output.fill_from")
         values["creation_options"] = {key: str(value) for key, value in values["creation_options"].items()}
@@ -279,46 +282,25 @@ class _Planner:
 
     # -- paths -------------------------------------------------------------------------------------------------------
 
-    def _inside(self, text: str, field: str) -> Path:
-        """Return an absolute path, which has to lie in the root wherever its links lead."""
-        if "\0" in text or "://" in text or text.startswith("/vsi"):
-            raise InputError(f"{text!r} is not a path of a file", file=self.path, field=field, remedy="give a file")
-        path = Path(os.path.abspath(self.base / text))
-        try:
-            resolved = path.resolve()
-            path.is_file()
-        except (OSError, RuntimeError, ValueError) as error:
-            # Names longer than the file system's, links in a circle, surrogates.
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(f"{text[:60]!r} is not a path of a file ({reason})", file=self.path, field=field,
-                             remedy="check the name, and the links on its way") from error  # fmt: skip
-        if not resolved.is_relative_to(self.root):
-            raise InputError(
-                f"{text} lies outside of the root {self.root}", file=self.path, field=field,
-                remedy=f"move it there, or allow a folder that holds both with `root={self._common(path.resolve())}`",
-            )  # fmt: skip
-        return path
+    def _file(self, text: str | None, image: Place, field: str) -> str | None:
+        return None if text is None else self.places.name(self._filled(text, image, field), field)
 
-    def _common(self, place: Path) -> str:
-        return os.path.commonpath([self.base.resolve(), place if place.is_dir() else place.parent])
-
-    def _file(self, text: str | None, image: Path, field: str) -> str | None:
-        return None if text is None else str(self._inside(self._filled(text, image, field), field))
-
-    def _perhaps_file(self, text: str, image: Path, field: str) -> str:
+    def _perhaps_file(self, text: str, image: Place, field: str) -> str:
         """Return the path of a value that names a file, any other value as it is."""
         text = self._filled(text, image, field)
         looks = os.sep in text and not text.startswith("+")
-        if looks or _is_file(self.base / text):
-            return str(self._inside(text, field))
+        if self.places.far:
+            return self.places.name(text, field) if looks or _SUFFIX.search(text) else text
+        if looks or _is_file(self.places.base / text):
+            return self.places.name(text, field)
         if _is_file(Path(text)):
             raise InputError(
                 f"{text!r} is a file of the current folder, but paths are relative to the pipeline file",
-                file=self.path, field=field, remedy=f"give its path relative to {self.base}",
+                file=self.path, field=field, remedy=f"give its path relative to {self.places.base}",
             )  # fmt: skip
         return text
 
-    def _filled(self, text: str, image: Path, field: str) -> str:
+    def _filled(self, text: str, image: Place, field: str) -> str:
         values = {"stem": image.stem, "folder": image.parent.name}
 
         def value(match: re.Match[str]) -> str:
@@ -330,7 +312,7 @@ class _Planner:
 
     # -- checks ------------------------------------------------------------------------------------------------------
 
-    def _checked_name(self, name: str, image: Path, where: str) -> str:
+    def _checked_name(self, name: str, image: Place, where: str) -> str:
         bad = not name or name.startswith(".") or name != name.strip() or len(os.fsencode(name)) > _NAME_BYTES
         if bad or any(letter in "/\\:\0" or not letter.isprintable() for letter in name):
             raise InputError(
@@ -364,22 +346,6 @@ class _Planner:
                         "the scenes of a mosaic share a grid", file=self.path, field=f"defaults.output.{field}",
                         remedy="say it under defaults: output: (such as crs: EPSG:32635 and resolution: 2.5)",
                     )  # fmt: skip
-
-
-def _found(base: str, parts: Sequence[str]) -> Iterator[str]:
-    """Yield what a pattern matches below a folder.
-
-    ``**`` walks no linked folders, as in shells: two links that lead up again would give 2 to the power of 40 paths.
-    """
-    at = parts.index("**") if "**" in parts else len(parts)
-    tops = glob.iglob(os.path.join(glob.escape(base), *parts[:at]))
-    if at == len(parts):
-        yield from tops
-        return
-    for top in tops:
-        for folder, names, _ in os.walk(top):
-            names[:] = [name for name in names if not name.startswith(".")]
-            yield from _found(folder, parts[at + 1 :] or ["*"])
 
 
 def for_run(

@@ -29,6 +29,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.mosaic.assembly import assemble
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
+from ortho_pipeline.files.locations import is_far
 from ortho_pipeline.report.page.run import write_run_page
 from ortho_pipeline.report.stac import write_catalog
 from ortho_pipeline.warp.mosaic import Ortho, Overlap, measure_seam
@@ -152,14 +153,14 @@ def _folders(job: Job) -> list[str | os.PathLike[str]]:
     """Return the files in whose folders a new name could change the scene."""
     return [path for path in (job.image, inputs.point_file(job.points), job.surface.dem, *job.match.reference,
                           job.ortho.fill_from, *job.scene.files.values())
-            if path is not None and os.path.isabs(path)]  # fmt: skip
+            if path is not None and os.path.isabs(path) and not is_far(path)]  # fmt: skip
 
 
 def _states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:
     """Return all files that a scene depends on: those of `roles`, and small companions of the image."""
     known = dict(roles)
     stem = job.image.stem
-    for entry in os.scandir(job.image.parent):
+    for entry in os.scandir(job.image.parent) if isinstance(job.image, Path) else ():
         rest = entry.name.removeprefix(stem)
         belongs = rest != entry.name and rest[:1] in ("_", ".", "-") and entry.path not in known
         if belongs and entry.is_file() and entry.stat().st_size <= _COMPANION_BYTES:
@@ -244,7 +245,12 @@ def run(
     InputError
         If the file is wrong, or another run works in the output folder. What is wrong with a scene is its outcome.
     """
-    planned = config if isinstance(config, Plan) else plan(config)
+    planned = config if isinstance(config, Plan) else plan(config, allow_network=allow_network)
+    if store is None and is_far(planned.path):
+        raise InputError(
+            "what a pipeline file of another machine asks for goes to a store", file=planned.path, field="output",
+            remedy="give a folder of objects for the outputs, such as s3://bucket/prefix, or copy the file",
+        )  # fmt: skip
     jobs, part = planned.chosen(only, shard), bool(only) or shard is not None
     if store is not None:
         _refuse_unshared(planned)

@@ -111,7 +111,7 @@ def run(
 
     if options["shard"] == "auto":
         options["shard"] = part_of_array()
-    planned = batch.plan(pipeline_file, root)
+    planned = batch.plan(pipeline_file, root, allow_network=options["allow_network"])
     if as_list:
         listed = batch.list_scenes(planned)
         if as_json:

@@ -123,6 +123,11 @@ class VsiPath:
             raise FileNotFoundError(2, "there is no such file", self._name)
         return SimpleNamespace(st_size=found.size)
 
+    def size(self) -> int:
+        """Return the bytes of the file; 0 where there is none."""
+        found = self._stat()
+        return 0 if found is None else int(found.size)
+
     def exists(self) -> bool:
         """Tell whether there is such a file or folder."""
         return self._stat() is not None
@@ -341,6 +346,15 @@ def is_far(name: AnyPath) -> bool:
     if url is not None:
         return url[1].lower() in SCHEMES
     return text.startswith("/vsi") and not in_local_archive(text) and not text.startswith("/vsimem")
+
+
+def url_of(name: AnyPath) -> str:
+    """Return the address of a file on another machine, whatever its name; any other name as it is."""
+    text = os.fspath(name)
+    for scheme, prefix in SCHEMES.items():
+        if text.startswith(prefix):
+            return f"{scheme}://{text.removeprefix(prefix)}"
+    return text
 
 
 def archive_of(name: str) -> Path | None:

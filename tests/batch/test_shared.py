@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import os
 import random
 import threading
 import time
@@ -16,10 +17,11 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 from osgeo import gdal
-from servers import moto_server, on_a_faulty_way
+from servers import moto_server, on_a_faulty_way, serving
 
+from ortho_pipeline.batch import runner
 from ortho_pipeline.batch.executors import Sequential
-from ortho_pipeline.batch.plan import STATE, Job, Plan
+from ortho_pipeline.batch.plan import STATE, Job, Plan, plan
 from ortho_pipeline.batch.results import Outcome
 from ortho_pipeline.batch.shared.arrays import part_of_array
 from ortho_pipeline.batch.shared.leases import Leases
@@ -233,3 +235,94 @@ def test_the_command_delivers_to_a_store_and_collects(store: str, tiny: Any, mon
     names = {name for name, _ in Objects(store, allow_network=True).names()}
     assert {"run.json", f"{STATE}/s0.result.json", "s1/s1_report.json"} <= names
     assert not (tiny.folder / "out").exists()
+
+
+def test_a_pipeline_file_in_a_store_names_images_there(store: str, tiny: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """File, images by a pattern, points and heights lie in a bucket; a STAC item stands for one of the images."""
+    for name, value in {"AWS_HTTPS": "NO", "AWS_VIRTUAL_HOSTING": "FALSE"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("AWS_S3_ENDPOINT", os.environ["AWS_ENDPOINT_URL"].removeprefix("http://"))
+    objects_in = Objects(f"{store}/in", allow_network=True)
+    objects_in.put("dem.tif", tiny.dem)
+    objects_in.put("raw/2024/a.tif", tiny.image)
+    objects_in.put("raw/2024/deep/b.tif", tiny.image)
+    objects_in.put("raw/note.txt", b"no image")
+    for name in ("a", "b"):
+        objects_in.put(f"gcps/{name}.csv", tiny.gcps)
+    asset = {"href": "../raw/2024/a.tif", "roles": ["data"], "type": "image/tiff"}
+    item = {"type": "Feature", "stac_version": "1.0.0", "id": "c", "assets": {"image": asset}}
+    objects_in.put("items/c.json", json.dumps(item).encode())
+    objects_in.put("pipeline.yaml", FAR.encode())
+    address = f"{store}/in/pipeline.yaml"
+    with pytest.raises(InputError, match="unasked"):
+        plan(address)
+    with pytest.raises(InputError, match="goes to a store"):
+        runner.run(address, allow_network=True)
+    command = ["run", address, "-o", f"{store}/out", "--allow-network", "--executor", "sequential", "--json"]
+    done = CliRunner().invoke(cli, command)
+    assert done.exit_code == 0, done.stderr + done.stdout
+    made = {one["name"]: one for one in json.loads(done.stdout)["scenes"]}
+    assert {name: one["status"] for name, one in made.items()} == {"a": "done", "b": "done", "c": "done"}
+    assert made["b"]["files"]["ortho"] == f"{store}/out/b/b_ortho.tif"
+    assert made["a"]["facts"]["rmse_px"]["control"] is not None
+    assert made["c"]["facts"]["rmse_px"]["control"] is None
+    again = CliRunner().invoke(cli, command)
+    assert json.loads(again.stdout)["counts"] == {"done": 0, "unchanged": 3, "failed": 0}
+    # Another image of that name is another scene.
+    objects_in.put("raw/2024/a.tif", tiny.image.read_bytes() + b"more")
+    gdal.VSICurlClearCache()
+    again = CliRunner().invoke(cli, command)
+    assert json.loads(again.stdout)["counts"]["done"] == 1
+
+
+FAR = """
+defaults:
+  surface: {dem: dem.tif, vertical: ellipsoid}
+  output: {format: GTiff}
+scenes:
+  - images: raw/**/*.tif
+    points: {gcps: "gcps/{stem}.csv", crs: "EPSG:4326", vertical: ellipsoid}
+  - image: items/c.json
+"""
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../up.tif", "file:///etc/passwd", "/vsicurl/http://h/a.tif"])
+def test_a_file_elsewhere_leads_to_nothing_on_this_machine(name: str, tmp_path: Path) -> None:
+    (tmp_path / "p.yaml").write_text(f"scenes:\n  - image: {name}\n    surface: {{height: 5}}\n")
+    with serving(tmp_path) as public, pytest.raises(InputError) as caught:
+        plan(f"{public.address}/p.yaml", allow_network=True)
+    assert caught.value.field == "scenes[0].image"
+
+
+def test_a_file_on_this_machine_may_name_addresses_if_that_is_allowed(tiny: Any) -> None:
+    file = tiny.folder / "p.yaml"
+    with serving(tiny.folder) as public:
+        file.write_text(
+            f"scenes:\n  - image: {public.address}/{tiny.image.name}\n"
+            f"    surface: {{dem: {public.address}/dem.tif, vertical: ellipsoid}}\n    output: {{format: GTiff}}\n"
+        )
+        with pytest.raises(InputError, match="unasked") as caught:
+            plan(file)
+        assert caught.value.field == "scenes[0].image"
+        made = runner.run(file, allow_network=True, executor="sequential")
+        assert [one.status for one in made.scenes] == ["done"]
+        again = runner.run(file, allow_network=True, executor="sequential")
+        assert [one.status for one in again.scenes] == ["unchanged"]
+        file.write_text(
+            file.read_text()
+            .replace(f"{public.address}/{tiny.image.name}", f"{public.address}/*.tif")
+            .replace("image:", "images:")
+        )
+        with pytest.raises(InputError, match="not searched"):
+            plan(file, allow_network=True)
+
+
+def test_items_of_a_local_pipeline_file_are_their_images(tiny: Any) -> None:
+    asset = {"href": tiny.image.name, "roles": ["data"], "type": "image/tiff"}
+    item = {"type": "Feature", "stac_version": "1.0.0", "id": "c", "assets": {"image": asset}}
+    (tiny.folder / "one.json").write_text(json.dumps(item))
+    file = tiny.folder / "p.yaml"
+    file.write_text("scenes:\n  - image: one.json\n    surface: {height: 500}\n    output: {format: GTiff}\n")
+    assert plan(file).jobs[0].image == tiny.image
+    assert [one.status for one in runner.run(file, executor="sequential").scenes] == ["done"]
+    assert [one.status for one in runner.run(file, executor="sequential").scenes] == ["unchanged"]

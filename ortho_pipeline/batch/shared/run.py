@@ -101,8 +101,8 @@ def _goes_along(path: Path) -> bool:
 
 def key_of_shared(job: Job) -> str:
     """Return the digest of what a scene is asked to be: settings, software, and the size of the image."""
-    size = job.image.stat().st_size if job.image.is_file() else 0
-    return key_of((), {**job.configuration, "image_bytes": size}, job.versions)
+    size = job.image.stat().st_size if isinstance(job.image, Path) and job.image.is_file() else 0
+    return key_of((), {"image_bytes": size, **job.configuration}, job.versions)
 
 
 def outcome_of(name: str, result: Mapping[str, Any]) -> Outcome:

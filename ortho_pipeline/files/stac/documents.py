@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import urljoin
 
 from ortho_pipeline.errors import InputError, StorageError
-from ortho_pipeline.files.locations import AnyPath, require_network, within
+from ortho_pipeline.files.locations import AnyPath, require_network, url_of, within
 from ortho_pipeline.files.reading import parse_json, read_json
 from ortho_pipeline.files.storage.objects import Objects, is_address
 from ortho_pipeline.files.traffic import count
@@ -31,7 +31,7 @@ def read_document(address: AnyPath, *, allow_network: bool) -> dict[str, Any]:
     StorageError
         If a server does not answer.
     """
-    text = os.fspath(address)
+    text = url_of(address)
     if text.startswith(("http://", "https://")):
         require_network(text, allow_network)
         found = parse_json(_answer(text), text, REMEDY)
@@ -94,7 +94,7 @@ def target(href: str, base: AnyPath, roots: tuple[AnyPath, ...] = ()) -> str:
     InputError
         If it is a file elsewhere on this machine: the document may be a stranger's.
     """
-    text, here = href.strip(), os.fspath(base)
+    text, here = href.strip(), url_of(base)
     if is_address(text):
         return text
     if not text or "\0" in text or text.startswith("/vsi") or (":" in text.partition("/")[0] and "://" in text):

@@ -10,7 +10,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files.locations import AnyPath
+from ortho_pipeline.files.locations import AnyPath, url_of
 from ortho_pipeline.files.stac.documents import REMEDY, read_document, target
 from ortho_pipeline.files.storage.objects import is_address
 
@@ -134,7 +134,7 @@ def is_item(path: object) -> bool:
 
 def split(path: AnyPath) -> tuple[str, str]:
     """Return an item's address and the key of the asset after its ``#``; empty where there is none."""
-    text = os.fspath(path)
+    text = url_of(path)
     address, _, key = text.partition("#") if is_address(text) or ".json#" in text.lower() else (text, "", "")
     return address, key
 
@@ -166,8 +166,8 @@ def item_of(document: Mapping[str, Any], address: AnyPath, roots: tuple[AnyPath,
         raise InputError("a STAC item has assets", file=address, field="assets", remedy=REMEDY)
     own = next(
         (link["href"] for link in _list(document.get("links")) if isinstance(link, dict) and link.get("rel") == "self"
-         and isinstance(link.get("href"), str) and is_address(link["href"]) and is_address(address)),
-        os.fspath(address),
+         and isinstance(link.get("href"), str) and is_address(link["href"]) and is_address(url_of(address))),
+        url_of(address),
     )  # fmt: skip
     found = []
     for key, asset in assets.items():
@@ -176,7 +176,7 @@ def item_of(document: Mapping[str, Any], address: AnyPath, roots: tuple[AnyPath,
         roles = tuple(role for role in _list(asset.get("roles")) if isinstance(role, str))
         kind = asset.get("type") if isinstance(asset.get("type"), str) else ""
         found.append(Asset(key, target(asset["href"], own, roots), roles, kind or ""))
-    return Item(os.fspath(address), str(document.get("id", "")), tuple(found))
+    return Item(url_of(address), str(document.get("id", "")), tuple(found))
 
 
 def _list(value: Any) -> list[Any]:

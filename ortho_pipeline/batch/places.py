@@ -1,0 +1,161 @@
+"""Places that a pipeline file names: paths in its root on this machine, and addresses of other machines."""
+
+from __future__ import annotations
+
+import fnmatch
+import glob
+import itertools
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.locations import VsiPath, is_far, located, url_of
+from ortho_pipeline.files.storage.objects import Objects, is_address
+
+_WALKS, _PATTERN_BYTES = 2, 1000
+#: No store has more objects behind a pattern.
+_MOST_LISTED = 1_000_000
+Place: TypeAlias = Path | VsiPath
+
+
+class Places:
+    """What names in a pipeline file stand for.
+
+    Names are relative to the file. Of a file on this machine they stay in its root wherever links lead; a file on
+    another one leads to no file of this one.
+
+    Parameters
+    ----------
+    file : path or address
+    root : path, optional
+        Folder that every path has to lie in; that of the file without.
+    allow_network : bool
+        Whether addresses may be named.
+    """
+
+    def __init__(self, file: str | os.PathLike[str], root: str | os.PathLike[str] | None, allow_network: bool) -> None:
+        self.file: str | os.PathLike[str] = file
+        self.far, self.allow_network = is_far(file), allow_network
+        self.base = Path() if self.far else Path(os.path.abspath(file)).parent
+        self.address = url_of(file).rpartition("/")[0] if self.far else ""
+        self.root = self.base.resolve() if root is None else Path(root).resolve()
+
+    def inside(self, text: str, field: str) -> Path:
+        """Return an absolute path on this machine, which has to lie in the root wherever its links lead."""
+        if "\0" in text or "://" in text or text.startswith("/vsi"):
+            raise InputError(f"{text!r} is not a path of a file", file=self.file, field=field, remedy="give a file")
+        path = Path(os.path.abspath(self.base / text))
+        try:
+            resolved = path.resolve()
+            path.is_file()
+        except (OSError, RuntimeError, ValueError) as error:
+            # Names longer than the file system's, links in a circle, surrogates.
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"{text[:60]!r} is not a path of a file ({reason})", file=self.file, field=field,
+                             remedy="check the name, and the links on its way") from error  # fmt: skip
+        if not resolved.is_relative_to(self.root):
+            raise InputError(
+                f"{text} lies outside of the root {self.root}", file=self.file, field=field,
+                remedy=f"move it there, or allow a folder that holds both with `root={self._common(path.resolve())}`",
+            )  # fmt: skip
+        return path
+
+    def of(self, text: str, field: str) -> Place:
+        """Return the place of a file: a path, or what lies at an address."""
+        if is_address(text):
+            return self._located(text, field)
+        return self._located(self._address(text, field), field) if self.far else self.inside(text, field)
+
+    def name(self, text: str, field: str) -> str:
+        """Return the place of a file as text: an absolute path, or an address."""
+        if is_address(text):
+            self._located(text, field)
+            return text
+        return self._address(text, field) if self.far else str(self.inside(text, field))
+
+    def matching(self, pattern: str, field: str) -> list[Place]:
+        """Return the files that a pattern stands for, by name."""
+        if len(os.fsencode(pattern)) > _PATTERN_BYTES or pattern.split("/").count("**") > _WALKS:
+            # Every ** walks all folders below each that the one before it found.
+            raise InputError(
+                f"{pattern[:60]!r} is too long a search", file=self.file, field=field,
+                remedy=f"at most {_WALKS} times ** and {_PATTERN_BYTES} bytes in a pattern",
+            )  # fmt: skip
+        if is_address(pattern) or self.far:
+            text = pattern if is_address(pattern) else self._address(pattern, field)
+            return [self._located(address, field) for address in self._listed(text, field)]
+        # Nothing outside of the root is searched either.
+        parts = pattern.split("/")
+        fixed = "/".join(itertools.takewhile(lambda part: not glob.has_magic(part), parts))
+        self.inside(fixed or ("/" if pattern.startswith("/") else "."), field)
+        names = set(_found("/" if pattern.startswith("/") else str(self.base), [part for part in parts if part]))
+        return [Path(os.path.abspath(name)) for name in sorted(names) if os.path.isfile(name)]
+
+    def _located(self, address: str, field: str) -> VsiPath:
+        if not self.allow_network:
+            raise InputError(
+                f"{address!r} lies on another machine, of which nothing is opened unasked", file=self.file, field=field,
+                remedy="allow it with `scene.allow_network`, or give a file",
+            )  # fmt: skip
+        place = located(address, allow_network=self.allow_network)
+        assert isinstance(place, VsiPath)
+        return place
+
+    def _address(self, text: str, field: str) -> str:
+        """Return the address of what a file on another machine names."""
+        parts = text.split("/")
+        if "\0" in text or "://" in text or text.startswith("/") or ".." in parts:
+            raise InputError(
+                f"{text[:200]!r} is no file below the folder of the pipeline file", file=self.file, field=field,
+                remedy="name it from there on, or give its whole address",
+            )  # fmt: skip
+        return "/".join([self.address, *(part for part in parts if part not in ("", "."))])
+
+    def _listed(self, pattern: str, field: str) -> list[str]:
+        """Return the addresses of the objects that a pattern stands for."""
+        if not glob.has_magic(pattern):
+            return [pattern]
+        scheme, _, rest = pattern.partition("://")
+        parts = rest.split("/")
+        fixed = list(itertools.takewhile(lambda part: not glob.has_magic(part), parts))
+        if scheme in ("http", "https") or not fixed:
+            raise InputError(
+                "a web server is not searched", file=self.file, field=field,
+                remedy="name the images one by one, or by a pattern in a store (s3, gs, az)",
+            )  # fmt: skip
+        wanted = parts[len(fixed) :]
+        folder = f"{scheme}://{'/'.join(fixed)}"
+        names = Objects(folder, allow_network=self.allow_network).names()
+        listed = (name for name, _ in itertools.islice(names, _MOST_LISTED) if _fits(name.split("/"), wanted))
+        return [f"{folder}/{name}" for name in sorted(listed)]
+
+    def _common(self, place: Path) -> str:
+        return os.path.commonpath([self.base.resolve(), place if place.is_dir() else place.parent])
+
+
+def _fits(name: Sequence[str], pattern: Sequence[str]) -> bool:
+    """Tell whether the parts of a name are those that a pattern stands for; ``**`` is any number of folders."""
+    if not pattern:
+        return not name
+    if pattern[0] == "**":
+        rest = pattern[1:] or ["*"]
+        return any(_fits(name[skipped:], rest) for skipped in range(len(name)))
+    return bool(name) and fnmatch.fnmatchcase(name[0], pattern[0]) and _fits(name[1:], pattern[1:])
+
+
+def _found(base: str, parts: Sequence[str]) -> Iterator[str]:
+    """Yield what a pattern matches below a folder.
+
+    ``**`` walks no linked folders, as in shells: two links that lead up again would give 2 to the power of 40 paths.
+    """
+    at = parts.index("**") if "**" in parts else len(parts)
+    tops = glob.iglob(os.path.join(glob.escape(base), *parts[:at]))
+    if at == len(parts):
+        yield from tops
+        return
+    for top in tops:
+        for folder, names, _ in os.walk(top):
+            names[:] = [name for name in names if not name.startswith(".")]
+            yield from _found(folder, parts[at + 1 :] or ["*"])
