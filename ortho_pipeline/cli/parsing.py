@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 import click
 
 from ortho_pipeline.cli.flags import name_as_typed
+from ortho_pipeline.cli.survey.examples import EXAMPLES, with_examples
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.options import is_usable
 
@@ -91,9 +92,15 @@ class Command(click.Command):
 
 
 class Group(click.Group):
-    """A group whose commands are of that kind."""
+    """A group whose commands are of that kind, with their examples in their help."""
 
     command_class = Command
+
+    def add_command(self, cmd: click.Command, name: str | None = None) -> None:
+        """Add a command, whose examples are found by its words."""
+        super().add_command(cmd, name)
+        words = f"{self.name} {name or cmd.name}".removeprefix("cli ")
+        cmd.help = with_examples(cmd.help, EXAMPLES.get(words, ()))
 
 
 class OneOrTwo(click.ParamType):

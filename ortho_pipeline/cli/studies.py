@@ -10,6 +10,7 @@ import click
 from ortho_pipeline.cli.options import folder_option, json_option
 from ortho_pipeline.cli.parsing import Command, Group
 from ortho_pipeline.cli.printing import print_result, progress
+from ortho_pipeline.cli.survey.examples import examples_of_study, with_examples
 
 if TYPE_CHECKING:
     from ortho_pipeline.hookspecs import Study, StudyOption
@@ -56,7 +57,7 @@ def _simulation(study: Study) -> click.Command:
     seed_option = click.option(
         "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of everything that is drawn."
     )
-    return click.command(study.name, cls=Command, help=_help(study.simulate), short_help=study.title)(
+    return click.command(study.name, cls=Command, help=_help(study, "simulate"), short_help=study.title)(
         folder_option(seed_option(callback))
     )
 
@@ -77,7 +78,7 @@ def _experiment(study: Study) -> click.Command:
             result = studies.reproduce(study.name, folder, realisations=realisations, progress=advance)
         print_result(result, as_json)
 
-    return click.command(study.name, cls=Command, help=_help(study.reproduce), short_help=study.title)(run)
+    return click.command(study.name, cls=Command, help=_help(study, "reproduce"), short_help=study.title)(run)
 
 
 def _option(option: StudyOption) -> Any:
@@ -96,5 +97,6 @@ def _option(option: StudyOption) -> Any:
     )  # fmt: skip
 
 
-def _help(function: Any) -> str:
-    return (inspect.getdoc(function) or "").partition("\n\n")[0]
+def _help(study: Study, group: str) -> str | None:
+    text = (inspect.getdoc(getattr(study, group)) or "").partition("\n\n")[0]
+    return with_examples(text, examples_of_study(group, study.name))

@@ -1,1 +1,1 @@
-"""What a new user types first: the program alone, a folder to look at, and the file of a run."""
+"""First use: what `ortho` alone, `info FOLDER` and `init` show, and the examples of every command."""

@@ -1,0 +1,87 @@
+"""Every command has an example in its help, and every example is run in a copy of the sample data."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.cli.survey.examples import EXAMPLES
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+#: What takes seconds, and what serves until somebody ends it.
+SLOW, SERVES = ("match", "ties", "--reference", "edge", "register"), ("measure",)
+#: What has to be there before.
+BEFORE = {
+    "mosaic": [
+        f"ortho rectify scene.tif --height 800 -t_srs EPSG:32636 -tr 10 10 -te {box} -o {name}"
+        for name, box in (("west", "530000 4121500 532000 4123500"), ("east", "531000 4121500 533000 4123500"))
+    ],
+}
+LINES = [(words, line) for words, examples in EXAMPLES.items() for _, line in examples]
+
+
+def is_slow(line: str) -> bool:
+    return any(word in shlex.split(line) for word in SLOW)
+
+
+def commands(group: click.Group, *words: str) -> Iterator[tuple[tuple[str, ...], click.Command]]:
+    """Return all commands with their words."""
+    context = click.Context(group, info_name="ortho")
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        assert command is not None
+        if isinstance(command, click.Group):
+            yield from commands(command, *words, name)
+        else:
+            yield (*words, name), command
+
+
+def test_every_command_has_an_example_in_its_help():
+    found = {" ".join(words): command for words, command in commands(cli)}
+    assert set(EXAMPLES) <= set(found)
+    for words, command in found.items():
+        text = CliRunner().invoke(cli, [*words.split(), "--help"], prog_name="ortho").output
+        assert "Examples:\n\n      # " in text, words
+        typed = [line.strip() for line in text.splitlines() if line.strip().startswith(f"ortho {words} ")]
+        assert typed or f"ortho {words}\n" in text, words
+        for line in typed:
+            command.make_context(words, shlex.split(line)[1 + len(words.split()) :], resilient_parsing=False)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """A copy of the sample data, in which one works."""
+    for name in ("scene.tif", "scene_RPC.TXT", "dem.tif", "gcps.geojson", "gcps.csv", "reference.tif"):
+        shutil.copy(ROOT / "sample_data" / name, tmp_path)
+    for name, original in (("red.tif", "scene.tif"), ("nir.tif", "scene.tif"), ("red_RPC.TXT", "scene_RPC.TXT")):
+        shutil.copy(ROOT / "sample_data" / original, tmp_path / name)
+    for name in ("cartosat", "orbview3"):
+        shutil.copytree(ROOT / "sample_data" / name, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ORTHO_CACHE", str(tmp_path / "cache"))
+    return tmp_path
+
+
+def play(lines: list[tuple[str, str]]) -> None:
+    for words, line in lines:
+        for one in (*BEFORE.get(words, ()), line):
+            done = CliRunner().invoke(cli, shlex.split(one)[1:], prog_name="ortho")
+            assert done.exit_code == 0, f"{one}\n{done.output}"
+
+
+@pytest.mark.usefixtures("folder")
+def test_examples_run():
+    play([(words, line) for words, line in LINES if words not in SERVES and not is_slow(line)])
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("folder")
+def test_long_examples_run():
+    play([(words, line) for words, line in LINES if words not in SERVES and is_slow(line)])
