@@ -170,6 +170,10 @@ def truth(count: int) -> tuple[dict[str, Any], list[str]]:
     low, high = LIMITS["spread"]
     if not low <= spread <= high:
         wrong.append(f"the spread of (estimate - truth) / sigma is {spread:.3f}")
+    rows = found["rough"] = trials.run(trials.rough(max(3, 3 * count // 10)), told)
+    for kind in ("gaussian", "matern", "exponential"):
+        spread = trials.spread([row for row in rows if row["setting"]["roughness"] == kind])
+        print(f"-- sigmas where errors are {kind}: a spread of {spread:.3f}\n")
     for what in REFUSED:
         rows = found[what] = trials.refusals(what, max(2, count // 10), told)
         refused = sum(bool(row["refused"]) for row in rows)

@@ -111,9 +111,23 @@ def _coefficients(tone: Texture, box: float, blur: float) -> Texture:
     return scipy.fft.irfft2(spectrum, s=tone.shape).astype(np.float32)
 
 
-def field_of(random: np.random.Generator, size: int, length: float) -> Array:
-    """Return a periodic Gaussian field, sigma 1, whose correlation at the distance d is exp(-(d / length)^2)."""
-    smooth = gaussian_filter(random.normal(0, 1, (size, size)), length / 2, mode="wrap", truncate=5)
+def correlation(roughness: str, distance: Array) -> Array:
+    """Return the correlation of errors at distances over their length, 1/e at 1: exponential, matern, gaussian."""
+    if roughness == "exponential":
+        return np.exp(-distance)
+    if roughness == "matern":
+        return (1.0 + 2.1461932206 * distance) * np.exp(-2.1461932206 * distance)
+    return np.exp(-(distance**2))
+
+
+def field_of(random: np.random.Generator, size: int, length: float, roughness: str = "gaussian") -> Array:
+    """Return a periodic Gaussian field, sigma 1, whose `correlation` falls over a length."""
+    noise = random.normal(0, 1, (size, size))
+    if roughness != "gaussian":
+        steps = np.minimum(np.arange(size), size - np.arange(size)) / length
+        spectrum = scipy.fft.fft2(correlation(roughness, np.hypot(steps[:, None], steps))).real
+        return scipy.fft.ifft2(scipy.fft.fft2(noise) * np.sqrt(np.maximum(spectrum, 0.0))).real
+    smooth = gaussian_filter(noise, length / 2, mode="wrap", truncate=5)
     # What a filter leaves of white noise is known: the sample's own deviation would take away the field's mean level.
     kernel = np.zeros(2 * int(5 * length / 2 + 0.5) + 3)
     kernel[len(kernel) // 2] = 1

@@ -83,6 +83,8 @@ class Setting:
         Correlated error of the DEM (m) and its length (m), and white error (m) of its samples.
     reference_sigma, reference_length : float
         The same of the reference, each axis, in metres.
+    roughness : str
+        How these errors are correlated, as in `landscape.correlation`.
     margin : float
         How far (px of the scene) the reference reaches beyond the scene.
     offset : (float, float)
@@ -112,6 +114,7 @@ class Setting:
     dem_noise: float = 0.0
     reference_sigma: float = 0.0
     reference_length: float = 150.0
+    roughness: str = "gaussian"
     reference_crs: str = UTM
     margin: float = 60.0
     offset: tuple[float, float] = (0.0, 0.0)
@@ -354,11 +357,12 @@ class Case:
         return x - moved[0], y - moved[1]
 
     def smooth(self, salt: int, length: float, x: Array, y: Array) -> Array:
-        """Return a Gaussian field, sigma 1, correlated over `length` metres, at map coordinates."""
+        """Return a field, sigma 1, correlated over `length` metres, at map coordinates."""
         # Its samples are finer than its length, and it repeats like the ground.
         size = min(SIZE // CELL, max(16, int(8 * SIZE * self.spacing / length)))
         u, v = self._texel(x, y)
-        samples = _field(self.setting.seed, salt, size, length * size / (SIZE * self.spacing))
+        scale = length * size / (SIZE * self.spacing)
+        samples = _field(self.setting.seed, salt, size, scale, self.setting.roughness)
         return bilinear(samples, u * (size / SIZE), v * (size / SIZE))
 
     def write_reference(self) -> None:
@@ -398,8 +402,8 @@ class Case:
 
 
 @lru_cache(maxsize=8)
-def _field(seed: int, salt: int, size: int, length: float) -> Array:
-    return field_of(np.random.default_rng([seed, salt]), size, length)
+def _field(seed: int, salt: int, size: int, length: float, roughness: str) -> Array:
+    return field_of(np.random.default_rng([seed, salt]), size, length, roughness)
 
 
 class Sky:

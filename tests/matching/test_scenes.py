@@ -10,7 +10,7 @@ import numpy as np
 import pyproj
 import pytest
 from cameras import Camera
-from landscape import SIZE, Land, field_of
+from landscape import SIZE, Land, correlation, field_of
 from numpy.typing import NDArray
 from osgeo import gdal
 from scenes import LEVEL, MIDDLE, UTM, Case, Setting, Sky, View
@@ -123,12 +123,15 @@ def test_the_dem_is_the_relief_with_the_errors_stated(tmp_path):
     np.testing.assert_allclose(surface.heights(ground[:, :2], UTM), ground[:, 2], atol=1e-3)
 
 
-@pytest.mark.parametrize("length", [2.0, 9.0])
-def test_fields_have_the_sigma_and_the_correlation_stated(length):
-    field = field_of(np.random.default_rng(4), 512, length)
+@pytest.mark.parametrize(
+    ("length", "roughness"), [(2.0, "gaussian"), (9.0, "gaussian"), (9.0, "matern"), (9.0, "exponential")]
+)
+def test_fields_have_the_sigma_and_the_correlation_stated(length, roughness):
+    field = field_of(np.random.default_rng(4), 512, length, roughness)
     assert field.std() == pytest.approx(1.0, abs=0.1)
-    distance = int(length)
-    assert (field * np.roll(field, distance, 1)).mean() == pytest.approx(np.exp(-((distance / length) ** 2)), abs=0.1)
+    for distance in (1, int(length)):
+        expected = float(correlation(roughness, np.array(distance / length)))
+        assert (field * np.roll(field, distance, 1)).mean() == pytest.approx(expected, abs=0.1)
 
 
 def pictured(case: Case) -> tuple[np.ndarray, np.ndarray]:

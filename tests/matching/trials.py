@@ -242,6 +242,21 @@ def coverage(count: int) -> list[Setting]:
     return found
 
 
+def rough(count: int) -> list[Setting]:
+    """Return scenes with wrong heights and references, whose errors are as rough as each of the correlations in turn.
+
+    Not of the 200: seeds from 200 on, of which those without such errors are passed over.
+    """
+    kinds, found, seed = grounds(), [], 200
+    while len(found) < count:
+        setting = drawn(seed, kinds)
+        if setting.dem_sigma or setting.reference_sigma:
+            kind = ("gaussian", "matern", "exponential")[len(found) % 3]
+            found.append(replace(setting, ground=kinds[len(found) * len(kinds) // count], roughness=kind))
+        seed += 1
+    return found
+
+
 def displaced(count: int, sigma: float = 2.0) -> list[Setting]:
     """Return small scenes whose reference lies as a whole where `sigma` (m, per axis) allows, drawn at random."""
     return [
