@@ -30,9 +30,11 @@ from ortho_pipeline.block.reliability.known_points import outlying
 from ortho_pipeline.block.reliability.suspects import Rejected
 from ortho_pipeline.block.variances.components import Posterior
 from ortho_pipeline.block.variances.grid import estimate, posterior, reweighed
+from ortho_pipeline.block.variances.shared_errors import SharedByImage
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, NotConverged, counted
 from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import marks_warning
@@ -265,8 +267,7 @@ def _result(
     active = problem.active(selection)
     used = selection.rays & active[points.point]
     variances = replace(found.variances, image=found.variances.image * problem.factor_of(points))
-    ground_covariance = solved.ground_covariance(found.covariance, found.image_square)
-    ground_covariance[found.rows] = found.ground
+    covariance, ground_covariance, shared = _covariances(solved, found, common)
     # Points that take no part still have a place where their rays meet, if they do.
     local = np.where(active[:, None], state.local, np.nan)
     ground = problem.frame.geodetic(local)
@@ -275,7 +276,7 @@ def _result(
     known = stated if common is None else common.corrected(stated)
     object_residuals = problem.frame.apart(known, local)
     used_ground = selection.ground & active
-    covariance, of_points = _with_common(found.covariance, common)
+    covariance, of_points = _with_common(covariance, common)
     # Points that share an error lie to each other as if there were none.
     apart = (points.sigma_common == 0)[:, None, None]
     doubts = outlying(solved, variances, object_residuals, ground_covariance + apart * of_points, used_ground)
@@ -303,12 +304,27 @@ def _result(
         variances=variances,
         gauge=gauge,
         common_error=common,
+        shared_errors=shared,
         rejected=rejected,
         outlying=doubts,
         warnings=(*(one.notice() for one in doubts), *notes),
         condition=solved.condition,
         iterations=solved.iterations,
     )
+
+
+def _covariances(
+    solved: Solved, found: Posterior, common: CommonError | None
+) -> tuple[Cofactors, Array, Mapping[str, SharedErrors]]:
+    """Return covariances of parameters and ground without what all points share, and what neighbours share."""
+    shared = SharedByImage.of(solved, common)
+    ground = solved.ground_covariance(found.covariance, found.image_square)
+    plain = ground.copy()
+    ground[found.rows] = found.ground
+    if shared is None:
+        return found.covariance, ground, {}
+    covariance = shared.added(found.covariance)
+    return covariance, ground + solved.ground_covariance(covariance, found.image_square) - plain, shared.images
 
 
 def _with_common(covariance: Cofactors, common: CommonError | None) -> tuple[Cofactors, Array]:

@@ -58,6 +58,8 @@ class CommonError:
         Information of the block on it; that of its own standard deviation is I.
     by_params, by_points : ndarray (P, 2), (N, 3, 2)
         How one standard deviation of it moves parameters, and points in their east, north, up.
+    seen : ndarray (M, 2, 2)
+        What one standard deviation leaves of the misfits of rays (whitened), along each axis of it.
     """
 
     sigmas: Array
@@ -67,6 +69,7 @@ class CommonError:
     told: Array
     by_params: Array
     by_points: Array
+    seen: Array
 
     @classmethod
     def of(cls, problem: BlockProblem, state: State, selection: Selection) -> CommonError | None:
@@ -76,7 +79,8 @@ class CommonError:
         shared = int((used & (sigmas > 0)).sum())
         if not shared or not problem.size:
             return None
-        nothing = np.zeros((problem.size, 2)), np.zeros((len(sigmas), 3, 2))
+        rays = problem.points.rays
+        nothing = np.zeros((problem.size, 2)), np.zeros((len(sigmas), 3, 2)), np.zeros((rays, 2, 2))
         found = cls(sigmas, problem.known, shared, np.zeros(2), np.zeros((2, 2)), *nothing)
         return found._seen_by(problem, state, selection) if (used & (sigmas == 0)).any() else found
 
@@ -118,16 +122,18 @@ class CommonError:
     def _moving(self, solved: Solved) -> tuple[CommonError, Array]:
         """Return it with what it moves, and what one sigma along each axis leaves of misfits ``(m, 2)``."""
         linear, problem = solved.linear, solved.problem
-        by_params, by_points, left = [], [], []
+        params, places, left = [], [], []
         for misfits in self._misfits(linear):
             step = step_of(replace(linear, misfits=misfits))
             # A misfit of known ground that is taken off the ground moves all the other way.
-            by_params.append(-step.solution.values)
+            params.append(-step.solution.values)
             turned = problem.frame.enu_at(problem.frame.geodetic(linear.state.local))
-            by_points.append(-(turned @ step.shift[:, :, None])[:, :, 0])
+            places.append(-(turned @ step.shift[:, :, None])[:, :, 0])
             left.append(misfits.minus(step.change).vector)
-        moved = replace(self, by_params=np.stack(by_params, axis=-1), by_points=np.stack(by_points, axis=-1))
-        return moved, np.stack(left, axis=-1)
+        whole = np.stack(left, axis=-1)
+        seen = whole[: 2 * problem.points.rays].reshape(-1, 2, 2)
+        by_params, by_points = np.stack(params, axis=-1), np.stack(places, axis=-1)
+        return replace(self, by_params=by_params, by_points=by_points, seen=seen), whole
 
     def _misfits(self, linear: Linear) -> list[Misfits]:
         """Return what one sigma of it, east and north, takes off the misfits."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from ortho_pipeline.display.notebook import block_html
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.estimation.fit import root_mean_square
+from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
@@ -42,7 +44,8 @@ class BlockFit:
     100 with few points too.
     `outlying` are known points that the block contradicts and that were left as they are. Where points have an error in
     common, `common_error` is that, covariances have its part, and residuals of known ground are what is left beside its
-    estimate.
+    estimate. Of images whose neighbouring measurements share errors, `shared_errors` says what they do, and covariances
+    have grown by it.
     """
 
     models: dict[str, SensorModel]
@@ -67,6 +70,7 @@ class BlockFit:
     outlying: tuple[Outlying, ...] = ()
     warnings: tuple[Notice, ...] = ()
     common_error: CommonError | None = None
+    shared_errors: Mapping[str, SharedErrors] = field(default_factory=dict)
     condition: float = 1.0
     iterations: int = 0
 
@@ -153,6 +157,9 @@ class BlockFit:
             "iterations": self.iterations,
             "variances": self.variances.to_json(),
             **({} if self.common_error is None else {"common_error": self.common_error.to_json()}),
+            **(
+                {"shared_errors": {k: v.to_json() for k, v in self.shared_errors.items()}} if self.shared_errors else {}
+            ),
             "images": {
                 image: {
                     "parameters": {

@@ -19,6 +19,7 @@ from ortho_pipeline.points.formats import read_block_table
 from ortho_pipeline.points.ground import ground_of
 from ortho_pipeline.points.image_errors import (
     covariance_of,
+    groups_of,
     sigmas_of,
 )
 from ortho_pipeline.points.rows import OF_GROUND, Row, Table, origin_shift
@@ -159,6 +160,7 @@ class _Joined:
             sigma_image=(sigma := sigmas_of(rows, DEFAULT_SIGMA_IMAGE)), source=os.fspath(path),
             shape_image=shape_of(covariance_of(rows, sigma)),
             sigma_common=np.array([one.get("sigma_common", 0.0) for one in said]),
+            groups=groups_of(rows),
         )  # fmt: skip
 
 

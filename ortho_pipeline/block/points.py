@@ -24,6 +24,7 @@ from ortho_pipeline.points import Points
 from ortho_pipeline.points.image_errors import (
     checked_common,
     checked_covariance,
+    checked_groups,
     says_more,
     sigma_of_covariance,
 )
@@ -65,6 +66,9 @@ class BlockPoints:
         given, measurements are as certain in all directions; other values of `sigma_image` change the scale alone.
     sigma_common : ndarray (N,), optional
         As in `Points`: standard deviation (m, per axis in plan) of what the ground of points with one has in common.
+    groups : ndarray (M,) of int, optional
+        As in `Points`: from 0 on where a measurement shares errors with those of neighbours in its image, else -1. None
+        where none does.
     """
 
     ids: tuple[str, ...]
@@ -80,6 +84,7 @@ class BlockPoints:
     source: str = ""
     shape_image: Array | None = None
     sigma_common: Array = None  # type: ignore[assignment]  # filled below
+    groups: Index | None = None
     _whitening: Array | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
@@ -96,44 +101,14 @@ class BlockPoints:
         object.__setattr__(self, "ids", tuple(self.ids))
         object.__setattr__(self, "images", tuple(self.images))
         object.__setattr__(self, "sigma_common", checked_common(self.sigma_common, count))
-        self._check_values()
-        self._check_identity()
+        groups = checked_groups(self.groups, rays)
+        object.__setattr__(self, "groups", groups if (groups >= 0).any() else None)
+        _check_values(self)
+        _check_identity(self)
         if self.shape_image is not None:
             directions = checked_covariance(self.shape_image, rays)
             object.__setattr__(self, "shape_image", directions)
             object.__setattr__(self, "_whitening", np.linalg.inv(np.linalg.cholesky(directions)))
-
-    def _check_values(self) -> None:
-        if not np.isin(self.roles, ROLES).all():
-            raise InputError(f"each point has one role of {', '.join(ROLES)}", field="roles")
-        if not np.isfinite(self.measured).all() or not (self.sigma_image > 0).all():
-            raise InputError("measurements are finite, their sigmas positive", field="measured, sigma_image")
-        if not (self.sigma_ground >= 0).all():
-            raise InputError("standard deviations are not negative", field="sigma_ground")
-        for role in ("control", "check"):
-            nowhere = (self.roles == role) & ~np.isfinite(self.ground[:, :2]).all(axis=1)
-            if nowhere.any():
-                names = ", ".join(self.ids[i] for i in np.flatnonzero(nowhere)[:5])
-                raise InputError(
-                    f"{role} points without ground coordinates: {names}", file=self.source or None, field="role",
-                    remedy="give their ground, or make them tie points",
-                )  # fmt: skip
-
-    def _check_identity(self) -> None:
-        if len(set(self.ids)) != len(self.ids) or len(set(self.images)) != len(self.images):
-            raise InputError("an id or the name of an image stands twice", file=self.source or None, field="id")
-        if len(self.point) and not (
-            (self.point >= 0).all() and (self.point < len(self.ids)).all()
-            and (self.image >= 0).all() and (self.image < len(self.images)).all()
-        ):  # fmt: skip
-            raise InputError("a ray is of a point or an image that does not exist", field="point, image")
-        rays, counts = np.unique(self.point * max(len(self.images), 1) + self.image, return_counts=True)
-        if (counts > 1).any():
-            point, image = divmod(int(rays[counts > 1][0]), len(self.images))
-            raise InputError(
-                f"the point {self.ids[point]!r} was measured twice in the image {self.images[image]!r}",
-                file=self.source or None, field="id", remedy="remove one of the two measurements",
-            )  # fmt: skip
 
     def __repr__(self) -> str:
         roles = ", ".join(f"{(self.roles == role).sum()} {role}" for role in ROLES if (self.roles == role).any())
@@ -180,6 +155,7 @@ class BlockPoints:
             source=", ".join(dict.fromkeys(table.source for table in tables.values() if table.source)),
             shape_image=shape_of(np.concatenate([table.covariance_image for table in tables.values()])),
             sigma_common=np.array(stated("sigma_common")),
+            groups=np.concatenate([table.groups for table in tables.values()]),
         )  # fmt: skip
 
     @property
@@ -240,11 +216,16 @@ class BlockPoints:
         chosen = np.arange(self.rays)[np.asarray(rays)]
         return replace(
             self, point=self.point[chosen], image=self.image[chosen], measured=self.measured[chosen],
-            sigma_image=self.sigma_image[chosen], shape_image=self._shape_of(chosen),
+            sigma_image=self.sigma_image[chosen], shape_image=self._shape_of(chosen), groups=self.grouped[chosen],
         )  # fmt: skip
 
     def _shape_of(self, rays: NDArray[Any]) -> Array | None:
         return None if self.shape_image is None else self.shape_image[rays]
+
+    @property
+    def grouped(self) -> Index:
+        """Groups of the measurements ``(M,)``, -1 for those that err on their own."""
+        return np.full(self.rays, -1) if self.groups is None else self.groups
 
     @property
     def covariance_image(self) -> Array:
@@ -276,14 +257,48 @@ class BlockPoints:
         return Points(
             ids=tuple(self.ids[i] for i in rows), image=self.measured[rays], ground=self.ground[rows],
             roles=self.roles[rows], sigma_image=self.sigma_image[rays], sigma_ground=self.sigma_ground[rows],
-            crs=self.crs, source=self.source,
-            covariance_image=self.covariance_image[rays], sigma_common=self.sigma_common[rows],
+            crs=self.crs, source=self.source, covariance_image=self.covariance_image[rays],
+            sigma_common=self.sigma_common[rows], groups=self.grouped[rays],
         )  # fmt: skip
 
     def known_in(self, crs: str | pyproj.CRS) -> Array:
         """Return the known ground ``(N, 3)`` in another CRS; an unknown height makes the whole row NaN."""
         target = pyproj.CRS.from_user_input(crs)
         return ground_transform(self.crs, target if target.is_geocentric else horizontal(target))(self.ground)
+
+
+def _check_values(points: BlockPoints) -> None:
+    if not np.isin(points.roles, ROLES).all():
+        raise InputError(f"each point has one role of {', '.join(ROLES)}", field="roles")
+    if not np.isfinite(points.measured).all() or not (points.sigma_image > 0).all():
+        raise InputError("measurements are finite, their sigmas positive", field="measured, sigma_image")
+    if not (points.sigma_ground >= 0).all():
+        raise InputError("standard deviations are not negative", field="sigma_ground")
+    for role in ("control", "check"):
+        nowhere = (points.roles == role) & ~np.isfinite(points.ground[:, :2]).all(axis=1)
+        if nowhere.any():
+            names = ", ".join(points.ids[i] for i in np.flatnonzero(nowhere)[:5])
+            raise InputError(
+                f"{role} points without ground coordinates: {names}", file=points.source or None, field="role",
+                remedy="give their ground, or make them tie points",
+            )  # fmt: skip
+
+
+def _check_identity(points: BlockPoints) -> None:
+    if len(set(points.ids)) != len(points.ids) or len(set(points.images)) != len(points.images):
+        raise InputError("an id or the name of an image stands twice", file=points.source or None, field="id")
+    if len(points.point) and not (
+        (points.point >= 0).all() and (points.point < len(points.ids)).all()
+        and (points.image >= 0).all() and (points.image < len(points.images)).all()
+    ):  # fmt: skip
+        raise InputError("a ray is of a point or an image that does not exist", field="point, image")
+    rays, counts = np.unique(points.point * max(len(points.images), 1) + points.image, return_counts=True)
+    if (counts > 1).any():
+        point, image = divmod(int(rays[counts > 1][0]), len(points.images))
+        raise InputError(
+            f"the point {points.ids[point]!r} was measured twice in the image {points.images[image]!r}",
+            file=points.source or None, field="id", remedy="remove one of the two measurements",
+        )  # fmt: skip
 
 
 def joined(images: Sequence[str], tables: Sequence[BlockPoints]) -> BlockPoints:
@@ -312,7 +327,7 @@ def joined(images: Sequence[str], tables: Sequence[BlockPoints]) -> BlockPoints:
         crs=crs, images=tuple(images), point=np.concatenate(points), image=np.concatenate(places),
         measured=all_of("measured"), sigma_image=all_of("sigma_image"),
         source=", ".join(dict.fromkeys(table.source for table in tables if table.source)),
-        shape_image=shape_of(all_of("covariance_image")), sigma_common=all_of("sigma_common"),
+        shape_image=shape_of(all_of("covariance_image")), sigma_common=all_of("sigma_common"), groups=all_of("grouped"),
     )  # fmt: skip
 
 

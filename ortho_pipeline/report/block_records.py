@@ -19,6 +19,7 @@ from ortho_pipeline.report.adjustment_records import (
     Residual,
     Rmse,
     Role,
+    SharedErrors,
 )
 from ortho_pipeline.report.records import InputFile, MapScaleRecord, RpcRecord, Size
 
@@ -235,6 +236,7 @@ class BlockAdjustment:
     warnings: tuple[str, ...]
     notices: tuple[NoticeDocument, ...]
     common_error: CommonError | None = None
+    shared_errors: dict[str, SharedErrors] | None = None
 
 
 @record

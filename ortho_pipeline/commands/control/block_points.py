@@ -137,8 +137,10 @@ def relative_to_reference(fit: BlockFit, options: BlockOptions, match: MatchOpti
     part = "all control was matched" if options.points is None else "control was matched"
     text = (
         f"{part}: accuracy is relative to the reference, and {floor}{beside}; an error that images and reference have "
-        "in common is not seen, and the sigmas know nothing of errors that neighbouring matches share"
+        "in common is not seen"
     )
+    if len(fit.shared_errors) > 1:
+        text += "; what neighbouring matches err together is in the sigmas, for each image as if it had its own"
     return [Notice("relative-to-reference", text, reference_sigma_m=sigma, in_sigmas=common is not None)]
 
 

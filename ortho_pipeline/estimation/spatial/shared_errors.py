@@ -101,24 +101,24 @@ def shared_errors(
     own, usual = design @ solution.cofactors, variance * solution.cofactors
     if common is not None:
         own, usual = common.influence(solution)[rows], variance * common.cofactors(solution)
-    scene = _Scene.of(image[rows], residuals, np.concatenate([design, own, shift[rows]], axis=2))
+    scene = Neighbours.of(image[rows], residuals, np.concatenate([design, own, shift[rows]], axis=2))
     if scene is None:
         # All that is known is who shares: a group is one point.
         effective = float(len(solution.groups) - len(rows) + groups)
         return SharedErrors(len(rows), groups, effective), usual * max(len(rows) / groups, 1.0)
     middle, likely = scene.middle(variance)
     count = design.shape[2]
-    covariance = usual + _positive(middle[count : 2 * count, count : 2 * count], usual)
+    covariance = usual + positive_part(middle[count : 2 * count, count : 2 * count], usual)
     # The same for a shift alone, of all points: those on their own count as they are.
     normal = np.einsum("nij,nik->jk", shift, shift)
     inverse = np.linalg.inv(normal)
     total = variance * inverse
-    grown = total + _positive(inverse @ middle[2 * count :, 2 * count :] @ inverse, total)
+    grown = total + positive_part(inverse @ middle[2 * count :, 2 * count :] @ inverse, total)
     effective = len(solution.groups) * float(np.trace(total) / np.trace(grown))
     return SharedErrors(len(rows), groups, effective, *likely), covariance
 
 
-def _positive(matrix: Array, unit: Array) -> Array:
+def positive_part(matrix: Array, unit: Array) -> Array:
     """Return the positive part of a symmetric matrix, in units of a positive one."""
     values, vectors = np.linalg.eigh(unit)
     root = vectors * np.sqrt(np.maximum(values, 1e-300))
@@ -130,7 +130,7 @@ def _positive(matrix: Array, unit: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class _Scene:
+class Neighbours:
     """Points that share errors, as the restricted likelihood takes them."""
 
     distance: Array  # (n, n) px
@@ -143,7 +143,7 @@ class _Scene:
     weight: float  # points over those that were drawn
 
     @classmethod
-    def of(cls, image: Array, residuals: Array, design: Array) -> _Scene | None:
+    def of(cls, image: Array, residuals: Array, design: Array) -> Neighbours | None:
         """Return the scene of points ``(n, 2)``, their whitened residuals, and design ``(n, 2, K)``."""
         given = len(image)
         order = np.lexsort(image.T)
