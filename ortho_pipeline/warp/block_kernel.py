@@ -64,6 +64,9 @@ class Target(NamedTuple):
     pixels: Any
     valid: Any
 
+#: Fewer pixels in a row are not worth being made together.
+_RUN = 8
+
 
 @inlined
 def _between(first, second, share):
@@ -230,31 +233,55 @@ def warp_block(source: SourceWindow, lattice: Lattice, dem: DemWindow, resamplin
     short = 0
     for row in range(target.first_row, target.last_row):
         block_coordinates(row, first, last, lattice, dem, ticks, columns, rows)
-        line, count = row - target.first_row, last - first
-        begin, end = (0, 0) if source.masked else _span(columns, rows, low_col, high_col, low_row, high_row)
-        for band in range(bands if end > begin else 0):
-            row_inside(
-                resampling, pixels[band], columns[begin:end], rows[begin:end], left, top, out[band, line, begin:end]
-            )
-        out_valid[:, line, begin:end] = True
-        for start, stop in ((0, begin), (end, count)):
-            if stop > start:
+        line, count, done = row - target.first_row, last - first, 0
+        while done < count:
+            # Parts of the row in which no neighbour is missing are made fast, the others with care.
+            if source.masked:
+                begin, end = _next_whole(source, columns, rows, low_col, high_col, low_row, high_row, done)
+            else:
+                begin, end = _span(columns, rows, low_col, high_col, low_row, high_row, done)
+            if begin > done:
                 short += row_with_edges(
-                    resampling, source, columns[start:stop], rows[start:stop], out[:, line, start:stop],
-                    out_valid[:, line, start:stop],
+                    resampling, source, columns[done:begin], rows[done:begin], out[:, line, done:begin],
+                    out_valid[:, line, done:begin],
                 )  # fmt: skip
+            for band in range(bands if end > begin else 0):
+                row_inside(
+                    resampling, pixels[band], columns[begin:end], rows[begin:end], left, top, out[band, line, begin:end]
+                )
+            out_valid[:, line, begin:end] = True
+            done = end
     return short
 
 
 @compiled
-def _span(columns, rows, low_col, high_col, low_row, high_row):
-    """Return where the part of a row begins and ends in which no neighbour is missing; the rest is done with care."""
-    begin, end = 0, columns.size
+def _span(columns, rows, low_col, high_col, low_row, high_row, done):
+    """Return where the next part of a row begins and ends in which no neighbour is missing: one part at most."""
+    count = columns.size
+    begin, end = (0, count) if done == 0 else (count, count)
     while begin < end and not (low_col <= columns[begin] < high_col and low_row <= rows[begin] < high_row):
         begin += 1
     while end > begin and not (low_col <= columns[end - 1] < high_col and low_row <= rows[end - 1] < high_row):
         end -= 1
-    inside = True
+    inside = begin < end
     for k in range(begin, end):
         inside &= (columns[k] >= low_col) & (columns[k] < high_col) & (rows[k] >= low_row) & (rows[k] < high_row)
-    return (begin, end) if inside else (0, 0)
+    return (begin, end) if inside else (count, count)
+
+
+@compiled
+def _next_whole(source, columns, rows, low_col, high_col, low_row, high_row, done):
+    """Return where the next part of a row begins and ends in which no neighbour is missing or invalid."""
+    whole, left, top = source.whole, source.left, source.top
+    begin, end, count = done, done, columns.size
+    while end < count:
+        col, row = columns[end], rows[end]
+        good = low_col <= col < high_col and low_row <= row < high_row
+        if good and whole[int(row) - top, int(col) - left]:
+            end += 1
+        elif end - begin >= _RUN:
+            break
+        else:
+            end += 1
+            begin = end
+    return (begin, end) if end - begin >= _RUN else (count, count)

@@ -403,7 +403,7 @@ class TileMaker:
                 else:
                     self._warp_cells(block, dem, area, tile)
             return
-        window = _window(self.source, *together)
+        window = _window(self.source, *together, reach=max(block.reach for block in blocks))
         for block in blocks:
             self._warp_block(block, window, dem, tile.target(block, area))
 
@@ -421,12 +421,12 @@ class TileMaker:
             window = self.lattices.source_window(block, *nodes)
             within = all(area[k] <= cell[k] and cell[k + 1] <= area[k + 1] for k in (0, 2))
             if window is not None and within:
-                self._warp_block(block, _window(self.source, *window), dem, tile.target(block, cell))
+                self._warp_block(block, _window(self.source, *window, reach=block.reach), dem, tile.target(block, cell))
 
     def _warp_block(self, block: OutputBlock, window: kernels.SourceWindow, dem: DemWindow, target: Target) -> None:
         resampling = self.resampling._replace(reach=block.reach, box=block.box)
         while target.pixels.size and warp_block(window, block.lattice, dem, resampling, target):
-            window = _wider(self.source, window)
+            window = _wider(self.source, window, block.reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -447,16 +447,22 @@ class _Tile:
         return Target(first_row, last_row, first, last, self.pixels[part], self.valid[part])
 
 
-def _window(source: RasterSource, left: int, top: int, right: int, bottom: int) -> kernels.SourceWindow:
+def _window(
+    source: RasterSource, left: int, top: int, right: int, bottom: int, *, reach: int
+) -> kernels.SourceWindow:
     pixels = source.read(left, top, right - left, bottom - top)
     valid = source.read_valid(left, top, pixels)
     masked = valid is not None
+    whole = np.ones(pixels.shape[1:] if masked else (1, 1), dtype=bool)
+    if valid is not None:
+        kernels.find_whole(valid, reach, whole)
     return kernels.SourceWindow(
-        pixels, valid if masked else np.ones((1, 1, 1), dtype=bool), masked, left, top, source.width, source.height
-    )
+        pixels, np.ones((1, 1, 1), dtype=bool) if valid is None else valid, whole, masked, left, top, source.width,
+        source.height,
+    )  # fmt: skip
 
 
-def _wider(source: RasterSource, window: kernels.SourceWindow) -> kernels.SourceWindow:
+def _wider(source: RasterSource, window: kernels.SourceWindow, reach: int) -> kernels.SourceWindow:
     """Return a window larger by 64 pixels all around (terrain between the nodes reached beyond this one)."""
     _, height, width = window.pixels.shape
     return _window(
@@ -465,4 +471,5 @@ def _wider(source: RasterSource, window: kernels.SourceWindow) -> kernels.Source
         max(0, window.top - 64),
         min(source.width, window.left + width + 64),
         min(source.height, window.top + height + 64),
+        reach=reach,
     )

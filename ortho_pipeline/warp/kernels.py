@@ -27,10 +27,13 @@ class SourceWindow(NamedTuple):
         Its values; the first pixel is (left, top) of the source, whose size is width x height.
     valid : (bands, h, w) bool
         Which pixels have a value; counts if `masked`, and may else have any size.
+    whole : (h, w) bool
+        Whether all bands of all pixels within the reach of the kernel have one; as `valid`.
     """
 
     pixels: Any
     valid: Any
+    whole: Any
     masked: bool
     left: int
     top: int
@@ -128,6 +131,26 @@ def _all_valid(valid, i, j, size):
             if not valid[j + b, i + a]:
                 return False
     return True
+
+
+@compiled
+def find_whole(valid: Any, reach: int, out: Any) -> None:
+    """Fill `SourceWindow.whole`; what lies outside of the window counts as valid."""
+    bands, height, width = valid.shape
+    row = np.empty(width, dtype=np.uint8)
+    out[:] = 1
+    for j in range(height):
+        row[:] = valid[0, j]
+        for band in range(1, bands):
+            row &= valid[band, j]
+        last = -reach - 1
+        for i in range(width):
+            if not row[i]:
+                # Those farther left than the last invalid one's reach are still to be marked.
+                for k in range(max(i - reach, last + reach + 1, 0), min(i + reach + 1, width)):
+                    for line in range(max(j - reach, 0), min(j + reach + 1, height)):
+                        out[line, k] = 0
+                last = i
 
 
 @inlined
@@ -320,7 +343,7 @@ def row_with_edges(
     int
         Number of pixels whose neighbours lie in the source but not in the window.
     """
-    pixels, valid, masked, left, top, full_width, full_height = source
+    pixels, valid, _, masked, left, top, full_width, full_height = source
     kernel, reach, box, low, high, integer, fill = resampling
     bands, window_height, window_width = pixels.shape
     short = 0
