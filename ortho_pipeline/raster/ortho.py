@@ -231,6 +231,20 @@ class RasterWriter:
             if self.profile.validity == "mask" and valid is not None:
                 mask = valid.view(np.uint8) * np.uint8(255)
                 self._dataset.GetRasterBand(1).GetMaskBand().WriteArray(mask, left, top)
+            if self.driver == "GTiff" and self._completes_blocks(left, top, pixels.shape[2], pixels.shape[1]):
+                # GDAL writes blocks when it needs room, which depends on what other threads read: their order in the
+                # file would be another in every run.
+                for band in range(self.profile.count):
+                    self._dataset.GetRasterBand(band + 1).FlushCache()
+                if self.profile.validity == "mask":
+                    self._dataset.GetRasterBand(1).GetMaskBand().FlushCache()
+
+    def _completes_blocks(self, left: int, top: int, width: int, height: int) -> bool:
+        """Tell whether all blocks that were begun are complete with a window, if windows come row by row."""
+        across, down = self._dataset.GetRasterBand(1).GetBlockSize()
+        right, bottom = left + width, top + height
+        beside = right == self.grid.width or left % across == right % across == 0
+        return beside and (bottom == self.grid.height or bottom % down == 0)
 
     def _create(self, path: Path | None, options: Mapping[str, str]) -> gdal.Dataset:
         from osgeo import gdal_array

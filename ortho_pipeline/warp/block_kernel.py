@@ -64,6 +64,7 @@ class Target(NamedTuple):
     pixels: Any
     valid: Any
 
+
 #: Fewer pixels in a row are not worth being made together.
 _RUN = 8
 

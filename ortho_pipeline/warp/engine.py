@@ -447,9 +447,7 @@ class _Tile:
         return Target(first_row, last_row, first, last, self.pixels[part], self.valid[part])
 
 
-def _window(
-    source: RasterSource, left: int, top: int, right: int, bottom: int, *, reach: int
-) -> kernels.SourceWindow:
+def _window(source: RasterSource, left: int, top: int, right: int, bottom: int, *, reach: int) -> kernels.SourceWindow:
     pixels = source.read(left, top, right - left, bottom - top)
     valid = source.read_valid(left, top, pixels)
     masked = valid is not None

@@ -148,3 +148,32 @@ def test_a_raster_of_a_plugin_appears_whole(tmp_path):
         dataset = gdal.GetDriverByName("GTiff").Create(str(temporary), 20, 10, 1)
         close(dataset)
     assert [path.name for path in tmp_path.iterdir()] == ["o.tif"]
+
+
+@pytest.mark.parametrize(
+    ("count", "validity", "options"),
+    [
+        (1, "nodata", {"COMPRESS": "NONE"}), (3, "mask", {"COMPRESS": "NONE"}), (3, "mask", {"COMPRESS": "DEFLATE"}),
+        (1, "nodata", {"TILED": "NO", "COMPRESS": "LZW"}), (1, "nodata", {"BLOCKXSIZE": "1024"}),
+    ],
+)  # fmt: skip
+def test_the_order_of_blocks_does_not_depend_on_the_room_gdal_has(tmp_path, count, validity, options):
+    grid = Grid(parse_crs("EPSG:32634"), 500000.0, 4300000.0, 1.0, 1.0, 1000, 900)
+    noise = np.random.default_rng(0).integers(0, 999, (count, 900, 1000), dtype=np.uint16)
+    if "TILED" not in options:
+        options = {"TILED": "YES", "BLOCKXSIZE": "128", "BLOCKYSIZE": "128", **options}
+    found, room = [], gdal.GetCacheMax()
+    try:
+        for megabytes in (1, 64):
+            gdal.SetCacheMax(megabytes << 20)
+            path = tmp_path / f"{megabytes}.tif"
+            profile = Profile(count, np.dtype(np.uint16), validity, nodata=0.0 if validity == "nodata" else None)
+            with RasterWriter(path, grid, profile, driver="GTiff", creation_options=options, threads=2) as writer:
+                for top in range(0, 900, 512):
+                    for left in range(0, 1000, 512):
+                        part = noise[:, top : top + 512, left : left + 512]
+                        writer.write(left, top, part, part[0] > 9)
+            found.append(path.read_bytes())
+    finally:
+        gdal.SetCacheMax(room)
+    assert found[0] == found[1]

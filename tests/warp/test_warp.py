@@ -16,6 +16,7 @@ import pyproj
 import pytest
 from osgeo import gdal
 from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import minimum_filter
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import export_rpc, rpc_metadata
@@ -26,6 +27,7 @@ from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp import engine as warp
+from ortho_pipeline.warp import kernels
 from ortho_pipeline.warp.engine import rectify, rectify_gdal
 
 UTM = pyproj.CRS.from_epsg(32735)
@@ -752,6 +754,16 @@ def test_a_fine_dem_under_a_coarse_output_stays_within_the_memory(scene, tmp_pat
         outputs.append(read(tmp_path / "o.tif")[0])
     assert np.isfinite(outputs[0]).mean() > 0.9
     np.testing.assert_array_equal(outputs[0], outputs[1])
+
+
+@pytest.mark.parametrize("reach", [1, 2, 5])
+def test_pixels_whose_neighbours_are_all_valid_are_known(reach):
+    valid = np.random.default_rng(reach).random((2, 60, 80)) > 0.004
+    valid[:, 3, 70:] = False
+    whole = np.empty(valid.shape[1:], dtype=bool)
+    kernels.find_whole(valid, reach, whole)
+    np.testing.assert_array_equal(whole, minimum_filter(valid.all(axis=0), 2 * reach + 1, mode="constant", cval=True))
+    assert 0.1 < whole.mean() < 0.99
 
 
 def test_masked_pixels_are_the_same_for_any_memory(scene, tmp_path):
