@@ -236,6 +236,9 @@ def _check_closure(model: SensorModel, ground: NDArray[np.float64], image: NDArr
 def _check_ground_partials(model: SensorModel, ground: NDArray[np.float64]) -> None:
     partials = model.ground_partials(ground)
     assert partials.shape == (len(ground), 2, 3), f"ground_partials returns (N, 2, 3), not {partials.shape}"
+    image, also = model.projected(ground)
+    np.testing.assert_allclose(image, model.ground_to_image(ground), rtol=1e-12, err_msg="projected")
+    np.testing.assert_allclose(also, partials, rtol=1e-9, atol=1e-12, err_msg="partials of projected")
     _, half = model.domain
     for axis, step in enumerate(1e-4 * half):
         nudge = np.zeros(3)
@@ -255,6 +258,9 @@ def _check_params(model: SensorModel, ground: NDArray[np.float64], image: NDArra
     assert np.allclose(same.ground_to_image(ground), image, rtol=0, atol=1e-9), "with_params(params) is another model"
     partials = model.param_partials(ground)
     assert partials.shape == (len(ground), 2, n), f"param_partials returns (N, 2, {n}), not {partials.shape}"
+    shared = model.linearised(ground)
+    np.testing.assert_allclose(shared[0], model.ground_to_image(ground), rtol=1e-12, err_msg="linearised")
+    np.testing.assert_allclose(shared[2], partials, rtol=1e-9, atol=1e-12, err_msg="param_partials of linearised")
     for k, name in enumerate(model.param_names):
         reach = np.abs(partials[:, :, k]).max()
         assert reach > 0, f"the parameter {name!r} moves no point"

@@ -247,8 +247,7 @@ def _solved(problem: BlockProblem, state: State, selection: Selection) -> tuple[
         )  # fmt: skip
     if solved.astray is None:
         return solved, selection
-    rays, ground = selection.rays & ~solved.astray[problem.points.point], selection.ground & ~solved.astray
-    return _solved(problem, solved.state, replace(selection, rays=rays, ground=ground))
+    return _solved(problem, solved.state, solved.without_astray(selection))
 
 
 def _result(

@@ -106,14 +106,16 @@ def intersect(models: Mapping[str, SensorModel], points: BlockPoints, *, scaled:
     found = np.asarray(np.isfinite(local).all(axis=1))
     residuals = points.measured - predict(frame, chosen, points, local)
     used = np.asarray(np.isfinite(residuals).all(axis=1))
-    misfit, rows = _equations(frame, chosen, points, used, local)
+    rays, misfit, partials = _equations(frame, chosen, points, used, local)
     freedom = 2 * int(used.sum()) - 3 * int(found.sum())
     sigma0 = math.sqrt(float((misfit**2).sum()) / freedom) if freedom > 0 else None
     axes = frame.enu_at(places.geodetic)
     covariance = np.full((len(points), 3, 3), np.nan)
-    normal = _per_point(points, rows.swapaxes(1, 2) @ rows)
+    normal = _per_point(points, rays, partials.swapaxes(1, 2) @ partials)
     covariance[found] = np.linalg.inv(normal[found])
     covariance = axes @ covariance @ axes.swapaxes(1, 2)
+    rows = np.zeros((points.rays, 2, 3))
+    rows[rays] = partials
     if scaled and sigma0 is not None:
         covariance *= sigma0**2
     return Intersection(points, places.geodetic, covariance, residuals, _angles(points, rows, found), sigma0)
@@ -180,15 +182,15 @@ def meet(frame: GroundFrame, models: Sequence[SensorModel], points: BlockPoints,
         mask = used & moving[points.point]
         if not mask.any():
             break
-        misfit, rows = _equations(frame, models, points, mask, local)
-        now = _per_point(points, (misfit**2).sum(axis=1))
+        rays, misfit, rows = _equations(frame, models, points, mask, local)
+        now = _per_point(points, rays, (misfit**2).sum(axis=1))
         with np.errstate(invalid="ignore"):
             worse = moving & ~(now <= squares * (1 + 1e-9) + 1e-14)
         factor[worse] /= 2
         better = moving & ~worse
         squares[better], before[better], factor[better] = now[better], local[better], 1.0
-        normal = _per_point(points, rows.swapaxes(1, 2) @ rows)
-        right = _per_point(points, (rows.swapaxes(1, 2) @ misfit[:, :, None])[:, :, 0])
+        normal = _per_point(points, rays, np.einsum("kic,kid->kcd", rows, rows))
+        right = _per_point(points, rays, np.einsum("kic,ki->kc", rows, misfit))
         rows_better = np.flatnonzero(better)
         step, open_ = _solved(normal[rows_better], right[rows_better])
         parallel[rows_better] = open_
@@ -232,25 +234,26 @@ def _first(frame: GroundFrame, models: Sequence[SensorModel], points: BlockPoint
 
 def _equations(
     frame: GroundFrame, models: Sequence[SensorModel], points: BlockPoints, used: np.ndarray, local: Array
-) -> tuple[Array, Array]:
-    """Return misfits ``(M, 2)`` over sigma and their partials by the points ``(M, 2, 3)``; zero for rays not used."""
+) -> tuple[Index, Array, Array]:
+    """Return the rays ``(k,)`` in the mask `used`, misfits ``(k, 2)`` over sigma, partials by points ``(k, 2, 3)``."""
     places = frame.places(local)
-    misfit, rows = np.zeros((points.rays, 2)), np.zeros((points.rays, 2, 3))
+    parts = [(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2, 3)))]
     for model, rays_of in zip(models, points.rays_of_images, strict=True):
         rays = rays_of[used[rays_of]]
         if not len(rays):
             continue
-        of = points.point[rays]
+        image, partials = places.projected(model, points.point[rays])
         sigma = points.sigma_image[rays]
-        misfit[rays] = points.whitened((points.measured[rays] - places.project(model, of)) / sigma[:, None], rays)
-        rows[rays] = points.whitened(places.ground_partials(model, of) / sigma[:, None, None], rays)
-    return misfit, rows
+        misfit = points.whitened((points.measured[rays] - image) / sigma[:, None], rays)
+        parts.append((rays, misfit, points.whitened(partials / sigma[:, None, None], rays)))
+    rays, misfits, partials = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return rays, misfits, partials
 
 
-def _per_point(points: BlockPoints, values: Array) -> Array:
-    """Return the sums over the rays of each point ``(N, ...)`` of values ``(M, ...)``."""
-    flat = values.reshape(len(values), -1)
-    sums = [np.bincount(points.point, weights=column, minlength=len(points)) for column in flat.T]
+def _per_point(points: BlockPoints, rays: Index, values: Array) -> Array:
+    """Return the sums over some rays of each point ``(N, ...)`` of values ``(k, ...)``."""
+    flat, of = values.reshape(len(values), -1), points.point[rays]
+    sums = [np.bincount(of, weights=column, minlength=len(points)) for column in flat.T]
     total: Array = np.stack(sums, axis=1).astype(float)
     return total.reshape(len(points), *values.shape[1:])
 

@@ -93,8 +93,21 @@ class Places:
 
     def ground_partials(self, model: SensorModel, rows: np.ndarray) -> Array:
         """Return d(image)/d(frame) ``(n, 2, 3)`` of some of the points."""
-        ground = self.in_crs(model.crs)[rows]
-        by_ground, way = model.ground_partials(ground), self.partials(model.crs)[rows]
+        return self._chained(model, model.ground_partials(self.in_crs(model.crs)[rows]), rows)
+
+    def linearised(self, model: SensorModel, rows: np.ndarray) -> tuple[Array, Array, Array]:
+        """Return image points ``(n, 2)``, their partials by the frame ``(n, 2, 3)`` and by the parameters."""
+        image, by_ground, by_params = model.linearised(self.in_crs(model.crs)[rows])
+        return image, self._chained(model, by_ground, rows), by_params
+
+    def projected(self, model: SensorModel, rows: np.ndarray) -> tuple[Array, Array]:
+        """Return the image points ``(n, 2)`` of some of the points, and their partials by the frame ``(n, 2, 3)``."""
+        image, by_ground = model.projected(self.in_crs(model.crs)[rows])
+        return image, self._chained(model, by_ground, rows)
+
+    def _chained(self, model: SensorModel, by_ground: Array, rows: np.ndarray) -> Array:
+        """Return d(image)/d(frame) of d(image)/d(ground)."""
+        way = self.partials(model.crs)[rows]
         # Written out: products of stacks of such small matrices take several times as long.
         x, y, h = (by_ground[:, :, axis, None] * way[:, None, axis] for axis in range(3))
         return x + y + h

@@ -194,6 +194,14 @@ class SensorModel(ABC):
             ) / (ahead[k] - behind[k])
         return partials
 
+    def projected(self, ground: ArrayLike) -> tuple[Array, Array]:
+        """Project ground points; return `ground_to_image` and `ground_partials` of them, which may share work."""
+        return self.ground_to_image(ground), self.ground_partials(ground)
+
+    def linearised(self, ground: ArrayLike) -> tuple[Array, Array, Array]:
+        """Project ground points; return `ground_to_image`, `ground_partials` and `param_partials` of them."""
+        return *self.projected(ground), self.param_partials(ground)
+
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
         """Intersect the rays of image points ``(N, 2)`` with ellipsoidal heights ``(N,)`` or one height.
 

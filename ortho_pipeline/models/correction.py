@@ -17,6 +17,7 @@ row_per_row.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
@@ -25,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.models.base import Array, SensorModel, as_ground, as_image
+from ortho_pipeline.models.base import Array, SensorModel, as_image
 
 COEFFICIENTS = ("col_shift", "col_per_col", "col_per_row", "row_shift", "row_per_col", "row_per_row")
 FREE = {
@@ -107,7 +108,8 @@ class ImageCorrection(SensorModel):
 
     @property
     def param_names(self) -> tuple[str, ...]:
-        return tuple(name for name in FREE[self.correction] if name not in self.removed)
+        names = FREE[self.correction]
+        return tuple(name for name in names if name not in self.removed) if self.removed else names
 
     @property
     def uses_height(self) -> bool:
@@ -140,7 +142,7 @@ class ImageCorrection(SensorModel):
 
     @property
     def _free(self) -> list[int]:
-        return [COEFFICIENTS.index(name) for name in self.param_names]
+        return _places(self.param_names)
 
     @property
     def matrix(self) -> Array:
@@ -153,26 +155,38 @@ class ImageCorrection(SensorModel):
         return self.coefficients[[0, 3]] - (self.matrix - np.eye(2)) @ self.origin
 
     def ground_to_image(self, ground: ArrayLike) -> Array:
-        image = self.model.ground_to_image(ground)
-        return image + (image - self.origin) @ (self.matrix - np.eye(2)).T + self.coefficients[[0, 3]]
+        return self._corrected(self.model.ground_to_image(ground))
 
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
         moved = as_image(image) - self.origin - self.coefficients[[0, 3]]
         return self.model.image_to_ground(np.linalg.solve(self.matrix, moved.T).T + self.origin, height)
 
+    def linearised(self, ground: ArrayLike) -> tuple[Array, Array, Array]:
+        image, partials = self.model.projected(ground)
+        return self._corrected(image), self._turned(partials), self._slopes(image)
+
+    def _corrected(self, image: Array) -> Array:
+        return image + (image - self.origin) @ (self.matrix - np.eye(2)).T + self.coefficients[[0, 3]]
+
     def ground_partials(self, ground: ArrayLike) -> Array:
-        partials = self.model.ground_partials(ground)
+        return self._turned(self.model.ground_partials(ground))
+
+    def _turned(self, partials: Array) -> Array:
         # Written out: products of stacks of such small matrices take ten times as long.
         return partials[:, :1] * self.matrix[:, :1] + partials[:, 1:] * self.matrix[:, 1:]
 
     def param_partials(self, ground: ArrayLike) -> Array:
-        ground = as_ground(ground)
-        centred = self.model.ground_to_image(ground) - self.origin
-        partials = np.zeros((len(ground), 2, 6))
+        return self._slopes(self.model.ground_to_image(ground))
+
+    def _slopes(self, image: Array) -> Array:
+        """Return d(image)/d(params) at image points of the model."""
+        centred = image - self.origin
+        partials = np.zeros((len(image), 2, 6))
         partials[:, 0, 0] = partials[:, 1, 3] = 1.0
         partials[:, 0, 1:3] = partials[:, 1, 4:6] = centred
         partials[~np.isfinite(centred).all(axis=1)] = np.nan
-        return partials[:, :, self._free]
+        free = self._free
+        return partials if len(free) == len(COEFFICIENTS) else partials[:, :, free]
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
@@ -183,6 +197,12 @@ class ImageCorrection(SensorModel):
             raise InputError("a correction needs the model that it corrects", field="model")
         # Files of versions before parameters could be removed do not have this field.
         return super().from_dict({"removed": (), **data, "model": model_from_dict(inner)})
+
+
+@functools.cache
+def _places(names: tuple[str, ...]) -> list[int]:
+    """Return the places of some of the coefficients."""
+    return [COEFFICIENTS.index(name) for name in names]
 
 
 def _matrix(coefficients: Array) -> Array:

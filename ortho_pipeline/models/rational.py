@@ -225,9 +225,12 @@ class RPC(SensorModel):
         return np.stack([self.col_num, self.col_den, self.row_num, self.row_den])
 
     def _project(self, ground: Array) -> Array:
-        terms = rpc_terms(*self.normalise(ground))
+        return self._image(self._polynomials @ rpc_terms(*self.normalise(ground)))
+
+    def _image(self, sums: Array) -> Array:
+        """Return image points of the values ``(4, N)`` of the polynomials."""
+        col_num, col_den, row_num, row_den = sums
         with np.errstate(divide="ignore", invalid="ignore"):
-            col_num, col_den, row_num, row_den = self._polynomials @ terms
             col = col_num / col_den * self.col_scale + self.col_off
             row = row_num / row_den * self.row_scale + self.row_off
             before_poles = (col_den * self.col_den[0] > 0) & (row_den * self.row_den[0] > 0)
@@ -237,9 +240,21 @@ class RPC(SensorModel):
 
     def ground_partials(self, ground: ArrayLike) -> Array:
         terms = rpc_terms(*self.normalise(ground))
+        return self._partials(terms, self._polynomials @ terms)
+
+    def projected(self, ground: ArrayLike) -> tuple[Array, Array]:
+        terms = rpc_terms(*self.normalise(ground))
         sums = self._polynomials @ terms
-        slopes = (self._polynomials @ _SLOPES).reshape(12, 10) @ terms[:10]
-        by_axis = slopes.reshape(3, 4, -1)
+        return self._image(sums), self._partials(terms, sums)
+
+    @cached_property
+    def _slope_polynomials(self) -> Array:
+        """Coefficients ``(12, 10)`` of the slopes of the polynomials by L, then P, then H."""
+        return (self._polynomials @ _SLOPES).reshape(12, 10)
+
+    def _partials(self, terms: Array, sums: Array) -> Array:
+        """Return d(image)/d(ground) of the terms ``(20, N)`` and the values ``(4, N)`` of the polynomials."""
+        by_axis = (self._slope_polynomials @ terms[:10]).reshape(3, 4, -1)
         scale = np.divide.outer((self.col_scale, self.row_scale), (self.lon_scale, self.lat_scale, self.h_scale)).T
         with np.errstate(divide="ignore", invalid="ignore"):
             found = (by_axis[:, ::2] - sums[::2] / sums[1::2] * by_axis[:, 1::2]) / sums[1::2] * scale[:, :, None]

@@ -9,10 +9,10 @@ import pyproj
 import pytest
 from ortho_cartosat.truth import StereoPair
 
-from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.adjustment import _prepared, adjust
 from ortho_pipeline.block.equations import solver as block_solver
 from ortho_pipeline.block.equations.problem import BlockProblem, Selection, State
-from ortho_pipeline.block.equations.solver import once, solve
+from ortho_pipeline.block.equations.solver import once, solve, solve_inside
 from ortho_pipeline.block.equations.steps import Steps
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.intersection import frame_of, intersect
@@ -814,6 +814,15 @@ def test_a_point_that_an_error_leads_out_of_the_models_does_not_keep_the_others(
     left = adjust(starts(truth), points, robust=False, exclude=lost)
     for name in truth:
         assert found.models[name].params == pytest.approx(left.models[name].params, rel=1e-6, abs=1e-9)
+    # In the search for gross errors, too, where it is what is left of a point that was judged.
+    problem, state, selection, _ = _prepared(tuple(starts(truth).values()), points, {}, ())
+    with pytest.raises(NotConverged):
+        solve(problem, state, selection)
+    solved, inside = solve_inside(problem, state, selection)
+    assert solved.astray is None
+    outside = {points.ids[k] for k in points.point[selection.rays & ~inside.rays]}
+    assert outside
+    assert outside <= set(lost)
 
 
 def test_what_does_not_converge_because_it_is_not_determined_says_so(

@@ -34,18 +34,18 @@ class Linear:
         """Return the observation equations of a problem at a state; `ordering` is given where it is known."""
         points = problem.points
         ordering = problem.ordering(weights) if ordering is None else ordering
-        misfits = problem.misfits(state, ordering, weights)
-        pseudo = problem.pseudo_equations(state)
         places = problem.frame.places(state.local)
         root = np.sqrt(weights.ray_weights) / points.sigma_image
+        predicted = np.zeros((points.rays, 2))
         by_point = np.zeros((points.rays, 2, 3))
         by_params = np.zeros((points.rays, 2, problem.columns.widest))
         for model, used in zip(state.models, ordering.rays_of_image, strict=True):
-            rows, scale = points.point[used], root[used][:, None, None]
-            by_point[used] = points.whitened(places.ground_partials(model, rows) * scale, used)
-            if count := len(model.params):
-                partials = model.param_partials(places.in_crs(model.crs)[rows]) * scale
-                by_params[used, :, :count] = points.whitened(partials, used)
+            predicted[used], partials, by_model = places.linearised(model, points.point[used])
+            scale = root[used][:, None, None]
+            by_point[used] = points.whitened(partials * scale, used)
+            by_params[used, :, : by_model.shape[2]] = points.whitened(by_model * scale, used)
+        pseudo = problem.pseudo_equations(state)
+        misfits = problem.misfits_of(predicted, state.local, pseudo, ordering, weights)
         ground_by_point, rows = np.zeros((len(points), 3, 3)), ordering.grounded
         scale = np.sqrt(weights.ground_weights[rows])[:, None] / problem.ground_sigmas[rows]
         ground_by_point[rows] = problem.enu[rows] * scale[:, :, None]

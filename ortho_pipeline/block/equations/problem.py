@@ -181,17 +181,24 @@ class BlockProblem:
 
     def misfits(self, state: State, ordering: Ordering, weights: Selection) -> Misfits:
         """Return the misfits of everything that takes part."""
-        points = self.points
         places = self.frame.places(state.local)
-        rays = np.zeros((points.rays, 2))
+        predicted = np.zeros((self.points.rays, 2))
         for model, used in zip(state.models, ordering.rays_of_image, strict=True):
-            predicted = places.project(model, points.point[used])
-            rays[used] = points.whitened((points.measured[used] - predicted) / points.sigma_image[used][:, None], used)
-        rays *= np.sqrt(weights.ray_weights)[:, None]
+            predicted[used] = places.project(model, self.points.point[used])
+        return self.misfits_of(predicted, state.local, self.pseudo_equations(state), ordering, weights)
+
+    def misfits_of(
+        self, predicted: Array, local: Array, pseudo: PseudoEquations, ordering: Ordering, weights: Selection
+    ) -> Misfits:
+        """Return the misfits of everything that takes part, with the image points ``(M, 2)`` of points ``(N, 3)``."""
+        points, used = self.points, ordering.rays
+        rays = np.zeros((points.rays, 2))
+        scale = np.sqrt(weights.ray_weights[used]) / points.sigma_image[used]
+        rays[used] = points.whitened((points.measured[used] - predicted[used]) * scale[:, None], used)
         ground, rows = np.zeros((len(points), 3)), ordering.grounded
-        apart = (self.enu[rows] @ (self.target[rows] - state.local[rows])[:, :, None])[:, :, 0]
+        apart = (self.enu[rows] @ (self.target[rows] - local[rows])[:, :, None])[:, :, 0]
         ground[rows] = apart / self.ground_sigmas[rows] * np.sqrt(weights.ground_weights[rows])[:, None]
-        return Misfits(rays, ground, self.pseudo_equations(state).misfit)
+        return Misfits(rays, ground, pseudo.misfit)
 
     def pseudo_equations(self, state: State) -> PseudoEquations:
         """Return the equations of priors, datum and the models' constraints at a state."""

@@ -60,6 +60,13 @@ class Solved:
     def state(self) -> State:
         return self.linear.state
 
+    def without_astray(self, selection: Selection) -> Selection:
+        """Return a selection without the points that are led out of the models."""
+        if self.astray is None:
+            return selection
+        rays = selection.rays & ~self.astray[self.problem.points.point]
+        return replace(selection, rays=rays, ground=selection.ground & ~self.astray)
+
     def unit_weight(self) -> tuple[float | None, float]:
         """Return the standard error of unit weight (None without redundancy), and the degrees of freedom.
 
@@ -106,6 +113,23 @@ def solve(problem: BlockProblem, start: State, selection: Selection) -> Solved:
     if not found.converged or found.astray is not None:
         raise NotConverged("the adjustment did not converge", remedy="give more control points or a simpler model")
     return found
+
+
+def solve_inside(problem: BlockProblem, start: State, selection: Selection) -> tuple[Solved, Selection]:
+    """Minimise the squared misfits without points whose rays lead out of the models; return what takes part, too.
+
+    Raises
+    ------
+    NotConverged
+        If no minimum is found.
+    """
+    found = attempt(problem, start, selection)
+    while found.converged and found.astray is not None:
+        selection = found.without_astray(selection)
+        found = attempt(problem, found.state, selection)
+    if not found.converged:
+        raise NotConverged("the adjustment did not converge", remedy="give more control points or a simpler model")
+    return found, selection
 
 
 def attempt(problem: BlockProblem, start: State, selection: Selection) -> Solved:

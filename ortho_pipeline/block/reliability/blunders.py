@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ortho_pipeline.block.equations.problem import BlockProblem, Selection
-from ortho_pipeline.block.equations.solver import Solved, attempt, once, solve
+from ortho_pipeline.block.equations.solver import Solved, attempt, once, solve_inside
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.reliability.standardised_residuals import SCALE_FLOOR, StandardisedResiduals, standardise
 from ortho_pipeline.block.reliability.suspects import Rejected, Trusted, judge
@@ -81,7 +81,7 @@ def find_blunders(solved: Solved, selection: Selection) -> Found:
             return Found(kept, tuple(rejected.values()), tuple(problem.points.ids[i] for i in doubted))
         kept, rejected = judge(trusted, selection, suspects)
         _refuse_many(problem, selection, list(rejected))
-        solved = solve(trusted.solved.problem, trusted.solved.state, kept)
+        solved, kept = solve_inside(trusted.solved.problem, trusted.solved.state, kept)
         more = _significant(solved, standardise(solved), trusted.variances)
         if variances.estimated:
             # Suspects were the worst, and without them a sigma is found too small: the others return into it.
