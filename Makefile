@@ -80,6 +80,7 @@ bench: setup
 
 docs: setup
 	@$(BIN)/python docs/make_tutorial_images.py
+	$(BIN)/python docs/make_reference.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	echo "Site:    $(CURDIR)/out/site/index.html"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import inspect
 import os
 import re
 import shlex
@@ -91,3 +92,21 @@ def test_every_study_is_in_the_table_of_commands(group):
     text = (ROOT / "docs/cli.md").read_text()
     for name in command.list_commands(click.Context(command)):
         assert f"| `ortho {group} {name} " in text
+
+
+def test_every_public_name_has_a_page_of_its_docstring(tmp_path):
+    import make_reference
+
+    make_reference.main(tmp_path)
+    assert {path.stem for path in tmp_path.iterdir()} == set(ortho_pipeline.__all__)
+    site = (ROOT / "mkdocs.yml").read_text()
+    for name in ortho_pipeline.__all__:
+        assert f"- reference/{name}.md\n" in site
+        page, thing = (tmp_path / f"{name}.md").read_text(), getattr(ortho_pipeline, name)
+        assert len(page.splitlines()) > 4, name
+        assert "---" not in page  # every section was understood
+        if not inspect.isclass(thing):
+            documented = re.findall(
+                r"^- `(\w+)`", page.partition("**Parameters**")[2].partition("**R")[0], re.MULTILINE
+            )
+            assert set(documented) <= set(inspect.signature(thing).parameters)
