@@ -93,10 +93,10 @@ def main(side: int) -> None:
             match=MatchOptions(reference=(str(folder / "reference.tif"),)),
         )  # fmt: skip
         tiles = Tiles(session)
-        limits = [tiles.limits("scene", 0, None, 0)]
+        limits = [tiles.limits("scene-0", 0, None, 0)]
         print(f"open, with the contrast of the scene         {time.perf_counter() - begin:8.2f} s")
         random = np.random.default_rng(2)
-        for pane, bound in (("scene", 100), ("reference", 150)):
+        for pane, bound in (("scene-0", 100), ("reference-0", 150), ("map-0", 100)):
             for factor in (1, 4, 16):
                 most = max(1, side // (256 * factor))
                 places = random.integers(0, most, (60, 2)).tolist()
@@ -107,7 +107,7 @@ def main(side: int) -> None:
 
                 show(0)
                 print(
-                    f"tile of the {pane:<9} 1 : {factor:<2} ({side}^2)    {waited(show, 60):8.0f} ms (asked: {bound})"
+                    f"tile of the {pane:<11} 1 : {factor:<2} ({side}^2)    {waited(show, 60):8.0f} ms (asked: {bound})"
                 )
         image = random.uniform(0, side, (100, 2))
         ground = session.places.ground_of(image)

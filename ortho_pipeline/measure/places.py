@@ -1,17 +1,18 @@
-"""Places: where ground lies in the image and image on the ground, by the model as it is adjusted now."""
+"""Places: where ground lies in an image or a map and these on the ground, by models as they are adjusted now."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, parse_crs
-from ortho_pipeline.imaging.matching import Reference, View
+from ortho_pipeline.imaging.matching import Reference, Target, View
 from ortho_pipeline.measure.marks import GROUND_CRS
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
@@ -22,19 +23,67 @@ from ortho_pipeline.surface.rays import meet_surface
 _NAMED = r"[a-z]{2,12}:[0-9]{1,9}(\+[0-9]{1,9})?|ellipsoid|egm96|egm2008"
 
 
+class Geometry(Protocol):
+    """What ground is shown in: pixels of an image by a model, or of a map."""
+
+    def image_of(self, ground: ArrayLike) -> Array:
+        """Return the pixels ``(N, 2)`` of ground ``(N, 3)`` in `GROUND_CRS`; NaN where there are none."""
+        ...
+
+    def ground_of(self, image: ArrayLike) -> Array:
+        """Return the ground ``(N, 3)`` in `GROUND_CRS` that pixels ``(N, 2)`` show; NaN where they show none."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """A reference in its own pixels: a map, north up where the file is.
+
+    Parameters
+    ----------
+    reference : Reference
+    surface : Surface
+        The heights of what the map shows.
+    """
+
+    reference: Reference
+    surface: Surface
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Columns and rows."""
+        return self.reference.intensity.width, self.reference.intensity.height
+
+    def image_of(self, ground: ArrayLike) -> Array:
+        """Return the pixels ``(N, 2)`` of ground ``(N, 3)``; NaN where the map does not reach."""
+        found = self.reference.project(np.asarray(ground, dtype=float).reshape(-1, 3), GROUND_CRS)
+        with np.errstate(invalid="ignore"):
+            found[~((found >= 0) & (found <= self.size)).all(axis=1)] = np.nan
+        return found
+
+    def ground_of(self, image: ArrayLike) -> Array:
+        """Return the ground ``(N, 3)`` of pixels ``(N, 2)``, with the heights of the surface."""
+        given = np.asarray(image, dtype=float).reshape(-1, 2)
+        linear, offset = self.reference.pixel_from_map[:, :2], self.reference.pixel_from_map[:, 2]
+        plan = (given - offset) @ np.linalg.inv(linear).T
+        heights = self.surface.heights(plan, self.reference.crs)
+        return ground_transform(self.reference.crs, GROUND_CRS)(np.column_stack([plan, heights]))
+
+
 @dataclass(frozen=True, eq=False)
 class Places:
-    """A scene and its references as one geometry.
+    """A scene, and what shows the same ground, as one geometry.
 
     Parameters
     ----------
     view : View
         The scene by the model that the reference is rendered with.
-    references : tuple of Reference
+    references : tuple of Target
+        Orthoimages, or other scenes.
     """
 
     view: View
-    references: tuple[Reference, ...]
+    references: tuple[Target, ...]
 
     @property
     def model(self) -> SensorModel:

@@ -11,11 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.statistics import squared_distances
+from ortho_pipeline.files.documents import json_position, json_value
 from ortho_pipeline.imaging.matching import REASONS
 from ortho_pipeline.imaging.matching.chip_search import MEASURED, SIDE, doubts, found_again
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
@@ -93,6 +96,45 @@ def propose(places: Places, image: Sequence[float], radius: float) -> Proposal:
     assert measured is not None
     covariance, scattered = _covariance(places, origin, shift, factor, measured)
     return Proposal(shift, covariance, float(measured.correlation[0]), REASONS.get(doubt, ""), scattered)
+
+
+def proposal_of(places: Places, click: Array | None, ground: Array | None, radius: float) -> dict[str, Any]:
+    """Return a match for a click, as JSON values: its `image` and `ground`, score and covariance, or the `reason`.
+
+    Parameters
+    ----------
+    click : (2,), optional
+        px of the scene.
+    ground : (3,), optional
+        Clicked or typed: its image is looked for about the click, within `NEAR`, or without a click about where the
+        model puts it, within `radius` px. Without a ground that of the click is looked for, within `radius` px.
+
+    Raises
+    ------
+    InputError
+        If there is neither.
+    """
+    if ground is not None:
+        expected = places.image_of([ground])[0]
+        if click is None and not np.isfinite(expected).all():
+            raise InputError("the model leads outside of the scene", field="ground", remedy="click it in the scene")
+        about = expected if click is None else click
+        found = propose(places.moved(about - expected), about.tolist(), radius if click is None else NEAR)
+        place, on_ground = about - found.shift, ground
+    elif click is None:
+        raise InputError("there is no place to match", field="image")
+    else:
+        found = propose(places, click.tolist(), radius)
+        place, on_ground = click, np.full(3, np.nan)
+        if np.isfinite(found.shift).all():
+            on_ground = places.ground_of([click + found.shift])[0]
+    reason = found.reason or ("" if np.isfinite(on_ground).all() else "the heights do not reach here")
+    (column, both), (_, row) = found.covariance
+    told: dict[str, Any] = json_value({
+        "image": json_position(place), "ground": json_position(on_ground), "score": found.score,
+        "covariance": json_position([column, row, both]), "scattered": found.scattered, "reason": reason,
+    })  # fmt: skip
+    return told
 
 
 def _factor(places: Places) -> int:

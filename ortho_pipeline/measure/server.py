@@ -22,7 +22,7 @@ from ortho_pipeline.files import parse_json
 from ortho_pipeline.measure.guard import REPORT_POLICY, App, Guard
 from ortho_pipeline.measure.making import PICTURES, Making
 from ortho_pipeline.measure.session import Session
-from ortho_pipeline.measure.tiles import MOST, PANES, SIDE, Tiles
+from ortho_pipeline.measure.tiles import MOST, SIDE, Tiles
 from ortho_pipeline.options import CORRECTIONS, OutputOptions, SceneOptions
 from ortho_pipeline.raster.block_cache import limit_cache
 
@@ -78,9 +78,9 @@ class _Answers:
         session = self._session
         writes = not session.journal.read_only and self._windows.claim(_window(given), take=bool(given.get("take")))
         return {
-            "scene": os.path.basename(session.scene.path), "output": os.path.basename(session.output),
-            "references": [os.path.basename(one.path) for one in session.places.references],
-            "size": [session.scene.width, session.scene.height], "tile": SIDE, "bands": self._tiles.bands,
+            "images": [_facts(view.intensity.source.path, view.size) for view in session.views],
+            "maps": [_facts(sheet.reference.path, sheet.size) for sheet in session.sheets],
+            "output": os.path.basename(session.output), "tile": SIDE, "bands": self._tiles.bands,
             "corrections": list(CORRECTIONS), "writes": writes, "locked": session.journal.read_only,
             "healed": session.journal.healed, "state": session.state(),
         }  # fmt: skip
@@ -103,19 +103,24 @@ class _Answers:
         return self._session.state()
 
     def predict(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Say where a place lies in both views."""
-        places = {name: _numbers(given.get(name), 2) for name in ("scene", "shown") if given.get(name) is not None}
+        """Say where a place lies in all views."""
+        version = _whole(given.get("version", 0))
         if given.get("ground") is not None:
-            places["ground"] = _numbers(given["ground"], 3)
-        if len(places) != 1:
-            raise InputError("one place is predicted: scene, shown or ground")
-        return self._session.predict(_whole(given.get("version", 0)), **places)
+            return self._session.predict(version, ground=_numbers(given["ground"], 3))
+        return self._session.predict(version, str(given.get("at")), _numbers(given.get("place"), 2))
+
+    def link(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Say how one view lies in another."""
+        version, place = _whole(given.get("version", 0)), _numbers(given.get("place"), 2)
+        return self._session.link(version, str(given.get("at")), place, str(given.get("to")))
 
     def propose(self, given: dict[str, Any]) -> dict[str, Any]:
         """Match a click."""
-        ground = given.get("ground")
+        image, ground = given.get("image"), given.get("ground")
+        if image is None and ground is None:
+            raise InputError("there is no place to match", field="image", remedy=_REMEDY)
         return self._session.proposal(
-            _numbers(given.get("image"), 2), None if ground is None else _numbers(ground, 3)
+            None if image is None else _numbers(image, 2), None if ground is None else _numbers(ground, 3)
         )  # fmt: skip
 
     def typed(self, given: dict[str, Any]) -> dict[str, Any]:
@@ -132,7 +137,7 @@ class _Answers:
     def stretch(self, given: dict[str, Any]) -> dict[str, Any]:
         """Return what is black and white, for each band."""
         pane, box = str(given.get("pane")), given.get("box")
-        if pane not in PANES:
+        if pane not in self._tiles.bands:
             raise InputError("there is no such view", field="pane")
         where = None if box is None else _numbers(box, 4)
         bands, version = _bands(given.get("bands")), _whole(given.get("version", 0))
@@ -251,7 +256,21 @@ class _Given:
         return JSONResponse(done, headers={"cache-control": "no-store"})
 
 
-_ASKED = ("begin", "leave", "act", "state", "predict", "propose", "typed", "stretch", "compare", "save", "make", "made")
+_ASKED = (
+    "begin",
+    "leave",
+    "act",
+    "state",
+    "predict",
+    "link",
+    "propose",
+    "typed",
+    "stretch",
+    "compare",
+    "save",
+    "make",
+    "made",
+)
 
 
 def serve(session: Session, opened: SceneOptions, ready: Callable[[str], None], port: int = 0) -> None:
@@ -333,6 +352,10 @@ def _numbers(values: Any, count: int) -> list[float]:
         ):
             raise InputError("this is no number", field="request", remedy=_REMEDY)
     return [float(value) for value in values]
+
+
+def _facts(path: str, size: tuple[int, int]) -> dict[str, Any]:
+    return {"name": os.path.basename(path), "size": list(size)}
 
 
 def _window(given: dict[str, Any]) -> str:

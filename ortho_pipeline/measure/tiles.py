@@ -1,18 +1,18 @@
-"""Tiles: the scene, and the reference rendered into its pixels, as PNG of any reduction, made when asked for."""
+"""Tiles: scenes, what is rendered into their pixels, and maps: PNG of any reduction, made when asked for."""
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
 from collections.abc import Hashable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.imaging.matching import Reference, View
 from ortho_pipeline.imaging.matching.chips import Renderer
-from ortho_pipeline.measure.session import Session
+from ortho_pipeline.measure.project import Project
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.raster.output import png_bytes
 from ortho_pipeline.raster.pyramid import Pyramid, stretch
@@ -20,7 +20,6 @@ from ortho_pipeline.raster.source import RasterSource
 
 #: Side of a tile (px).
 SIDE = 256
-PANES = ("scene", "reference")
 #: Pixels of the scene in one of a tile: whole powers of two up to this.
 MOST = 1 << 16
 
@@ -28,7 +27,7 @@ Pixels = NDArray[np.float32]
 
 
 class Tiles:
-    """Tiles of one session.
+    """Tiles of one project, by the names of its views (`Project`).
 
     Parameters
     ----------
@@ -36,21 +35,24 @@ class Tiles:
         Bytes of pixels that are kept.
     """
 
-    def __init__(self, session: Session, opened: SceneOptions = SceneOptions(), memory: int = 256_000_000) -> None:
-        self._session, self._access = session, opened.access
-        self._references = session.places.references
-        self._sources = {
-            "scene": [session.places.view.intensity.source],
-            "reference": [one.intensity.source for one in self._references],
-        }
+    def __init__(self, project: Project, opened: SceneOptions = SceneOptions(), memory: int = 256_000_000) -> None:
+        self._project, self._access = project, opened.access
+        images = [view.intensity.source for view in project.views]
+        maps = [sheet.reference.intensity.source for sheet in project.sheets]
+        self._sources: dict[str, list[RasterSource]] = {}
+        for number, source in enumerate(images):
+            self._sources[f"scene-{number}"] = [source]
+            if maps:
+                self._sources[f"reference-{number}"] = maps
+        self._sources |= {f"map-{number}": [source] for number, source in enumerate(maps)}
         self._lock = threading.Lock()
-        self._open: dict[tuple[str, int], list[Pyramid]] = {}
+        self._open: dict[tuple[RasterSource, int], Pyramid] = {}
         self._kept: OrderedDict[Hashable, Pixels] = OrderedDict()
         self._most = max(1, memory // (4 * SIDE * SIDE))
-        self.bands = {pane: sources[0].count for pane, sources in self._sources.items()}
+        self.bands = {name: sources[0].count for name, sources in self._sources.items()}
 
     def png(
-        self, pane: str, version: int, factor: int, column: int, row: int, bands: Sequence[int],
+        self, name: str, version: int, factor: int, column: int, row: int, bands: Sequence[int],
         limits: Sequence[tuple[float, float]],
     ) -> bytes:  # fmt: skip
         """Return a tile as PNG, transparent where nothing is shown.
@@ -67,13 +69,13 @@ class Tiles:
             What is black and what is white, for each band.
         """
         planes = [
-            self.pixels(pane, version, factor, column * SIDE * factor, row * SIDE * factor, band) for band in bands
+            self.pixels(name, version, factor, column * SIDE * factor, row * SIDE * factor, band) for band in bands
         ]
         valid = np.logical_and.reduce([np.isfinite(plane) for plane in planes])
         shown = [_shade(plane, *limit) for plane, limit in zip(planes, limits, strict=True)]
         return png_bytes(np.stack([*shown, np.where(valid, 255, 0).astype(np.uint8)]))
 
-    def limits(self, pane: str, version: int, box: Sequence[float] | None, band: int) -> tuple[float, float]:
+    def limits(self, name: str, version: int, box: Sequence[float] | None, band: int) -> tuple[float, float]:
         """Return what is black and what is white: percentiles 1 and 99 of the raster, or of a box of the view.
 
         Parameters
@@ -82,58 +84,52 @@ class Tiles:
             px of the scene.
         """
         if box is None:
-            return self._pyramids(pane, band)[0].stretch()
+            return self._pyramids(name, band)[0].stretch()
         left, top, right, bottom = (round(value) for value in box)
         factor = 1
         while max(right - left, bottom - top) > SIDE * factor and factor < MOST:
             factor *= 2
-        plane = self.pixels(pane, version, factor, left, top, band)
+        plane = self.pixels(name, version, factor, left, top, band)
         rows, columns = (max(1, extent // factor) for extent in (bottom - top, right - left))
-        return stretch(plane[:rows, :columns]) or self._pyramids(pane, band)[0].stretch()
+        return stretch(plane[:rows, :columns]) or self._pyramids(name, band)[0].stretch()
 
-    def pixels(self, pane: str, version: int, factor: int, left: int, top: int, band: int) -> Pixels:
+    def pixels(self, name: str, version: int, factor: int, left: int, top: int, band: int) -> Pixels:
         """Return the intensities ``(SIDE, SIDE)`` of a square of the scene's pixels; NaN where nothing is shown."""
         if (
-            pane not in PANES
-            or not 0 <= band <= self.bands[pane]
+            name not in self.bands
+            or not 0 <= band <= self.bands[name]
             or not (1 <= factor <= MOST and factor & (factor - 1) == 0)
         ):
             raise InputError("there is no such tile", field="tile")
-        key = (pane, version if pane == "reference" else 0, factor, left, top, band)
+        places = self._project.rendering(name, version)
+        key = (name, 0 if places is None else version, factor, left, top, band)
         with self._lock:
             if key in self._kept:
                 self._kept.move_to_end(key)
                 return self._kept[key]
-        made = self._made(pane, version, factor, left, top, band)
+        pyramids = self._pyramids(name, band)
+        if places is None:
+            made = pyramids[0].read(left, top, SIDE, SIDE, factor)
+        else:
+            shown = [
+                replace(target, intensity=pyramid)  # type: ignore[type-var]  # all of them are dataclasses
+                for target, pyramid in zip(places.references, pyramids, strict=True)
+            ]
+            made = Renderer(places.view, shown, np.array([[left, top]]), SIDE, factor).render(np.array([0]))[0]
         with self._lock:
             self._kept[key] = made
             while len(self._kept) > self._most:
                 self._kept.popitem(last=False)
         return made
 
-    def _made(self, pane: str, version: int, factor: int, left: int, top: int, band: int) -> Pixels:
-        pyramids = self._pyramids(pane, band)
-        if pane == "scene":
-            return pyramids[0].read(left, top, SIDE, SIDE, factor)
-        places = self._session.at(version)
-        shown = [
-            Reference(pyramid, one.crs, one.pixel_from_map)
-            for pyramid, one in zip(pyramids, self._references, strict=True)
-        ]
-        view = View(places.view.intensity, places.model, places.surface)
-        return Renderer(view, shown, np.array([[left, top]]), SIDE, factor).render(np.array([0]))[0]
-
-    def _pyramids(self, pane: str, band: int) -> list[Pyramid]:
-        """Return the rasters of a pane, opened when they are first asked for."""
+    def _pyramids(self, name: str, band: int) -> list[Pyramid]:
+        """Return the rasters of a view, opened when they are first asked for."""
         with self._lock:
-            found = self._open.get((pane, band))
-            if found is None:
-                found = [
-                    Pyramid(RasterSource(*one.paths, bands=[band] if 0 < band <= one.count else None, **self._access))
-                    for one in self._sources[pane]
-                ]
-                self._open[pane, band] = found
-            return found
+            for one in self._sources[name]:
+                if (one, band) not in self._open:
+                    bands = [band] if 0 < band <= one.count else None
+                    self._open[one, band] = Pyramid(RasterSource(*one.paths, bands=bands, **self._access))
+            return [self._open[one, band] for one in self._sources[name]]
 
 
 def _shade(plane: Pixels, low: float, high: float) -> NDArray[np.uint8]:

@@ -130,6 +130,36 @@ def test_a_person_clicks_six_points_in_either_view(serve, reference: Path, truth
 
 
 @pytest.mark.slow
+def test_a_point_is_measured_in_the_map_which_follows_the_scene(serve, whole_reference: Path, truth) -> None:
+    served = serve(whole_reference)
+    page = served.page
+    page.keyboard.press("u")
+    served.says("#reference-title", "Reference as a map")
+    accepted = 0
+    while accepted < 3:
+        page.keyboard.press("n")
+        page.wait_for_load_state("networkidle")
+        page.focus("#reference")
+        page.keyboard.press("m")
+        served.says("#said", "Matched|No match")
+        if "Matched" in page.inner_text("#said"):
+            accepted += 1
+            served.accept(f"P{accepted}")
+    # Panned in the map, the scene follows: what is measured there is the same place.
+    page.focus("#reference")
+    page.keyboard.press("ArrowRight")
+    page.wait_for_timeout(800)
+    page.focus("#scene")
+    page.keyboard.press("m")
+    served.says("#said", "Matched|No match")
+    page.keyboard.press("Escape")
+    points = served.end()
+    assert len(points) == 3
+    assert missed(points, truth).max() < 0.1
+    assert not served.faults
+
+
+@pytest.mark.slow
 def test_six_points_by_keyboard_alone(serve, whole_reference: Path, truth) -> None:
     served = serve(whole_reference)
     page = served.page

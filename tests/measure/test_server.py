@@ -91,12 +91,14 @@ def test_no_path_of_a_request_is_opened(client: TestClient, path: str, monkeypat
     [
         ("begin", {}), ("act", {"window": WINDOW, "action": {"do": "begin", "marks": []}}),
         ("act", {"window": WINDOW, "action": {"do": "put", "mark": {"id": "A", "image": [1e400, 0]}}}),
-        ("act", {"window": WINDOW}), ("propose", {"image": [1]}), ("propose", {"image": ["1", 2]}),
-        ("predict", {}), ("predict", {"scene": [1, 2], "version": -1}), ("predict", {"scene": [1, 2], "version": 99}),
+        ("act", {"window": WINDOW}), ("propose", {}), ("propose", {"image": [1]}), ("propose", {"image": ["1", 2]}),
+        ("predict", {}), ("predict", {"at": "scene-0", "place": [1, 2], "version": -1}),
+        ("predict", {"at": "scene-0", "place": [1, 2], "version": 99}), ("predict", {"at": "scene-1", "place": [1, 2]}),
+        ("link", {"at": "scene-0", "to": "../x", "place": [1, 2]}), ("link", {"at": "scene-0", "to": "map-0"}),
         ("typed", {"values": [1, 2]}), ("typed", {"values": [1, 2, 3], "crs": "file:///etc/passwd"}),
         ("typed", {"values": [1, 2, 3], "vertical": "/etc/geoid.gtx"}),
         ("typed", {"values": [1, 2, 3], "crs": "+proj=longlat +nadgrids=/etc/passwd"}),
-        ("stretch", {"pane": "../x", "bands": [0]}), ("stretch", {"pane": "scene", "bands": [5]}), ("act", []),
+        ("stretch", {"pane": "../x", "bands": [0]}), ("stretch", {"pane": "scene-0", "bands": [5]}), ("act", []),
     ],
 )  # fmt: skip
 def test_what_makes_no_sense_is_one_line_and_changes_nothing(client: TestClient, what: str, given: object) -> None:
@@ -138,11 +140,12 @@ def test_no_file_is_looked_for_that_a_request_names(client: TestClient, tmp_path
 
 
 def test_a_tile_is_a_picture_and_nonsense_is_none(client: TestClient) -> None:
-    answer = client.get(f"/{TOKEN}/tiles/scene/0/2/0/1?b=0&l=0,2000")
+    answer = client.get(f"/{TOKEN}/tiles/scene-0/0/2/0/1?b=0&l=0,2000")
     assert answer.headers["content-type"] == "image/png"
     assert answer.content[:4] == b"\x89PNG"
-    for wrong in ("scene/0/3/0/0?l=0,1", "scene/0/1/0/0?l=0,nan", "scene/0/1/0/0?l=0", "scene/0/1/0/0?b=1,2&l=0,1,2,3",
-                  "scene/0/131072/0/0?l=0,1", "scene/0/1/9999999/0?l=0,1"):  # fmt: skip
+    for wrong in ("scene-0/0/3/0/0?l=0,1", "scene-0/0/1/0/0?l=0,nan", "scene-0/0/1/0/0?l=0",
+                  "scene-0/0/1/0/0?b=1,2&l=0,1,2,3", "scene-0/0/131072/0/0?l=0,1",
+                  "scene-0/0/1/9999999/0?l=0,1"):  # fmt: skip
         assert client.get(f"/{TOKEN}/tiles/{wrong}").status_code == 400
 
 

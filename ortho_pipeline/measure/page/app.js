@@ -1,6 +1,6 @@
 // The page: what is being measured, requests, keys. The server computes; what is shown here was written down before.
 import { Table } from './table.js';
-import { Views } from './views.js';
+import { PANES, Views, geometryOf } from './views.js';
 
 const $ = (id) => document.getElementById(id);
 const windowName = crypto.randomUUID();
@@ -9,7 +9,7 @@ let selected = null;
 let pending = null; // {image, ground, shown, ...}: the point under way
 let skipped = 0; // places that were offered and passed over
 let turn = 0; // answers to requests that something newer overtook are not shown
-const look = { scene: { bands: [0], limits: null }, reference: { bands: [0], limits: null } };
+const looks = {}; // of each view: bands and contrast
 const compared = { flicker: false, difference: false, swipe: 0 };
 
 async function ask(what, given = {}) {
@@ -39,17 +39,30 @@ const shownMarks = () => state.marks.map((mark) => ({ ...mark, ...(state.points[
 const markOf = (id) => state.marks.find((mark) => mark.id === id);
 const number = (value, digits) => (value === null || value === undefined ? '–' : value.toFixed(digits));
 
-async function showTiles(panes = ['scene', 'reference']) {
-  await Promise.all(panes.map(async (pane) => {
-    const { bands } = look[pane];
-    look[pane].limits ??= (await ask('stretch', { pane, bands, version: state.version })).limits;
-    views.tiles[pane].show({ version: state.version, bands, limits: look[pane].limits });
+const look = (name) => (looks[name] ??= { bands: [0], limits: null });
+/** The number of the image that a view is in the geometry of, null for a map. */
+const imageOf = (name) => { const [kind, number] = geometryOf(name).split('-'); return kind === 'scene' ? Number(number) : null; };
+
+/** The reference in the geometry of the left pane, where there is one: what flickers, and what a difference is from. */
+const overlay = () => { const name = `reference-${imageOf(views.shows.scene)}`; return facts.bands[name] ? name : null; };
+
+async function showTiles(names = Object.values(views.shows)) {
+  await Promise.all([...new Set(names)].map(async (name) => {
+    const one = look(name);
+    one.limits ??= (await ask('stretch', { pane: name, bands: one.bands, version: state.version })).limits;
+    views.of(name).show({ version: state.version, ...one });
   }));
+}
+
+/** Where a mark is in a view, and its residual there: measured in an image, where its ground is shown elsewhere. */
+function placed(mark, name) {
+  if (name !== 'scene-0') return { place: mark.places?.[name] ?? null };
+  return { place: mark.image ?? null, residual: mark.residual };
 }
 
 function draw() {
   const marks = shownMarks();
-  views.draw(marks, selected, pending, nextPlace());
+  views.draw(marks, selected, pending, nextPlace(), placed);
   table.draw(marks, selected);
 }
 
@@ -69,7 +82,9 @@ function show(next) {
   $('notices').replaceChildren(...items);
   $('doubts-title').textContent = `Notices (${items.length})`;
   draw();
-  if (rendered) safely(showTiles)(['reference']);
+  if (rendered) safely(showTiles)([...Object.values(views.shows), overlay()].filter((name) => name?.startsWith('reference-')));
+  // Where the other geometry lies has changed with the model.
+  if (rendered) views.relink();
 }
 
 function tellNext() {
@@ -133,8 +148,9 @@ function take(found, wanted) {
 const measure = safely(async (pane, place) => {
   begin();
   const mine = (turn += 1);
+  const name = views.shows[pane];
   say('Matching …');
-  if (pane === 'scene') {
+  if (name.startsWith('scene-')) {
     const known = pending.ground && (pending.by_hand || pending.ground_from !== 'reference') ? pending.ground : null;
     Object.assign(pending, { image: place, how: 'manual', covariance: null, score: null, clicked: true });
     const found = await ask('propose', { image: place, ground: known });
@@ -142,12 +158,11 @@ const measure = safely(async (pane, place) => {
     if (found.reason && !known) { pending.ground = null; pending.ground_from = null; }
     take(found, 'reference');
   } else {
-    const there = await ask('predict', { shown: place, version: state.version });
+    const there = await ask('predict', { at: name, place, version: state.version });
     if (mine !== turn) return;
     if (!there.ground) { say('The reference shows no ground here.', true); return; }
     Object.assign(pending, { ground: there.ground, ground_from: 'reference', by_hand: true });
-    const image = pending.clicked ? pending.image : there.scene;
-    const found = image ? await ask('propose', { image, ground: there.ground }) : { reason: 'the model leads outside of the scene' };
+    const found = await ask('propose', { image: pending.clicked ? pending.image : null, ground: there.ground });
     if (mine !== turn) return;
     take(found, 'scene');
   }
@@ -157,9 +172,9 @@ const measure = safely(async (pane, place) => {
 /** Ask where the ground of the point under way is shown, and draw it. */
 async function locate(mine) {
   const there = pending.ground ? await ask('predict', { ground: pending.ground, version: state.version })
-    : await ask('predict', { scene: pending.image, version: state.version });
+    : await ask('predict', { at: 'scene-0', place: pending.image, version: state.version });
   if (mine !== turn || !pending) return;
-  pending.shown = there.shown;
+  pending.places = there.places;
   fill();
   draw();
 }
@@ -172,7 +187,7 @@ const nudge = safely(async (column, row) => {
   say(`By hand: column ${pending.image[0].toFixed(2)}, row ${pending.image[1].toFixed(2)}. Enter accepts.`);
   fill();
   draw();
-  if (!pending.shown) await locate(mine);
+  if (!pending.places) await locate(mine);
 });
 
 const decimal = (id) => {
@@ -211,7 +226,7 @@ function choose(id) {
   selected = id;
   pending = { ...mark, was: id, by_hand: true, clicked: true };
   say(`${id}: ${mark.role}, ${mark.how}${mark.off ? ', off' : ''}. Nudge it, click it anew, or change what stands here; Enter accepts.`);
-  if (mark.image) views.goTo(mark.image, 1);
+  views.goTo({ ...mark.places, ...(mark.image ? { 'scene-0': mark.image } : {}) }, 1);
   fill();
   draw();
 }
@@ -222,10 +237,10 @@ const remove = () => { if (selected) { const id = selected; cancel(); act({ do: 
 function goNext() {
   if (!state.next.length) return;
   const place = nextPlace();
-  const [column, row] = views.middle();
+  const [column, row] = views.middle('scene');
   if (Math.hypot(place.image[0] - column, place.image[1] - row) < 1) skipped += 1;
   cancel();
-  views.goTo(nextPlace().image, 1);
+  views.goTo(nextPlace().places, 1);
   tellNext();
   say('The next place: press m at the feature in the middle, or click one. Press n again for another place.');
 }
@@ -234,23 +249,28 @@ const dragged = safely(async (pane, id, place) => {
   const mark = markOf(id);
   if (!mark || !facts.writes) { draw(); return; }
   const changed = { ...mark, how: 'manual', covariance: null, score: null };
-  if (pane === 'scene') changed.image = place;
+  const name = views.shows[pane];
+  if (name.startsWith('scene-')) changed.image = place;
   else {
-    const there = await ask('predict', { shown: place, version: state.version });
+    const there = await ask('predict', { at: name, place, version: state.version });
     if (!there.ground) { draw(); return; }
     Object.assign(changed, { ground: there.ground, ground_from: 'reference' });
   }
   await act({ do: 'put', mark: plain(changed), was: id });
 });
 
-function compare(change) {
+async function compare(change) {
   Object.assign(compared, change);
-  views.compare(compared);
+  if (overlay()) await safely(showTiles)([overlay()]);
+  views.compare(overlay(), compared);
   for (const name of ['flicker', 'difference']) $(name).setAttribute('aria-pressed', String(compared[name]));
 }
 
 const stretch = safely(async () => {
-  for (const pane of ['scene', 'reference']) look[pane].limits = (await ask('stretch', { pane, bands: look[pane].bands, version: state.version, box: views.box() })).limits;
+  for (const pane of PANES) {
+    const name = views.shows[pane];
+    look(name).limits = (await ask('stretch', { pane: name, bands: look(name).bands, version: state.version, box: views.box(pane) })).limits;
+  }
   await showTiles();
 });
 
@@ -315,8 +335,8 @@ const typed = safely(async () => {
   Object.assign(pending, { ground, ground_from: 'typed', by_hand: true });
   const there = await ask('predict', { ground, version: state.version });
   if (mine !== turn) return;
-  pending.shown = there.shown;
-  if (there.scene) views.goTo(there.scene, 1);
+  pending.places = there.places;
+  views.goTo(there.places, 1);
   say('Ground taken. Now click it in the scene: where it is expected is in the middle.');
   fill();
   draw();
@@ -339,7 +359,8 @@ function pressed(event) {
   }
   const along = (step) => { const { order } = table; if (order.length) choose(order[(order.indexOf(selected) + step + order.length) % order.length] ?? order[0]); };
   const keys = {
-    m: () => measure(target.id === 'reference' ? 'reference' : 'scene', views.middle()),
+    m: () => { const pane = target.id === 'reference' ? 'reference' : 'scene'; measure(pane, views.middle(pane)); },
+    u: () => { const select = $('reference-shows'); showIn('reference', select.options[(select.selectedIndex + 1) % select.options.length].value); },
     n: goNext, j: () => along(1), k: () => along(-1), o: toggleOff, Delete: remove, c: models, s: stretch, g: makeOrtho,
     r: () => { const roles = ['control', 'check', 'tie']; $('role').value = roles[(roles.indexOf($('role').value) + 1) % 3]; if (pending) pending.role = $('role').value; say(`Role: ${$('role').value}.`); },
     f: () => compare({ flicker: !compared.flicker, difference: false }), d: () => compare({ difference: !compared.difference, flicker: false }),
@@ -348,13 +369,37 @@ function pressed(event) {
   if (key === 'Enter' && (inMap || target === document.body)) { event.preventDefault(); accept(); } else if (keys[key]) { event.preventDefault(); keys[key](); }
 }
 
+/** What the panes may show: names of views, and what people call them. */
+function choices(pane) {
+  const scenes = facts.images.map((image, number) => [`scene-${number}`, facts.images.length > 1 ? image.name : 'Scene']);
+  if (pane === 'scene') return scenes;
+  return [['reference-0', 'Reference, as the scene would see it'],
+    ...facts.maps.map((one, number) => [`map-${number}`, `Reference as a map${facts.maps.length > 1 ? `: ${one.name}` : ''}`])];
+}
+
+/** Show a view in a pane. */
+function showIn(pane, name) {
+  const select = $(`${pane}-shows`);
+  select.value = name;
+  const title = select.selectedOptions[0].textContent;
+  $(`${pane}-title`).textContent = title;
+  $(pane).setAttribute('aria-label', `${title}. Arrow keys pan, plus and minus zoom, m measures at the cross in the middle.`);
+  views.put(pane, name);
+  bandChoices(pane);
+  if (pane === 'scene') compare({});
+  draw();
+  return safely(showTiles)([name]);
+}
+
 function bandChoices(pane) {
   const select = $(`${pane}-bands`);
-  const count = facts.bands[pane];
-  const choices = [[[0], count > 1 ? 'mean' : '1'], ...(count >= 3 ? [[[1, 2, 3], '1, 2, 3'], [[3, 2, 1], '3, 2, 1']] : []),
+  const name = views.shows[pane];
+  const count = facts.bands[name];
+  const offered = [[[0], count > 1 ? 'mean' : '1'], ...(count >= 3 ? [[[1, 2, 3], '1, 2, 3'], [[3, 2, 1], '3, 2, 1']] : []),
     ...(count > 1 ? Array.from({ length: count }, (_, index) => [[index + 1], String(index + 1)]) : [])];
-  select.replaceChildren(...choices.map(([, name]) => new Option(name)));
-  select.addEventListener('change', () => { look[pane] = { bands: choices[select.selectedIndex][0], limits: null }; safely(showTiles)([pane]); });
+  select.replaceChildren(...offered.map(([, title]) => new Option(title)));
+  select.selectedIndex = Math.max(0, offered.findIndex(([bands]) => String(bands) === String(look(name).bands)));
+  select.onchange = () => { looks[name] = { bands: offered[select.selectedIndex][0], limits: null }; safely(showTiles)([name]); };
 }
 
 function banner() {
@@ -367,21 +412,31 @@ function banner() {
 
 async function start(given = {}) {
   facts = await ask('begin', given);
-  document.title = `${facts.scene} – ortho measure`;
-  $('title').textContent = `${facts.scene} → ${facts.output}`;
+  const names = facts.images.map((image) => image.name).join(', ');
+  document.title = `${names} – ortho measure`;
+  $('title').textContent = `${names} → ${facts.output}`;
   banner();
   if (!views) {
-    views = new Views(facts, (pane, place, hit) => (hit && !pending ? choose(hit) : measure(pane, place)), dragged);
-    views.whole(facts.size);
-    // Vectors of residuals are as long on the screen at every zoom.
-    views.view.on('change:resolution', () => { if (state) draw(); });
+    views = new Views(facts, {
+      clicked: (pane, place, hit) => (hit && !pending ? choose(hit) : measure(pane, place)), dragged,
+      linked: (at, to, place) => safely(ask)('link', { at, to, place, version: state.version }),
+      zoomed: () => { if (state) draw(); },
+    });
     table = new Table($('table'), choose);
-    for (const pane of ['scene', 'reference']) bandChoices(pane);
+    state = facts.state;
+    for (const pane of PANES) {
+      const select = $(`${pane}-shows`);
+      select.replaceChildren(...choices(pane).map(([name, title]) => new Option(title, name)));
+      select.hidden = select.options.length < 2;
+      $(`${pane}-title`).classList.toggle('hidden', !select.hidden);
+      select.addEventListener('change', () => showIn(pane, select.value));
+      views.put(pane, select.value);
+    }
     $('correction').replaceChildren(new Option('shift (default)', ''), ...facts.corrections.map((name) => new Option(name)));
   }
   show(facts.state);
   fill();
-  await showTiles();
+  await Promise.all(PANES.map((pane) => showIn(pane, views.shows[pane])));
 }
 
 for (const [id, work] of Object.entries({

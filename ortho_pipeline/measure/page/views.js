@@ -1,14 +1,18 @@
-// The views: scene and reference share one OpenLayers view in pixels of the scene, so that they pan and zoom as one.
-// OpenLayers' y goes up: a pixel (column, row) lies at (column, -row).
+// Two panes, each with a view by its name: `scene-K` is image K, `reference-K` the reference rendered into its pixels, `map-R`
+// reference R in its own. Panes of one geometry share an OpenLayers view, and so pan and zoom as one; of two, one follows the
+// other by how they lie in each other about the middle. OpenLayers' y goes up: a pixel (column, row) lies at (column, -row).
 /* global ol */
 
 const SHAPES = { control: 3, check: 0, tie: 4 };
 const COLOURS = { control: '#ffb000', check: '#35c3ff', tie: '#8be04e' };
 const at = ([column, row]) => [column, -row];
 export const pixel = ([x, y]) => [x, -y];
+/** Which geometry a view is in. */
+export const geometryOf = (name) => name.replace(/^reference-/, 'scene-');
+export const PANES = ['scene', 'reference'];
 
-/** Tiles of one pane in one rendering; `show` gives them another rendering, bands or contrast. */
-function tiled(pane, size, tile, projection) {
+/** Tiles of one view in one rendering; `show` gives them another rendering, bands or contrast. */
+function tiled(name, size, tile, projection) {
   const resolutions = [1];
   while (Math.max(...size) / resolutions[0] > tile) resolutions.unshift(resolutions[0] * 2);
   const grid = new ol.tilegrid.TileGrid({ origin: [0, 0], extent: [0, -size[1], size[0], 0], resolutions, tileSize: tile });
@@ -18,7 +22,7 @@ function tiled(pane, size, tile, projection) {
     show({ version, bands, limits }) {
       const query = `b=${bands.join(',')}&l=${limits.flat().join(',')}`;
       source.setTileUrlFunction(([z, x, y]) => (x < 0 || y < 0 ? undefined
-        : `tiles/${pane}/${version}/${resolutions[z]}/${x}/${y}?${query}`), `${version}?${query}`);
+        : `tiles/${name}/${version}/${resolutions[z]}/${x}/${y}?${query}`), `${version}?${query}`);
     },
   };
 }
@@ -42,42 +46,134 @@ const CROSS = [new ol.style.Style({ image: new ol.style.RegularShape({ points: 4
 const NEXT = new ol.style.Style({ image: new ol.style.Circle({ radius: 16, stroke: new ol.style.Stroke({ color: '#fff', width: 2, lineDash: [5, 5] }) }) });
 
 export class Views {
-  /** @param {{size: number[], tile: number}} facts @param {(pane: string, place: number[], hit: string|null) => void} clicked @param {(pane: string, id: string, place: number[]) => void} dragged */
-  constructor(facts, clicked, dragged) {
-    const [width, height] = facts.size;
-    const projection = new ol.proj.Projection({ code: 'image', units: 'pixels', extent: [0, -height, width, 0] });
-    this.tiles = { scene: tiled('scene', facts.size, facts.tile, projection), reference: tiled('reference', facts.size, facts.tile, projection) };
-    this.view = new ol.View({ projection, center: [width / 2, -height / 2], minResolution: 1 / 32,
-      maxResolution: Math.max(width, height) / 250, resolution: 1, enableRotation: false, smoothExtentConstraint: false });
-    this.marks = { scene: new ol.source.Vector(), reference: new ol.source.Vector() };
+  /**
+   * @param {{images: {size: number[]}[], maps: {size: number[]}[], tile: number}} facts
+   * @param {{clicked: (pane: string, place: number[], hit: string|null) => void, dragged: (pane: string, id: string, place: number[]) => void,
+   *   linked: (at: string, to: string, place: number[]) => Promise<{place: number[]|null, matrix: number[][]|null}|undefined>, zoomed: () => void}} told
+   */
+  constructor(facts, told) {
+    this.facts = facts;
+    this.told = told;
+    this.geometries = {};
+    this.tiles = {};
+    this.shows = {};
     this.maps = {};
-    const extent = projection.getExtent(); // tiles reach beyond the scene, where the reference goes on
-    this.over = new ol.layer.Tile({ source: this.tiles.reference.source, visible: false, extent });
+    this.marks = {};
+    this.loupes = {};
+    this.base = {};
+    this.link = null; // {lead, from, to, matrix}: how the pane that leads lies in the other one
+    this.lead = 'scene';
+    this.turn = 0;
+    this.over = new ol.layer.Tile({ visible: false });
     this.swipe = 0;
     this.difference = false;
     this.over.on('prerender', (event) => this.#clip(event));
     this.over.on('postrender', (event) => { event.context.restore(); });
-    for (const pane of ['scene', 'reference']) {
-      const layers = [new ol.layer.Tile({ source: this.tiles[pane].source, extent })];
-      if (pane === 'scene') layers.push(this.over);
-      layers.push(new ol.layer.Vector({ source: this.marks[pane], updateWhileAnimating: true, updateWhileInteracting: true }));
-      const map = new ol.Map({ target: pane, view: this.view, controls: [], layers });
+    for (const pane of PANES) {
+      this.marks[pane] = new ol.source.Vector();
+      this.base[pane] = new ol.layer.Tile({});
+      const layers = [this.base[pane], ...(pane === 'scene' ? [this.over] : []),
+        new ol.layer.Vector({ source: this.marks[pane], updateWhileAnimating: true, updateWhileInteracting: true })];
+      const map = new ol.Map({ target: pane, controls: [], layers });
       map.on('click', (event) => {
         const hit = map.forEachFeatureAtPixel(event.pixel, (feature) => feature.getId() ?? null, { hitTolerance: 4 });
         document.getElementById(pane).focus();
-        clicked(pane, pixel(event.coordinate), hit ?? null);
+        told.clicked(pane, pixel(event.coordinate), hit ?? null);
       });
+      map.on('moveend', () => { if (pane === this.lead) this.relink(); });
       const drag = new ol.interaction.Translate({ filter: (feature) => feature.getId() !== undefined, hitTolerance: 4 });
-      drag.on('translateend', (event) => event.features.forEach((feature) => dragged(pane, feature.getId(), pixel(feature.getGeometry().getCoordinates()))));
+      drag.on('translateend', (event) => event.features.forEach((feature) => told.dragged(pane, feature.getId(), pixel(feature.getGeometry().getCoordinates()))));
       map.addInteraction(drag);
       this.maps[pane] = map;
+      this.loupes[pane] = new ol.Map({ target: `loupe-${pane}`, controls: [], interactions: [], layers: [new ol.layer.Tile({})] });
     }
-    this.loupes = {};
-    for (const pane of ['scene', 'reference']) {
-      const view = new ol.View({ projection, center: at([width / 2, height / 2]), resolution: 1 / 6, enableRotation: false });
-      this.loupes[pane] = new ol.Map({ target: `loupe-${pane}`, view, controls: [], interactions: [],
-        layers: [new ol.layer.Tile({ source: this.tiles[pane].source, extent })] });
+  }
+
+  /** What is shown in: pixels of an image or of a map, with the view that panes of this geometry share. */
+  #geometry(name) {
+    const [kind, number] = name.split('-');
+    return this.geometries[name] ??= (() => {
+      const [width, height] = (kind === 'map' ? this.facts.maps : this.facts.images)[number].size;
+      const extent = [0, -height, width, 0];
+      const projection = new ol.proj.Projection({ code: name, units: 'pixels', extent });
+      const view = new ol.View({ projection, center: [width / 2, -height / 2], minResolution: 1 / 32,
+        maxResolution: Math.max(width, height) / 250, resolution: 1, enableRotation: false, smoothExtentConstraint: false });
+      view.on('change', () => this.#moved(name));
+      // Vectors of residuals are as long on the screen at every zoom.
+      view.on('change:resolution', () => this.told.zoomed());
+      return { size: [width, height], extent, projection, view };
+    })();
+  }
+
+  /** Tiles of a view by its name. */
+  of(name) {
+    const { size, projection } = this.#geometry(geometryOf(name));
+    return this.tiles[name] ??= tiled(name, size, this.facts.tile, projection);
+  }
+
+  view(pane) { return this.#geometry(geometryOf(this.shows[pane])).view; }
+
+  /** Show a view in a pane. */
+  put(pane, name) {
+    const before = this.shows[pane];
+    this.shows[pane] = name;
+    const { extent, projection, view, size } = this.#geometry(geometryOf(name));
+    const source = this.of(name).source;
+    for (const layer of [this.base[pane], this.loupes[pane].getLayers().item(0)]) {
+      layer.setSource(source);
+      layer.setExtent(extent); // tiles reach beyond the scene, where the reference goes on
     }
+    if (pane === 'scene') this.over.setExtent(extent);
+    this.maps[pane].setView(view);
+    this.loupes[pane].setView(new ol.View({ projection, center: at([size[0] / 2, size[1] / 2]), resolution: 1 / 6, enableRotation: false }));
+    if (before === undefined) this.whole(pane);
+    // What was looked at stays in the other pane, and this one goes there.
+    this.lead = PANES.find((other) => other !== pane);
+    this.link = null;
+    if (this.shows[this.lead]) this.relink();
+  }
+
+  /** Whether both panes are in one geometry. */
+  get together() { return geometryOf(this.shows.scene) === geometryOf(this.shows.reference); }
+
+  /** Ask anew how the pane that leads lies in the other one, and let this one follow. */
+  async relink() {
+    const mine = (this.turn += 1);
+    if (this.together) { this.link = null; return; }
+    const { lead } = this;
+    const other = PANES.find((pane) => pane !== lead);
+    const from = this.middle(lead);
+    const found = await this.told.linked(this.shows[lead], this.shows[other], from);
+    if (mine !== this.turn) return;
+    this.link = found?.place ? { lead, from, to: found.place, matrix: found.matrix } : null;
+    this.#follow();
+  }
+
+  /** A view was moved, by a person or by what follows. */
+  #moved(geometry) {
+    if (this.following || !this.shows.reference || this.together) return;
+    const pane = PANES.find((one) => geometryOf(this.shows[one]) === geometry);
+    if (!pane) return;
+    if (this.lead !== pane) {
+      this.lead = pane;
+      if (this.link) {
+        const [[a, b], [c, d]] = this.link.matrix;
+        const size = a * d - b * c;
+        this.link = { lead: pane, from: this.link.to, to: this.link.from, matrix: [[d / size, -b / size], [-c / size, a / size]] };
+      }
+    }
+    this.#follow();
+  }
+
+  #follow() {
+    if (!this.link) return;
+    const { lead, from, to, matrix: [[a, b], [c, d]] } = this.link;
+    const follower = this.view(PANES.find((pane) => pane !== lead));
+    const [column, row] = this.middle(lead).map((value, axis) => value - from[axis]);
+    this.following = true;
+    follower.setResolution(this.view(lead).getResolution() * Math.sqrt(Math.abs(a * d - b * c)));
+    follower.setCenter(at([to[0] + a * column + b * row, to[1] + c * column + d * row]));
+    this.following = false;
   }
 
   #clip(event) {
@@ -92,28 +188,33 @@ export class Views {
     if (this.difference) context.globalCompositeOperation = 'difference';
   }
 
-  /** Show the reference in the scene's own pane: as a whole, right of a handle, or as a difference. */
-  compare({ flicker, swipe, difference }) {
+  /** Show a view of the same geometry in the scene's own pane: as a whole, right of a handle, or as a difference. */
+  compare(name, { flicker, swipe, difference }) {
     this.swipe = flicker || difference ? 0 : swipe;
     this.difference = difference;
-    this.over.setVisible(flicker || difference || swipe > 0);
+    if (name) this.over.setSource(this.of(name).source);
+    this.over.setVisible(Boolean(name) && (flicker || difference || swipe > 0));
     this.maps.scene.render();
   }
 
-  /** Draw marks with their residuals, the point under way, and the next place. */
-  draw(marks, selected, pending, next) {
-    for (const pane of ['scene', 'reference']) {
+  /**
+   * Draw marks with their residuals, the point under way, and the next place.
+   * @param {(mark: object, name: string) => {place: number[]|null, residual?: number[]|null}} placed where a mark is in a view
+   */
+  draw(marks, selected, pending, next, placed) {
+    for (const pane of PANES) {
+      const name = this.shows[pane];
       const source = this.marks[pane];
       source.clear(true);
       const features = [];
-      const extent = Math.max(...marks.filter((mark) => mark.residual).map((mark) => Math.hypot(...mark.residual)), 0);
-      for (const mark of marks) {
-        const place = pane === 'scene' ? mark.image : mark.shown;
+      const all = marks.map((mark) => [mark, placed(mark, name)]);
+      const extent = Math.max(...all.map(([, { residual }]) => (residual ? Math.hypot(...residual) : 0)), 0);
+      for (const [mark, { place, residual }] of all) {
         if (!place) continue;
-        if (pane === 'scene' && mark.residual && extent > 0) {
+        if (residual && extent > 0) {
           // The longest vector is as long as 60 px of the screen.
-          const scale = 60 / extent * this.view.getResolution();
-          const end = [place[0] + mark.residual[0] * scale, place[1] + mark.residual[1] * scale];
+          const scale = 60 / extent * this.view(pane).getResolution();
+          const end = [place[0] + residual[0] * scale, place[1] + residual[1] * scale];
           const vector = new ol.Feature(new ol.geom.LineString([at(place), at(end)]));
           vector.setStyle([line('#000', 4), line(mark.suspicious ? '#ff3b1f' : '#ffe600', 2)]);
           features.push(vector);
@@ -123,27 +224,34 @@ export class Views {
         feature.setStyle(symbol(mark, mark.id === selected));
         features.push(feature);
       }
-      const place = pending && (pane === 'scene' ? pending.image : pending.shown);
+      const { place } = pending ? placed(pending, name) : { place: null };
       if (place) { const feature = new ol.Feature(new ol.geom.Point(at(place))); feature.setStyle(CROSS); features.push(feature); }
-      if (next) { const feature = new ol.Feature(new ol.geom.Point(at(next.image))); feature.setStyle(NEXT); features.push(feature); }
+      const ahead = next?.places[name];
+      if (ahead) { const feature = new ol.Feature(new ol.geom.Point(at(ahead))); feature.setStyle(NEXT); features.push(feature); }
       source.addFeatures(features);
       if (place) this.loupes[pane].getView().setCenter(at(place));
     }
   }
 
-  middle() { return pixel(this.view.getCenter()); }
+  /** What is in the middle of a pane. */
+  middle(pane) { return pixel(this.view(pane).getCenter()); }
 
-  goTo(place, resolution) {
-    this.view.setCenter(at(place));
-    if (resolution && this.view.getResolution() > resolution) this.view.setResolution(resolution);
+  /** Go to a place in whichever pane shows it; the other one follows. */
+  goTo(places, resolution) {
+    const pane = PANES.find((one) => places[this.shows[one]]);
+    if (!pane) return;
+    this.lead = pane;
+    const view = this.view(pane);
+    view.setCenter(at(places[this.shows[pane]]));
+    if (resolution && view.getResolution() > resolution) view.setResolution(resolution);
   }
 
-  /** Show the whole scene. */
-  whole(size) { this.view.fit([0, -size[1], size[0], 0], { size: this.maps.scene.getSize() }); }
+  /** Show the whole of a pane's view. */
+  whole(pane) { this.view(pane).fit(this.#geometry(geometryOf(this.shows[pane])).extent, { size: this.maps[pane].getSize() }); }
 
-  /** What is seen of the scene: left, top, right, bottom. */
-  box() {
-    const [left, low, right, high] = this.view.calculateExtent(this.maps.scene.getSize());
+  /** What is seen in a pane: left, top, right, bottom. */
+  box(pane) {
+    const [left, low, right, high] = this.view(pane).calculateExtent(this.maps[pane].getSize());
     return [left, -high, right, -low];
   }
 }
