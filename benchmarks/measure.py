@@ -20,8 +20,8 @@ from osgeo import gdal, osr
 
 from ortho_pipeline.exchange.rpc import write_rpc_txt
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
+from ortho_pipeline.measure.serving.tiles import Tiles
 from ortho_pipeline.measure.session import open_session
-from ortho_pipeline.measure.tiles import Tiles
 from ortho_pipeline.options import MatchOptions, SurfaceOptions
 from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.surface.writing import write_dem

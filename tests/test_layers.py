@@ -153,7 +153,7 @@ def test_heavy_libraries_stay_where_they_belong(path: Path) -> None:
         if library == "numba":
             assert name in NUMBA_MODULES, f"{name} imports numba"
         if library in ("starlette", "uvicorn"):
-            assert name == "measure.server", f"{name} imports {library}: the page is served by measure/server.py"
+            assert name == "measure.serving.server", f"{name} imports {library}: only measure/serving/server.py does"
             assert not at_top, f"{name}: {library} is an extra, and only loaded inside functions"
         if library == "jinja2":
             assert name == "display.pages", f"{name} imports jinja2: pages are rendered by display/pages.py"

@@ -53,7 +53,7 @@ def measure(
     if missing:
         raise InputError(f"measuring in the browser needs {' and '.join(missing)}",
                          remedy='pip install "ortho-pipeline[measure]"')  # fmt: skip
-    from ortho_pipeline.measure.server import serve
+    from ortho_pipeline.measure.serving.server import serve
 
     session = open_session(
         image, output or f"{Path(image).stem}_points.geojson", scene=scene, points=points, surface=surface, match=match

@@ -18,8 +18,8 @@ from ortho_pipeline.options import MatchOptions, PointOptions, SurfaceOptions
 pytest.importorskip("starlette", reason="the extra 'measure' is not installed")
 from starlette.testclient import TestClient
 
-from ortho_pipeline.measure.guard import MAX_BODY, REPORT_POLICY
-from ortho_pipeline.measure.server import PAGE, application
+from ortho_pipeline.measure.serving.guard import MAX_BODY, REPORT_POLICY
+from ortho_pipeline.measure.serving.server import PAGE, application
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 TOKEN, HOST, WINDOW = "a-token-of-tests", "127.0.0.1:4321", "window-one"

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any
 
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import parse_json
-from ortho_pipeline.measure.guard import REPORT_POLICY, App, Guard
-from ortho_pipeline.measure.making import PICTURES, Making
+from ortho_pipeline.measure.serving.guard import REPORT_POLICY, App, Guard
+from ortho_pipeline.measure.serving.making import PICTURES, Making
+from ortho_pipeline.measure.serving.tiles import MOST, SIDE, Tiles
 from ortho_pipeline.measure.session import Session
-from ortho_pipeline.measure.tiles import MOST, SIDE, Tiles
 from ortho_pipeline.options import CORRECTIONS, OutputOptions, SceneOptions
 from ortho_pipeline.raster.block_cache import limit_cache
 
