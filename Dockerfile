@@ -11,7 +11,7 @@ FROM python:3.13-slim
 RUN useradd --create-home --uid 10001 ortho && mkdir /cache /work /opt/numba && chown ortho:ortho /cache /work /opt/numba
 COPY --from=build /opt/ortho /opt/ortho
 ENV PATH=/opt/ortho/bin:$PATH ORTHO_CACHE=/cache/ortho NUMBA_CACHE_DIR=/opt/numba PYTHONUNBUFFERED=1
-USER ortho
+USER 10001
 WORKDIR /work
 # Compiled code of the usual job is in the image: a new container does not compile.
 COPY --chown=ortho:ortho sample_data/scene.tif /tmp/sample/

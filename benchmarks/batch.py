@@ -1,6 +1,7 @@
 """How long many small scenes take: a plain loop, `ortho run` in one process, in two, and on two dask workers.
 
     python benchmarks/batch.py [--scenes 200] [--repeat 3] [--quiet SECONDS] [--json FILE]
+    python benchmarks/batch.py --dask [--scenes 600] [--repeat 3]      the CPU of dask beside that of the loop, in pairs
 
 The scenes are windows of sample_data/scene.tif with the RPC moved along, so that each is a scene of its own. Every way
 starts with an empty output folder; the time is that of the whole call, the start of the processes included. A run that
@@ -184,6 +185,17 @@ def measure(folder: Path, few: Path, scenes: int, repeat: int, quiet: float) -> 
     }
 
 
+def dask_overhead(folder: Path, few: Path, repeat: int) -> None:
+    """Print how much CPU two dask workers take beside the plain loop, in pairs."""
+    timed(few, loop)
+    ratios = []
+    for _ in range(repeat):
+        plain, spread = timed(folder, loop), timed_on_dask(folder, few)
+        ratios.append(spread["cpu"] / plain["cpu"])
+        print(f"loop {plain['cpu']:.1f} s CPU, dask {spread['cpu']:.1f} s, ratio {ratios[-1]:.3f}", flush=True)
+    print(f"median {statistics.median(ratios):.3f}")
+
+
 def main() -> None:
     """Measure, print, and write the numbers."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -191,11 +203,14 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--quiet", type=float, default=0.0)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--dask", action="store_true")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder, few = Path(name) / "all", Path(name) / "few"
         make_scenes(folder, given.scenes)
         make_scenes(few, 4)
+        if given.dask:
+            return dask_overhead(folder, few, given.repeat)
         found = measure(folder, few, given.scenes, given.repeat, given.quiet)
         found["killed_and_resumed"] = killed_and_resumed(folder, given.scenes)
     if given.json:
@@ -209,6 +224,7 @@ def main() -> None:
           f"{found['overhead_wall_ms_per_scene']:.1f} ms wall")  # fmt: skip
     print(f"a scene that is there:       {found['unchanged_ms_per_scene']:.2f} ms")
     print(f"killed and resumed:          {found['killed_and_resumed']}")
+    return None
 
 
 if __name__ == "__main__":

@@ -105,7 +105,7 @@ class PublicFolder:
 
 
 @contextmanager
-def _running(served: Any) -> Iterator[Any]:
+def running(served: Any) -> Iterator[Any]:
     """Let an object answer requests on the loopback for the length of a block."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
@@ -148,7 +148,7 @@ def _content_of(path: Path, _: int) -> tuple[bytes, str]:
 @contextmanager
 def serving(folder: Path, delay: float = 0.0) -> Iterator[PublicFolder]:
     """Serve a folder on the loopback for the length of a block."""
-    with _running(PublicFolder(folder, delay)) as public:
+    with running(PublicFolder(folder, delay)) as public:
         yield public
 
 
@@ -240,7 +240,7 @@ class FaultyWay:
 @contextmanager
 def on_a_faulty_way(target: tuple[str, int], seed: int, share: float = 0.3) -> Iterator[FaultyWay]:
     """Run a `FaultyWay` for the length of a block."""
-    with _running(FaultyWay(target, seed, share)) as way:
+    with running(FaultyWay(target, seed, share)) as way:
         yield way
 
 

@@ -49,6 +49,9 @@ def is_address(text: str | os.PathLike[str]) -> bool:
     return bool(_ADDRESS.match(os.fspath(text)))
 
 
+_OTHER_TAG = "the checksum is not the one that the store states"
+
+
 @dataclass(frozen=True)
 class Content:
     """What an object was when it was written or read: its size, checksums, and the store's name of this version.
@@ -86,6 +89,7 @@ class Objects:
             )
         self.address = address.rstrip("/")
         self._store = _store_of(self.address)
+        self._encrypts = self.address.startswith("s3://")
 
     def __repr__(self) -> str:
         return f"Objects({self.address!r})"
@@ -123,7 +127,7 @@ class Objects:
         return self._attempts(name, limit, write)[1]
 
     def _attempts(self, name: str, limit: int, take: Any) -> tuple[Any, Content]:
-        wrong = ""
+        wrong, before = "", None
         for _ in range(_ATTEMPTS):
             with self._errors(name):
                 result = self._store.get(name)
@@ -137,8 +141,10 @@ class Objects:
                 content = digests.content(result.meta["e_tag"])
                 count(content.size)
                 wrong = _difference(content, result.meta)
-            if not wrong:
+            # The ETag of what S3 encrypts with keys of its own is no checksum: the same twice is what is there.
+            if not wrong or (wrong == _OTHER_TAG and self._encrypts and content == before):
                 return taken, content
+            before = content
         raise StorageError(
             f"{wrong}, {_ATTEMPTS} times", file=self.of(name),
             remedy="try again later; if it stays so, the object is damaged in its store",
@@ -186,13 +192,22 @@ class Objects:
             with self._errors(name):
                 self._store.put(name, data, chunk_size=PART, max_concurrency=4)
                 stored = self._store.head(name)
-            if not (wrong := _difference(content, stored, ours=True)):
+            wrong = _difference(content, stored, ours=True)
+            if not wrong or (wrong == _OTHER_TAG and self._encrypts and self._is_there(name, content)):
                 return replace(content, e_tag=stored["e_tag"])
         self.delete(name)
         raise StorageError(
             f"{wrong} after it was written, {_ATTEMPTS} times; it was removed", file=self.of(name),
             remedy="try again; if it stays so, check the store and the way to it",
         )  # fmt: skip
+
+    def _is_there(self, name: str, content: Content) -> bool:
+        """Tell whether an object has a content, by reading it: where the store's ETag is no checksum."""
+        digests = _Digests()
+        with self._errors(name):
+            for _ in digests.through(self._store.get(name).stream(min_chunk_size=_CHUNK), content.size):
+                pass
+        return digests.content(None).sha256 == content.sha256
 
     def _put_if(self, name: str, data: bytes | Path, content: Content, mode: Any) -> Content:
         """Store an object on a condition.
@@ -316,7 +331,7 @@ def _difference(content: Content, stated: Mapping[str, Any], *, ours: bool = Fal
     tag = _TAG.fullmatch(stated["e_tag"] or "")
     if tag is None or tag[1] in content.tags or (tag[2] and not ours):
         return ""
-    return "the checksum is not the one that the store states"
+    return _OTHER_TAG
 
 
 def _status(error: Exception) -> str:
