@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
 from collections.abc import Iterator
@@ -53,6 +54,28 @@ def test_every_command_has_an_example_in_its_help():
         assert typed or f"ortho {words}\n" in text, words
         for line in typed:
             command.make_context(words, shlex.split(line)[1 + len(words.split()) :], resilient_parsing=False)
+
+
+def test_every_yes_of_ours_is_a_command_that_is_run():
+    """Of the table beside other programs: each command, with its options, stands in a tutorial or an example."""
+    from sessions import steps
+
+    run = [shlex.split(line) for words, line in LINES if words not in SERVES]
+    for page in (ROOT / "docs" / "tutorials").glob("*.md"):
+        run += [shlex.split(step.command) for step in steps(page) if step.command.startswith("ortho ")]
+    table = (ROOT / "docs" / "comparison.md").read_text(encoding="utf-8").partition("## Whom")[0]
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines() if line.startswith("| ")]
+    assert len(rows) > 20
+    assert all(len(row) == 6 for row in rows)
+    ours = [row[1] for row in rows if row[1].startswith("yes")]
+    assert len(ours) > 10
+    for cell in ours:
+        shown = re.findall(r"`(ortho [^`]+)`", cell)
+        linked = re.findall(r"\]\(([^)]+)\)", cell)
+        assert shown or linked, cell
+        for command in shown:
+            words = set(shlex.split(command))
+            assert any(words <= set(line) for line in run), command
 
 
 @pytest.fixture
