@@ -5,8 +5,6 @@
     python benchmarks/warp.py --kernels        by kernel, number of bands and sensor model
     python benchmarks/warp.py --layers         what layers beside the ortho cost, as shares of the warp alone
     python benchmarks/warp.py --accuracy       every output pixel of a ramp against an independent exact evaluation
-    python benchmarks/warp.py --against DIR    the warp alone and the whole job, in pairs with another checkout
-                                               (of any time after it got this option), and the first run, which compiles
 
 Every figure is of a whole process: wall time, CPU time, peak memory. Outputs are uncompressed tiled GeoTIFFs. What
 machines do at one moment differs from the next, so programs take turns and only ratios within a round count.
@@ -15,7 +13,6 @@ machines do at one moment differs from the next, so programs take turns and only
 from __future__ import annotations
 
 import argparse
-import ast
 import json
 import os
 import platform
@@ -324,74 +321,6 @@ def alone(job: Job, model: SensorModel | None = None, kernel: str = "bilinear") 
     return result.seconds
 
 
-WARP_CPU = """
-import sys, time, pyproj
-from pathlib import Path
-from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
-from ortho_pipeline.exchange.rpc import rpc_of_dataset
-from ortho_pipeline.warp.engine import rectify
-image, dem, out, step, *extent = sys.argv[1:]
-grid = Grid.of_extent(pyproj.CRS("EPSG:32735"), [float(value) for value in extent], (float(step), float(step)))
-model = rpc_of_dataset(open_dataset(image))[0]
-for name in ("warm", "counted"):
-    begin = time.process_time()
-    rectify(model, RasterSource(image), Surface.open(dem, "ellipsoid"), grid, out, driver="GTiff")
-    Path(out).unlink()
-print(time.process_time() - begin)
-"""
-
-
-def code_of(home: Path) -> str:
-    """Return `WARP_CPU` of a checkout: each knows the names of its own modules."""
-    tree = ast.parse((home / "benchmarks/warp.py").read_text(encoding="utf-8"))
-    (value,) = [
-        node.value for node in tree.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "WARP_CPU"
-    ]
-    return str(ast.literal_eval(value))
-
-
-def against(job: Job, other: Path, pairs: int) -> dict[str, list[tuple[float, float]]]:
-    """Alternate this checkout and another one: CPU seconds (here, there) of the warp, the whole job, a first run."""
-    homes = (Path(__file__).resolve().parents[1], other.resolve())
-    places = [{**os.environ, "PYTHONPATH": os.pathsep.join((str(home), str(home / "plugins")))} for home in homes]
-    codes = [code_of(home) for home in homes]
-
-    def warp(which: int) -> float:
-        command = [sys.executable, "-c", codes[which], *api(job, job.folder / "warp.tif")[3:]]
-        return float(subprocess.run(command, env=places[which], cwd=job.folder, check=True, capture_output=True).stdout)
-
-    def whole(which: int) -> float:
-        # Not in the folder of this checkout: with `-m`, what lies there goes before PYTHONPATH.
-        return measure(ours(job, job.folder / "ours"), places[which], job.folder).cpu
-
-    def first(which: int) -> float:
-        with tempfile.TemporaryDirectory() as cache:
-            empty = {**places[which], "NUMBA_CACHE_DIR": cache}
-            return measure(ours(job, job.folder / "ours"), empty, job.folder).cpu
-
-    found: dict[str, list[tuple[float, float]]] = {}
-    todo = (("the warp alone", warp, pairs), ("the whole job", whole, pairs), ("the first run", first, min(pairs, 5)))
-    for name, run, count in todo:
-        for which in (0, 1) if run is not first else ():
-            run(which)
-        found[name] = []
-        for number in range(count):
-            order = (0, 1) if number % 2 else (1, 0)
-            seconds = {which: run(which) for which in order}
-            found[name].append((seconds[0], seconds[1]))
-        ratios = sorted(here / there for here, there in found[name])
-        # Order statistics: this interval holds the median of such ratios in 95 of 100 cases.
-        rank = max(0, int((count - 1.96 * count**0.5) / 2))
-        here, there = (statistics.median(values) for values in zip(*found[name], strict=True))
-        print(
-            f"{name:15s} {here:6.2f} s of CPU here, {there:6.2f} s there; {count} pairs: "
-            f"{statistics.median(ratios):.3f} ({ratios[rank]:.3f}-{ratios[-1 - rank]:.3f})",
-            flush=True,
-        )
-    return found
-
-
 def scaling(folder: Path) -> dict[str, list[Run]]:
     """From 1000² to 24000² source pixels; the largest source is sparse."""
     runs: dict[str, list[Run]] = {}
@@ -549,8 +478,7 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=12000)
     parser.add_argument("--folder", type=Path, help="where scenes are kept between runs (default: a temporary one)")
     parser.add_argument("--json", type=Path, help="write all runs there")
-    parser.add_argument("--against", type=Path, metavar="DIR", help="another checkout of this project")
-    parser.add_argument("--pairs", type=int, default=20, help="of runs, with --against")
+    parser.add_argument("--pairs", type=int, default=5, help="of runs, with --layers")
     for option in ("scaling", "kernels", "accuracy", "layers"):
         parser.add_argument(f"--{option}", action="store_true")
     arguments = parser.parse_args()
@@ -563,9 +491,7 @@ def main() -> None:
         elif arguments.kernels:
             document["kernels"] = {name: [asdict(run) for run in runs] for name, runs in kernels(folder).items()}
         elif arguments.layers:
-            document["layers"] = layers(Job(folder, arguments.side).make(), min(arguments.pairs, 5))
-        elif arguments.against:
-            document["against"] = against(Job(folder, arguments.side).make(), arguments.against, arguments.pairs)
+            document["layers"] = layers(Job(folder, arguments.side).make(), arguments.pairs)
         elif arguments.accuracy:
             document["accuracy"] = accuracy(folder, arguments.side)
         else:
