@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 
 from ortho_pipeline.commands.control.matching import Matched
 from ortho_pipeline.display import notebook
@@ -158,18 +158,32 @@ def outputs_together(command: Callable[_P, _R]) -> Callable[_P, _R]:
         if bound.get("folder") is None:
             return command(*given, **named)
         if address_of(bound["folder"]) is not None:
-            return _to_store(wrapper, signature.bind(*given, **named))
+            name = Path(next(iter(bound.values()))).stem
+            return _to_store(wrapper, signature.bind(*given, **named), name)
         with together(bound["folder"], Path(next(iter(bound.values()))).stem):
             return command(*given, **named)
 
     return wrapper
 
 
-def _to_store(command: Callable[..., Any], bound: inspect.BoundArguments) -> Any:
+def block_to_store(command: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Let the outputs of a command on many images (`folder`) go to a store of objects too."""
+    signature = inspect.signature(command)
+
+    @functools.wraps(command)
+    def wrapper(*given: _P.args, **named: _P.kwargs) -> _R:
+        bound = signature.bind(*given, **named)
+        if address_of(bound.arguments["folder"]) is None:
+            return command(*given, **named)
+        return cast(_R, _to_store(command, bound, "block"))
+
+    return wrapper
+
+
+def _to_store(command: Callable[..., Any], bound: inspect.BoundArguments, name: str) -> Any:
     """Run a command in a folder of this machine, upload what it wrote, and return its result with the addresses."""
     address = str(bound.arguments["folder"]).rstrip("/")
     allowed = bound.arguments.get("scene", SceneOptions()).allow_network
-    name = Path(next(iter(bound.arguments.values()))).stem
     with delivered(address, name, allow_network=allowed, keep=_goes_along) as folder:
         bound.arguments["folder"] = folder
         result = command(*bound.args, **bound.kwargs)

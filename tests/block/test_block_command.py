@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from osgeo import gdal
+from servers import moto_server
 
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.block.points import BlockPoints
@@ -18,6 +19,7 @@ from ortho_pipeline.commands.block_images import labels_of, points_of_images
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.exchange.rpc import export_rpc, read_rpc, rpc_metadata
+from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.models import RPC
 from ortho_pipeline.simulation.scanner import LineScanner
 
@@ -160,6 +162,24 @@ def test_written_points_are_read_as_ground_again(stereo: Stereo, tmp_path: Path)
     np.testing.assert_allclose(first["geometry"]["coordinates"], stereo.ground[0], rtol=0, atol=2.0)
     wide = read_block_points(points_without_ground(points), gcps=out / "block_points.geojson")
     np.testing.assert_allclose(wide.ground, again.ground, atol=1e-9)
+
+
+def test_what_adjust_writes_goes_to_a_store(stereo: Stereo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with moto_server("blocks") as (host, port):
+        at = {"AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_REGION": "us-east-1"}
+        for name, value in (at | dict.fromkeys(("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"), "test")).items():
+            monkeypatch.setenv(name, value)
+        args = ("adjust", *stereo.images, "--points", stereo.write(), "--json", "-o")
+        assert "--allow-network" in json.loads(run(*args, "s3://blocks/out", code=2))["error"]["remedy"]
+        there = json.loads(run(*args, "s3://blocks/out", "--allow-network"))
+        here = json.loads(run(*args, tmp_path / "out"))
+        store = Objects("s3://blocks/out", allow_network=True)
+        listed = {one["name"] for one in json.loads(store.read("block_delivery.json", 1 << 20)[0])["files"]}
+        assert {name for name, _ in store.names()} == listed | {"block_delivery.json"}
+        assert {Path(path).name for path in there["files"].values()} == listed
+        assert there["files"] == {
+            kind: path.replace(str(tmp_path), "s3://blocks") for kind, path in here["files"].items()
+        }
 
 
 def test_an_adjustment_starts_from_saved_models(stereo: Stereo, tmp_path: Path) -> None:
