@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -50,6 +50,17 @@ class Linear:
         scale = np.sqrt(weights.ground_weights[rows])[:, None] / problem.ground_sigmas[rows]
         ground_by_point[rows] = problem.enu[rows] * scale[:, :, None]
         return cls(problem, state, ordering, weights, misfits, by_params, by_point, ground_by_point, pseudo)
+
+    def reweighted(self, weights: Selection) -> Linear:
+        """Return these equations with other weights of what takes part."""
+        of_rays = np.sqrt(weights.ray_weights / self.weights.ray_weights)
+        of_ground = np.sqrt(weights.ground_weights / self.weights.ground_weights)
+        misfits, each = self.misfits, (slice(None), None, None)
+        return replace(
+            self, weights=weights, by_params=self.by_params * of_rays[each], by_point=self.by_point * of_rays[each],
+            misfits=replace(misfits, rays=misfits.rays * of_rays[:, None], ground=misfits.ground * of_ground[:, None]),
+            ground_by_point=self.ground_by_point * of_ground[each],
+        )  # fmt: skip
 
     @property
     def pseudo_design(self) -> Array:

@@ -141,12 +141,11 @@ def attempt(problem: BlockProblem, start: State, selection: Selection) -> Solved
         If nothing can be computed at the start.
     """
     ordering = problem.ordering(selection)
-    state, damping, steps, held = start, 0.0, Steps(), None
-    square = problem.misfits(state, ordering, selection).square
-    if not math.isfinite(square):
+    damping, steps, held = 0.0, Steps(), None
+    linear = Linear.at(problem, start, selection, ordering)
+    if not math.isfinite(square := linear.misfits.square):
         raise NotConverged("the start values put points outside of the models", remedy="give better start values")
     for iteration in range(1, _STEPS + 1):
-        linear = Linear.at(problem, state, selection, ordering)
         step = step_of(linear, damping)
         if not step.finite or (iteration == 1 and step.condition > CONDITION_LIMIT):
             # In a valley without a bottom the iteration would only wander: the caller says what is undetermined.
@@ -166,10 +165,9 @@ def attempt(problem: BlockProblem, start: State, selection: Selection) -> Solved
                 steps = Steps()
             else:
                 steps.made(change, whole, ahead.move)
-            state, square, before_that, held = ahead.state, ahead.square, held, ahead.held
+            linear, square, before_that, held = ahead.linear, ahead.square, held, ahead.held
             if held is not None and before_that is not None and (held & before_that).any():
                 # The step reckons with them where they cannot go: the others have to be solved for without them.
-                linear = Linear.at(problem, state, selection, ordering)
                 return Solved(linear, step_of(linear), iteration, astray=held & before_that)
             damping = damping / 10 if damping > 1e-6 else 0.0
             continue
@@ -195,30 +193,29 @@ def _change(step: Step, held: Mask | None) -> Array:
     return change.vector
 
 
-def once(problem: BlockProblem, state: State, selection: Selection) -> tuple[Solved, State]:
-    """Return one step's solution, with the misfits that it leaves to first order, and the state after it.
+def once(linear: Linear) -> tuple[Solved, Linear]:
+    """Return one step's solution, with the misfits that it leaves to first order, and the equations after it.
 
     Points that it leads out of the models stay where they were.
     """
-    linear = Linear.at(problem, state, selection)
     step = step_of(linear)
     left = replace(linear, misfits=linear.misfits.minus(step.change))
     ahead = _moved(linear, step.whole)
-    return Solved(left, step), state if ahead is None else ahead.state
+    return Solved(left, step), linear if ahead is None else ahead.linear
 
 
 @dataclass(frozen=True, eq=False)
 class _Ahead:
-    """A state with smaller squares, the move that led there, and the points ``(N,)`` that were held, if any."""
+    """The equations after a move, the sum of their squares, and the points ``(N,)`` that were held, if any."""
 
-    state: State
+    linear: Linear
     square: float
     move: Array
     held: Mask | None
 
 
 def _descent(linear: Linear, whole: Array, further: Array | None, square: float) -> _Ahead | None:
-    """Return the state after a move that descends: further than the step, the step, or a part of it."""
+    """Return the equations after a move that descends: further than the step, the step, or a part of it."""
     moves = [] if further is None else [further]
     for move in (*moves, *(whole / 2.0**k for k in range(10))):
         ahead = _moved(linear, move)
@@ -229,7 +226,7 @@ def _descent(linear: Linear, whole: Array, further: Array | None, square: float)
 
 
 def _moved(linear: Linear, move: Array) -> _Ahead | None:
-    """Return the state after a move; points that it leads out of their models stay where they are.
+    """Return the equations after a move; points that it leads out of their models stay where they are.
 
     A gross error sends a point whose rays are nearly parallel kilometres up or down. Nothing is known of it there, and
     it must not keep all others from where they belong.
@@ -238,13 +235,13 @@ def _moved(linear: Linear, move: Array) -> _Ahead | None:
     for _ in range(2):
         try:
             ahead = state.moved(move[: problem.size], move[problem.size :].reshape(-1, 3))
-            misfits = problem.misfits(ahead, linear.ordering, linear.weights)
+            made = Linear.at(problem, ahead, linear.weights, linear.ordering)
         except InputError:  # a correction that cannot be inverted
             return None
-        if math.isfinite(misfits.square):
-            return _Ahead(ahead, misfits.square, move, held)
+        if math.isfinite(square := made.misfits.square):
+            return _Ahead(made, square, move, held)
         held = np.zeros(len(problem.points), dtype=bool)
-        held[problem.points.point[~np.isfinite(misfits.rays).all(axis=1)]] = True
+        held[problem.points.point[~np.isfinite(made.misfits.rays).all(axis=1)]] = True
         move = move.copy()
         move[problem.size :].reshape(-1, 3)[held] = 0.0
     return None

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Selection
 from ortho_pipeline.block.equations.solver import Solved, attempt, once, solve_inside
 from ortho_pipeline.block.equations.unknowns import Mask
@@ -123,17 +124,19 @@ def _robust(
     Sigmas of measurements are often guessed. Were good ground judged by how much better than that the images agree with
     each other, it would look wrong.
     """
-    problem, state = solved.problem, solved.state
+    problem, linear = solved.problem, solved.linear
     estimated = variances.of_ground(problem)
     for weigh in (_huber, _geman_mcclure):
         before = np.zeros(problem.points.rays)
+        if linear.problem is not problem:
+            linear = Linear.at(problem, linear.state, linear.weights)
         for _ in range(_ROBUST_ROUNDS):
             rays, ground = tests.sizes(estimated)
             weights = replace(selection, ray_weights=weigh(rays), ground_weights=weigh(ground))
-            found, ahead = once(problem, state, weights)
+            found, ahead = once(linear.reweighted(weights))
             if not np.isfinite(found.linear.misfits.rays).all():
-                return problem, replace(solved, linear=replace(solved.linear, state=state))
-            solved, state = found, ahead
+                return problem, replace(solved, linear=replace(solved.linear, state=linear.state))
+            solved, linear = found, ahead
             tests = standardise(solved)
             if np.abs(weights.ray_weights - before).mean() < _SETTLED:
                 break
@@ -144,7 +147,7 @@ def _robust(
             scale = tests.scale_of_ground(estimated) if estimated.any() else 1.0
             assumed = (problem.assumed[0] * scale, problem.assumed[1] * scale)
             problem = replace(problem, points=replace(points, sigma_image=sigma_image), assumed=assumed)
-    return problem, replace(solved, linear=replace(solved.linear, state=state))
+    return problem, replace(solved, linear=replace(solved.linear, state=linear.state))
 
 
 def _huber(size: Array) -> Array:

@@ -17,6 +17,7 @@ from ortho_pipeline.block.equations.problem import Selection
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.intersection import PARALLEL
+from ortho_pipeline.block.points import Index
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.estimation.blunders import BLUNDER_RISK
 from ortho_pipeline.models.base import Array
@@ -24,6 +25,7 @@ from ortho_pipeline.models.base import Array
 #: The chance at which a good part is rejected, for ground whose sigma is estimated: few points never reach a smaller
 #: one, and a gross error that stays does more harm than a good point that goes.
 _GROUND_RISK = 0.01
+_EPSILON = float(np.finfo(float).eps)
 #: The part of a suspect that is its known ground; the others are its rays, counted from 0.
 _GROUND = -1
 
@@ -71,13 +73,18 @@ def judge(trusted: Trusted, selection: Selection, suspects: Mask) -> tuple[Selec
     for rows in eliminate(linear):
         suspect = _Suspects(rows, solved.cofactors)
         agree, agree_without = limits.verdicts(suspect, estimated[rows.chunk.points])
-        for k in np.flatnonzero(~agree).tolist():
-            culprits = [part for part in suspect.parts if agree_without[part][k]]
-            number = int(rows.chunk.points[k])
-            rejected[number] = suspect.rejected(k, culprits)
-            bad = culprits if len(culprits) == 1 else list(suspect.parts)
-            rays[[rows.chunk.rays[k, part] for part in bad if part != _GROUND]] = False
-            ground[number] &= _GROUND not in bad
+        bad = np.flatnonzero(~agree)
+        possible = np.array([agree_without[part][bad] for part in suspect.parts])
+        only = np.where(possible.sum(axis=0) == 1, possible.argmax(axis=0), len(suspect.parts))
+        for place, culprit in enumerate((*suspect.parts, None)):
+            if not len(of := bad[only == place]):
+                continue
+            for k, size in zip(of.tolist(), suspect.sizes(of, culprit).tolist(), strict=True):
+                number = int(rows.chunk.points[k])
+                rejected[number] = suspect.rejected(k, culprit, size)
+                ground[number] &= culprit not in (_GROUND, None)
+            if culprit != _GROUND:
+                rays[rows.chunk.rays[of] if culprit is None else rows.chunk.rays[of, culprit]] = False
     return Selection.of(rays, ground), rejected
 
 
@@ -188,31 +195,41 @@ class _Suspects:
     def _all_but(self, without: int | None) -> np.ndarray:
         return np.concatenate([part for name, part in self.parts.items() if name != without])
 
-    def rejected(self, k: int, culprits: list[int]) -> Rejected:
-        """Return what is said of a point when it is these parts, each by itself, that could be wrong."""
+    def sizes(self, of: Index, culprit: int | None) -> Array:
+        """Return how far one part of some points is from where the others put it; all from each other if that is None.
+
+        In metres for known ground, in pixels for rays.
+        """
+        points, chunk = self.problem.points, self.rows.chunk
+        apart = self._apart(of, culprit)
+        if culprit is None:
+            rays = chunk.rays[of]
+            missed = points.in_pixels(apart[:, : 2 * rays.shape[1]].reshape(-1, 2), rays.ravel())
+            return np.asarray(np.abs(missed).reshape(len(of), -1).max(axis=1))
+        apart = apart[:, self.parts[culprit]]
+        if culprit == _GROUND:
+            sigmas = self.problem.ground_sigmas[chunk.points[of]]
+            known = np.isfinite(sigmas)
+            return np.asarray(np.linalg.norm(np.where(known, apart * np.where(known, sigmas, 0.0), 0.0), axis=1))
+        return np.asarray(np.linalg.norm(points.in_pixels(apart, chunk.rays[of, culprit]), axis=1))
+
+    def rejected(self, k: int, culprit: int | None, size: float) -> Rejected:
+        """Return what is said of a point when a part of it, or an unknown one, is so far off."""
         points, chunk = self.problem.points, self.rows.chunk
         name = points.ids[chunk.points[k]]
-        known = _GROUND in self.parts
-        if len(culprits) != 1:
+        if culprit is None:
+            known = _GROUND in self.parts
             who = "its ground and its measurements contradict each other" if known else "its rays miss each other"
-            missed = self._apart(k, None)[: 2 * chunk.rays.shape[1]].reshape(-1, 2)
-            size = float(np.abs(points.in_pixels(missed, chunk.rays[k])).max())
             reason = f"gross error: {who} by {size:.1f} px, and it cannot be decided which is wrong"
             return Rejected(name, "point", None, reason)
-        culprit = culprits[0]
-        apart = self._apart(k, culprit)[self.parts[culprit]]
         if culprit == _GROUND:
-            sigmas = self.problem.ground_sigmas[chunk.points[k]]
-            metres = float(np.linalg.norm((apart * sigmas)[np.isfinite(sigmas)]))
-            return Rejected(name, "ground", None, f"gross error: {metres:.1f} m from where its rays meet")
-        ray = chunk.rays[k, culprit]
-        size = float(np.hypot(*points.in_pixels(apart[None], np.array([ray]))[0]))
-        image = points.images[points.image[ray]]
+            return Rejected(name, "ground", None, f"gross error: {size:.1f} m from where its rays meet")
+        image = points.images[points.image[chunk.rays[k, culprit]]]
         return Rejected(name, "ray", image, f"gross error: {size:.1f} px from where the other rays and points put it")
 
-    def _apart(self, k: int, without: int | None) -> Array:
-        """Return the misfits of all rows of a point at the place that all parts but one give."""
+    def _apart(self, of: Index, without: int | None) -> Array:
+        """Return the misfits ``(n, m)`` of all rows of some points at the places that all parts but one give."""
         keep = self._all_but(without)
-        place = np.linalg.lstsq(self.design[k, keep], self.misfit[k, keep], rcond=None)[0]
-        apart: Array = self.misfit[k] - self.design[k] @ place
-        return apart
+        design, misfit = self.design[of], self.misfit[of]
+        inverse = np.linalg.pinv(design[:, keep], rcond=_EPSILON * max(len(keep), 3))
+        return np.asarray(misfit - (design @ (inverse @ misfit[:, keep, None]))[:, :, 0])
