@@ -252,10 +252,11 @@ def _equations(
 
 def _per_point(points: BlockPoints, rays: Index, values: Array) -> Array:
     """Return the sums over some rays of each point ``(N, ...)`` of values ``(k, ...)``."""
-    flat, of = values.reshape(len(values), -1), points.point[rays]
-    sums = [np.bincount(of, weights=column, minlength=len(points)) for column in flat.T]
-    total: Array = np.stack(sums, axis=1).astype(float)
-    return total.reshape(len(points), *values.shape[1:])
+    of = points.point[rays]
+    total = np.zeros((len(points), *values.shape[1:]))
+    for place in np.ndindex(values.shape[1:]):
+        total[:, *place] = np.bincount(of, weights=values[:, *place], minlength=len(points))
+    return total
 
 
 def _angles(points: BlockPoints, rows: Array, found: np.ndarray) -> Array:
