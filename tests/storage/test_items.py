@@ -138,6 +138,12 @@ def test_an_rpc_that_gdal_finds_is_left_to_it(tiny: Any) -> None:
         rpc = one.rpc_of(one.image())
         assert (rpc and rpc.name) == found
     item(tiny.folder / "i.json", **elsewhere["assets"])
+    several = document(
+        image=asset("a.tif", "data"), one=asset("b_RPC.TXT", type=TEXT), two=asset("c_RPC.TXT", type=TEXT)
+    )
+    ambiguous = item_of(several, str(tiny.folder / "i.json"))
+    with pytest.raises(InputError, match="several assets may be the RPC of 'image': one, two"):
+        ambiguous.rpc_of(ambiguous.image())
     assert resolved(tiny.folder / "i.json", SceneOptions())[1].rpc == str(tiny.folder / "b_RPC.TXT")
     assert resolved(tiny.folder / "i.json", SceneOptions(rpc="tag"))[1].rpc == "tag", "what the user says comes first"
 

@@ -13,7 +13,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.beside import ask_beside
 from ortho_pipeline.files.locations import is_far
-from ortho_pipeline.files.stac.item import Asset, is_item, read_item, split
+from ortho_pipeline.files.stac.item import Asset, Item, is_item, read_item, split
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 
 _P = ParamSpec("_P")
@@ -44,7 +44,7 @@ def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
             elif name == _IMAGES:
                 given[name] = [_one_of_several(image, scene) for image in value]
             elif name == _DEM and is_item(value):
-                given[name] = _assets(value, scene)[0].href
+                given[name] = _chosen(value, scene)[1].href
             else:
                 given[name] = _in_options(value, scene)
         if place is not None:
@@ -66,23 +66,24 @@ def resolved(image: Any, scene: SceneOptions) -> tuple[Any, SceneOptions]:
     """
     if not is_item(image):
         return image, scene
-    chosen, rpc = _assets(image, scene)
-    if rpc is None or scene.rpc is not None or scene.model is not None or "rpc" in scene.sensor_options:
+    item, chosen = _chosen(image, scene)
+    if scene.rpc is not None or scene.model is not None or "rpc" in scene.sensor_options:
         return chosen.href, scene
-    return chosen.href, replace(scene, rpc=rpc.href)
+    rpc = item.rpc_of(chosen)
+    return chosen.href, scene if rpc is None else replace(scene, rpc=rpc.href)
 
 
-def _assets(image: Any, scene: SceneOptions) -> tuple[Asset, Asset | None]:
+def _chosen(image: Any, scene: SceneOptions) -> tuple[Item, Asset]:
     address, key = split(image)
     item = read_item(address, allow_network=scene.allow_network, roots=tuple(scene.roots))
-    chosen = item.image(key)
-    return chosen, item.rpc_of(chosen)
+    return item, item.image(key)
 
 
 def _one_of_several(image: Any, scene: SceneOptions) -> Any:
     if not is_item(image):
         return image
-    chosen, rpc = _assets(image, scene)
+    item, chosen = _chosen(image, scene)
+    rpc = item.rpc_of(chosen)
     if rpc is not None:
         raise InputError(
             f"the RPC of this image lies elsewhere ({rpc.name}), and several images have no option for it", file=image,
@@ -95,7 +96,7 @@ def _in_options(value: Any, scene: SceneOptions) -> Any:
     """Return options with the files in place of items."""
 
     def raster(path: Any) -> Any:
-        return _assets(path, scene)[0].href if is_item(path) else path
+        return _chosen(path, scene)[1].href if is_item(path) else path
 
     if isinstance(value, SurfaceOptions):
         return replace(value, dem=raster(value.dem), sigma=raster(value.sigma))

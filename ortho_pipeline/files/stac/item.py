@@ -84,11 +84,24 @@ class Item:
         return self._chosen(key, [[asset for asset in self.assets if asset.is_table]], "table of points")
 
     def rpc_of(self, image: Asset) -> Asset | None:
-        """Return the side-car with the RPC of an image; None where there is none, or where GDAL finds it by itself."""
+        """Return the side-car with the RPC of an image; None where there is none, or where GDAL finds it by itself.
+
+        Raises
+        ------
+        InputError
+            If there are several, and not one that has the name of the image.
+        """
         found = [asset for asset in self.assets if asset.is_rpc]
         if len(found) > 1:
             stem = PurePosixPath(image.name).stem
-            found = [asset for asset in found if asset.name.startswith(stem)] or found[:1]
+            named = [asset for asset in found if asset.name.startswith(stem)]
+            if len(named) != 1:
+                raise InputError(
+                    f"several assets may be the RPC of {image.key!r}: {self._keys(named or found)}",
+                    file=self.address, field="assets",
+                    remedy="name one as `scene.rpc`, or give the address of the image itself",
+                )  # fmt: skip
+            found = named
         if not found:
             return None
         beside = found[0].href.rpartition("/")[0] == image.href.rpartition("/")[0]
