@@ -145,8 +145,11 @@ def _prepared(
 
 
 def _without(points: BlockPoints, lost: Mask) -> list[Notice]:
-    """Return notices of points that take no part, by their roles."""
+    """Return notices of points that take no part, by their roles; matches that check do so in one image."""
     notes = []
+    matched = np.zeros(len(points), dtype=bool)
+    matched[points.point[points.grouped >= 0]] = True
+    lost = lost & ~(points.check & matched)
     for role in ("control", "check", "tie"):
         names = [points.ids[i] for i in np.flatnonzero(lost & (points.roles == role))]
         if names:

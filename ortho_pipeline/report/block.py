@@ -28,6 +28,7 @@ from ortho_pipeline.report.block_records import (
     VariancesRecord,
     merged,
 )
+from ortho_pipeline.report.matching import RELATIVE
 from ortho_pipeline.report.network.cards import PICTURES, card, rays_by_image
 from ortho_pipeline.report.network.drawing import plot_network
 from ortho_pipeline.report.network.facts import found_network, network_record, placed, suffices_for, thinly_covered
@@ -82,7 +83,7 @@ def build_report(
         provenance=made_of(BlockProvenance, json_value(provenance)),
         warnings=tuple(noted["warnings"]),
         notices=tuple(noted["notices"]),
-        headline=headline(adjustment),
+        headline=headline(adjustment, relative=any(one.code == RELATIVE for one in warnings)),
         network=network_record(network),
         map_scale=None if suffices is None else made_of(MapScaleRecord, suffices.to_json()),
     )
@@ -91,8 +92,13 @@ def build_report(
 # -- words -----------------------------------------------------------------------------------------------------------
 
 
-def headline(adjustment: BlockAdjustment) -> BlockHeadline:
-    """Say how accurate the block is from the best evidence that there is: check points, else the fit of control."""
+def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHeadline:
+    """Say how accurate the block is from the best evidence that there is: check points, else the fit of control.
+
+    What matches say is `relative` to their reference; they are seen in one image each, and measured check points in two
+    or more come first.
+    """
+    to = ", relative to the reference" if relative else ""
     notes = [f"{adjustment.gauge[0].upper()}{adjustment.gauge[1:]}."]
 
     def said(figure: str, what: str, height: str | None = None) -> BlockHeadline:
@@ -107,13 +113,13 @@ def headline(adjustment: BlockAdjustment) -> BlockHeadline:
     seen = [image.rms.back_projected for image in adjustment.images.values()]
     if check := merged(*(one.check for one in seen)):
         what = f"RMSE of {counted(check.n, 'measurement')} of check points, whose ground took no part, in the images"
-        return said(px(check.total), what)
+        return said(px(check.total), what + to)
     control = merged(*(one.control for one in seen))
     if adjustment.object_rms.control and control:
         notes.append("No check points were kept apart.")
         if not adjustment.redundancy:
             return said("Not tested", "nothing is left over to test the fit with")
-        what = f"RMSE of {counted(control.n, 'measurement')} of control points in the images: the fit, not a test"
+        what = f"RMSE of {counted(control.n, 'measurement')} of control points in the images{to}: the fit, not a test"
         return said(px(control.total), what)
     sizes = [math.hypot(*ray.residual) for ray in adjustment.rays if ray.used and is_known(ray.residual)]
     figure = px(float(np.median(sizes))) if sizes else "Not tested"

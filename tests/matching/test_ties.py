@@ -254,6 +254,8 @@ def test_an_adjustment_finds_ties_and_control_by_itself(tmp_path):
     assert {"relative-to-reference", "dem-sigma-by-default"} & {one["code"] for one in report["notices"]} == {
         "relative-to-reference"
     }
+    assert "takes-no-part" not in {one["code"] for one in report["notices"]}
+    assert report["headline"]["what"].endswith("in the images, relative to the reference")
     assert {one["role"] for one in report["provenance"]["inputs"]} >= {"reference", "DEM"}
     # Pixels are 1 m: however many matches, the images lie as well as the reference does.
     adjustment = report["adjustment"]
