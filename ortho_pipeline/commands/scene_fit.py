@@ -261,19 +261,19 @@ def relative_to_reference(adjusted: Fit, match: MatchOptions) -> list[Notice]:
     if common is not None and common.value.any():
         east, north = common.value * common.sigma
         text += f"; the other points put the reference {east:+.2f} m along x and {north:+.2f} m along y"
+    relative = Notice(
+        "relative-to-reference", text, reference_sigma_m=sigma, matched=count, control=control,
+        in_sigmas=common is not None,
+    )  # fmt: skip
     off = _reference_off(adjusted) if count == control else None
-    if off is not None:
-        east, north = off.mean(axis=0)
-        text += (
-            f"; {counted(len(off), 'measured point')} that took no part put the reference {east:+.2f} m along x and "
-            f"{north:+.2f} m along y: they correct it with `match.gcps_as=control` and a `match.reference_sigma`"
-        )
-    return [
-        Notice(
-            "relative-to-reference", text, reference_sigma_m=sigma, matched=count, control=control,
-            in_sigmas=common is not None, reference_off_m=None if off is None else off.mean(axis=0).tolist(),
-        )
-    ]  # fmt: skip
+    if off is None:
+        return [relative]
+    east, north = off.mean(axis=0).tolist()
+    text = (
+        f"{counted(len(off), 'measured point')} that took no part put the reference {east:+.2f} m along x and "
+        f"{north:+.2f} m along y, and the ortho lies where it does"
+    )
+    return [relative, Notice("reference-displaced", text, reference_off_m=[east, north], points=len(off))]
 
 
 def _reference_off(adjusted: Fit) -> Array | None:

@@ -30,6 +30,16 @@ def render(template: str, **values: Any) -> str:
     return str(_environment().get_template(f"{room}/templates/{name}").render(**values))
 
 
+def _coded(text: str) -> Any:
+    """Return a text with what stands between backticks as code; everything is escaped."""
+    from markupsafe import Markup, escape
+
+    parts = [escape(part) for part in str(text).split("`")]
+    if len(parts) % 2 == 0:
+        return escape(text)
+    return Markup("").join(Markup("<code>{}</code>").format(part) if k % 2 else part for k, part in enumerate(parts))
+
+
 @functools.cache
 def _environment() -> Any:
     """Return the environment, with the filters that write numbers as people read them."""
@@ -61,6 +71,7 @@ def _environment() -> Any:
         trim_blocks=True, lstrip_blocks=True, bytecode_cache=Kept(),
     )  # fmt: skip
     environment.filters |= {
+        "coded": _coded,
         "px": px, "m": metres, "signed": signed, "share": share, "fixed": fixed, "number": short, "plain": plain_size,
     }  # fmt: skip
     return environment

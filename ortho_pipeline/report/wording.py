@@ -14,6 +14,8 @@ from ortho_pipeline.report.records import Dem, FlatGround, Headline, MapScaleRec
 
 #: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
 ENOUGH_CHECK_POINTS = 30
+#: From so many measured points on their figure leads before that of matches.
+_LEADING = 3
 FEW = f"Fewer than {ENOUGH_CHECK_POINTS} check points: an indication, not a claim of accuracy (ASPRS 2023)."
 
 
@@ -107,15 +109,27 @@ def fitness(found: MapScaleRecord) -> str:
 
 
 def _of_matches(matching: MatchingRecord, relative: Tested, notes: list[str]) -> Headline:
-    """Say how well matches that were held out agree, and apart from that what measured points tell."""
-    if said := matching.absolute_text():
-        few = matching.absolute is not None and matching.absolute.n < ENOUGH_CHECK_POINTS
-        notes = [f"{said} {FEW}" if few else said, *notes]
+    """Say what measured points tell, and apart from that how well matches agree that were held out.
+
+    From three measured points on these lead: matches do not know where the reference lies.
+    """
+    said, absolute = matching.absolute_text(), matching.absolute
     cells = "in cells of the image that took no part in the adjustment, relative to the reference"
-    return Headline(
-        figure=px(relative.px), metres=None if relative.m is None else metres(relative.m),
-        what=f"RMSE at {counted(relative.n, 'match', 'matches')} {cells}", notes=(matching.floor(), *notes),
-    )  # fmt: skip
+    held_out = f"RMSE at {counted(relative.n, 'match', 'matches')} {cells}"
+    if absolute is None or absolute.n < _LEADING:
+        if said:
+            notes = [f"{said} {FEW}", *notes]
+        return Headline(
+            figure=px(relative.px), metres=None if relative.m is None else metres(relative.m),
+            what=held_out, notes=(matching.floor(), *notes),
+        )  # fmt: skip
+    ground = "" if relative.m is None else f" ({metres(relative.m)})"
+    notes = [f"Relative: {px(relative.px)}{ground} {held_out}.", matching.floor(), *notes]
+    if absolute.n < ENOUGH_CHECK_POINTS:
+        notes.insert(0, FEW)
+    what = f"RMSE at {counted(absolute.n, 'measured point')} that took no part in the adjustment, which was to matches"
+    on_ground = None if absolute.m is None else metres(absolute.m)
+    return Headline(figure=px(absolute.px), metres=on_ground, what=what, notes=tuple(notes))
 
 
 def _headline(rmse: Rmse, ground: RmseOnGround | None, what: str, notes: Iterable[str]) -> Headline:

@@ -19,7 +19,7 @@ from scenes import UTM, Case, Setting, View, write_raster
 import ortho_pipeline as op
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.control.matching import search_of
-from ortho_pipeline.display.numbers import px
+from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
@@ -176,8 +176,10 @@ def test_measured_points_see_what_matches_cannot(moved: Case, tmp_path: Path) ->
     assert np.hypot(*report["accuracy"]["sigma_m"]) == pytest.approx(2 * np.sqrt(2), rel=0.05)
     assert report["accuracy"]["shares"]["reference"] > 0.9
     head = report["headline"]
-    assert "relative to the reference" in head["what"]
-    assert any(note.startswith("Absolute: ") and "6 measured points" in note for note in head["notes"])
+    # What is read first is what the measured points say.
+    assert head["metres"] == metres(matching["absolute"]["m"])
+    assert "6 measured points" in head["what"]
+    assert any(note.startswith("Relative: ") and "relative to the reference" in note for note in head["notes"])
     assert any("2.00 m per axis" in note for note in head["notes"])
     # Six measured points test the scale of a map; matches do not.
     assert (report["map_scale"]["evidence"], report["map_scale"]["n"]) == ("check", 6)
@@ -209,9 +211,9 @@ def test_measured_points_that_only_check_say_where_the_reference_lies(moved: Cas
     image[2] += (6.0, 0.0)
     op.write_points(replace(points, image=image), tmp_path / "survey.csv")
     found = document(matched(moved, "fit", "--gcps", tmp_path / "survey.csv", "--json"))
-    notice = next(one for one in found["notices"] if one["code"] == "relative-to-reference")
+    notice = next(one for one in found["notices"] if one["code"] == "reference-displaced")
     np.testing.assert_allclose(notice["reference_off_m"], (5.0, -3.0), atol=0.2)
-    assert "measured points that took no part put the reference +" in notice["text"]
+    assert (notice["points"], "put the reference +" in notice["text"]) == (5, True)
     suspects = {one["id"] for one in found["outlying"]}
     assert suspects & set(points.ids) == {points.ids[2]}
 

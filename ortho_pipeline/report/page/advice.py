@@ -9,6 +9,8 @@ from typing import Any, Literal
 Level = Literal["stop", "look", "know"]
 
 _STOP: dict[str, str] = {
+    "reference-displaced": "Let the measured points control beside the matches (`match.gcps_as=control`), and state "
+    "how accurate the reference is (`match.reference_sigma`).",
     "heights-disagree": "Find out which height datum points and DEM have, state both, and make it again.",
     "model-elsewhere": "Check that image, points and their CRS belong together, and that columns and rows are not "
     "swapped.",
