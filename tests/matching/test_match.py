@@ -66,6 +66,33 @@ def test_what_scene_and_reference_are_like_does_not_matter(tmp_path, change):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("ratio", "changes"), [(6.0, {"side": 900, "fine": 1.2}), (1 / 6, {"side": 360, "fine": 1.0})])
+def test_a_reference_may_be_six_times_coarser_or_finer(tmp_path, ratio, changes):
+    found = outcome(tmp_path, ratio=ratio, **changes)
+    assert found.succeeded, found
+    assert found.off < 0.05, found
+
+
+@pytest.mark.slow
+def test_a_reference_may_be_in_parts(tmp_path):
+    """As a VRT of two files, and as two files, one of which lies in another zone."""
+    case = Case(replace(PLAIN, side=400), tmp_path).write()
+    whole, parts = gdal.Open(str(case.reference_file)), [tmp_path / "west.tif", tmp_path / "east.tif"]
+    half = whole.RasterXSize // 2
+    for path, left in zip(parts, (0, half), strict=True):
+        width = half if left == 0 else whole.RasterXSize - half
+        gdal.Translate(str(path), whole, srcWin=[left, 0, width, whole.RasterYSize]).FlushCache()
+    gdal.BuildVRT(str(tmp_path / "both.vrt"), [str(path) for path in parts]).FlushCache()
+    zone = tmp_path / "zone.tif"
+    gdal.Warp(str(zone), str(parts[1]), dstSRS="EPSG:32734", resampleAlg="cubic", dstNodata=0).FlushCache()
+    for references in ([tmp_path / "both.vrt"], [parts[0], zone]):
+        found = tried(case, references)
+        assert found.succeeded, found
+        assert found.found > 250, found
+        assert found.off < 0.05, found
+
+
+@pytest.mark.slow
 def test_stripes_of_a_detector_do_not_attract_matches(tmp_path):
     found = outcome(tmp_path, scene=View(stripes=0.1), heading_deg=180.0)
     assert found.refused or found.off < 0.3, found
