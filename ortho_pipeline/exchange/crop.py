@@ -11,12 +11,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.models import RPC, ImageCorrection, SensorModel
+from ortho_pipeline.models import RPC, Cropped, ImageCorrection, SensorModel
 
 #: Below this part of the size for which an RPC is meant, an image is remarkably small.
 _SMALL = 0.5
@@ -97,8 +95,10 @@ def moved(model: SensorModel, offset: tuple[float, float]) -> SensorModel:
         return model
     if isinstance(model, RPC):
         return model.shifted(*offset)
-    coefficients = np.array([-offset[0], 0.0, 0.0, -offset[1], 0.0, 0.0])
-    return replace(ImageCorrection.identity(model, "none", (0.0, 0.0)), coefficients=coefficients)
+    if isinstance(model, ImageCorrection):
+        origin = model.origin[0] - offset[0], model.origin[1] - offset[1]
+        return replace(model, model=moved(model.model, offset), origin=origin)
+    return Cropped(model, offset)
 
 
 def _moved(scene: Scene, offset: tuple[float, float], said: Notice) -> Scene:

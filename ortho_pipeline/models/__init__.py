@@ -12,14 +12,14 @@ from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.families import Family, families, family_of
 from ortho_pipeline.models.frame.camera import FrameCamera
 from ortho_pipeline.models.map_plane import MapPlane
-from ortho_pipeline.models.mosaicked import Pieces
+from ortho_pipeline.models.mosaicked import Cropped, Pieces
 from ortho_pipeline.models.pushbroom.scanner import Pushbroom
 from ortho_pipeline.models.rational import RPC, Rational
 from ortho_pipeline.models.rational_start import model_crs, start_model
 
 #: Model classes by the `kind` under which files name them; the hook `ortho_models` adds to it.
 KINDS: dict[str, type[SensorModel]] = {
-    cls.kind: cls for cls in (RPC, Rational, ImageCorrection, FrameCamera, MapPlane, Pieces, Pushbroom)
+    cls.kind: cls for cls in (RPC, Rational, ImageCorrection, Cropped, FrameCamera, MapPlane, Pieces, Pushbroom)
 }
 
 
@@ -69,6 +69,7 @@ def require_view(model: SensorModel) -> None:
 __all__ = [
     "KINDS",
     "RPC",
+    "Cropped",
     "Family",
     "FrameCamera",
     "ImageCorrection",

@@ -1,7 +1,8 @@
-"""One image that was delivered in pieces, each with a sensor model in its own pixels."""
+"""Parts of images: one delivered in pieces, each with a model in its own pixels, and one cut out of another."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import parse_crs
-from ortho_pipeline.models.base import Array, SensorModel, as_ground
+from ortho_pipeline.models.base import Array, Constraints, SensorModel, as_ground, as_image
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,3 +104,116 @@ class Pieces(SensorModel):
         models = tuple(map(model_from_dict, data.get("models", ())))
         pairs = {name: tuple(map(tuple, data.get(name, ()))) for name in ("offsets", "sizes")}
         return super().from_dict({**data, "models": models, **pairs})
+
+
+@dataclass(frozen=True, eq=False)
+class Cropped(SensorModel):
+    """A model in pixels that count from another corner; its parameters are those of the whole image's model.
+
+    Parameters
+    ----------
+    model : SensorModel
+        Of the whole image.
+    offset : (float, float)
+        Column and row of the crop's first corner in the whole image.
+    """
+
+    kind: ClassVar[str] = "cropped"
+
+    model: SensorModel
+    offset: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        offset = np.asarray(self.offset, dtype=np.float64)
+        if offset.shape != (2,) or not np.isfinite(offset).all():
+            raise InputError("a crop has a column and a row where it begins", field="offset")
+        object.__setattr__(self, "offset", (float(offset[0]), float(offset[1])))
+
+    @property
+    def crs(self) -> str:
+        return self.model.crs
+
+    @property
+    def domain(self) -> tuple[Array, Array]:
+        return self.model.domain
+
+    @property
+    def height_range(self) -> tuple[float, float]:
+        return self.model.height_range
+
+    @property
+    def height_limits(self) -> tuple[float, float]:
+        return self.model.height_limits
+
+    def with_heights(self, low: float, high: float) -> Self:
+        return self._replace(model=self.model.with_heights(low, high))
+
+    @property
+    def corners(self) -> Array:
+        return self.model.corners
+
+    @property
+    def detail(self) -> float:
+        return self.model.detail
+
+    @property
+    def uses_height(self) -> bool:
+        return self.model.uses_height
+
+    # -- parameters --------------------------------------------------------------------------------------------------
+
+    @property
+    def param_names(self) -> tuple[str, ...]:
+        return self.model.param_names
+
+    @property
+    def params(self) -> Array:
+        return self.model.params
+
+    def with_params(self, params: ArrayLike) -> Self:
+        return self._replace(model=self.model.with_params(params))
+
+    @property
+    def minimum_points(self) -> int:
+        return self.model.minimum_points
+
+    @property
+    def removable(self) -> tuple[str, ...]:
+        return self.model.removable
+
+    def without(self, names: Iterable[str]) -> Self:
+        return self._replace(model=self.model.without(names))
+
+    def constraints(self) -> Constraints:
+        return self.model.constraints()
+
+    # -- maps --------------------------------------------------------------------------------------------------------
+
+    def ground_to_image(self, ground: ArrayLike) -> Array:
+        return self.model.ground_to_image(ground) - self.offset
+
+    def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
+        return self.model.image_to_ground(as_image(image) + self.offset, height)
+
+    def ground_partials(self, ground: ArrayLike) -> Array:
+        return self.model.ground_partials(ground)
+
+    def param_partials(self, ground: ArrayLike) -> Array:
+        return self.model.param_partials(ground)
+
+    def projected(self, ground: ArrayLike) -> tuple[Array, Array]:
+        image, partials = self.model.projected(ground)
+        return image - self.offset, partials
+
+    def linearised(self, ground: ArrayLike) -> tuple[Array, Array, Array]:
+        image, by_ground, by_params = self.model.linearised(ground)
+        return image - self.offset, by_ground, by_params
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        from ortho_pipeline.models import model_from_dict
+
+        inner = data.get("model")
+        if not isinstance(inner, dict):
+            raise InputError("a crop needs the model of the whole image", field="model")
+        return super().from_dict({**data, "model": model_from_dict(inner)})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,18 @@ from osgeo import gdal
 from ortho_pipeline import commands
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.estimation.family_fit import fit_own
 from ortho_pipeline.exchange.crop import moved, noted_offset
 from ortho_pipeline.exchange.rpc import read_rpc, rpc_metadata, write_rpc_txt
-from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.models import ImageCorrection, model_from_dict
+from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.options import PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.plugins import open_scene as open_product
+from ortho_pipeline.points.table import Points
 from ortho_pipeline.raster.source import open_dataset
+from ortho_pipeline.simulation.scanner import LineScanner
+from ortho_pipeline.testing import check_sensor_model
 
 gdal.UseExceptions()
 CORNER = (100.0, 50.0)
@@ -187,3 +194,32 @@ def test_pleiades_crops_meet_each_other(real):
         seen = scenes["right"].model.ground_to_image(scenes["left"].model.image_to_ground([[0.0, 0.0]], height))
         corner = noted_offset(open_dataset(images["right"]))
         np.testing.assert_allclose(seen[0] + corner, (column, row), atol=0.1)
+
+
+def test_a_crop_is_adjusted_by_the_parameters_of_the_whole():
+    """A line scanner, its points measured in the crop: the same parameters, sigmas and residuals as in the whole."""
+    corners = LineScanner.over(
+        33.35, 37.25, 850.0, image_width=900, image_height=700, off_nadir_deg=5.0, altitude=618e3, heights=(0.0, 1700.0)
+    ).image_to_ground([(0, 0), (900, 0), (900, 700), (0, 700)], 850.0)
+    whole = pushbroom_of_metadata(corners, 900, 700, altitude=618e3, along_deg=0.0, heights=(0.0, 1700.0))
+    random = np.random.default_rng(0)
+    image = random.uniform((200, 100), (900, 700), (25, 2))
+    ground = whole.image_to_ground(image, random.uniform(200, 1500, 25))
+    measured = image + (3.0, -2.0) + 1e-3 * image + random.normal(0, 0.2, image.shape)
+    crop = moved(whole, (200.0, 100.0))
+    check_sensor_model(crop, ground)
+    fits = [
+        fit_own(
+            model,
+            Points(
+                tuple(map(str, range(25))), at, ground, np.full(25, "control"), np.full(25, 0.2), np.zeros((25, 3)),
+                parse_crs(whole.crs), "",
+            ),
+        )
+        for model, at in ((whole, measured), (crop, measured - (200.0, 100.0)))
+    ]  # fmt: skip
+    np.testing.assert_allclose(fits[1].model.params, fits[0].model.params, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(fits[1].residuals, fits[0].residuals, atol=1e-6)
+    assert abs(fits[1].sigma0 / fits[0].sigma0 - 1) < 1e-6
+    again = model_from_dict(json.loads(json.dumps(fits[1].model.to_dict())))
+    np.testing.assert_array_equal(again.ground_to_image(ground), fits[1].model.ground_to_image(ground))
