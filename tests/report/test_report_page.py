@@ -13,9 +13,11 @@ import pytest
 from click.testing import CliRunner
 
 from ortho_pipeline import commands
+from ortho_pipeline.batch import runner
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands import block as blocks
 from ortho_pipeline.commands import results
-from ortho_pipeline.options import PointOptions, SurfaceOptions
+from ortho_pipeline.options import BlockOptions, PointOptions, SurfaceOptions
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -34,6 +36,27 @@ def made(tmp_path_factory) -> dict[str, results.Result | results.CompareResult]:
     compared = commands.compare(image, points, folder=folder / "compare", surface=surface)
     bare = commands.rectify(image, folder / "bare", surface=surface)
     return {"rectify": rectified, "compare": compared, "bare": bare}
+
+
+@pytest.fixture(scope="module")
+def block(tmp_path_factory) -> Path:
+    """Return the page of the sample's stereo pair."""
+    pair = [ROOT / "sample_data" / "cartosat" / name for name in ("BANDF.tif", "BANDA.tif")]
+    options = BlockOptions(points=ROOT / "sample_data" / "cartosat" / "points.csv", correction="shift")
+    return blocks.adjust(pair, tmp_path_factory.mktemp("block"), options).files["html"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """Return the page of a run with a scene that failed."""
+    folder = tmp_path_factory.mktemp("run")
+    for name in ("scene.tif", "scene_RPC.TXT"):
+        shutil.copy(ROOT / "sample_data" / name, folder)
+    shutil.copy(folder / "scene.tif", folder / "a_scene_without_a_model_and_with_quite_a_long_name.tif")
+    text = "defaults: {surface: {height: 800}, output: {resolution: 20}}\nscenes: [{images: '*.tif'}]\n"
+    (folder / "pipeline.yaml").write_text(text)
+    runner.run(folder / "pipeline.yaml", executor="sequential")
+    return folder / "out" / "index.html"
 
 
 @pytest.mark.parametrize("which", ["rectify", "compare", "bare"])
@@ -96,6 +119,47 @@ def test_page_fits_every_screen_and_asks_for_nothing(made, browser, which):
         assert {"residuals", "directions", "heights", "correlation", "neighbours", "relative", "locator"} <= plots
 
 
+@pytest.mark.parametrize("which", ["block", "run"])
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
+def test_pages_of_blocks_and_runs_fit_every_screen(request, browser, which, scheme):
+    for width in (1440, 1024, 390):
+        page, complaints = opened(browser, request.getfixturevalue(which), width, color_scheme=scheme)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert complaints == []
+        page.context.close()
+
+
+def test_first_screens_of_blocks_runs_and_comparisons_answer_a_fresh_reader(made, block, run, browser):
+    """How good, by what evidence, what is wrong, what next: seen before scrolling."""
+    seen = {
+        block: (".figure", ".what", ".verdict", ".signals li .to-do", "svg[data-plot=network]", ".facts dd"),
+        run: ("h1", "tr.failed .remedy", "tbody img"),
+        made["compare"].files["html"]: (".figure", ".what", ".verdict strong", ".signals li .to-do"),
+    }
+    for path, places in seen.items():
+        page, _ = opened(browser, path)
+        for where in places:
+            box = page.locator(where).first.bounding_box()
+            assert box is not None, where
+            assert box["y"] + box["height"] <= 900, where
+        page.context.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("paper", ["A4", "Letter"])
+def test_pages_print(made, block, run, browser, paper):
+    """Nothing is cut off at the right."""
+    for path in (made["rectify"].files["html"], block, run):
+        page, complaints = opened(browser, path)
+        assert page.pdf(format=paper).startswith(b"%PDF")
+        wide = {"A4": 688, "Letter": 710}[paper]  # CSS px between the margins
+        page.set_viewport_size({"width": wide, "height": 1000})
+        page.emulate_media(media="print")
+        assert page.evaluate("document.documentElement.scrollWidth") <= wide
+        assert complaints == []
+        page.context.close()
+
+
 def test_first_screen_says_how_good_by_what_evidence_what_is_wrong_and_what_next(made, browser):
     """A fresh reader answers these from what is seen before scrolling."""
     page, _ = opened(browser, made["rectify"].files["html"])
@@ -135,10 +199,15 @@ def test_without_a_script_nothing_essential_is_missing(made, browser):
 
 
 @pytest.mark.slow
-def test_page_can_be_used_by_everybody(made, browser):
+@pytest.mark.parametrize("which", ["rectify", "block", "run"])
+def test_page_can_be_used_by_everybody(request, browser, which):
     axe = (ROOT / "tests" / "measure" / "axe" / "axe.min.js").read_text(encoding="utf-8")
+    path = (
+        request.getfixturevalue("made")[which].files["html"] if which == "rectify" else request.getfixturevalue(which)
+    )
     for scheme, rules in (("light", "{}"), ("dark", "{runOnly: ['color-contrast']}")):
-        page, _ = opened(browser, made["rectify"].files["html"], bypass_csp=True, color_scheme=scheme)
+        page, _ = opened(browser, path, bypass_csp=True, color_scheme=scheme)
         page.evaluate(axe)
-        assert [one["id"] for one in page.evaluate(f"axe.run({rules})")["violations"]] == []
+        found = page.evaluate(f"axe.run({rules})")["violations"]
+        assert [(one["id"], [node["html"][:120] for node in one["nodes"][:3]]) for one in found] == []
         page.context.close()
