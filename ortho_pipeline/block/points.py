@@ -233,7 +233,7 @@ class BlockPoints:
         shape = np.eye(2) if self.shape_image is None else self.shape_image
         return np.asarray(self.sigma_image[:, None, None] ** 2 * shape)
 
-    def whitened(self, values: Array, rays: Index) -> Array:
+    def whitened(self, values: Array, rays: Index | slice) -> Array:
         """Return values of rays ``(k, 2, ...)``, over their sigma already, as independent and of sigma 1."""
         if self._whitening is None:
             return values

@@ -69,7 +69,8 @@ class ImageCorrection(SensorModel):
         coefficients = np.array(self.coefficients, dtype=np.float64)
         if coefficients.shape != (6,) or not np.isfinite(coefficients).all():
             raise InputError("a correction has 6 finite coefficients", field="coefficients")
-        if abs(np.linalg.det(_matrix(coefficients))) < 1e-6:
+        (a, b), (c, d) = _matrix(coefficients).tolist()
+        if abs(a * d - b * c) < 1e-6:
             raise InputError("this correction cannot be inverted", field="coefficients")
         object.__setattr__(self, "removed", tuple(self.removed))
         if not set(self.removed) <= set(FREE[self.correction]):
@@ -184,7 +185,9 @@ class ImageCorrection(SensorModel):
         partials = np.zeros((len(image), 2, 6))
         partials[:, 0, 0] = partials[:, 1, 3] = 1.0
         partials[:, 0, 1:3] = partials[:, 1, 4:6] = centred
-        partials[~np.isfinite(centred).all(axis=1)] = np.nan
+        lost = ~(np.isfinite(centred[:, 0]) & np.isfinite(centred[:, 1]))
+        if lost.any():
+            partials[lost] = np.nan
         free = self._free
         return partials if len(free) == len(COEFFICIENTS) else partials[:, :, free]
 
@@ -206,4 +209,5 @@ def _places(names: tuple[str, ...]) -> list[int]:
 
 
 def _matrix(coefficients: Array) -> Array:
-    return np.eye(2) + coefficients[[1, 2, 4, 5]].reshape(2, 2)
+    _, a, b, _, c, d = coefficients.tolist()
+    return np.array([[1.0 + a, b], [c, 1.0 + d]])

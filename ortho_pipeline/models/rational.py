@@ -234,8 +234,11 @@ class RPC(SensorModel):
             col = col_num / col_den * self.col_scale + self.col_off
             row = row_num / row_den * self.row_scale + self.row_off
             before_poles = (col_den * self.col_den[0] > 0) & (row_den * self.row_den[0] > 0)
-        image = np.stack([col, row], axis=1)
-        image[~(np.isfinite(image).all(axis=1) & before_poles)] = np.nan
+        image = np.empty((sums.shape[1], 2))
+        image[:, 0], image[:, 1] = col, row
+        good = before_poles & np.isfinite(col) & np.isfinite(row)
+        if not good.all():
+            image[~good] = np.nan
         return image
 
     def ground_partials(self, ground: ArrayLike) -> Array:

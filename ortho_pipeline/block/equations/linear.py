@@ -35,15 +35,15 @@ class Linear:
         points = problem.points
         ordering = problem.ordering(weights) if ordering is None else ordering
         places = problem.frame.places(state.local)
-        root = np.sqrt(weights.ray_weights) / points.sigma_image
-        predicted = np.zeros((points.rays, 2))
+        predicted = points.measured.copy()
         by_point = np.zeros((points.rays, 2, 3))
         by_params = np.zeros((points.rays, 2, problem.columns.widest))
         for model, used in zip(state.models, ordering.rays_of_image, strict=True):
-            predicted[used], partials, by_model = places.linearised(model, points.point[used])
-            scale = root[used][:, None, None]
-            by_point[used] = points.whitened(partials * scale, used)
-            by_params[used, :, : by_model.shape[2]] = points.whitened(by_model * scale, used)
+            predicted[used], by_point[used], partials = places.linearised(model, points.point[used])
+            by_params[used, :, : partials.shape[2]] = partials
+        root = (np.sqrt(weights.ray_weights) / points.sigma_image)[:, None, None]
+        by_point = points.whitened(np.multiply(by_point, root, out=by_point), slice(None))
+        by_params = points.whitened(np.multiply(by_params, root, out=by_params), slice(None))
         pseudo = problem.pseudo_equations(state)
         misfits = problem.misfits_of(predicted, state.local, pseudo, ordering, weights)
         ground_by_point, rows = np.zeros((len(points), 3, 3)), ordering.grounded

@@ -182,7 +182,7 @@ class BlockProblem:
     def misfits(self, state: State, ordering: Ordering, weights: Selection) -> Misfits:
         """Return the misfits of everything that takes part."""
         places = self.frame.places(state.local)
-        predicted = np.zeros((self.points.rays, 2))
+        predicted = self.points.measured.copy()
         for model, used in zip(state.models, ordering.rays_of_image, strict=True):
             predicted[used] = places.project(model, self.points.point[used])
         return self.misfits_of(predicted, state.local, self.pseudo_equations(state), ordering, weights)
@@ -190,11 +190,13 @@ class BlockProblem:
     def misfits_of(
         self, predicted: Array, local: Array, pseudo: PseudoEquations, ordering: Ordering, weights: Selection
     ) -> Misfits:
-        """Return the misfits of everything that takes part, with the image points ``(M, 2)`` of points ``(N, 3)``."""
-        points, used = self.points, ordering.rays
-        rays = np.zeros((points.rays, 2))
-        scale = np.sqrt(weights.ray_weights[used]) / points.sigma_image[used]
-        rays[used] = points.whitened((points.measured[used] - predicted[used]) * scale[:, None], used)
+        """Return the misfits of everything that takes part.
+
+        `predicted` ``(M, 2)`` are image points of points `local` ``(N, 3)``, of what takes no part those measured.
+        """
+        points = self.points
+        scale = np.sqrt(weights.ray_weights) / points.sigma_image
+        rays = points.whitened((points.measured - predicted) * scale[:, None], slice(None))
         ground, rows = np.zeros((len(points), 3)), ordering.grounded
         apart = (self.enu[rows] @ (self.target[rows] - local[rows])[:, :, None])[:, :, 0]
         ground[rows] = apart / self.ground_sigmas[rows] * np.sqrt(weights.ground_weights[rows])[:, None]
