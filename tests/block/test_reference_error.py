@@ -12,10 +12,13 @@ import pytest
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.block.variances import shared_errors
+from ortho_pipeline.commands.control.block_points import relative_to_reference
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.estimation.problem import Prior
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models import RPC, ImageCorrection, SensorModel
+from ortho_pipeline.options import BlockOptions, MatchOptions
 from ortho_pipeline.points import Points
 
 SIZE = 10_000.0
@@ -262,6 +265,20 @@ def test_groups_of_one_image_grow_as_in_its_fit(rpcs: dict[str, RPC]) -> None:
     start = starts(rpcs, "affine")["left"]
     found, single = adjust({"left": start}, points), fit(start, points.in_image("left"))
     np.testing.assert_allclose(found.sigmas, single.sigmas, rtol=0.05)
+
+
+def test_a_large_block_says_that_its_sigmas_know_nothing_of_neighbours(
+    rpcs: dict[str, RPC], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points, _ = alike(rpcs, np.random.default_rng(3), matched=40, sigma=2.0)
+    options, match = BlockOptions(ties="auto"), MatchOptions(reference=("ortho.tif",), reference_sigma=2.0)
+    words = [relative_to_reference(adjust(starts(rpcs), points), options, match)[0]]
+    monkeypatch.setattr(shared_errors, "MOST_PARAMETERS", 3)
+    large = adjust(starts(rpcs), points)
+    assert not large.shared_errors
+    words.append(relative_to_reference(large, options, match)[0])
+    assert "in the sigmas, for each image" in words[0]
+    assert "not in the sigmas: this block is too large" in words[1]
 
 
 @pytest.mark.slow

@@ -21,6 +21,8 @@ from ortho_pipeline.block.points import Index
 from ortho_pipeline.estimation.spatial.shared_errors import Neighbours, SharedErrors
 from ortho_pipeline.models.base import Array
 
+#: Of blocks with more parameters it is not estimated: each measurement has an influence on all of them.
+MOST_PARAMETERS = 1000
 #: Combinations of parameters whose effect is less than this part of the largest are none.
 _NO_EFFECT = 1e-9
 
@@ -38,7 +40,9 @@ class SharedByImage:
 
     @classmethod
     def of(cls, solved: Solved, common: CommonError | None = None) -> SharedByImage | None:
-        """Return it of the measurements of a solution that have groups, and stand on known ground; None without.
+        """Return it of the measurements of a solution that have groups, and stand on known ground.
+
+        None without any, and of a block with more than `MOST_PARAMETERS`.
 
         Parameters
         ----------
@@ -47,7 +51,7 @@ class SharedByImage:
         """
         problem, sigma0 = solved.problem, solved.unit_weight()[0]
         points = problem.points
-        if sigma0 is None or points.groups is None:
+        if sigma0 is None or points.groups is None or problem.size > MOST_PARAMETERS:
             return None
         known = np.zeros(len(points), dtype=bool)
         known[solved.linear.ordering.grounded] = True

@@ -139,7 +139,9 @@ def relative_to_reference(fit: BlockFit, options: BlockOptions, match: MatchOpti
         f"{part}: accuracy is relative to the reference, and {floor}{beside}; an error that images and reference have "
         "in common is not seen"
     )
-    if len(fit.shared_errors) > 1:
+    if fit.points.groups is not None and not fit.shared_errors:
+        text += "; what neighbouring matches err together is not in the sigmas: this block is too large for that"
+    elif len(fit.shared_errors) > 1:
         text += "; what neighbouring matches err together is in the sigmas, for each image as if it had its own"
     return [Notice("relative-to-reference", text, reference_sigma_m=sigma, in_sigmas=common is not None)]
 
