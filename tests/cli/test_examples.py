@@ -56,6 +56,22 @@ def test_every_command_has_an_example_in_its_help():
             command.make_context(words, shlex.split(line)[1 + len(words.split()) :], resilient_parsing=False)
 
 
+def test_the_page_of_options_says_of_each_when_one_needs_it():
+    page = (ROOT / "docs" / "options.md").read_text(encoding="utf-8")
+    told = {
+        flag for row in re.findall(r"^\| (`--[^|]+)\|", page, re.MULTILINE) for flag in re.findall(r"`(--[\w-]+)`", row)
+    }
+    found = {
+        max((name for name in option.opts if name.startswith("--")), key=len)
+        for words, command in commands(cli)
+        if words[0] not in ("simulate", "reproduce", "cache")
+        for option in command.params
+        if isinstance(option, click.Option)
+    }
+    assert found - told == set()
+    assert told <= found
+
+
 def test_every_yes_of_ours_is_a_command_that_is_run():
     """Of the table beside other programs: each command, with its options, stands in a tutorial or an example."""
     from sessions import steps
