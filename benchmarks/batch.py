@@ -37,6 +37,7 @@ from ortho_pipeline.options import OutputOptions, SurfaceOptions
 SAMPLE = Path(__file__).resolve().parent.parent / "sample_data"
 SIDE = 400
 PROCESSORS, TICKS = len(os.sched_getaffinity(0)), os.sysconf("SC_CLK_TCK")
+ALLOCATOR = {"OMP_NUM_THREADS": 1, "MALLOC_TRIM_THRESHOLD_": 1 << 28, "MALLOC_MMAP_THRESHOLD_": 32 << 20}
 FILE = """
 defaults:
   surface: {dem: dem.tif}
@@ -86,11 +87,14 @@ def timed(folder: Path, work: Callable[[Path], None]) -> dict[str, float]:
     return {"wall": wall, "cpu": cpu, "others": max(0.0, busy - cpu) / (wall * PROCESSORS)}
 
 
-def timed_on_dask(folder: Path, few: Path) -> dict[str, float]:
-    """Return what `timed` does on a new cluster of two workers, which have made a few scenes before."""
+def timed_on_dask(folder: Path, few: Path, workers: int = 2) -> dict[str, float]:
+    """Return what `timed` does on a new cluster, whose workers have made a few scenes before."""
+    import dask
     from distributed import LocalCluster
 
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
+    # docs/scale.md: dask's own settings of the allocator cost 15 %.
+    dask.config.set({"distributed.nanny.pre-spawn-environ": ALLOCATOR})
+    with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
         work = functools.partial(run, executor="dask", scheduler=cluster.scheduler_address)
         timed(few, work)
         return timed(folder, work)
@@ -186,11 +190,14 @@ def measure(folder: Path, few: Path, scenes: int, repeat: int, quiet: float) -> 
 
 
 def dask_overhead(folder: Path, few: Path, repeat: int) -> None:
-    """Print how much CPU two dask workers take beside the plain loop, in pairs."""
+    """Print how much CPU a dask cluster of one worker takes beside the plain loop, in pairs.
+
+    Two workers at once would disturb each other's caches: that is no overhead of dask.
+    """
     timed(few, loop)
     ratios = []
     for _ in range(repeat):
-        plain, spread = timed(folder, loop), timed_on_dask(folder, few)
+        plain, spread = timed(folder, loop), timed_on_dask(folder, few, 1)
         ratios.append(spread["cpu"] / plain["cpu"])
         print(f"loop {plain['cpu']:.1f} s CPU, dask {spread['cpu']:.1f} s, ratio {ratios[-1]:.3f}", flush=True)
     print(f"median {statistics.median(ratios):.3f}")

@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import argparse
 import os
+import resource
+import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 from osgeo import gdal
 from warp import Job
@@ -45,32 +48,42 @@ def main() -> None:
             os.environ |= {"AWS_S3_ENDPOINT": public.address.removeprefix("http://"), "AWS_HTTPS": "NO",
                            "AWS_VIRTUAL_HOSTING": "FALSE", "AWS_NO_SIGN_REQUEST": "YES"}  # fmt: skip
             far = "s3://bucket" if given.kind == "s3" else f"{public.address}/bucket"
-            seconds(str(folder), top)
+            work(str(folder), top)
             ratios = []
             for _ in range(given.pairs):
                 public.asked.clear()
                 public.times.clear()
                 public.sent = 0
-                near_s, far_s = seconds(str(folder), top), seconds(far, top)
-                ratios.append(far_s / near_s)
+                near, there = work(str(folder), top), work(far, top)
+                ratios.append(there.wall / near.wall)
                 print(
-                    f"local {near_s:.2f} s, far {far_s:.2f} s, ratio {ratios[-1]:.2f}: "
-                    f"{sum(public.asked.values())} requests, waited {public.rounds:.0f} times the delay, "
-                    f"{public.sent / 1e6:.1f} of {size / 1e6:.1f} MB"
+                    f"local {near.wall:.2f} s ({near.cpu:.2f} s CPU), far {there.wall:.2f} s ({there.cpu:.2f} s CPU), "
+                    f"ratio {ratios[-1]:.2f}; {sum(public.asked.values())} requests, "
+                    f"waited {public.rounds:.0f} times the delay, {public.sent / 1e6:.1f} of {size / 1e6:.1f} MB read, "
+                    f"{there.made / 1e6:.1f} MB made"
                 )
         print(f"median ratio {statistics.median(ratios):.2f}")
 
 
-def seconds(where: str, top: str) -> float:
-    """Return the wall time of the job."""
-    out = ["-o", tempfile.mkdtemp(dir=top), "--format", "GTiff"]
+class Took(NamedTuple):
+    """Wall and CPU seconds of a job, and the bytes of its outputs."""
+
+    wall: float
+    cpu: float
+    made: int
+
+
+def work(where: str, top: str) -> Took:
+    """Make the ortho, and return what it took."""
+    folder = Path(tempfile.mkdtemp(dir=top))
     heights = ["--dem", f"{where}/dem.tif", "--dem-vertical", "ellipsoid"]
-    begin = time.monotonic()
-    subprocess.run(
-        [sys.executable, "-m", "ortho_pipeline", "rectify", f"{where}/scene.tif", *heights, *out, "--allow-network"],
-        check=True, capture_output=True,
-    )  # fmt: skip
-    return time.monotonic() - begin
+    begin, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    command = [sys.executable, "-m", "ortho_pipeline", "rectify", f"{where}/scene.tif", *heights, "-o", str(folder)]
+    subprocess.run([*command, "--allow-network"], check=True, capture_output=True)
+    wall, after = time.monotonic() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
+    made = sum(path.stat().st_size for path in folder.iterdir())
+    shutil.rmtree(folder)
+    return Took(wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, made)
 
 
 if __name__ == "__main__":
