@@ -1,6 +1,6 @@
 """Take the pictures of docs/measure.md: python docs/make_measure_images.py (needs Chromium; about a minute).
 
-Six points of the sample scene are measured by keyboard against an ortho of its own landscape.
+Six points of the sample scene are measured by keyboard against an ortho of its own landscape, and four of a pair.
 """
 
 from __future__ import annotations
@@ -41,10 +41,12 @@ def taken(page: Any, name: str) -> None:
 
 def measured(page: Any, points: int) -> None:
     """Measure points at the places that tell most; every third checks."""
-    page.select_option("#correction", "shift-drift")
+    if "second" not in page.title():
+        page.select_option("#correction", "shift-drift")
     page.focus("#scene")
     count = 0
     while count <= points:
+        page.focus("#scene")
         page.keyboard.press("n")
         page.keyboard.press("m")
         said(page, "Matched|No match")
@@ -59,11 +61,12 @@ def measured(page: Any, points: int) -> None:
         said(page, "accepted")
 
 
-def main(reference: Path, folder: Path) -> None:
+def main(reference: Path, folder: Path, *images: Path) -> None:
+    """Take the pictures of one image, or that of several."""
     done = "from ortho_pipeline.cli.program import main; main()"
     server = subprocess.Popen(
-        [sys.executable, "-c", done, "measure", str(SAMPLE / "scene.tif"), "--reference", str(reference), "--dem",
-         str(SAMPLE / "dem.tif"), "-o", str(folder / "points.geojson"), "--no-browser"],
+        [sys.executable, "-c", done, "measure", str(SAMPLE / "scene.tif"), *map(str, images), "--reference",
+         str(reference), "--dem", str(SAMPLE / "dem.tif"), "-o", str(folder / "points.geojson"), "--no-browser"],
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert server.stdout is not None
@@ -72,15 +75,16 @@ def main(reference: Path, folder: Path) -> None:
     with sync_playwright() as started:
         browser = started.chromium.launch(executable_path=chromium, args=_FLAGS)
         page = opened(browser, address, viewport={"width": 1400, "height": 860})
-        measured(page, 6)
-        taken(page, "measure.jpg")
+        measured(page, 4 if images else 6)
+        taken(page, "measure-block.jpg" if images else "measure.jpg")
         page.close()
-        page = opened(browser, address, viewport={"width": 1400, "height": 860}, color_scheme="dark")
-        page.locator("#swipe").fill("50")
-        taken(page, "measure-dark.jpg")
-        page.close()
-        page = opened(browser, address, viewport={"width": 820, "height": 1180}, has_touch=True)
-        taken(page, "measure-tablet.jpg")
+        if not images:
+            page = opened(browser, address, viewport={"width": 1400, "height": 860}, color_scheme="dark")
+            page.locator("#swipe").fill("50")
+            taken(page, "measure-dark.jpg")
+            page.close()
+            page = opened(browser, address, viewport={"width": 820, "height": 1180}, has_touch=True)
+            taken(page, "measure-tablet.jpg")
         browser.close()
     server.send_signal(signal.SIGINT)
     server.wait(30)
@@ -94,3 +98,7 @@ if __name__ == "__main__":
         if not made.exists():
             conftest.write_reference(conftest.truth_of_sample(), made)
         main(made, Path(place))
+        pair = conftest.write_second(conftest.truth_of_sample(), Path(place) / "second.tif")
+        (Path(place) / "points.geojson").unlink()
+        (Path(place) / "points.geojson.journal").unlink()
+        main(made, Path(place), pair.path)

@@ -1,14 +1,15 @@
-"""The command `ortho measure`: points by hand in the browser."""
+"""The command `ortho measure`: points of one image or several by hand in the browser."""
 
 from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from ortho_pipeline.cli.options import (
-    image_argument,
+    images_argument,
     json_option,
     point_options,
     reference_options,
@@ -18,35 +19,36 @@ from ortho_pipeline.cli.options import (
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_json
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+
+if TYPE_CHECKING:
+    from ortho_pipeline.measure.project import Project
 
 
 @click.command(cls=Command)
-@image_argument
+@images_argument
 @reference_options
 @point_options
 @surface_options
 @click.option(
     "--output", "-o", type=click.Path(dir_okay=False), metavar="FILE.geojson",
-    help="Points, with their journal beside them.  [default: <stem>_points.geojson]",
+    help="Points, with their journal beside them.  [default: <stems>_points.geojson]",
 )  # fmt: skip
 @click.option("--no-browser", is_flag=True, help="Print the address, and open nothing.")
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="On this machine.  [default: any that is free]")
 @scene_options
 @json_option
 def measure(
-    image: str, match: MatchOptions, points: PointOptions, surface: SurfaceOptions, output: str | None,
+    images: tuple[str, ...], match: MatchOptions, points: PointOptions, surface: SurfaceOptions, output: str | None,
     no_browser: bool, port: int, scene: SceneOptions, as_json: bool,
 ) -> None:  # fmt: skip
-    """Measure points of IMAGE in the browser, beside its reference in the geometry of the image.
+    """Measure points of an IMAGE in the browser, beside its reference in the geometry of the image, or of several.
 
     A click is matched to a part of a pixel, the fit is solved after every point, and the page says where the next one
     tells most. Everything stays on this machine; Ctrl-C ends. The file of points is for --gcps of 'ortho fit',
-    'rectify', 'compare' and 'export'.
+    'rectify', 'compare' and 'export'; of several images, such as a stereo pair, for --points of 'ortho adjust'.
     """
-    from ortho_pipeline.measure.session import open_session
-
-    if not match.reference:
+    if not match.reference and len(images) == 1:
         raise InputError("there is nothing to measure against", field="match.reference",
                          remedy="give an orthoimage of the same place")  # fmt: skip
     missing = [name for name in ("starlette", "uvicorn") if importlib.util.find_spec(name) is None]
@@ -55,9 +57,7 @@ def measure(
                          remedy='pip install "ortho-pipeline[measure]"')  # fmt: skip
     from ortho_pipeline.measure.serving.server import serve
 
-    session = open_session(
-        image, output or f"{Path(image).stem}_points.geojson", scene=scene, points=points, surface=surface, match=match
-    )  # fmt: skip
+    session = _session(images, output, scene, points, surface, match)
 
     def ready(address: str) -> None:
         if as_json:
@@ -71,3 +71,28 @@ def measure(
             webbrowser.open(address)
 
     serve(session, scene, ready, port)
+
+
+def _session(
+    images: tuple[str, ...], output: str | None, scene: SceneOptions, points: PointOptions, surface: SurfaceOptions,
+    match: MatchOptions,
+) -> Project:  # fmt: skip
+    """Open the session of one image, or of several."""
+    name = output or "_".join([*(Path(image).stem for image in images[:2]), "points.geojson"])
+    if len(images) == 1:
+        from ortho_pipeline.measure.session import open_session
+
+        return open_session(images[0], name, scene=scene, points=points, surface=surface, match=match)
+    from ortho_pipeline.measure.block.session import open_block_session
+
+    for field in ("select", "fit_model", "model_crs", "prune", "params", "significance", "ridge", "near"):
+        if getattr(points, field) != getattr(PointOptions, field):
+            raise InputError("this is said of one image, and there are several", field=f"points.{field}",
+                             remedy="leave it out")  # fmt: skip
+    if points.gcps is not None and not isinstance(points.gcps, str):
+        raise InputError("several images begin with a file of points", field="points.gcps", remedy="give a file")
+    asked = BlockOptions(
+        points=points.gcps, crs=points.crs, vertical=points.vertical, pixel_origin=points.pixel_origin,
+        check=points.check, correction=points.correction,
+    )  # fmt: skip
+    return open_block_session(images, name, scene=scene, points=asked, surface=surface, match=match)

@@ -29,12 +29,29 @@ MOST_MARKS, LONGEST_ID, LONGEST_NOTE = 20_000, 64, 500
 
 
 @record
+class Ray:
+    """A point as it was measured in one of several images: as `Mark` has it of a single one."""
+
+    image: tuple[float, float]
+    sigma_image: float | None = None
+    covariance: tuple[float, float, float] | None = None
+    how: Literal["manual", "matched", "file"] = "manual"
+    score: float | None = None
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """Covariance ``(2, 2)`` of the measurement, px^2."""
+        return _matrix(self.sigma_image, self.covariance)
+
+
+@record
 class Mark:
     """One point as it was measured.
 
     `image` is column, row from the outer corner of the first pixel (px), `ground` as `GROUND_CRS`; None is not
     measured. `covariance` has the variances of column and row and their covariance (px^2), `sigma_image` (px) counts
     where it is None. `how` says who gave the image, `ground_from` who gave the ground, `score` how alike chips were.
+    Of several images `rays` has what was measured, by the names of the images, in place of all that is of one image.
     """
 
     id: str
@@ -51,13 +68,18 @@ class Mark:
     how: Literal["manual", "matched", "file"] = "manual"
     ground_from: Literal["reference", "typed", "file"] | None = None
     score: float | None = None
+    rays: dict[str, Ray] = field(default_factory=dict)
     note: str = ""
     at: str = ""
 
     @property
     def whole(self) -> bool:
-        """Whether both places are known."""
-        return self.image is not None and self.ground is not None
+        """Whether both places are known; of several images: whether it says something of them."""
+        if not self.rays:
+            return self.image is not None and self.ground is not None
+        if self.role == "tie" or self.ground is None:
+            return self.role == "tie" and len(self.rays) >= 2
+        return self.role == "control" or len(self.rays) >= 2
 
     @property
     def counts(self) -> bool:
@@ -67,10 +89,34 @@ class Mark:
     @property
     def matrix(self) -> np.ndarray:
         """Covariance ``(2, 2)`` of the measurement, px^2."""
-        if self.covariance is None:
-            return np.eye(2) * (self.sigma_image or DEFAULT_SIGMA_IMAGE) ** 2
-        column, row, both = self.covariance
-        return np.array([[column, both], [both, row]])
+        return _matrix(self.sigma_image, self.covariance)
+
+    @property
+    def places(self) -> set[tuple[object, ...]]:
+        """Where it is, as no other point may be: a file with both would be refused by whoever reads it."""
+        images = {name: ray.image for name, ray in self.rays.items()} if self.rays else {"": self.image}
+        found: set[tuple[object, ...]] = {
+            ("image", name, *np.round(place, 6).tolist()) for name, place in images.items() if place is not None
+        }
+        if self.ground is not None and not (self.rays and self.role == "tie"):
+            found.add(("ground", *np.round(self.ground, 8).tolist()))
+        return found
+
+
+def _matrix(sigma: float | None, covariance: tuple[float, float, float] | None) -> np.ndarray:
+    if covariance is None:
+        return np.eye(2) * (sigma or DEFAULT_SIGMA_IMAGE) ** 2
+    column, row, both = covariance
+    return np.array([[column, both], [both, row]])
+
+
+def errors_of(measured: Sequence[Mark | Ray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return standard deviations ``(N,)`` and covariances ``(N, 2, 2)`` of measurements, as a file of them says."""
+    covariance = np.array([one.matrix for one in measured], dtype=float).reshape(-1, 2, 2)
+    sigma = sigma_of_covariance(covariance)
+    for k in np.flatnonzero(~says_more(covariance)).tolist():
+        sigma[k] = measured[k].sigma_image or sigma[k] if measured[k].covariance is None else sigma[k]
+    return sigma, covariance
 
 
 def checked(mark: Mark) -> Mark:
@@ -87,24 +133,30 @@ def checked(mark: Mark) -> Mark:
                          remedy=f"1 to {LONGEST_ID} characters, single blanks only within")  # fmt: skip
     if len(mark.note) > LONGEST_NOTE or not is_writable(mark.note):
         raise InputError("this note cannot be kept", field="note", remedy=f"write at most {LONGEST_NOTE} characters")
-    if mark.image is not None and max(map(abs, mark.image)) > 1e8:
-        raise InputError("this is no place in an image", field="image")
+    _check_measurement(mark, "")
+    for name, ray in mark.rays.items():
+        _check_measurement(ray, f"rays.{name}.")
     if mark.ground is not None:
         lon, lat, height = mark.ground
         if not (abs(lon) <= 360 and abs(lat) <= 90 and abs(height) <= 20_000):
             raise InputError("this is no place on Earth", field="ground", remedy="check the coordinates and their CRS")
-    if mark.sigma_image is not None and not 1e-6 <= mark.sigma_image <= 1e6:
-        raise InputError("a standard deviation is positive", field="sigma_image", remedy="give pixels")
     for key in ("sigma_xy", "sigma_h", "sigma_common"):
         if not 0 <= getattr(mark, key) <= 1e6:
             raise InputError("a standard deviation is not negative", field=key, remedy="give metres")
-    if mark.covariance is not None:
-        column, row, both = mark.covariance
-        if not (column > 0 and row > 0 and both**2 < column * row * (1 - 1e-9)):
-            raise InputError("this is no covariance", field="covariance")
     if mark.group is not None and mark.group < 0:
         raise InputError("groups are numbered from 0 on", field="group")
     return mark
+
+
+def _check_measurement(one: Mark | Ray, where: str) -> None:
+    if one.image is not None and max(map(abs, one.image)) > 1e8:
+        raise InputError("this is no place in an image", field=f"{where}image")
+    if one.sigma_image is not None and not 1e-6 <= one.sigma_image <= 1e6:
+        raise InputError("a standard deviation is positive", field=f"{where}sigma_image", remedy="give pixels")
+    if one.covariance is not None:
+        column, row, both = one.covariance
+        if not (column > 0 and row > 0 and both**2 < column * row * (1 - 1e-9)):
+            raise InputError("this is no covariance", field=f"{where}covariance")
 
 
 def mark_of(document: Any) -> Mark:
@@ -137,10 +189,7 @@ class Marks:
         groups = np.array([-1 if mark.group is None else mark.group for mark in used], dtype=np.int64)
         of_reference = np.array([mark.ground_from == "reference" for mark in used], dtype=bool) & (groups < 0)
         groups[of_reference] = groups.max(initial=-1) + 1 + np.arange(int(of_reference.sum()))
-        covariance = np.array([mark.matrix for mark in used], dtype=float).reshape(-1, 2, 2)
-        sigma = sigma_of_covariance(covariance)
-        for k in np.flatnonzero(~says_more(covariance)):
-            sigma[k] = used[k].sigma_image or sigma[k] if used[k].covariance is None else sigma[k]
+        sigma, covariance = errors_of(used)
         return Points(
             ids=tuple(mark.id for mark in used),
             image=np.array([mark.image for mark in used], dtype=float).reshape(-1, 2),
@@ -287,9 +336,7 @@ def _refuse_twin(others: Sequence[Mark], mark: Mark) -> None:
     if not mark.counts:
         return
     for other in others:
-        if not other.counts:
-            continue
-        for name, digits in (("image", 6), ("ground", 8)):
-            if np.array_equal(np.round(getattr(mark, name), digits), np.round(getattr(other, name), digits)):
-                raise InputError(f"{other.id} has the same {name}", field=name,
-                                 remedy=f"measure {other.id} anew, or switch it off")  # fmt: skip
+        if other.counts and (same := mark.places & other.places):
+            name = str(min(same, key=str)[0])
+            raise InputError(f"{other.id} has the same {name}", field=name,
+                             remedy=f"measure {other.id} anew, or switch it off")  # fmt: skip

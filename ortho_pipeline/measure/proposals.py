@@ -75,7 +75,7 @@ def propose(places: Places, image: Sequence[float], radius: float) -> Proposal:
     places : Places
         With a model that puts the wanted ground at the click, as well as is known.
     """
-    factor = _factor(places)
+    factor = chip_factor(places.view, places.references, np.asarray(image, dtype=float)[None])
     reach = int(np.clip(np.ceil(radius / factor), NEAR, FARTHEST))
     origin = np.round(np.asarray(image, dtype=float) - SIDE * factor / 2).astype(int)[None]
     scene = scene_chips(places.view, origin, SIDE, factor)
@@ -135,12 +135,6 @@ def proposal_of(places: Places, click: Array | None, ground: Array | None, radiu
         "covariance": json_position([column, row, both]), "scattered": found.scattered, "reason": reason,
     })  # fmt: skip
     return told
-
-
-def _factor(places: Places) -> int:
-    """Return the scene's pixels in a chip pixel."""
-    middle = np.array([[places.view.size[0] / 2, places.view.size[1] / 2]])
-    return chip_factor(places.view, places.references, middle)
 
 
 def _rendered(places: Places, origins: NDArray[np.int_], radius: int, factor: int) -> NDArray[np.float32]:

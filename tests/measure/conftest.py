@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from osgeo import gdal, osr
 
+from ortho_pipeline.exchange.rpc import write_rpc_txt
+from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.simulation.terrain import Landscape, Terrain
@@ -29,10 +31,10 @@ class Truth:
         """Return where the camera has ground ``(N, 3)`` in longitude, latitude and ellipsoidal height."""
         return self.camera.ground_to_image(ground_transform("EPSG:4979", self.camera.crs)(np.asarray(ground)))
 
-    def ground_at(self, image: np.ndarray) -> np.ndarray:
-        """Return the true ground ``(N, 3)`` of image points, lon, lat, h."""
+    def ground_at(self, image: np.ndarray, rounds: int = 40) -> np.ndarray:
+        """Return the true ground ``(N, 3)`` of image points, lon, lat, h; each round is some ten times as near."""
         height = np.full(len(image), 850.0)
-        for _ in range(40):
+        for _ in range(rounds):
             ground = ground_transform(self.camera.crs, "EPSG:4979")(self.camera.image_to_ground(image, height))
             height = self.terrain(ground[:, 0], ground[:, 1])
         return np.column_stack([ground[:, :2], height])
@@ -101,3 +103,50 @@ def write_reference(truth: Truth, path: Path, about: np.ndarray | None = None) -
         values = landscape(np.column_stack([x.ravel(), y.ravel()])).reshape(x.shape)
         band.WriteArray(np.round(1 + values * 250).astype(np.uint8), column, row)
     dataset = None
+
+
+#: What the RPC of the second scene is off by (px), and half the side of what is there about each feature.
+SECOND_BIAS, _SEEN = np.array([-3.0, 5.0]), 60
+
+
+@dataclass(frozen=True)
+class Stereo:
+    """A second scene of the same ground, from the other side: its file and its truth."""
+
+    path: Path
+    truth: Truth
+
+
+@pytest.fixture(scope="session")
+def stereo(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Stereo:
+    path = tmp_path_factory.mktemp("stereo") / "second.tif"
+    return write_second(truth, path, FEATURES)
+
+
+def write_second(truth: Truth, path: Path, about: np.ndarray | None = None) -> Stereo:
+    """Write a scene from 14 degrees on the other side, with a biased RPC; only about features if they are given."""
+    camera = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=-14.0, heights=(600.0, 1200.0))
+    second = Truth(camera, truth.terrain)
+    landscape = Landscape(truth.terrain, _PIXEL, seed=7)
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), camera.width, camera.height, 1, gdal.GDT_Byte)
+    step = 2 * _SEEN
+    if about is None:
+        corners = [(column, row) for column in range(0, 980, step) for row in range(0, 980, step)]
+    else:
+        corners = (np.round(second.image_of(truth.ground_at(about))).astype(int) - _SEEN).tolist()
+    for column, row in corners:
+        left, top = max(column, 0), max(row, 0)
+        width, height = min(column + step, camera.width) - left, min(row + step, camera.height) - top
+        columns, rows = np.meshgrid(left + np.arange(width) + 0.5, top + np.arange(height) + 0.5)
+        ground = second.ground_at(np.column_stack([columns.ravel(), rows.ravel()]), rounds=4)
+        values = landscape(truth.terrain.xy(*ground[:, :2].T)).reshape(height, width)
+        dataset.GetRasterBand(1).WriteArray(np.round(1 + values * 250).astype(np.uint8), left, top)
+    dataset = None
+    centre, half = camera.domain
+    box = *(centre - 1.02 * half)[:2].tolist(), *(centre + 1.02 * half)[:2].tolist()
+    rpc = fit_rpc(camera, box, (600.0, 1200.0)).rpc
+    column, row = SECOND_BIAS
+    write_rpc_txt(
+        replace(rpc, col_off=rpc.col_off - column, row_off=rpc.row_off - row), path.with_name("second_RPC.TXT")
+    )
+    return Stereo(path, second)

@@ -29,11 +29,12 @@ _SLOW_MACHINE = 60_000
 class Served:
     """`ortho measure` as a process of its own, and a browser page on it."""
 
-    def __init__(self, page, folder: Path, reference: Path) -> None:
+    def __init__(self, page, folder: Path, reference: Path, *images: Path) -> None:
         self.output = folder / "p.geojson"
         code = "from ortho_pipeline.cli.program import main; main()"
         self.process = subprocess.Popen(
-            [sys.executable, "-c", code, "measure", str(SAMPLE / "scene.tif"), "--reference", str(reference), "--dem",
+            [sys.executable, "-c", code, "measure", str(SAMPLE / "scene.tif"), *map(str, images),
+             "--reference", str(reference), "--dem",
              str(SAMPLE / "dem.tif"), "-o", str(self.output), "--no-browser"],
             stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
@@ -81,9 +82,9 @@ def browser() -> Iterator[object]:
 def serve(browser, tmp_path: Path):
     running = []
 
-    def serving(reference: Path, **context: object) -> Served:
+    def serving(reference: Path, *images: Path, **context: object) -> Served:
         page = browser.new_page(**{"viewport": {"width": 1400, "height": 860}, **context})
-        running.append(Served(page, tmp_path, reference))
+        running.append(Served(page, tmp_path, reference, *images))
         return running[-1]
 
     yield serving
@@ -106,6 +107,11 @@ def test_a_person_clicks_two_points(serve, reference: Path, truth, features: np.
         served.accept(f"P{number + 1}")
     served.says("#what", "left out in turn, relative to the reference")
     assert served.page.locator("#table tbody tr").count() == 2
+    # Loaded anew, the page shows the points that there are.
+    served.page.reload()
+    served.says("#what", "left out in turn, relative to the reference")
+    playwright.expect(served.page.locator("#table tbody tr")).to_have_count(2)
+    served.says("#said", "Click a feature")
     points = served.end()
     assert missed(points, truth).max() < 0.1
     assert [one["properties"]["measured"] for one in points] == ["matched", "matched"]
@@ -156,6 +162,40 @@ def test_a_point_is_measured_in_the_map_which_follows_the_scene(serve, whole_ref
     points = served.end()
     assert len(points) == 3
     assert missed(points, truth).max() < 0.1
+    assert not served.faults
+
+
+@pytest.mark.slow
+def test_a_stereo_pair_is_tied_by_clicks_in_either_image(
+    serve, reference: Path, stereo, truth, features: np.ndarray, tmp_path: Path
+) -> None:
+    served = serve(reference, stereo.path)
+    page = served.page
+    served.says("#reference-title", "second.tif")
+    # Ties and control by a click in the first image; the last one begins in the second.
+    for number, role in enumerate(["control", "tie", "control", "check"]):
+        page.select_option("#role", role)
+        served.click("scene", features[number] + np.array([2, -2]))
+        served.says("#said", "Matched: second")
+        page.keyboard.press("Enter")
+        served.says("#said", f"P{number + 1} accepted")
+        page.keyboard.press("Escape")
+    served.says("#what", "1 check point whose ground took no part, relative to the reference")
+    page.select_option("#role", "tie")
+    page.select_option("#scene-shows", "scene-1")
+    page.select_option("#reference-shows", "scene-0")
+    page.keyboard.press("j")
+    served.says("#said", "P1: control")
+    page.keyboard.press("Escape")
+    page.select_option("#reference-shows", "map-0")
+    page.wait_for_timeout(500)
+    playwright.expect(page.locator("#table tbody tr")).to_have_count(4)
+    features_of_file = served.end()
+    assert [one["properties"]["filename"] for one in features_of_file] == ["scene.tif", "second.tif"] * 4
+    for first, second in zip(features_of_file[::2], features_of_file[1::2], strict=True):
+        ground = truth.ground_at(np.array([first["properties"]["ji"]]) + 0.5)
+        apart = np.array(second["properties"]["ji"]) + 0.5 - stereo.truth.image_of(ground)[0]
+        assert np.hypot(*apart) < 0.2
     assert not served.faults
 
 

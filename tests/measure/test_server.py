@@ -91,7 +91,8 @@ def test_no_path_of_a_request_is_opened(client: TestClient, path: str, monkeypat
     [
         ("begin", {}), ("act", {"window": WINDOW, "action": {"do": "begin", "marks": []}}),
         ("act", {"window": WINDOW, "action": {"do": "put", "mark": {"id": "A", "image": [1e400, 0]}}}),
-        ("act", {"window": WINDOW}), ("propose", {}), ("propose", {"image": [1]}), ("propose", {"image": ["1", 2]}),
+        ("act", {"window": WINDOW}), ("propose", {}), ("tie", {"number": 0, "image": [1, 2]}),
+        ("propose", {"image": [1]}), ("propose", {"image": ["1", 2]}),
         ("predict", {}), ("predict", {"at": "scene-0", "place": [1, 2], "version": -1}),
         ("predict", {"at": "scene-0", "place": [1, 2], "version": 99}), ("predict", {"at": "scene-1", "place": [1, 2]}),
         ("link", {"at": "scene-0", "to": "../x", "place": [1, 2]}), ("link", {"at": "scene-0", "to": "map-0"}),

@@ -43,6 +43,9 @@ const look = (name) => (looks[name] ??= { bands: [0], limits: null });
 /** The number of the image that a view is in the geometry of, null for a map. */
 const imageOf = (name) => { const [kind, number] = geometryOf(name).split('-'); return kind === 'scene' ? Number(number) : null; };
 
+/** What the points call the image of a view, where there are several. */
+const labelOf = (name) => (facts.labels && name.startsWith('scene-') ? facts.labels[imageOf(name)] : null);
+
 /** The reference in the geometry of the left pane, where there is one: what flickers, and what a difference is from. */
 const overlay = () => { const name = `reference-${imageOf(views.shows.scene)}`; return facts.bands[name] ? name : null; };
 
@@ -56,8 +59,20 @@ async function showTiles(names = Object.values(views.shows)) {
 
 /** Where a mark is in a view, and its residual there: measured in an image, where its ground is shown elsewhere. */
 function placed(mark, name) {
-  if (name !== 'scene-0') return { place: mark.places?.[name] ?? null };
-  return { place: mark.image ?? null, residual: mark.residual };
+  const label = labelOf(name);
+  if (!name.startsWith('scene-')) return { place: mark.places?.[name] ?? null };
+  if (!facts.labels) return { place: mark.image ?? null, residual: mark.residual };
+  const ray = mark.rays?.[label];
+  return ray ? { place: ray.image, residual: mark.residuals?.[label] } : { place: mark.places?.[name] ?? null, expected: true };
+}
+
+/** Whether a point has all that it needs. */
+function complete(mark) {
+  if (!mark) return false;
+  if (!facts.labels) return Boolean(mark.image && mark.ground);
+  const rays = Object.keys(mark.rays).length;
+  const role = $('role').value;
+  return role === 'tie' ? rays >= 2 : Boolean(mark.ground) && rays >= (role === 'control' ? 1 : 2);
 }
 
 function draw() {
@@ -98,14 +113,14 @@ function tellNext() {
 function fill() {
   const mark = pending ?? {};
   $('name').value = mark.id ?? '';
-  $('role').value = mark.role ?? 'control';
+  $('role').value = mark.role ?? (facts.labels ? $('role').value : 'control');
   $('sigma').value = mark.sigma_image ?? '';
   $('sigma').placeholder = mark.covariance ? Math.sqrt((mark.covariance[0] + mark.covariance[1]) / 2).toFixed(3) : '0.5';
   $('note').value = mark.note ?? '';
   $('sigma-xy').value = mark.sigma_xy || '';
   $('sigma-h').value = mark.sigma_h || '';
   const writes = facts.writes;
-  $('accept').disabled = !writes || !pending?.image || !pending?.ground;
+  $('accept').disabled = !writes || !complete(pending);
   $('cancel').disabled = !pending;
   $('off').disabled = $('remove').disabled = !writes || !selected;
   $('next').disabled = !state.next.length;
@@ -118,7 +133,7 @@ function freeName() {
 }
 
 function begin() {
-  pending ??= { id: freeName(), role: $('role').value || 'control', how: 'manual', ground_from: null, sigma_xy: 0, sigma_h: 0, note: '' };
+  pending ??= { id: freeName(), role: $('role').value || 'control', how: 'manual', ground_from: null, sigma_xy: 0, sigma_h: 0, note: '', rays: {}, first: null };
 }
 
 function cancel() {
@@ -145,11 +160,57 @@ function take(found, wanted) {
   say(`Matched: score ${found.score.toFixed(3)}, ±${sigma.toFixed(3)} px${found.scattered ? ` by the scatter of ${found.scattered} neighbours` : ' (no neighbours to tell)'}. Enter accepts.`);
 }
 
+/** Take what the images show of a point under way, and tell what they do not. */
+function takeRays({ rays, ground }, clicked) {
+  const told = [];
+  for (const [label, ray] of Object.entries(rays)) {
+    if (ray.image && !ray.reason) {
+      const by = ray.covariance ? 'matched' : 'manual';
+      pending.rays[label] = { image: ray.image, covariance: ray.covariance ?? null, score: ray.score ?? null, how: by };
+      if (label !== clicked && by === 'matched') told.push(`${label} ±${Math.sqrt((ray.covariance[0] + ray.covariance[1]) / 2).toFixed(3)} px`);
+    }
+  }
+  const missing = Object.entries(rays).filter(([, ray]) => ray.reason && ray.seen);
+  if (ground && !ground.reason && !pending.by_hand) Object.assign(pending, { ground: ground.ground, ground_from: 'reference' });
+  const none = missing.map(([label, { reason }]) => ` No match in ${label}: ${reason}. Click it there.`).join('');
+  const unknown = ground?.reason && !pending.ground ? ` The reference: ${ground.reason}.` : '';
+  say(`${told.length ? `Matched: ${told.join(', ')}.` : ''}${none}${unknown}${complete(pending) ? ' Enter accepts.' : ''}`.trim(), !complete(pending));
+}
+
+/** Measure a place in one of several images, or of the ground in the reference. */
+async function tie(name, place, mine) {
+  const label = labelOf(name);
+  if (label) {
+    const again = pending.first === null || pending.first === label;
+    if (again) Object.assign(pending, { rays: {}, first: label });
+    else pending.rays[label] = { image: place, covariance: null, score: null, how: 'manual' };
+    const known = again ? {} : { [pending.first]: pending.rays[pending.first].image };
+    const found = await ask('tie', { number: imageOf(name), image: place, known });
+    if (mine !== turn) return;
+    takeRays(found, label);
+  } else {
+    const there = await ask('predict', { at: name, place, version: state.version });
+    if (mine !== turn) return;
+    if (!there.ground) { say('The reference shows no ground here.', true); return; }
+    Object.assign(pending, { ground: there.ground, ground_from: 'reference', by_hand: true });
+    if ($('role').value === 'tie') { pending.role = 'control'; $('role').value = 'control'; }
+    if (Object.keys(pending.rays).length) say('Ground taken. Enter accepts.');
+    else {
+      const found = await ask('tie', { ground: there.ground });
+      if (mine !== turn) return;
+      takeRays(found, null);
+      pending.first = Object.keys(pending.rays)[0] ?? null;
+    }
+  }
+  await locate(mine);
+}
+
 const measure = safely(async (pane, place) => {
   begin();
   const mine = (turn += 1);
   const name = views.shows[pane];
   say('Matching …');
+  if (facts.labels) { await tie(name, place, mine); return; }
   if (name.startsWith('scene-')) {
     const known = pending.ground && (pending.by_hand || pending.ground_from !== 'reference') ? pending.ground : null;
     Object.assign(pending, { image: place, how: 'manual', covariance: null, score: null, clicked: true });
@@ -171,20 +232,29 @@ const measure = safely(async (pane, place) => {
 
 /** Ask where the ground of the point under way is shown, and draw it. */
 async function locate(mine) {
-  const there = pending.ground ? await ask('predict', { ground: pending.ground, version: state.version })
-    : await ask('predict', { at: 'scene-0', place: pending.image, version: state.version });
+  const [first] = Object.entries(pending.rays ?? {});
+  const seen = first ? { at: `scene-${facts.labels.indexOf(first[0])}`, place: first[1].image } : { at: 'scene-0', place: pending.image };
+  const there = await ask('predict', { ...(pending.ground ? { ground: pending.ground } : seen), version: state.version });
   if (mine !== turn || !pending) return;
   pending.places = there.places;
   fill();
   draw();
 }
 
-const nudge = safely(async (column, row) => {
-  if (!pending?.image) return;
+/** What the arrow keys move in a pane: the measurement that it shows, if there is one under way. */
+function movable(pane) {
+  const label = pane && facts.labels && labelOf(views.shows[pane]);
+  if (label) return pending?.rays[label] ?? null;
+  return !facts.labels && pending?.image ? pending : null;
+}
+
+const nudge = safely(async (pane, column, row) => {
+  const moved = movable(pane);
+  if (!moved) return;
   const mine = (turn += 1);
-  pending.image = [pending.image[0] + column, pending.image[1] + row];
-  Object.assign(pending, { how: 'manual', covariance: null, score: null, clicked: true });
-  say(`By hand: column ${pending.image[0].toFixed(2)}, row ${pending.image[1].toFixed(2)}. Enter accepts.`);
+  Object.assign(moved, { image: [moved.image[0] + column, moved.image[1] + row], how: 'manual', covariance: null, score: null });
+  pending.clicked = true;
+  say(`By hand: column ${moved.image[0].toFixed(2)}, row ${moved.image[1].toFixed(2)}. Enter accepts.`);
   fill();
   draw();
   if (!pending.places) await locate(mine);
@@ -199,14 +269,21 @@ const decimal = (id) => {
 };
 
 /** The members of a mark that the server knows. */
-const plain = (mark) => Object.fromEntries(['id', 'image', 'ground', 'role', 'off', 'sigma_image', 'covariance', 'sigma_xy', 'sigma_h', 'sigma_common', 'group', 'how', 'ground_from', 'score', 'note']
-  .filter((key) => mark[key] !== undefined).map((key) => [key, mark[key]]));
+const only = (object, keys) => Object.fromEntries(keys.filter((key) => object[key] !== undefined).map((key) => [key, object[key]]));
+const plain = (mark) => (facts.labels ? {
+  ...only(mark, ['id', 'ground', 'role', 'off', 'sigma_xy', 'sigma_h', 'how', 'ground_from', 'note']),
+  rays: Object.fromEntries(Object.entries(mark.rays).map(([label, ray]) => [label, only(ray, ['image', 'sigma_image', 'covariance', 'how', 'score'])])),
+} : only(mark, ['id', 'image', 'ground', 'role', 'off', 'sigma_image', 'covariance', 'sigma_xy', 'sigma_h', 'sigma_common', 'group', 'how', 'ground_from', 'score', 'note']));
 
 const act = safely(async (action) => { const next = await ask('act', { action }); show(next); return next; });
 
 const accept = safely(async () => {
-  if (!pending?.image || !pending?.ground) { say('A point has a place in the scene and one on the ground.', true); return; }
+  if (!complete(pending)) {
+    say(facts.labels ? 'A tie is measured in two images or more; control and check points have their ground too.' : 'A point has a place in the scene and one on the ground.', true);
+    return;
+  }
   const sigma = decimal('sigma');
+  if (sigma !== null) for (const ray of Object.values(pending.rays ?? {})) Object.assign(ray, { sigma_image: sigma, covariance: null });
   const mark = plain({ ...pending, id: $('name').value.trim() || freeName(), role: $('role').value, note: $('note').value,
     sigma_xy: decimal('sigma-xy') ?? 0, sigma_h: decimal('sigma-h') ?? 0,
     ...(sigma === null ? {} : { sigma_image: sigma, covariance: null }) });
@@ -224,9 +301,10 @@ function choose(id) {
   if (!mark) return;
   turn += 1;
   selected = id;
-  pending = { ...mark, was: id, by_hand: true, clicked: true };
-  say(`${id}: ${mark.role}, ${mark.how}${mark.off ? ', off' : ''}. Nudge it, click it anew, or change what stands here; Enter accepts.`);
-  views.goTo({ ...mark.places, ...(mark.image ? { 'scene-0': mark.image } : {}) }, 1);
+  const rays = Object.fromEntries(Object.entries(mark.rays ?? {}).map(([label, ray]) => [label, { ...ray }]));
+  pending = { ...mark, rays, first: Object.keys(rays)[0] ?? null, was: id, by_hand: true, clicked: true };
+  say(`${id}: ${mark.role}${facts.labels ? '' : `, ${mark.how}`}${mark.off ? ', off' : ''}. Nudge it, click it anew, or change what stands here; Enter accepts.`);
+  views.goTo({ ...mark.places, ...(mark.image ? { 'scene-0': mark.image } : {}), ...Object.fromEntries(Object.entries(rays).map(([label, ray]) => [`scene-${facts.labels.indexOf(label)}`, ray.image])) }, 1);
   fill();
   draw();
 }
@@ -250,7 +328,9 @@ const dragged = safely(async (pane, id, place) => {
   if (!mark || !facts.writes) { draw(); return; }
   const changed = { ...mark, how: 'manual', covariance: null, score: null };
   const name = views.shows[pane];
-  if (name.startsWith('scene-')) changed.image = place;
+  const label = labelOf(name);
+  if (label) changed.rays = { ...mark.rays, [label]: { image: place, how: 'manual', covariance: null, score: null } };
+  else if (name.startsWith('scene-')) changed.image = place;
   else {
     const there = await ask('predict', { at: name, place, version: state.version });
     if (!there.ground) { draw(); return; }
@@ -350,19 +430,19 @@ function pressed(event) {
   if (typing) { if (key === 'Enter' && target.closest('#point')) { event.preventDefault(); accept(); } return; }
   const inMap = target.classList.contains('map');
   const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[key];
-  if (arrow && inMap && pending?.image) {
+  if (arrow && inMap && movable(target.id)) {
     event.preventDefault();
     event.stopPropagation(); // the view does not pan
     const step = event.shiftKey ? 1 : 0.1;
-    nudge(arrow[0] * step, arrow[1] * step);
+    nudge(target.id, arrow[0] * step, arrow[1] * step);
     return;
   }
   const along = (step) => { const { order } = table; if (order.length) choose(order[(order.indexOf(selected) + step + order.length) % order.length] ?? order[0]); };
   const keys = {
     m: () => { const pane = target.id === 'reference' ? 'reference' : 'scene'; measure(pane, views.middle(pane)); },
     u: () => { const select = $('reference-shows'); showIn('reference', select.options[(select.selectedIndex + 1) % select.options.length].value); },
-    n: goNext, j: () => along(1), k: () => along(-1), o: toggleOff, Delete: remove, c: models, s: stretch, g: makeOrtho,
-    r: () => { const roles = ['control', 'check', 'tie']; $('role').value = roles[(roles.indexOf($('role').value) + 1) % 3]; if (pending) pending.role = $('role').value; say(`Role: ${$('role').value}.`); },
+    n: goNext, j: () => along(1), k: () => along(-1), o: toggleOff, Delete: remove, s: stretch, ...(facts.labels ? {} : { c: models, g: makeOrtho }),
+    r: () => { const roles = ['control', 'check', 'tie']; $('role').value = roles[(roles.indexOf($('role').value) + 1) % 3]; if (pending) pending.role = $('role').value; say(`Role: ${$('role').value}.`); if (pending) fill(); },
     f: () => compare({ flicker: !compared.flicker, difference: false }), d: () => compare({ difference: !compared.difference, flicker: false }),
     z: () => act({ do: 'undo' }), Z: () => act({ do: 'redo' }), '?': () => $('keys').showModal(),
   };
@@ -371,9 +451,10 @@ function pressed(event) {
 
 /** What the panes may show: names of views, and what people call them. */
 function choices(pane) {
-  const scenes = facts.images.map((image, number) => [`scene-${number}`, facts.images.length > 1 ? image.name : 'Scene']);
+  const scenes = facts.images.map((image, number) => [`scene-${number}`, facts.labels ? image.name : 'Scene']);
   if (pane === 'scene') return scenes;
-  return [['reference-0', 'Reference, as the scene would see it'],
+  const rendered = facts.images.map((image, number) => [`reference-${number}`, facts.labels ? `Reference, as ${image.name} sees it` : 'Reference, as the scene would see it']);
+  return [...(facts.labels ? [...scenes.slice(1), scenes[0]] : []), ...rendered.filter(([name]) => facts.bands[name]),
     ...facts.maps.map((one, number) => [`map-${number}`, `Reference as a map${facts.maps.length > 1 ? `: ${one.name}` : ''}`])];
 }
 
@@ -387,6 +468,7 @@ function showIn(pane, name) {
   views.put(pane, name);
   bandChoices(pane);
   if (pane === 'scene') compare({});
+  for (const id of ['flicker', 'difference', 'swipe']) $(id).disabled = !overlay();
   draw();
   return safely(showTiles)([name]);
 }
@@ -420,9 +502,11 @@ async function start(given = {}) {
     views = new Views(facts, {
       clicked: (pane, place, hit) => (hit && !pending ? choose(hit) : measure(pane, place)), dragged,
       linked: (at, to, place) => safely(ask)('link', { at, to, place, version: state.version }),
-      zoomed: () => { if (state) draw(); },
+      zoomed: () => { if (state && views.shows.reference) draw(); },
     });
-    table = new Table($('table'), choose);
+    table = new Table($('table'), choose, Boolean(facts.labels));
+    $('compare').hidden = $('make').hidden = Boolean(facts.labels);
+    if (facts.labels) $('role').value = 'tie';
     state = facts.state;
     for (const pane of PANES) {
       const select = $(`${pane}-shows`);
@@ -432,7 +516,7 @@ async function start(given = {}) {
       select.addEventListener('change', () => showIn(pane, select.value));
       views.put(pane, select.value);
     }
-    $('correction').replaceChildren(new Option('shift (default)', ''), ...facts.corrections.map((name) => new Option(name)));
+    $('correction').replaceChildren(new Option(facts.labels ? 'default' : 'shift (default)', ''), ...facts.corrections.map((name) => new Option(name)));
   }
   show(facts.state);
   fill();
@@ -447,7 +531,7 @@ for (const [id, work] of Object.entries({
 $('ortho-mix').addEventListener('input', () => { $('ortho-reference').style.opacity = $('ortho-mix').value / 100; });
 $('swipe').addEventListener('input', () => compare({ swipe: Number($('swipe').value), flicker: false, difference: false }));
 $('correction').addEventListener('change', () => act({ do: 'correct', correction: $('correction').value || null }));
-for (const [id, key] of [['name', 'id'], ['role', 'role'], ['note', 'note']]) $(id).addEventListener('change', () => { if (pending) pending[key] = $(id).value; });
+for (const [id, key] of [['name', 'id'], ['role', 'role'], ['note', 'note']]) $(id).addEventListener('change', () => { if (pending) { pending[key] = $(id).value; fill(); } });
 document.addEventListener('keydown', pressed, true);
 addEventListener('pagehide', () => navigator.sendBeacon('api/leave', JSON.stringify({ window: windowName })));
 safely(start)();

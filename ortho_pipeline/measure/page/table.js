@@ -1,8 +1,8 @@
 // The table of points, sorted by whatever is clicked.
 
-const number = (value, digits = 3) => (value === null || value === undefined ? '–' : value.toFixed(digits));
+const number = (value, digits = 3) => (value === null || value === undefined ? '–' : value.toFixed(digits).replace(/^-(0\.?0*)$/, '$1'));
 const length = (pair) => (pair ? Math.hypot(...pair) : null);
-const COLUMNS = [
+const ONE = [
   ['Point', (mark) => mark.id, (mark) => mark.id],
   ['Role', (mark) => mark.role, (mark) => (mark.off ? `${mark.role}, off` : mark.role)],
   ['Column', (mark) => mark.residual?.[0] ?? null, (mark) => number(mark.residual?.[0])],
@@ -10,17 +10,33 @@ const COLUMNS = [
   ['m', (mark) => length(mark.residual_m), (mark) => number(length(mark.residual_m))],
   ['Left out', (mark) => length(mark.loo), (mark) => number(length(mark.loo))],
   ['w', (mark) => mark.w ?? null, (mark) => number(mark.w, 1)],
-  ['By', (mark) => mark.how, (mark) => ({ matched: 'match', manual: 'hand' }[mark.how] ?? mark.how)],
+  ['By', (mark) => mark.how, (mark) => (hands[mark.how] ?? mark.how)],
+];
+
+const rays = (mark) => Object.keys(mark.rays ?? {}).length;
+const longest = (mark) => (mark.residuals ? Math.max(...Object.values(mark.residuals).map(length)) : null);
+const plan = (values) => (values ? Math.hypot(values[0], values[1]) : null);
+const hands = { matched: 'match', manual: 'hand' };
+const SEVERAL = [
+  ['Point', (mark) => mark.id, (mark) => mark.id],
+  ['Role', (mark) => mark.role, (mark) => (mark.off ? `${mark.role}, off` : mark.role)],
+  ['Rays', rays, (mark) => String(rays(mark))],
+  ['px', longest, (mark) => number(longest(mark))],
+  ['Plan, m', (mark) => plan(mark.residual_m), (mark) => number(plan(mark.residual_m), 2)],
+  ['h, m', (mark) => mark.residual_m?.[2] ?? null, (mark) => number(mark.residual_m?.[2], 2)],
+  ['± h, m', (mark) => mark.sigma_m?.[2] ?? null, (mark) => number(mark.sigma_m?.[2], 2)],
+  ['By', (mark) => rays(mark), (mark) => [...new Set(Object.values(mark.rays ?? {}).map((ray) => hands[ray.how] ?? ray.how))].join(', ')],
 ];
 
 export class Table {
-  /** @param {HTMLTableElement} table @param {(id: string) => void} chosen */
-  constructor(table, chosen) {
+  /** @param {HTMLTableElement} table @param {(id: string) => void} chosen @param {boolean} several images */
+  constructor(table, chosen, several) {
+    this.columns = several ? SEVERAL : ONE;
     this.body = table.tBodies[0];
     this.chosen = chosen;
     this.by = 0;
     this.down = false;
-    this.heads = COLUMNS.map(([name], index) => {
+    this.heads = this.columns.map(([name], index) => {
       const head = document.createElement('th');
       head.scope = 'col';
       const button = document.createElement('button');
@@ -37,7 +53,7 @@ export class Table {
   draw(marks, selected) {
     this.marks = marks;
     this.selected = selected;
-    const key = COLUMNS[this.by][1];
+    const key = this.columns[this.by][1];
     const size = (mark) => { const value = key(mark); return typeof value === 'number' ? Math.abs(value) : value; };
     const sorted = [...marks].sort((one, other) => {
       const [first, second] = [size(one), size(other)];
@@ -54,7 +70,7 @@ export class Table {
       row.setAttribute('aria-selected', String(mark.id === selected));
       row.className = [mark.off ? 'off' : '', mark.suspicious ? 'doubt' : ''].join(' ');
       if (mark.reason) row.title = mark.reason;
-      row.append(...COLUMNS.map(([, , text]) => { const cell = document.createElement('td'); cell.textContent = text(mark); return cell; }));
+      row.append(...this.columns.map(([, , text]) => { const cell = document.createElement('td'); cell.textContent = text(mark); return cell; }));
       row.addEventListener('click', () => this.chosen(mark.id));
       row.addEventListener('keydown', (event) => { if (event.key === 'Enter') { event.stopPropagation(); this.chosen(mark.id); } });
       return row;

@@ -27,9 +27,10 @@ function tiled(name, size, tile, projection) {
   };
 }
 
-function symbol(mark, selected) {
-  const off = mark.off || !mark.image || !mark.ground;
-  const stroke = new ol.style.Stroke({ color: mark.suspicious ? '#ff3b1f' : COLOURS[mark.role], width: selected ? 4 : 2 });
+/** Dashed is where a point is expected and was not measured. */
+function symbol(mark, selected, expected) {
+  const off = mark.off || expected;
+  const stroke = new ol.style.Stroke({ color: mark.suspicious ? '#ff3b1f' : COLOURS[mark.role], width: selected ? 4 : 2, lineDash: expected ? [3, 4] : undefined });
   const fill = new ol.style.Fill({ color: off ? 'rgba(0,0,0,0)' : 'rgba(0,0,0,.35)' });
   const points = SHAPES[mark.role];
   return new ol.style.Style({
@@ -199,7 +200,7 @@ export class Views {
 
   /**
    * Draw marks with their residuals, the point under way, and the next place.
-   * @param {(mark: object, name: string) => {place: number[]|null, residual?: number[]|null}} placed where a mark is in a view
+   * @param {(mark: object, name: string) => {place: number[]|null, residual?: number[]|null, expected?: boolean}} placed where a mark is in a view
    */
   draw(marks, selected, pending, next, placed) {
     for (const pane of PANES) {
@@ -209,7 +210,7 @@ export class Views {
       const features = [];
       const all = marks.map((mark) => [mark, placed(mark, name)]);
       const extent = Math.max(...all.map(([, { residual }]) => (residual ? Math.hypot(...residual) : 0)), 0);
-      for (const [mark, { place, residual }] of all) {
+      for (const [mark, { place, residual, expected }] of all) {
         if (!place) continue;
         if (residual && extent > 0) {
           // The longest vector is as long as 60 px of the screen.
@@ -220,8 +221,8 @@ export class Views {
           features.push(vector);
         }
         const feature = new ol.Feature(new ol.geom.Point(at(place)));
-        feature.setId(mark.id);
-        feature.setStyle(symbol(mark, mark.id === selected));
+        if (!expected) feature.setId(mark.id);
+        feature.setStyle(symbol(mark, mark.id === selected, expected));
         features.push(feature);
       }
       const { place } = pending ? placed(pending, name) : { place: null };

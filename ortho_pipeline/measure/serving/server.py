@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import parse_json
+from ortho_pipeline.measure.block.session import BlockSession
+from ortho_pipeline.measure.project import Project
 from ortho_pipeline.measure.serving.guard import REPORT_POLICY, App, Guard
 from ortho_pipeline.measure.serving.making import PICTURES, Making
 from ortho_pipeline.measure.serving.tiles import MOST, SIDE, Tiles
@@ -69,9 +71,29 @@ class Windows:
 class _Answers:
     """What is answered to each request; methods of the same names as paths."""
 
-    def __init__(self, session: Session, tiles: Tiles) -> None:
+    def __init__(self, session: Project, tiles: Tiles) -> None:
         self._session, self._tiles, self._windows = session, tiles, Windows()
-        self.making = Making(session)
+        self._making = Making(session) if isinstance(session, Session) else None
+
+    @property
+    def scene(self) -> Session:
+        """The session of a single scene.
+
+        Raises
+        ------
+        InputError
+            If there are several.
+        """
+        if not isinstance(self._session, Session):
+            raise InputError("this is asked of one scene", field="request", remedy=_REMEDY)
+        return self._session
+
+    @property
+    def making(self) -> Making:
+        """What makes orthos of a single scene."""
+        if self._making is None:
+            raise InputError("orthos are made of one scene", field="request", remedy=_REMEDY)
+        return self._making
 
     def begin(self, given: dict[str, Any]) -> dict[str, Any]:
         """Say what does not change: sizes, names, bands."""
@@ -80,6 +102,7 @@ class _Answers:
         return {
             "images": [_facts(view.intensity.source.path, view.size) for view in session.views],
             "maps": [_facts(sheet.reference.path, sheet.size) for sheet in session.sheets],
+            "labels": list(session.images.labels) if isinstance(session, BlockSession) else None,
             "output": os.path.basename(session.output), "tile": SIDE, "bands": self._tiles.bands,
             "corrections": list(CORRECTIONS), "writes": writes, "locked": session.journal.read_only,
             "healed": session.journal.healed, "state": session.state(),
@@ -119,9 +142,22 @@ class _Answers:
         image, ground = given.get("image"), given.get("ground")
         if image is None and ground is None:
             raise InputError("there is no place to match", field="image", remedy=_REMEDY)
-        return self._session.proposal(
+        return self.scene.proposal(
             None if image is None else _numbers(image, 2), None if ground is None else _numbers(ground, 3)
         )  # fmt: skip
+
+    def tie(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Match a click in one of several images, or a ground, in all of them."""
+        session, known = self._session, given.get("known") or {}
+        if not isinstance(session, BlockSession) or not isinstance(known, dict):
+            raise InputError("there is one image", field="request", remedy=_REMEDY)
+        if given.get("ground") is not None:
+            return session.of_ground(_numbers(given["ground"], 3))
+        number, labels = _whole(given.get("number")), session.images.labels
+        if number >= len(labels) or not set(known) <= set(labels):
+            raise InputError("there is no such image", field="number", remedy=_REMEDY)
+        places = {str(label): _numbers(place, 2) for label, place in known.items()}
+        return session.proposal(number, _numbers(given.get("image"), 2), places)
 
     def typed(self, given: dict[str, Any]) -> dict[str, Any]:
         """Understand typed coordinates."""
@@ -145,7 +181,7 @@ class _Answers:
 
     def compare(self, given: dict[str, Any]) -> dict[str, Any]:
         """Compare the models that the points could be fitted with."""
-        return self._session.compared()
+        return self.scene.compared()
 
     def save(self, given: dict[str, Any]) -> dict[str, Any]:
         """Write the points."""
@@ -172,7 +208,7 @@ class _Answers:
         return band
 
 
-def application(session: Session, token: str, hosts: set[str], opened: SceneOptions = SceneOptions()) -> App:
+def application(session: Project, token: str, hosts: set[str], opened: SceneOptions = SceneOptions()) -> App:
     """Return the ASGI application of a session."""
     from starlette.applications import Starlette
     from starlette.routing import Route
@@ -191,7 +227,7 @@ def application(session: Session, token: str, hosts: set[str], opened: SceneOpti
 class _Given:
     """What a request is given: parts of the page, tiles, answers, and what was made; work is done by threads."""
 
-    def __init__(self, session: Session, tiles: Tiles) -> None:
+    def __init__(self, session: Project, tiles: Tiles) -> None:
         self._session, self._tiles, self._answers = session, tiles, _Answers(session, tiles)
         room = resources.files("ortho_pipeline.measure")
         self._files = {name: room.joinpath("page", name).read_bytes() for name in PAGE}
@@ -225,8 +261,9 @@ class _Given:
         """Give the report of the ortho that was made, or a picture of it."""
         from starlette.responses import JSONResponse, Response
 
-        which, making, own = request.path_params["which"], self._answers.making, {"cache-control": "no-store"}
+        which, own = request.path_params["which"], {"cache-control": "no-store"}
         try:
+            making = self._answers.making
             if which == "report":
                 own["content-security-policy"] = REPORT_POLICY
                 return Response(await self._run(making.report), media_type="text/html; charset=utf-8", headers=own)
@@ -257,23 +294,12 @@ class _Given:
 
 
 _ASKED = (
-    "begin",
-    "leave",
-    "act",
-    "state",
-    "predict",
-    "link",
-    "propose",
-    "typed",
-    "stretch",
-    "compare",
-    "save",
-    "make",
-    "made",
-)
+    "begin", "leave", "act", "state", "predict", "link", "propose", "tie", "typed", "stretch", "compare", "save",
+    "make", "made",
+)  # fmt: skip
 
 
-def serve(session: Session, opened: SceneOptions, ready: Callable[[str], None], port: int = 0) -> None:
+def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], port: int = 0) -> None:
     """Serve the page of a session until the process is asked to end.
 
     Parameters

@@ -1,0 +1,328 @@
+"""A session of several images: a stereo pair or a block, with or without a reference."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.block.start import Start
+from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.block_images import labels_of, start_of
+from ortho_pipeline.commands.control.block_points import read_points
+from ortho_pipeline.commands.control.matching import search_of
+from ortho_pipeline.commands.control.ties import DEM_SIGMA, FLAT_SIGMA, names_of
+from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
+from ortho_pipeline.commands.scene_fit import on_surface
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import sha256
+from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.geodesy.crs import horizontal, parse_crs
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.imaging.matching import OtherScene, Reference, View, open_references
+from ortho_pipeline.imaging.matching.targets import metres_per_pixel
+from ortho_pipeline.measure.block.proposals import Pair
+from ortho_pipeline.measure.block.solution import BlockSolution, figures, solve
+from ortho_pipeline.measure.block.table import block_points, document, marks_of_block
+from ortho_pipeline.measure.marks import GROUND_CRS, Mark
+from ortho_pipeline.measure.places import Geometry, Places, Sheet
+from ortho_pipeline.measure.planning import Grid, Next, measure_next
+from ortho_pipeline.measure.project import Project, moved, now
+from ortho_pipeline.measure.proposals import proposal_of
+from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.options import BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.points import Points
+from ortho_pipeline.raster.intensity import Intensity
+from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.surface.accuracy import typical_sigma
+
+#: What a click may be off in any case (px), once there is an adjustment.
+_HAND = 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class BlockImages:
+    """The images of a session: their paths, labels, names in files, scenes, and places by the models as delivered."""
+
+    paths: tuple[str, ...]
+    labels: tuple[str, ...]
+    names: tuple[str, ...]
+    scenes: tuple[Scene, ...]
+    places: tuple[Places, ...]
+
+
+class BlockSession(Project):
+    """Points that are measured in several images.
+
+    Parameters
+    ----------
+    images : BlockImages
+    references : tuple of Reference
+        None or more.
+    output : Path
+        The GeoJSON of the points; its journal lies beside it.
+    options : BlockOptions
+        What is adjusted, as for `ortho adjust`; `points` is what it begins with.
+    """
+
+    def __init__(
+        self, images: BlockImages, references: tuple[Reference, ...], output: Path, options: BlockOptions,
+        opened: SceneOptions = SceneOptions(), match: MatchOptions = MatchOptions(),
+    ) -> None:  # fmt: skip
+        surface = images.places[0].surface
+        maps = [Sheet(one, surface) for one in references]
+        super().__init__(output, surface, [one.view for one in images.places], maps)
+        self.images, self._options, self._opened = images, options, opened
+        self._starts: dict[str | None, dict[str, Start]] = {}
+        self._search = [
+            search_of(scene, match, metres_per_pixel(one.view)).distance / metres_per_pixel(one.view)
+            for scene, one in zip(images.scenes, images.places, strict=True)
+        ]
+        usual = FLAT_SIGMA if surface.provenance.get("constant_height") is not None else DEM_SIGMA
+        stated = typical_sigma(surface)
+        self._sigma_height = usual if stated is None else stated
+        others = tuple(OtherScene(one.view.intensity, one.model) for one in images.places[1:])
+        self.grid = Grid.over(replace(images.places[0], references=others))
+        self._everywhere = [self._spread(one) for one in images.places]
+        self.rendered: list[tuple[SensorModel, ...]] = [tuple(one.model for one in images.places)]
+        self._solution = BlockSolution(dict(zip(images.labels, self.rendered[0], strict=True)))
+        self._begin()
+
+    @staticmethod
+    def _spread(places: Places) -> Array:
+        """Return ground in the CRS of the model, all over an image."""
+        width, height = places.view.size
+        columns, rows = np.meshgrid(np.linspace(0, width, 5), np.linspace(0, height, 5))
+        image = np.column_stack([columns.ravel(), rows.ravel()])
+        return places.model.image_to_ground(image, np.full(len(image), places.model.reference_height))
+
+    # -- as any project ----------------------------------------------------------------------------------------------
+
+    def _identity(self) -> dict[str, Any]:
+        return {"images": [
+            {"name": name, "size": list(view.size)} for name, view in zip(self.images.names, self.views, strict=True)
+        ]}  # fmt: skip
+
+    def _source(self) -> dict[str, Any] | None:
+        path = self._options.points
+        return None if path is None else {"name": Path(path).name, "sha256": sha256(path)}
+
+    def _given(self) -> list[Mark] | None:
+        if self._options.points is None:
+            return None
+        images = self.images
+        table, _ = read_points(images.paths, images.labels, self._options, self._opened.allow_network, whole=False)
+        return marks_of_block(table, now())
+
+    def _document(self) -> dict[str, Any]:
+        return document(self.marks, dict(zip(self.images.labels, self.images.names, strict=True)), self._called)
+
+    @property
+    def _called(self) -> str:
+        return os.fspath(self.output)
+
+    def starts(self, correction: str | None) -> Mapping[str, Start]:
+        """Return what the adjustment starts from with a correction, as `ortho adjust` has it.
+
+        Raises
+        ------
+        InputError
+            If a model cannot be corrected so.
+        """
+        if correction not in self._starts:
+            asked = replace(self._options, points=None, correction=correction or self._options.correction)
+            self._starts[correction] = {
+                label: start_of(path, asked, self._opened, _nothing(), None)
+                for label, path in zip(self.images.labels, self.images.paths, strict=True)
+            }
+        return self._starts[correction]
+
+    def act(self, action: Mapping[str, Any]) -> dict[str, Any]:
+        mark = action.get("mark")
+        rays = mark.get("rays") if isinstance(mark, dict) else None
+        strangers = sorted(set(rays) - set(self.images.labels)) if isinstance(rays, dict) else []
+        if strangers or (isinstance(mark, dict) and mark.get("image") is not None):
+            raise InputError("there is no such image", field="rays", remedy="load the page anew")
+        if action.get("do") == "correct":
+            self.starts(action.get("correction") if isinstance(action.get("correction"), str) else None)
+        return super().act(action)
+
+    def _solve(self) -> None:
+        table = block_points(self.marks, self.images.labels, self._called)
+        self._solution = solve(self.starts(self.marks.correction), table, self._options.hold)
+        if self._solution.fit is None:
+            # Heights under the scene are known to the models that were opened for it.
+            delivered = dict(zip(self.images.labels, self.rendered[0], strict=True))
+            self._solution = replace(self._solution, models=delivered)
+        models = tuple(self._solution.models[label] for label in self.images.labels)
+        if any(moved(*three) for three in zip(self.rendered[-1], models, self._everywhere, strict=True)):
+            self.rendered.append(models)
+
+    @property
+    def solution(self) -> BlockSolution:
+        """The adjustment to the points as they are now."""
+        return self._solution
+
+    @property
+    def version(self) -> int:
+        return len(self.rendered) - 1
+
+    def _figures(self) -> dict[str, Any]:
+        relative = any(mark.ground_from == "reference" and mark.role != "tie" and mark.counts
+                       for mark in self.marks.by_id.values())  # fmt: skip
+        return {"correction": self.marks.correction, **figures(self._solution, relative)}
+
+    def _ahead(self) -> list[Next]:
+        first = self.images.labels[0]
+        taken = [mark.rays[first].image for mark in self.marks.by_id.values() if first in mark.rays and mark.counts]
+        return measure_next(self.grid, None, np.array(taken, dtype=float).reshape(-1, 2))
+
+    def _grounds(self, marks: Sequence[Mark]) -> Array:
+        """Return known ground, that of the adjustment for ties, and on the surface for what has one ray alone."""
+        found, fit = super()._grounds(marks), self._solution.fit
+        adjusted = {} if fit is None else dict(zip(fit.points.ids, fit.ground, strict=True))
+        for k, mark in enumerate(marks):
+            if mark.ground is not None and mark.role != "tie":
+                continue
+            found[k] = adjusted.get(mark.id, np.full(3, np.nan))
+            if not np.isfinite(found[k]).all() and mark.rays:
+                label, ray = next(iter(mark.rays.items()))
+                found[k] = self._now(self.images.labels.index(label)).ground_of([ray.image])[0]
+        return found
+
+    def _sigma(self, ground: Array) -> list[float] | None:
+        return None
+
+    # -- places ------------------------------------------------------------------------------------------------------
+
+    def _now(self, number: int) -> Places:
+        return self.images.places[number].by(self._solution.models[self.images.labels[number]])
+
+    def at(self, version: int, number: int = 0) -> Places:
+        """Return the geometry that references were rendered with for an image."""
+        if not 0 <= version < len(self.rendered):
+            raise InputError("there is no such rendering", field="version")
+        return self.images.places[number].by(self.rendered[version][number])
+
+    def _geometries(self, version: int) -> dict[str, Geometry]:
+        found: dict[str, Geometry] = {}
+        for number in range(len(self.images.labels)):
+            found[f"scene-{number}"] = self._now(number)
+            found[f"reference-{number}"] = self.at(version, number)
+        return found | {f"map-{number}": sheet for number, sheet in enumerate(self.sheets)}
+
+    def rendering(self, name: str, version: int) -> Places | None:
+        kind, number = name.split("-")
+        return self.at(version, int(number)) if kind == "reference" else None
+
+    # -- proposals ---------------------------------------------------------------------------------------------------
+
+    def proposal(self, number: int, image: Sequence[float], known: Mapping[str, Sequence[float]]) -> dict[str, Any]:
+        """Return what the other images and the references show at a click in an image.
+
+        Parameters
+        ----------
+        number : int
+            Of the image.
+        known : mapping of label to (column, row)
+            Where the point was clicked already: with any, the first of them is looked for about the click.
+
+        Returns
+        -------
+        dict
+            `rays` by label: of the click itself its `covariance`; of the others as `Pair.proposal`. `ground`: as
+            `measure.proposals.proposal_of` for the references, null without any.
+        """
+        labels, click = self.images.labels, np.asarray(image, dtype=float)
+        rays: dict[str, Any] = {}
+        before = next((label for label in labels if label in known and label != labels[number]), None)
+        if before is not None:
+            pair = Pair(self._now(labels.index(before)), self._now(number))
+            rays[labels[number]] = pair.proposal(np.asarray(known[before], dtype=float), 0.0, 0.0, click)
+            return {"rays": rays, "ground": None}
+        own = []
+        for other, label in enumerate(labels):
+            if other != number:
+                rays[label] = Pair(self._now(number), self._now(other)).proposal(
+                    click, self._radius(number), self._sigma_height
+                )
+                if rays[label]["image"] is not None:
+                    own.append(rays[label]["own"])
+        rays[labels[number]] = {
+            "seen": True, "reason": "", "image": click.tolist(),
+            "covariance": np.mean(own, axis=0).tolist() if own else None,
+        }  # fmt: skip
+        ground = proposal_of(self._now(number), click, None, self._radius(number)) if self.sheets else None
+        return {"rays": json_value(rays), "ground": ground}
+
+    def of_ground(self, ground: Sequence[float]) -> dict[str, Any]:
+        """Return where all images show a ground of the reference, by matching: `rays` as `proposal` has them."""
+        place, rays = np.asarray(ground, dtype=float), {}
+        for number, label in enumerate(self.images.labels):
+            known = self._now(number)
+            there = known.image_of(place)[0]
+            if not (np.isfinite(there).all() and ((there >= 0) & (there <= known.view.size)).all()):
+                rays[label] = {"seen": False, "reason": "this image does not show this place", "image": None}
+            elif not self.sheets:
+                rays[label] = {"seen": True, "reason": "there is no reference to match with", "image": None}
+            else:
+                found = proposal_of(known, None, place, self._radius(number))
+                rays[label] = {**found, "image": None if found["reason"] else found["image"], "seen": True}
+        return {"rays": rays, "ground": None}
+
+    def _radius(self, number: int) -> float:
+        """Return within how many px of the prediction a click is looked for."""
+        return self._search[number] if self._solution.fit is None else _HAND
+
+
+def _nothing() -> Points:
+    """Return a table without points."""
+    none = np.zeros(0)
+    return Points((), none.reshape(0, 2), none.reshape(0, 3), none.astype("<U7"), none, none.reshape(0, 3),
+                  horizontal(parse_crs(GROUND_CRS)), "")  # fmt: skip
+
+
+def open_block_session(
+    images: Sequence[str | os.PathLike[str]],
+    output: str | os.PathLike[str],
+    *,
+    scene: SceneOptions = SceneOptions(),
+    points: BlockOptions = BlockOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+    match: MatchOptions = MatchOptions(),
+) -> BlockSession:
+    """Open images, heights and references, and go on with the points that a journal beside the output has.
+
+    Parameters
+    ----------
+    output : path
+        A ``.geojson`` file.
+
+    Raises
+    ------
+    InputError
+        For whatever the user can correct.
+    """
+    path = Path(output)
+    if path.suffix.lower() != ".geojson":
+        raise InputError("measured points are written as GeoJSON", file=path, field="output",
+                         remedy="a name with `.geojson`")  # fmt: skip
+    require_heights(surface)
+    labels, names = labels_of(images), names_of(images)
+    for image in images:
+        inputs.check_paths({"points": path}, image, scene, PointOptions(), surface, match)
+    alone = [inputs.open_scene(image, scene) for image in images]
+    heights = open_surface(surface, scene, under=alone)
+    scenes = tuple(on_surface(one, heights) for one in alone)
+    references = open_references(match.reference, **scene.access) if match.reference else ()
+    places = tuple(
+        Places(View(Intensity(RasterSource(*(one.rasters or (one.path,)), **scene.access)), one.model, heights),
+               references)
+        for one in scenes
+    )  # fmt: skip
+    known = BlockImages(tuple(os.fspath(image) for image in images), tuple(labels), tuple(names), scenes, places)
+    return BlockSession(known, references, path, points, scene, match)

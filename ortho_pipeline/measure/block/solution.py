@@ -1,0 +1,111 @@
+"""The bundle adjustment that is shown: that of `ortho adjust` to the points as they are now, and figures about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.block.start import Start
+from ortho_pipeline.errors import OrthoError, counted
+from ortho_pipeline.files.documents import json_position, json_value
+from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS
+
+
+@dataclass(frozen=True, eq=False)
+class BlockSolution:
+    """An adjustment, or why there is none.
+
+    Parameters
+    ----------
+    models : mapping of label to SensorModel
+        Adjusted; as they were delivered where nothing was adjusted.
+    fit : BlockFit, optional
+    error : str
+        What keeps it from being made, as people read it.
+    """
+
+    models: Mapping[str, SensorModel]
+    fit: BlockFit | None = None
+    error: str = ""
+
+
+def solve(starts: Mapping[str, Start], points: BlockPoints, hold: float | None) -> BlockSolution:
+    """Adjust images and points as `ortho adjust` does."""
+    models = {label: start.model for label, start in starts.items()}
+    if not len(points):
+        return BlockSolution(models)
+    without = [label for k, label in enumerate(points.images) if not (points.image == k).any()]
+    if without:
+        return BlockSolution(models, None, f"no point was measured in {without[0]} yet")
+    try:
+        fit = adjust(models, points, priors={label: start.priors for label, start in starts.items()}, hold=hold)
+    except OrthoError as error:
+        return BlockSolution(models, None, error.message)
+    except np.linalg.LinAlgError as error:
+        # What is in the journal has to open again, whatever it is.
+        return BlockSolution(models, None, f"the points cannot be adjusted ({error})")
+    return BlockSolution(fit.models, fit)
+
+
+def figures(solution: BlockSolution, relative: bool) -> dict[str, Any]:
+    """Return what the page shows of a solution, as JSON values; `relative` is one to a reference."""
+    fit = solution.fit
+    if fit is None:
+        return {"error": solution.error, "points": {}, "headline": _headline(None, relative), "notices": []}
+    table = fit.points
+    points: dict[str, dict[str, Any]] = {
+        name: {
+            "residuals": {}, "residual_m": json_position(fit.object_residuals[k]), "suspicious": False,
+            "sigma_m": json_position(fit.ground_sigmas[k]),
+        }
+        for k, name in enumerate(table.ids)
+    }  # fmt: skip
+    for ray in range(table.rays):
+        points[table.ids[table.point[ray]]]["residuals"][table.images[table.image[ray]]] = json_position(
+            fit.residuals[ray]
+        )
+    for one in fit.rejected:
+        where = f" in {one.image}" if one.image else ""
+        points[one.point] |= {"suspicious": True, "reason": f"left out{where}: {one.reason}"}
+    for doubt in fit.outlying:
+        text = f"the block contradicts its {doubt.what} by {doubt.metres:.2f} m ({doubt.sigmas:.1f} sigmas)"
+        points[doubt.point] |= {"suspicious": True, "reason": text}
+    return {
+        "error": "", "points": points, "headline": _headline(fit, relative), "sigma0": json_value(fit.sigma0),
+        "redundancy": fit.redundancy, "gauge": fit.gauge,
+        "parameters": json_value({
+            label: {
+                name: {"value": value, "sigma": sigma}
+                for (of, name), value, sigma in zip(fit.parameters, fit.values, fit.sigmas, strict=True) if of == label
+            }
+            for label in table.images
+        }),
+        "notices": [str(one) for one in fit.warnings],
+    }  # fmt: skip
+
+
+def _headline(fit: BlockFit | None, relative: bool) -> dict[str, Any]:
+    """Return the best evidence of accuracy that there is: check points, and never the residuals of the fit itself."""
+    if fit is None:
+        return {"px": None, "m": None, "what": "not tested: no fit"}
+    found = fit.object_rms()
+    if found is None:
+        return {"px": None, "m": None, "what": f"not tested: no check points; {fit.gauge}"}
+    rays = [one for one in (fit.image_rms(image, "check") for image in fit.points.images) if one is not None]
+    count = sum(int(one["n"]) for one in rays)
+    total = float(np.sqrt(sum(one["n"] * one["total"] ** 2 for one in rays) / count)) if count else None
+    few = f"; fewer than {ENOUGH_CHECK_POINTS} check points, no claim" if found["n"] < ENOUGH_CHECK_POINTS else ""
+    to = ", relative to the reference" if relative else ""
+    text = (
+        f"RMSE in plan, {found['h']:.3f} m in height, at {counted(found['n'], 'check point')} whose ground took no "
+        f"part{to}{few}"
+    )
+    told: dict[str, Any] = json_value({"px": total, "m": found["plan"], "n": found["n"], "what": text})
+    return told
