@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/report.md from a run on the sample scene: ``make images`` (Chromium)."""
+"""Draw the pictures of docs/report.md from the sample scene and the stereo pair: ``make images`` (Chromium)."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from pathlib import Path
 from playwright.sync_api import sync_playwright
 
 from ortho_pipeline import commands
-from ortho_pipeline.options import PointOptions, SurfaceOptions
+from ortho_pipeline.commands import block as blocks
+from ortho_pipeline.options import BlockOptions, PointOptions, SurfaceOptions
 
 ROOT = Path(__file__).resolve().parent.parent
 SAMPLE, IMAGES = ROOT / "sample_data", ROOT / "docs" / "images"
 
 
 def main() -> None:
-    """Rectify the sample scene and take pictures of its report: the first screen, dark, and the chips."""
+    """Take pictures of the report of the sample scene (first screen, dark, chips) and of that of the stereo pair."""
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as started:
         points, surface = PointOptions(gcps=SAMPLE / "gcps.geojson"), SurfaceOptions(dem=SAMPLE / "dem.tif")
@@ -28,6 +29,11 @@ def main() -> None:
             page.screenshot(path=IMAGES / f"{name}.jpg", type="jpeg", quality=80)
             if scheme == "light":
                 page.locator(".measured").screenshot(path=IMAGES / "report-chips.jpg", type="jpeg", quality=80)
+        pair = [SAMPLE / "cartosat" / name for name in ("BANDF.tif", "BANDA.tif")]
+        options = BlockOptions(points=SAMPLE / "cartosat" / "points.csv", correction="shift")
+        page = browser.new_page(viewport={"width": 1280, "height": 760})
+        page.goto(blocks.adjust(pair, Path(folder) / "block", options).files["html"].resolve().as_uri())
+        page.screenshot(path=IMAGES / "report-block.jpg", type="jpeg", quality=80)
         browser.close()
 
 
