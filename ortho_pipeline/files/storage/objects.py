@@ -49,6 +49,8 @@ def is_address(text: str | os.PathLike[str]) -> bool:
     return bool(_ADDRESS.match(os.fspath(text)))
 
 
+#: What we note of our checksum beside an object.
+_SHA256 = "sha256"
 _OTHER_TAG = "the checksum is not the one that the store states"
 
 
@@ -127,7 +129,7 @@ class Objects:
         return self._attempts(name, limit, write)[1]
 
     def _attempts(self, name: str, limit: int, take: Any) -> tuple[Any, Content]:
-        wrong, before = "", None
+        wrong = ""
         for _ in range(_ATTEMPTS):
             with self._errors(name):
                 result = self._store.get(name)
@@ -141,10 +143,10 @@ class Objects:
                 content = digests.content(result.meta["e_tag"])
                 count(content.size)
                 wrong = _difference(content, result.meta)
-            # The ETag of what S3 encrypts with keys of its own is no checksum: the same twice is what is there.
-            if not wrong or (wrong == _OTHER_TAG and self._encrypts and content == before):
+                ours = result.attributes.get(_SHA256)
+            # The ETag of what S3 encrypts with keys of its own is no checksum; what we wrote has one of ours beside it.
+            if not wrong or (wrong == _OTHER_TAG and ours == content.sha256):
                 return taken, content
-            before = content
         raise StorageError(
             f"{wrong}, {_ATTEMPTS} times", file=self.of(name),
             remedy="try again later; if it stays so, the object is damaged in its store",
@@ -190,7 +192,7 @@ class Objects:
             return self._put_if(name, data, content, "create" if new else {"e_tag": replacing})
         for _ in range(_ATTEMPTS):
             with self._errors(name):
-                made = self._store.put(name, data, chunk_size=PART, max_concurrency=4)
+                made = self._store.put(name, data, chunk_size=PART, max_concurrency=4, attributes=_noted(content))
                 # The answer says what was stored, unless the store gives no ETags.
                 stated = {"size": content.size, "e_tag": made["e_tag"]}
                 stored = stated if made["e_tag"] else self._store.head(name)
@@ -221,7 +223,7 @@ class Objects:
             wrong, failed = "", None
             try:
                 with self._errors(name):
-                    made = self._store.put(name, data, mode=mode, use_multipart=False)
+                    made = self._store.put(name, data, mode=mode, use_multipart=False, attributes=_noted(content))
                 stated = {"size": content.size, "e_tag": made["e_tag"]}
                 if not (wrong := _difference(content, stated, ours=True)):
                     return replace(content, e_tag=made["e_tag"])
@@ -309,6 +311,10 @@ class _Digests:
         joined = hashlib.md5(b"".join(parts), usedforsecurity=False).hexdigest()
         tags = (self._md5.hexdigest(), f"{joined}-{len(parts)}")
         return Content(self._size, self._sha256.hexdigest(), tags, e_tag)
+
+
+def _noted(content: Content) -> Any:
+    return {_SHA256: content.sha256}
 
 
 def _content(data: bytes | Path) -> Content:
