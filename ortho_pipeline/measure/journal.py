@@ -85,6 +85,25 @@ class Journal:
             raise _unwritable(self.path, error) from error
         self.actions.append(dict(action))
 
+    def more(self) -> list[dict[str, Any]]:
+        """Return what another process has written since, and keep it; a line that is not whole yet is left for later.
+
+        Raises
+        ------
+        InputError
+            If the journal is damaged.
+        """
+        if not self.read_only:
+            return []
+        try:
+            os.lseek(self._file, 0, os.SEEK_SET)
+            data = _whole(self._file, self.path)
+        except OSError as error:
+            raise _unwritable(self.path, error) from error
+        new = _lines(data, self.path)[1][len(self.actions) :]
+        self.actions += new
+        return new
+
     def close(self) -> None:
         """Let go of the file and of its lock."""
         if self._file >= 0:

@@ -182,9 +182,18 @@ class Project(abc.ABC):
         """Return the ground ``(N, 3)`` at which marks are shown; NaN where there is none."""
         return np.array([mark.ground or (np.nan,) * 3 for mark in marks], dtype=float).reshape(-1, 3)
 
+    def _follow(self) -> None:
+        """Do what another process has done since, if that one writes."""
+        new = self.journal.more()
+        for action in new:
+            self._history.take(self._history.after(_plain(action)))
+        if new:
+            self._solve()
+
     def state(self) -> dict[str, Any]:
         """Return all that changes with the points, as JSON values."""
         with self._lock:
+            self._follow()
             marks, history, version = list(self.marks.by_id.values()), self._history, self.version
             shown, ahead = self._places(version, self._grounds(marks)), self._ahead()
             there = self._geometries(version)["scene-0"].ground_of(

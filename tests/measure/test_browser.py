@@ -112,6 +112,15 @@ def test_a_person_clicks_two_points(serve, reference: Path, truth, features: np.
     served.says("#what", "left out in turn, relative to the reference")
     playwright.expect(served.page.locator("#table tbody tr")).to_have_count(2)
     served.says("#said", "Click a feature")
+    # A second window follows what the first one does.
+    second = served.page.context.browser.new_page()
+    second.goto(served.address)
+    playwright.expect(second.locator("#banner-text")).to_have_text(re.compile("Read only"), timeout=_SLOW_MACHINE)
+    served.page.keyboard.press("z")
+    playwright.expect(second.locator("#table tbody tr")).to_have_count(1, timeout=_SLOW_MACHINE)
+    second.close()
+    served.page.keyboard.press("Shift+Z")
+    playwright.expect(served.page.locator("#table tbody tr")).to_have_count(2)
     points = served.end()
     assert missed(points, truth).max() < 0.1
     assert [one["properties"]["measured"] for one in points] == ["matched", "matched"]

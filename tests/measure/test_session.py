@@ -145,6 +145,15 @@ def test_reopening_goes_on_where_it_ended(opens: Opens, tmp_path: Path) -> None:
     assert second.marks == first.marks
     with pytest.raises(InputError, match="another process"):
         second.act({"do": "undo"})
+    # It follows what the one that writes does, and not the half of a line.
+    again.act({"do": "remove", "id": again.state()["marks"][0]["id"]})
+    assert second.state()["marks"] == again.state()["marks"]
+    assert second.marks == again.marks
+    again.act({"do": "undo"})
+    with again.journal.path.open("ab") as torn:
+        torn.write(b'{"crc":"')
+    assert second.state()["points"] == again.state()["points"]
+    assert second.marks == again.marks
     again.close()
     assert len(json.loads((tmp_path / "p.geojson").read_text())["features"]) == 17
     with pytest.raises(InputError, match="began with others"):

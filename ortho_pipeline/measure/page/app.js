@@ -485,12 +485,19 @@ function bandChoices(pane) {
 }
 
 function banner() {
-  const text = facts.locked ? 'Read only: another process measures these points. This one shows them as they were when it was opened.'
+  const text = facts.locked ? 'Read only: another process measures these points. This one shows what that one does.'
     : facts.writes ? (facts.healed ? 'The last action had not been written as a whole, and was left out.' : '') : 'Read only: another window measures these points.';
   $('banner-text').textContent = text;
   $('banner').hidden = !text;
   $('take').hidden = facts.locked || facts.writes;
 }
+
+/** A window that only reads shows what the other one does. */
+setInterval(async () => {
+  if (!facts || facts.writes) return;
+  const next = await ask('state').catch(() => null);
+  if (next && next.actions !== state.actions && !facts.writes) { show(next); fill(); }
+}, 1500);
 
 async function start(given = {}) {
   facts = await ask('begin', given);
