@@ -213,3 +213,14 @@ def test_what_control_tells_nothing_of_needs_no_part_in_the_grid(monkeypatch: py
     np.testing.assert_allclose((one.image, *one.redundancy), (other.image, *other.redundancy), rtol=1e-8)
     if not stated:
         np.testing.assert_allclose((one.sigma_xy, one.sigma_h), (other.sigma_xy, other.sigma_h), rtol=1e-8)
+
+
+def test_equations_with_a_few_points_elsewhere_are_those_of_the_state(linear: Linear) -> None:
+    moved = np.arange(len(linear.problem.points)) % 7 == 0
+    local = linear.state.local + 5.0 * moved[:, None]
+    wanted = Linear.at(linear.problem, State(linear.state.models, local), linear.weights)
+    found = linear.with_points_moved(local, moved)
+    np.testing.assert_allclose(found.misfits.vector, wanted.misfits.vector, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(found.by_point, wanted.by_point, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(found.by_params, wanted.by_params, rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(found.state.local, local)

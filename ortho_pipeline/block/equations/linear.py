@@ -51,6 +51,29 @@ class Linear:
         ground_by_point[rows] = problem.enu[rows] * scale[:, :, None]
         return cls(problem, state, ordering, weights, misfits, by_params, by_point, ground_by_point, pseudo)
 
+    def with_points_moved(self, local: Array, moved: Mask) -> Linear:
+        """Return these equations with points at `local` ``(N, 3)``; only those `moved` ``(N,)`` are elsewhere."""
+        problem, points, numbers = self.problem, self.problem.points, np.flatnonzero(moved)
+        place = np.zeros(len(points), dtype=np.int64)
+        place[numbers] = np.arange(len(numbers))
+        places = problem.frame.places(local[numbers])
+        root = np.sqrt(self.weights.ray_weights) / points.sigma_image
+        rays, by_point, by_params = self.misfits.rays.copy(), self.by_point.copy(), self.by_params.copy()
+        for model, of_image in zip(self.state.models, self.ordering.rays_of_image, strict=True):
+            used = of_image[moved[points.point[of_image]]]
+            if not len(used):
+                continue
+            image, by_place, partials = places.linearised(model, place[points.point[used]])
+            scale = root[used]
+            rays[used] = points.whitened((points.measured[used] - image) * scale[:, None], used)
+            by_point[used] = points.whitened(by_place * scale[:, None, None], used)
+            by_params[used, :, : partials.shape[2]] = points.whitened(partials * scale[:, None, None], used)
+        ground = problem.ground_misfits(local, self.ordering, self.weights)
+        return replace(
+            self, state=replace(self.state, local=local), by_point=by_point, by_params=by_params,
+            misfits=replace(self.misfits, rays=rays, ground=ground),
+        )  # fmt: skip
+
     def reweighted(self, weights: Selection) -> Linear:
         """Return these equations with other weights of what takes part."""
         of_rays = np.sqrt(weights.ray_weights / self.weights.ray_weights)

@@ -197,10 +197,14 @@ class BlockProblem:
         points = self.points
         scale = np.sqrt(weights.ray_weights) / points.sigma_image
         rays = points.whitened((points.measured - predicted) * scale[:, None], slice(None))
-        ground, rows = np.zeros((len(points), 3)), ordering.grounded
+        return Misfits(rays, self.ground_misfits(local, ordering, weights), pseudo.misfit)
+
+    def ground_misfits(self, local: Array, ordering: Ordering, weights: Selection) -> Array:
+        """Return the misfits ``(N, 3)`` of known ground with points at `local` ``(N, 3)``."""
+        ground, rows = np.zeros((len(self.points), 3)), ordering.grounded
         apart = (self.enu[rows] @ (self.target[rows] - local[rows])[:, :, None])[:, :, 0]
         ground[rows] = apart / self.ground_sigmas[rows] * np.sqrt(weights.ground_weights[rows])[:, None]
-        return Misfits(rays, ground, pseudo.misfit)
+        return ground
 
     def pseudo_equations(self, state: State) -> PseudoEquations:
         """Return the equations of priors, datum and the models' constraints at a state."""

@@ -232,16 +232,16 @@ def _moved(linear: Linear, move: Array) -> _Ahead | None:
     it must not keep all others from where they belong.
     """
     problem, state, held = linear.problem, linear.state, None
-    for _ in range(2):
-        try:
-            ahead = state.moved(move[: problem.size], move[problem.size :].reshape(-1, 3))
-            made = Linear.at(problem, ahead, linear.weights, linear.ordering)
-        except InputError:  # a correction that cannot be inverted
-            return None
-        if math.isfinite(square := made.misfits.square):
-            return _Ahead(made, square, move, held)
-        held = np.zeros(len(problem.points), dtype=bool)
-        held[problem.points.point[~np.isfinite(made.misfits.rays).all(axis=1)]] = True
-        move = move.copy()
-        move[problem.size :].reshape(-1, 3)[held] = 0.0
-    return None
+    try:
+        ahead = state.moved(move[: problem.size], move[problem.size :].reshape(-1, 3))
+        made = Linear.at(problem, ahead, linear.weights, linear.ordering)
+        if not math.isfinite(made.misfits.square):
+            held = np.zeros(len(problem.points), dtype=bool)
+            held[problem.points.point[~np.isfinite(made.misfits.rays).all(axis=1)]] = True
+            move = move.copy()
+            move[problem.size :].reshape(-1, 3)[held] = 0.0
+            made = made.with_points_moved(np.where(held[:, None], state.local, ahead.local), held)
+    except InputError:  # a correction that cannot be inverted
+        return None
+    square = made.misfits.square
+    return _Ahead(made, square, move, held) if math.isfinite(square) else None
