@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from osgeo import gdal
-from servers import FaultyWay, moto_server, on_a_faulty_way, running, serving
+from servers import FaultyWay, moto_server, on_a_faulty_way, serving
 
 from ortho_pipeline.commands import export, rectify
 from ortho_pipeline.errors import InputError, OrthoError, StorageError
@@ -141,35 +141,6 @@ def test_nothing_is_asked_without_leave_and_no_secret_is_told(moto: Address, mon
     assert not {"the-secret", "the-key", "127.0.0.1"} & set(
         str(caught.value).replace("/", " ").replace(":", " ").split()
     )
-
-
-class EncryptedStore(FaultyWay):
-    """S3 with keys of its own: ETags look like those of others and are no checksums."""
-
-    def say(self, handler: Any, status: int, headers: list[tuple[str, str]], data: bytes, *, cut: bool = False) -> None:
-        """Answer with ETags that say nothing of the content."""
-        told = [(k, f'"{hashlib.md5(v.encode()).hexdigest()}"' if k.lower() == "etag" else v) for k, v in headers]
-        super().say(handler, status, told, data, cut=cut)
-
-
-def test_encrypted_objects_are_checked_by_their_content(moto: Address, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was written is read back; what is read is held against the checksum that was noted beside it."""
-    with running(EncryptedStore(moto, 1, share=0.0)) as way:
-        at(way.address, monkeypatch)
-        store = Objects("s3://bucket/kms", allow_network=True)
-        secret = random.Random(1).randbytes(2000)
-        assert store.put("a", secret).sha256 == hashlib.sha256(secret).hexdigest()
-        assert store.read("a", 2000)[0] == secret
-        assert store.put("lease", b"mine", new=True).sha256 == hashlib.sha256(b"mine").hexdigest()
-        # On the way there and back a bit may turn: each time another one.
-        way.KINDS, way.share = ("flipped request",), 1.0
-        with pytest.raises(StorageError, match="checksum"):
-            store.put("b", bytes(1000))
-        for kind in ("flipped", "truncated"):
-            # What is cut at the same place each time is no less wrong for that.
-            way.KINDS = (kind,)
-            with pytest.raises(StorageError, match="checksum"):
-                store.read("a", 2000)
 
 
 # -- a way on which things go wrong ------------------------------------------------------------------------------------

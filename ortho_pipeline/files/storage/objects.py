@@ -49,11 +49,6 @@ def is_address(text: str | os.PathLike[str]) -> bool:
     return bool(_ADDRESS.match(os.fspath(text)))
 
 
-#: What we note of our checksum beside an object.
-_SHA256 = "sha256"
-_OTHER_TAG = "the checksum is not the one that the store states"
-
-
 @dataclass(frozen=True)
 class Content:
     """What an object was when it was written or read: its size, checksums, and the store's name of this version.
@@ -91,7 +86,6 @@ class Objects:
             )
         self.address = address.rstrip("/")
         self._store = _store_of(self.address)
-        self._encrypts = self.address.startswith("s3://")
 
     def __repr__(self) -> str:
         return f"Objects({self.address!r})"
@@ -143,9 +137,7 @@ class Objects:
                 content = digests.content(result.meta["e_tag"])
                 count(content.size)
                 wrong = _difference(content, result.meta)
-                ours = result.attributes.get(_SHA256)
-            # The ETag of what S3 encrypts with keys of its own is no checksum; what we wrote has one of ours beside it.
-            if not wrong or (wrong == _OTHER_TAG and ours == content.sha256):
+            if not wrong:
                 return taken, content
         raise StorageError(
             f"{wrong}, {_ATTEMPTS} times", file=self.of(name),
@@ -192,26 +184,17 @@ class Objects:
             return self._put_if(name, data, content, "create" if new else {"e_tag": replacing})
         for _ in range(_ATTEMPTS):
             with self._errors(name):
-                made = self._store.put(name, data, chunk_size=PART, max_concurrency=4, attributes=_noted(content))
-                # The answer says what was stored, unless the store gives no ETags.
-                stated = {"size": content.size, "e_tag": made["e_tag"]}
-                stored = stated if made["e_tag"] else self._store.head(name)
-            wrong = _difference(content, stored, ours=True)
-            if not wrong or (wrong == _OTHER_TAG and self._encrypts and self._is_there(name, content)):
+                made = self._store.put(name, data, chunk_size=PART, max_concurrency=4)
+                if (made["e_tag"] or "").strip('"') in content.tags:
+                    return replace(content, e_tag=made["e_tag"])
+                stored = self._store.head(name)
+            if not (wrong := _difference(content, stored, ours=True)):
                 return replace(content, e_tag=stored["e_tag"])
         self.delete(name)
         raise StorageError(
             f"{wrong} after it was written, {_ATTEMPTS} times; it was removed", file=self.of(name),
             remedy="try again; if it stays so, check the store and the way to it",
         )  # fmt: skip
-
-    def _is_there(self, name: str, content: Content) -> bool:
-        """Tell whether an object has a content, by reading it: where the store's ETag is no checksum."""
-        digests = _Digests()
-        with self._errors(name):
-            for _ in digests.through(self._store.get(name).stream(min_chunk_size=_CHUNK), content.size):
-                pass
-        return digests.content(None).sha256 == content.sha256
 
     def _put_if(self, name: str, data: bytes | Path, content: Content, mode: Any) -> Content:
         """Store an object on a condition.
@@ -223,7 +206,7 @@ class Objects:
             wrong, failed = "", None
             try:
                 with self._errors(name):
-                    made = self._store.put(name, data, mode=mode, use_multipart=False, attributes=_noted(content))
+                    made = self._store.put(name, data, mode=mode, use_multipart=False)
                 stated = {"size": content.size, "e_tag": made["e_tag"]}
                 if not (wrong := _difference(content, stated, ours=True)):
                     return replace(content, e_tag=made["e_tag"])
@@ -313,10 +296,6 @@ class _Digests:
         return Content(self._size, self._sha256.hexdigest(), tags, e_tag)
 
 
-def _noted(content: Content) -> Any:
-    return {_SHA256: content.sha256}
-
-
 def _content(data: bytes | Path) -> Content:
     digests = _Digests()
     if isinstance(data, bytes):
@@ -339,7 +318,7 @@ def _difference(content: Content, stated: Mapping[str, Any], *, ours: bool = Fal
     tag = _TAG.fullmatch(stated["e_tag"] or "")
     if tag is None or tag[1] in content.tags or (tag[2] and not ours):
         return ""
-    return _OTHER_TAG
+    return "the checksum is not the one that the store states"
 
 
 def _status(error: Exception) -> str:
