@@ -157,9 +157,8 @@ def test_two_workers_at_once_make_every_scene_once(store: str) -> None:
     assert work_together(store, count=3, scenes=8, patience=4.0) == {f"s{k:03}": 1 for k in range(8)}
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_scenes_of_workers_that_died_are_taken_over(store: str, seed: int) -> None:
-    assert set(work_together(store, count=3, scenes=5, patience=0.4, dying=seed)) == {f"s{k:03}" for k in range(5)}
+def test_scenes_of_workers_that_died_are_taken_over(store: str) -> None:
+    assert set(work_together(store, count=3, scenes=5, patience=0.4, dying=1)) == {f"s{k:03}" for k in range(5)}
 
 
 @pytest.mark.slow
