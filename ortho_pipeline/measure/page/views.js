@@ -99,7 +99,7 @@ export class Views {
       const projection = new ol.proj.Projection({ code: name, units: 'pixels', extent });
       const view = new ol.View({ projection, center: [width / 2, -height / 2], minResolution: 1 / 32,
         maxResolution: Math.max(width, height) / 250, resolution: 1, enableRotation: false, smoothExtentConstraint: false });
-      view.on('change', () => this.#moved(name));
+      view.on(['change:center', 'change:resolution'], () => this.#moved(name));
       // Vectors of residuals are as long on the screen at every zoom.
       view.on('change:resolution', () => this.told.zoomed());
       return { size: [width, height], extent, projection, view };
