@@ -24,6 +24,7 @@ from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import (
     KINDS,
     RPC,
+    Cropped,
     FrameCamera,
     ImageCorrection,
     MapPlane,
@@ -158,9 +159,15 @@ def pieces(draw: st.DrawFn) -> Pieces:
     return Pieces((rpc, rpc.shifted(left, 0)), ((0.0, 0.0), (float(left), 0.0)), sizes)
 
 
+@st.composite
+def crops(draw: st.DrawFn) -> Cropped:
+    """Draw a crop of an image that a correction moves."""
+    return Cropped(draw(corrections()), (draw(st.floats(-1e4, 1e4)), draw(st.floats(-1e4, 1e4))))
+
+
 MODELS = {
-    RPC: rpcs, Rational: rationals, ImageCorrection: corrections, FrameCamera: frames, MapPlane: map_planes,
-    Pieces: pieces, Pushbroom: pushbrooms,
+    RPC: rpcs, Rational: rationals, ImageCorrection: corrections, Cropped: crops, FrameCamera: frames,
+    MapPlane: map_planes, Pieces: pieces, Pushbroom: pushbrooms,
 }  # fmt: skip
 EVERY_KIND = pytest.mark.parametrize("kind", MODELS, ids=lambda kind: kind.kind)
 
