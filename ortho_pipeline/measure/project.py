@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import datetime
+import os
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -275,6 +276,21 @@ class Project(abc.ABC):
 def _plain(action: Mapping[str, Any]) -> dict[str, Any]:
     """Return an action without what the journal says about it."""
     return {key: value for key, value in action.items() if key not in ("at", "image", "source")}
+
+
+def points_file(output: str | os.PathLike[str]) -> Path:
+    """Return the path that measured points are written to.
+
+    Raises
+    ------
+    InputError
+        If it is not named as GeoJSON.
+    """
+    path = Path(output)
+    if path.suffix.lower() != ".geojson":
+        raise InputError("measured points are written as GeoJSON", file=path, field="output",
+                         remedy="a name with `.geojson`")  # fmt: skip
+    return path
 
 
 def moved(before: SensorModel, after: SensorModel, ground: Array) -> bool:

@@ -26,7 +26,7 @@ from ortho_pipeline.imaging.matching.targets import metres_per_pixel
 from ortho_pipeline.measure.marks import Mark, marks_of
 from ortho_pipeline.measure.places import Geometry, Places, Sheet
 from ortho_pipeline.measure.planning import Grid, Next, measure_next
-from ortho_pipeline.measure.project import Project, moved, now
+from ortho_pipeline.measure.project import Project, moved, now, points_file
 from ortho_pipeline.measure.proposals import proposal_of
 from ortho_pipeline.measure.solution import Solution, figures, solve
 from ortho_pipeline.models.base import Array, SensorModel
@@ -210,10 +210,7 @@ def open_session(
     InputError
         For whatever the user can correct.
     """
-    path = Path(output)
-    if path.suffix.lower() != ".geojson":
-        raise InputError("measured points are written as GeoJSON", file=path, field="output",
-                         remedy="a name with `.geojson`")  # fmt: skip
+    path = points_file(output)
     if points.fit_model is not None:
         raise InputError("the reference is shown by the scene's own model", field="points.fit_model",
                          remedy="leave it out, and fit the model to the saved points")  # fmt: skip

@@ -38,7 +38,60 @@ FREE = {
 
 
 @dataclass(frozen=True, eq=False)
-class ImageCorrection(SensorModel):
+class OverAnother(SensorModel):
+    """A model that moves the image points of another one: meant for the same ground, with the same detail.
+
+    Parameters
+    ----------
+    model : SensorModel
+        The other one.
+    """
+
+    model: SensorModel
+
+    @property
+    def crs(self) -> str:
+        return self.model.crs
+
+    @property
+    def domain(self) -> tuple[Array, Array]:
+        return self.model.domain
+
+    @property
+    def height_range(self) -> tuple[float, float]:
+        return self.model.height_range
+
+    @property
+    def height_limits(self) -> tuple[float, float]:
+        return self.model.height_limits
+
+    def with_heights(self, low: float, high: float) -> Self:
+        return self._replace(model=self.model.with_heights(low, high))
+
+    @property
+    def corners(self) -> Array:
+        return self.model.corners
+
+    @property
+    def detail(self) -> float:
+        return self.model.detail
+
+    @property
+    def uses_height(self) -> bool:
+        return self.model.uses_height
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        from ortho_pipeline.models import model_from_dict
+
+        inner = data.get("model")
+        if not isinstance(inner, dict):
+            raise InputError(f"a model of kind {cls.kind!r} needs the model that it moves", field="model")
+        return super().from_dict({**data, "model": model_from_dict(inner)})
+
+
+@dataclass(frozen=True, eq=False)
+class ImageCorrection(OverAnother):
     """A sensor model whose image points are moved by a shift, shift and drift, or affine transformation.
 
     Parameters
@@ -57,7 +110,6 @@ class ImageCorrection(SensorModel):
 
     kind: ClassVar[str] = "image_correction"
 
-    model: SensorModel
     correction: str
     origin: tuple[float, float]
     coefficients: Array
@@ -85,36 +137,9 @@ class ImageCorrection(SensorModel):
         return cls(model, correction, origin, np.zeros(6))
 
     @property
-    def crs(self) -> str:
-        return self.model.crs
-
-    @property
-    def domain(self) -> tuple[Array, Array]:
-        return self.model.domain
-
-    @property
-    def height_limits(self) -> tuple[float, float]:
-        return self.model.height_limits
-
-    def with_heights(self, low: float, high: float) -> Self:
-        return self._replace(model=self.model.with_heights(low, high))
-
-    @property
-    def corners(self) -> Array:
-        return self.model.corners
-
-    @property
-    def detail(self) -> float:
-        return self.model.detail
-
-    @property
     def param_names(self) -> tuple[str, ...]:
         names = FREE[self.correction]
         return tuple(name for name in names if name not in self.removed) if self.removed else names
-
-    @property
-    def uses_height(self) -> bool:
-        return self.model.uses_height
 
     @property
     def removable(self) -> tuple[str, ...]:
@@ -193,13 +218,8 @@ class ImageCorrection(SensorModel):
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        from ortho_pipeline.models import model_from_dict
-
-        inner = data.get("model")
-        if not isinstance(inner, dict):
-            raise InputError("a correction needs the model that it corrects", field="model")
         # Files of versions before parameters could be removed do not have this field.
-        return super().from_dict({"removed": (), **data, "model": model_from_dict(inner)})
+        return super().from_dict({"removed": (), **data})
 
 
 @functools.cache

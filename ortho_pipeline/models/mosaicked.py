@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.models.base import Array, Constraints, SensorModel, as_ground, as_image
+from ortho_pipeline.models.correction import OverAnother
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +108,7 @@ class Pieces(SensorModel):
 
 
 @dataclass(frozen=True, eq=False)
-class Cropped(SensorModel):
+class Cropped(OverAnother):
     """A model in pixels that count from another corner; its parameters are those of the whole image's model.
 
     Parameters
@@ -120,7 +121,6 @@ class Cropped(SensorModel):
 
     kind: ClassVar[str] = "cropped"
 
-    model: SensorModel
     offset: tuple[float, float]
 
     def __post_init__(self) -> None:
@@ -128,37 +128,6 @@ class Cropped(SensorModel):
         if offset.shape != (2,) or not np.isfinite(offset).all():
             raise InputError("a crop has a column and a row where it begins", field="offset")
         object.__setattr__(self, "offset", (float(offset[0]), float(offset[1])))
-
-    @property
-    def crs(self) -> str:
-        return self.model.crs
-
-    @property
-    def domain(self) -> tuple[Array, Array]:
-        return self.model.domain
-
-    @property
-    def height_range(self) -> tuple[float, float]:
-        return self.model.height_range
-
-    @property
-    def height_limits(self) -> tuple[float, float]:
-        return self.model.height_limits
-
-    def with_heights(self, low: float, high: float) -> Self:
-        return self._replace(model=self.model.with_heights(low, high))
-
-    @property
-    def corners(self) -> Array:
-        return self.model.corners
-
-    @property
-    def detail(self) -> float:
-        return self.model.detail
-
-    @property
-    def uses_height(self) -> bool:
-        return self.model.uses_height
 
     # -- parameters --------------------------------------------------------------------------------------------------
 
@@ -208,12 +177,3 @@ class Cropped(SensorModel):
     def linearised(self, ground: ArrayLike) -> tuple[Array, Array, Array]:
         image, by_ground, by_params = self.model.linearised(ground)
         return image - self.offset, by_ground, by_params
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
-        from ortho_pipeline.models import model_from_dict
-
-        inner = data.get("model")
-        if not isinstance(inner, dict):
-            raise InputError("a crop needs the model of the whole image", field="model")
-        return super().from_dict({**data, "model": model_from_dict(inner)})

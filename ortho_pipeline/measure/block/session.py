@@ -31,7 +31,7 @@ from ortho_pipeline.measure.block.table import block_points, document, marks_of_
 from ortho_pipeline.measure.marks import GROUND_CRS, Mark
 from ortho_pipeline.measure.places import Geometry, Places, Sheet
 from ortho_pipeline.measure.planning import Grid, Next, measure_next
-from ortho_pipeline.measure.project import Project, moved, now
+from ortho_pipeline.measure.project import Project, moved, now, points_file
 from ortho_pipeline.measure.proposals import proposal_of
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options import BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
@@ -307,10 +307,7 @@ def open_block_session(
     InputError
         For whatever the user can correct.
     """
-    path = Path(output)
-    if path.suffix.lower() != ".geojson":
-        raise InputError("measured points are written as GeoJSON", file=path, field="output",
-                         remedy="a name with `.geojson`")  # fmt: skip
+    path = points_file(output)
     require_heights(surface)
     labels, names = labels_of(images), names_of(images)
     for image in images:
