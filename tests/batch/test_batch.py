@@ -16,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
 from click.testing import CliRunner, Result
 from osgeo import gdal
@@ -193,7 +194,7 @@ def test_the_examples_of_the_guide_are_right(tmp_path):
     for example in examples:
         (tmp_path / "p.yaml").write_text(example)
         batch_config.read_config(tmp_path / "p.yaml")
-    options = {name for option in cli.commands["run"].params for name in option.opts}
+    options = {name for option in cli.get_command(click.Context(cli), "run").params for name in option.opts}
     for line in re.findall(r"ortho run [^`\n]*", guide):
         assert set(re.findall(r"--[a-z-]+", line)) <= options | {"--wrap"}, line
 

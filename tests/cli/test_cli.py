@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import pkgutil
 import subprocess
 import sys
 from typing import Any
 
+import click
 import pytest
 from click.testing import CliRunner, Result
 
+from ortho_pipeline import cli as rooms
 from ortho_pipeline import commands
+from ortho_pipeline.cli.program import COMMANDS as KNOWN
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import ModelError
 
@@ -33,6 +38,34 @@ def test_help_does_not_load_heavy_libraries():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_help_of_all_commands_loads_none_of_them():
+    code = (
+        "import sys; from click.testing import CliRunner; from ortho_pipeline.cli.program import cli; "
+        "r = CliRunner().invoke(cli, ['--help']); assert 'rectify' in r.output, r.output; "
+        "print(*sorted(name for name in sys.modules if name.startswith('ortho_pipeline.')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert [name.removeprefix("ortho_pipeline.") for name in done.stdout.split()] == [
+        "cli", "cli.program", "cli.signals", "errors",
+    ]  # fmt: skip
+
+
+def test_what_is_said_of_commands_before_they_are_loaded_is_what_they_say():
+    ctx = click.Context(cli)
+    for name, (module, said) in KNOWN.items():
+        command = cli.get_command(ctx, name)
+        assert command is not None
+        assert (command.name, command.get_short_help_str(1000)) == (name, said), f"correct COMMANDS of {module}"
+    # No command is missing there: each that stands in a module of the room is known, or of a group.
+    found = {
+        one.name
+        for module in pkgutil.walk_packages(rooms.__path__, f"{rooms.__name__}.")
+        for one in vars(importlib.import_module(module.name)).values()
+        if isinstance(one, click.Command)
+    }
+    assert found - {*cli.get_command(ctx, "cache").commands} == {*KNOWN, "cli"}
 
 
 def test_python_m_is_the_same_command():
@@ -218,7 +251,7 @@ def test_without_gdal_every_command_says_one_line_and_its_remedy(tmp_path):
         assert (code, stdout, len(lines)) == (2, "", 2), stderr
         assert lines[0].startswith("Error: GDAL's Python bindings cannot be loaded")
         assert lines[1].startswith("  Remedy: pip install")
-    assert set(cli.commands) <= {line.split()[0] for line in COMMANDS}
+    assert set(KNOWN) <= {line.split()[0] for line in COMMANDS}
     assert not list(tmp_path.iterdir())
 
 

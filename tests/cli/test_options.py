@@ -11,13 +11,19 @@ from click.testing import CliRunner
 
 from ortho_pipeline import commands
 from ortho_pipeline.cli.flags import FLAGS, flags_of, with_flags
-from ortho_pipeline.cli.program import cli
+from ortho_pipeline.cli.program import COMMANDS, cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import GROUPS, BlockOptions, SurfaceOptions, options_of
 
 
+def command_of(name: str) -> click.Command:
+    command = cli.get_command(click.Context(cli), name)
+    assert command is not None
+    return command
+
+
 def params(command: str) -> dict[str, click.Option]:
-    return {str(one.name): one for one in cli.commands[command].params if isinstance(one, click.Option)}
+    return {str(one.name): one for one in command_of(command).params if isinstance(one, click.Option)}
 
 
 @pytest.mark.parametrize(
@@ -89,12 +95,12 @@ def test_an_error_names_options_as_the_caller_knows_them(tiny, tmp_path) -> None
 
 
 def test_every_flag_of_a_command_has_a_name() -> None:
-    for command in cli.commands.values():
+    for command in map(command_of, COMMANDS):
         names = flags_of(command)
         typed = {one.opts[0] for one in command.params if isinstance(one, click.Option)}
         assert typed == set(names.values())
-    assert flags_of(cli.commands["edge"])["output.bands"] == "--band"
-    assert flags_of(cli.commands["run"])["output.memory"] == "--memory"
-    assert "surface.dem" not in flags_of(cli.commands["run"])
-    assert flags_of(cli.commands["adjust"])["points.model"] == "--model"
-    assert "scene.model" not in flags_of(cli.commands["adjust"])
+    assert flags_of(command_of("edge"))["output.bands"] == "--band"
+    assert flags_of(command_of("run"))["output.memory"] == "--memory"
+    assert "surface.dem" not in flags_of(command_of("run"))
+    assert flags_of(command_of("adjust"))["points.model"] == "--model"
+    assert "scene.model" not in flags_of(command_of("adjust"))

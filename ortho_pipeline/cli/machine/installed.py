@@ -1,0 +1,39 @@
+"""The commands `ortho sensors` and `ortho models`: what there is to choose from."""
+
+from __future__ import annotations
+
+import click
+
+from ortho_pipeline.cli.options import json_option
+from ortho_pipeline.cli.parsing import Command
+from ortho_pipeline.cli.printing import print_json, print_models
+
+
+@click.command(cls=Command)
+@json_option
+def sensors(as_json: bool) -> None:
+    """List the sensors that are installed."""
+    from ortho_pipeline import commands
+
+    document = commands.sensors()
+    if as_json:
+        return print_json(document)
+    for sensor in document["sensors"]:
+        click.echo(f"{sensor['name']:<14} {sensor['description']}   [{sensor['distribution']} {sensor['version']}]")
+        for option, text in sensor["options"].items():
+            click.echo(f"{'':<14}   {option}: {text}")
+    for broken in document["broken"]:
+        click.echo(f"left out: {broken['plugin']} ({broken['error']})", err=True)
+    return None
+
+
+@click.command(cls=Command)
+@json_option
+def models(as_json: bool) -> None:
+    """List the models that can be fitted to points alone."""
+    from ortho_pipeline import commands
+
+    listed = commands.models()
+    if as_json:
+        return print_json(listed)
+    return print_models(listed)

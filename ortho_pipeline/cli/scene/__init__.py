@@ -1,0 +1,1 @@
+"""Commands about one scene: its model, its ortho, its bands, the heights under it."""

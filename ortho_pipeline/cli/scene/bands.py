@@ -1,0 +1,49 @@
+"""The commands `ortho edge` and `ortho register`: how sharp an image is, and single bands as one image."""
+
+from __future__ import annotations
+
+import click
+
+from ortho_pipeline.cli.options import folder_option, image_argument, json_option, network_option, scene_options
+from ortho_pipeline.cli.parsing import Command
+from ortho_pipeline.cli.printing import print_result
+from ortho_pipeline.options import SceneOptions
+
+
+@click.command(cls=Command)
+@image_argument
+@click.option("--edge", metavar="X1,Y1,X2,Y2", help="Columns and rows of its ends  [default: edges are looked for]")
+@click.option("--band", type=click.IntRange(min=1), default=1, show_default=True)
+@click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="For JSON and a plot.")
+@network_option
+@json_option
+def edge(image: str, edge: str | None, band: int, folder: str | None, scene: SceneOptions, as_json: bool) -> None:
+    """Measure the effective resolution of IMAGE from straight edges (edge spread, line spread, width in pixels)."""
+    from ortho_pipeline import commands
+
+    print_result(commands.edge(image, folder, edge=edge, band=band, allow_network=scene.allow_network), as_json)
+
+
+@click.command(cls=Command)
+@click.argument("images", nargs=-1, required=True, type=click.Path())
+@folder_option
+@click.option("--reference", metavar="IMAGE", help="Onto which the others are brought  [default: the first]")
+@click.option(
+    "--transform",
+    type=click.Choice(["similarity", "affine", "projective", "poly2"]),
+    default="projective",
+    show_default=True,
+)
+@scene_options
+@json_option
+def register(
+    images: tuple[str, ...], folder: str, reference: str | None, transform: str, scene: SceneOptions, as_json: bool
+) -> None:
+    """Bring single bands IMAGES onto one of them and write one image of all, which opens as the reference did.
+
+    For bands of one acquisition that were taken by cameras of their own. The metadata file of the reference is carried
+    along, or its model written as a model file.
+    """
+    from ortho_pipeline.commands import bands
+
+    print_result(bands.register(images, folder, reference=reference, transform=transform, scene=scene), as_json)

@@ -1,0 +1,79 @@
+"""The commands `ortho fit` and `ortho compare`: one model of a scene, or many, adjusted to points."""
+
+from __future__ import annotations
+
+import click
+
+from ortho_pipeline.cli.options import (
+    image_argument,
+    json_option,
+    match_options,
+    point_options,
+    scene_options,
+    surface_options,
+)
+from ortho_pipeline.cli.parsing import Command
+from ortho_pipeline.cli.printing import print_comparison, print_fit, print_json
+from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+
+
+@click.command(cls=Command)
+@image_argument
+@point_options
+@match_options
+@scene_options
+@surface_options
+@json_option
+def fit(
+    image: str,
+    points: PointOptions,
+    match: MatchOptions,
+    scene: SceneOptions,
+    surface: SurfaceOptions,
+    as_json: bool,
+) -> None:
+    """Adjust the model of IMAGE to control points and show every residual (measured minus predicted, pixels)."""
+    from ortho_pipeline import commands
+
+    result = commands.fit(image, points, scene, surface, match)
+    if as_json:
+        return print_json(result.to_json())
+    print_fit(result)
+    return None
+
+
+@click.command(cls=Command)
+@image_argument
+@click.option("--models", default="all", show_default=True, metavar="all|A,B,C", help="Which models.")
+@click.option("--units", type=click.Choice(["px", "m"]), default="px", show_default=True, help="Of the table.")
+@click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the report.")
+@point_options
+@match_options
+@scene_options
+@surface_options
+@json_option
+def compare(
+    image: str,
+    models: str,
+    units: str,
+    folder: str | None,
+    points: PointOptions,
+    match: MatchOptions,
+    scene: SceneOptions,
+    surface: SurfaceOptions,
+    as_json: bool,
+) -> None:
+    """Fit many models to the same points of IMAGE and recommend one.
+
+    The image's own model takes part with each of its corrections (rpc, rpc+shift, rpc+shift-drift, rpc+affine). With
+    -o the report of the recommended model is written, with the comparison in it.
+    """
+    from ortho_pipeline import commands
+
+    command = click.get_current_context().meta["command"]
+    result = commands.compare(
+        image, points, models=models, folder=folder, scene=scene, surface=surface, match=match, command=command
+    )  # fmt: skip
+    if as_json:
+        return print_json(result.to_json())
+    return print_comparison(result, units)

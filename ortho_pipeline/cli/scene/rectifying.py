@@ -1,0 +1,126 @@
+"""The commands `ortho rectify`, `ortho export` and `ortho report`: the ortho of a scene, its model, the plots."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from ortho_pipeline.cli.options import (
+    folder_option,
+    image_argument,
+    json_option,
+    match_options,
+    output_options,
+    point_options,
+    scene_options,
+    surface_options,
+)
+from ortho_pipeline.cli.parsing import Command
+from ortho_pipeline.cli.printing import print_result, progress
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+
+
+@click.command(
+    cls=Command,
+    one="It takes one image; 'ortho run PIPELINE.yaml' makes many, and all outputs go to the folder of '-o DIR'.",
+)
+@image_argument
+@folder_option
+@click.option(
+    "--overwrite",
+    "-overwrite",
+    is_flag=True,
+    help="Remove old models that would attach to the ortho, and what an unreported earlier run left. Outputs of the "
+    "same name are replaced without it.",
+)
+@point_options
+@match_options
+@scene_options
+@surface_options
+@output_options
+@json_option
+def rectify(
+    image: str,
+    folder: str,
+    overwrite: bool,
+    points: PointOptions,
+    match: MatchOptions,
+    scene: SceneOptions,
+    surface: SurfaceOptions,
+    output: OutputOptions,
+    as_json: bool,
+) -> None:
+    """Make the orthoimage of IMAGE, its adjusted model, and the accuracy report."""
+    from ortho_pipeline import commands
+
+    with progress("Orthorectifying") as advance:
+        result = commands.rectify(
+            image,
+            folder,
+            scene=scene,
+            points=points,
+            surface=surface,
+            match=match,
+            output=output,
+            progress=advance,
+            overwrite=overwrite,
+            command=click.get_current_context().meta["command"],
+        )
+    print_result(result, as_json)
+
+
+@click.command(cls=Command)
+@image_argument
+@folder_option
+@click.option(
+    "--format",
+    "formats",
+    multiple=True,
+    metavar="F[,F...]",
+    help="rpc-txt, rpb, tag, vrt, gcp, gcp-tag, geolocation, csm; may be repeated  [default: the four kinds of RPC]",
+)
+@click.option("--force", is_flag=True, help="Accept an RPC that is more than 0.1 px from the model.")
+@point_options
+@match_options
+@scene_options
+@surface_options
+@json_option
+def export(
+    image: str,
+    folder: str,
+    formats: tuple[str, ...],
+    force: bool,
+    points: PointOptions,
+    match: MatchOptions,
+    scene: SceneOptions,
+    surface: SurfaceOptions,
+    as_json: bool,
+) -> None:
+    """Write the model of IMAGE for GDAL and every GIS, adjusted if --gcps or a --reference are given.
+
+    RPC as text, RPB, VRT and tag of a copy; control points (the measured ones, or else a grid) as VRT and copy; or
+    geolocation arrays.
+    """
+    from ortho_pipeline import commands
+
+    chosen = [name.strip() for text in formats for name in text.split(",")]
+    given: dict[str, Any] = {"formats": chosen} if chosen else {}
+    result = commands.export(
+        image, folder, scene=scene, points=points, surface=surface, match=match, force=force, **given
+    )  # fmt: skip
+    print_result(result, as_json)
+
+
+@click.command(cls=Command)
+@click.argument("report_file", metavar="REPORT.json", type=click.Path())
+@click.option("--plots", "folder", required=True, type=click.Path(file_okay=False), metavar="DIR", help="Where to.")
+@click.option(
+    "--kind", type=click.Choice(["svg", "png"]), default="svg", show_default=True, help="PNG needs matplotlib."
+)
+@json_option
+def report(report_file: str, folder: str, kind: str, as_json: bool) -> None:
+    """Write the plots of a report, each as a picture of its own."""
+    from ortho_pipeline import commands
+
+    print_result(commands.write_plots(report_file, folder, kind), as_json)
