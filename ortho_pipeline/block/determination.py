@@ -81,7 +81,7 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         if not len(model.params) or not len(used):
             continue
         partials = solved.linear.by_params[used][:, :, : len(model.params)]
-        cofactors = solved.cofactors.of_images([image])
+        cofactors = solved.cofactors.of_image(image)
         of_image = problem.points.rays_of_images[image]
         measured = float(np.median(problem.points.sigma_image[of_image]))
         sigma = max(measured, float(np.median(stated.sigma_image[of_image])))

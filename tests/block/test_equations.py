@@ -1,4 +1,7 @@
-"""Equations of large blocks: compiled elimination, normal equations in levels, and what is taken of their inverse."""
+"""Equations of blocks: compiled elimination, normal equations in levels, and what is taken of their inverse.
+
+They are compared with one dense least-squares problem of all unknowns, solved by triangulation.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,8 @@ import pyproj
 import pytest
 
 from ortho_pipeline.block.adjustment import adjust
-from ortho_pipeline.block.equations import elimination
-from ortho_pipeline.block.equations.cofactors import LevelCofactors
-from ortho_pipeline.block.equations.elimination import StackedElimination, StreamedElimination
+from ortho_pipeline.block.equations.cofactors import Cofactors
+from ortho_pipeline.block.equations.elimination import Elimination, step_of
 from ortho_pipeline.block.equations.image_pairs import ImagePairs, Levels
 from ortho_pipeline.block.equations.level_factor import LevelFactor
 from ortho_pipeline.block.equations.linear import Linear
@@ -99,45 +101,86 @@ def linear() -> Linear:
     return Linear.at(problem, State(ordered, local), weights)
 
 
-def test_compiled_elimination_is_that_of_the_stacks(linear: Linear) -> None:
-    stacked, streamed = StackedElimination(linear), StreamedElimination(linear)
-    wanted, found = stacked.system().solve(0.0), streamed.system().solve(0.0)
-    sigmas = np.sqrt(wanted.cofactors.variances)
-    assert wanted.condition == pytest.approx(found.condition, rel=1e-8)
-    np.testing.assert_allclose(found.values / sigmas, wanted.values / sigmas, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(streamed.system().scaled(), stacked.system().scaled(), rtol=0, atol=1e-12)
-    shifts = stacked.shifts(wanted.values)
-    np.testing.assert_allclose(streamed.shifts(wanted.values), shifts, rtol=0, atol=1e-9 * np.abs(shifts).max())
-    for one, other in zip(stacked.hats(wanted.cofactors), streamed.hats(found.cofactors), strict=True):
-        np.testing.assert_allclose(other, one, rtol=0, atol=1e-9)
-    covariances = stacked.ground(wanted.cofactors, 1.7)
-    np.testing.assert_allclose(streamed.ground(found.cofactors, 1.7), covariances, rtol=1e-6, equal_nan=True)
+def dense(linear: Linear) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of all equations by parameters, then points that take part, and their misfits."""
+    problem, points, numbers = linear.problem, linear.problem.points, linear.ordering.numbers
+    place = np.full(len(points), -1)
+    place[numbers] = problem.size + 3 * np.arange(len(numbers))
+    design, misfits = [], []
+    for ray in linear.ordering.rays:
+        rows = np.zeros((2, problem.size + 3 * len(numbers)))
+        of_image = problem.columns.of_image(points.image[ray])
+        rows[:, of_image] = linear.by_params[ray][:, : len(of_image)]
+        rows[:, place[points.point[ray]] + np.arange(3)] = linear.by_point[ray]
+        design.append(rows)
+        misfits.append(linear.misfits.rays[ray])
+    for point in linear.ordering.grounded:
+        rows = np.zeros((3, problem.size + 3 * len(numbers)))
+        rows[:, place[point] + np.arange(3)] = linear.ground_by_point[point]
+        design.append(rows)
+        misfits.append(linear.misfits.ground[point])
+    known = linear.pseudo_design
+    design.append(np.pad(known, ((0, 0), (0, 3 * len(numbers)))))
+    misfits.append(linear.misfits.pseudo)
+    return np.concatenate(design), np.concatenate(misfits)
 
 
-def test_damped_steps_are_the_same(linear: Linear) -> None:
-    wanted = StackedElimination(linear).system().solve(0.3).values
-    found = StreamedElimination(linear).system().solve(0.3).values
+def test_a_step_is_that_of_one_least_squares_problem_of_all_unknowns(linear: Linear) -> None:
+    design, misfits = dense(linear)
+    size, numbers = linear.problem.size, linear.ordering.numbers
+    q, r = np.linalg.qr(design)
+    inverse = np.linalg.inv(r)
+    cofactors, whole = inverse @ inverse.T, inverse @ (q.T @ misfits)
+    sigmas = np.sqrt(np.diag(cofactors))
+    step = step_of(linear)
+    found = np.concatenate([step.solution.values, step.shift[numbers].ravel()])
+    np.testing.assert_allclose(found / sigmas, whole / sigmas, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(step.solution.cofactors.variances, sigmas[:size] ** 2, rtol=1e-9)
+    own = np.arange(size, len(whole)).reshape(-1, 3)
+    of_points = cofactors[own[:, :, None], own[:, None, :]]
+    found = step.points.ground(step.solution.cofactors, 1.0)
+    np.testing.assert_allclose(found[numbers], of_points, rtol=1e-7, atol=1e-12 * of_points.max())
+    assert np.isnan(np.delete(found, numbers, axis=0)).all()
+    of_rays, of_ground = step.points.hats(step.solution.cofactors)
+    hat, rays = q @ q.T, linear.ordering.rays
+    for rows, parts in ((0, of_rays[rays]), (2 * len(rays), of_ground[linear.ordering.grounded])):
+        at = rows + np.arange(parts.shape[0] * parts.shape[1]).reshape(parts.shape[:2])
+        np.testing.assert_allclose(parts, hat[at[:, :, None], at[:, None, :]], rtol=0, atol=1e-9)
+
+
+def test_the_condition_is_that_of_the_design_without_the_points(linear: Linear) -> None:
+    design, size = dense(linear)[0], linear.problem.size
+    of_points = np.linalg.qr(design[:, size:])[0]
+    left = design[:, :size] - of_points @ (of_points.T @ design[:, :size])
+    assert step_of(linear).condition == pytest.approx(np.linalg.cond(left / np.linalg.norm(left, axis=0)), rel=1e-8)
+
+
+def test_damped_steps_are_those_of_a_longer_diagonal(linear: Linear) -> None:
+    """Points stay free: what is damped are the parameters, relative to their equations without the points."""
+    design, misfits = dense(linear)
+    size = linear.problem.size
+    of_points = np.linalg.qr(design[:, size:])[0]
+    left = design[:, :size] - of_points @ (of_points.T @ design[:, :size])
+    normal = left.T @ left
+    wanted = np.linalg.solve(normal + 0.3 * np.diag(np.diag(normal)), left.T @ misfits)
+    found = Elimination(linear).system().solve(0.3).values
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
 
 
 def test_parts_of_the_inverse_are_those_of_the_whole(linear: Linear) -> None:
-    system = StreamedElimination(linear).system()
+    system = Elimination(linear).system()
     found = system.solve(0.0).cofactors
-    assert isinstance(found, LevelCofactors)
     assert len(found.levels.of_level) > 2
     lengths = np.sqrt(np.abs(np.diag(np.linalg.inv(system.scaled()))))
     scale = np.sqrt(found.variances) / lengths
     whole = np.linalg.inv(system.scaled()) * np.outer(scale, scale)
     sigmas = np.sqrt(np.diag(whole))
     np.testing.assert_allclose(found.matrix / np.outer(sigmas, sigmas), whole / np.outer(sigmas, sigmas), atol=1e-9)
-    columns, points = linear.problem.columns, linear.problem.points
-    of_points = [points.image[points.point == k].tolist() for k in range(len(points))]
-    longest = max(of_points, key=len)
-    assert len(longest) > 2
-    for images in ([4], longest, longest[::-1]):
-        of = np.concatenate([columns.of_image(image) for image in images])
-        wanted = whole[np.ix_(of, of)]
-        np.testing.assert_allclose(found.of_images(images), wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
+    columns = linear.problem.columns
+    for first, second in ((4, 4), (1, 2), (2, 1), (6, 5)):
+        wanted = whole[np.ix_(columns.of_image(first), columns.of_image(second))]
+        part = found.between(np.array([first]), np.array([second]))[0, : wanted.shape[0], : wanted.shape[1]]
+        np.testing.assert_allclose(part, wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
     random = np.random.default_rng(2)
     root, inner = random.normal(0, 1, (columns.size, 3)) * sigmas[:, None], np.diag([1.0, 2.0, 3.0])
     mixed = found.mixed(2.0, root, inner)
@@ -149,7 +192,7 @@ def test_parts_of_the_inverse_are_those_of_the_whole(linear: Linear) -> None:
 
 
 def test_the_condition_of_many_parameters_is_iterated_for(linear: Linear, monkeypatch: pytest.MonkeyPatch) -> None:
-    system = StreamedElimination(linear).system()
+    system = Elimination(linear).system()
     wanted = system.solve(0.0).condition
     monkeypatch.setattr("ortho_pipeline.block.equations.level_factor._FEW", 0)
     assert system.solve(0.0).condition == pytest.approx(wanted, rel=1e-8)
@@ -179,14 +222,13 @@ def test_images_without_common_points_are_levels_of_their_own() -> None:
     np.testing.assert_allclose(factor.solve(np.eye(9)), np.linalg.inv(dense), rtol=0, atol=1e-12)
 
 
-def test_a_large_block_is_adjusted_as_a_small_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same by compiled elimination and levels, without any matrix of all parameters by all, from first to last."""
+def test_no_block_needs_the_whole_inverse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From first to last, without any matrix of all parameters by all; where control tells a part of all."""
     models, points = strip(12, 320)
     points = replace(points, measured=points.measured + 30.0 * (np.arange(points.rays) % 41 == 7)[:, None])
     wanted = adjust(models, points)
-    monkeypatch.setattr(elimination, "_ORTHOGONAL_LIMIT", 0.0)
     monkeypatch.setattr(control_equations, "_FAR_LESS", np.inf)
-    monkeypatch.setattr(LevelCofactors, "matrix", property(lambda self: pytest.fail("the whole inverse was made")))
+    monkeypatch.setattr(Cofactors, "matrix", property(lambda self: pytest.fail("the whole inverse was made")))
     found = adjust(models, points)
     assert wanted.rejected == found.rejected
     assert len(found.rejected) > 10

@@ -1,4 +1,4 @@
-r"""Normal equations of large blocks, factored level by level, and those parts of their inverse that are needed.
+r"""Normal equations of a block, factored level by level, and those parts of their inverse that are needed.
 
 With the images in levels the matrix is block tridiagonal, :math:`D_l` on the diagonal and :math:`E_l` from a level to
 the next. The factor is :math:`L_l L_l^T = D_l - W_{l-1}^T W_{l-1}` with :math:`W_l = L_l^{-1} E_l^T`, and of the
@@ -139,6 +139,8 @@ class LevelFactor(LevelMatrix):
     def condition(self) -> float:
         """Return the square root of the ratio of the extreme eigenvalues of the scaled matrix."""
         size = self.levels.columns.size
+        if not size:
+            return 1.0
         if size <= _FEW:
             low, high = np.linalg.eigvalsh(self.dense())[[0, -1]]
         else:

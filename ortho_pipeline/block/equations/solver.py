@@ -75,7 +75,7 @@ class Solved:
         linear, ordering, misfits = self.linear, self.linear.ordering, self.linear.misfits
         true = linear.pseudo.true
         effective = self.problem.size - sum(
-            float(((rows @ self.cofactors.of_images([image])) * rows).sum())
+            float(((rows @ self.cofactors.of_image(image)) * rows).sum())
             for image, rows in linear.pseudo_by_image(~true)
         )
         known = int(np.isfinite(self.problem.known[ordering.grounded]).sum())

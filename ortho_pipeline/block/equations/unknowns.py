@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 from ortho_pipeline.block.points import BlockPoints, Index
 
 Mask = NDArray[np.bool_]
-#: Points that are eliminated at once.
-_CHUNK = 20_000
+#: Points that are looked at at once.
+_CHUNK = 2_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,21 +59,17 @@ class Columns:
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """Points ``(n,)`` with the same number of rays ``(n, k)`` in images ``(n, k)``, and whether known ground weighs in.
-
-    Points of one set of images stand together: `groups` are their slices.
-    """
+    """Points ``(n,)`` with equally many rays ``(n, k)`` in images ``(n, k)``, and whether known ground weighs in."""
 
     points: Index
     rays: Index
     images: Index
     ground: bool
-    groups: tuple[slice, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Ordering:
-    """Order in which the unknowns are eliminated: point by point, or points in chunks, then the parameters.
+    """Order in which the unknowns are eliminated: point by point, then the parameters.
 
     `rays` ``(K,)`` that take part stand by point and image, those of the n `numbers` of points between `starts`
     ``(n + 1,)``; `known` ``(n,)`` says whose known ground weighs in. `rays_of_image` are the rays of each image.
@@ -108,18 +103,16 @@ class Ordering:
 
     @cached_property
     def chunks(self) -> tuple[Chunk, ...]:
-        """Points with the same number of rays."""
+        """Points in parts of equally many rays, to be looked at side by side."""
         counts = np.diff(self.starts)
         chunks = []
         for count in np.unique(counts):
             for ground in (False, True):
                 rows = np.flatnonzero((counts == count) & (self.known == ground))
                 table = self.rays[self.starts[rows][:, None] + np.arange(count)]
-                order = np.lexsort(self.image[table].T[::-1])
-                for begin in range(0, len(order), _CHUNK):
-                    part = order[begin : begin + _CHUNK]
-                    images = self.image[table[part]]
-                    chunks.append(Chunk(self.numbers[rows[part]], table[part], images, ground, _groups(images)))
+                for begin in range(0, len(rows), _CHUNK):
+                    part = slice(begin, begin + _CHUNK)
+                    chunks.append(Chunk(self.numbers[rows[part]], table[part], self.image[table[part]], ground))
         return tuple(chunks)
 
     @property
@@ -136,9 +129,3 @@ class Ordering:
     def points(self) -> int:
         """Number of points that take part."""
         return len(self.numbers)
-
-
-def _groups(images: Index) -> tuple[slice, ...]:
-    """Return the slices of rows ``(n, k)`` that are the same."""
-    ends = np.flatnonzero((images[1:] != images[:-1]).any(axis=1)) + 1
-    return tuple(slice(a, b) for a, b in itertools.pairwise([0, *ends.tolist(), len(images)]))

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ortho_pipeline.block.equations.cofactors import Cofactors
-from ortho_pipeline.block.equations.elimination import Eliminated, eliminate
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import Selection
 from ortho_pipeline.block.equations.solver import Solved
-from ortho_pipeline.block.equations.unknowns import Mask
+from ortho_pipeline.block.equations.unknowns import Chunk, Mask
 from ortho_pipeline.block.intersection import PARALLEL
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.block.variances.components import Variances
@@ -70,9 +69,9 @@ def judge(trusted: Trusted, selection: Selection, suspects: Mask) -> tuple[Selec
     linear = Linear.at(problem, solved.state, alone)
     limits = _Limits.of(trusted, selection)
     estimated = trusted.variances.of_ground(problem)
-    for rows in eliminate(linear):
-        suspect = _Suspects(rows, solved.cofactors)
-        agree, agree_without = limits.verdicts(suspect, estimated[rows.chunk.points])
+    for chunk in linear.ordering.chunks:
+        suspect = _Suspects(chunk, linear, solved.cofactors)
+        agree, agree_without = limits.verdicts(suspect, estimated[chunk.points])
         bad = np.flatnonzero(~agree)
         possible = np.array([agree_without[part][bad] for part in suspect.parts])
         only = np.where(possible.sum(axis=0) == 1, possible.argmax(axis=0), len(suspect.parts))
@@ -80,11 +79,11 @@ def judge(trusted: Trusted, selection: Selection, suspects: Mask) -> tuple[Selec
             if not len(of := bad[only == place]):
                 continue
             for k, size in zip(of.tolist(), suspect.sizes(of, culprit).tolist(), strict=True):
-                number = int(rows.chunk.points[k])
+                number = int(chunk.points[k])
                 rejected[number] = suspect.rejected(k, culprit, size)
                 ground[number] &= culprit not in (_GROUND, None)
             if culprit != _GROUND:
-                rays[rows.chunk.rays[of] if culprit is None else rows.chunk.rays[of, culprit]] = False
+                rays[chunk.rays[of] if culprit is None else chunk.rays[of, culprit]] = False
     return Selection.of(rays, ground), rejected
 
 
@@ -146,20 +145,27 @@ class _Limits:
 
 
 class _Suspects:
-    """The rows of points of a chunk; their parts are their rays, and their ground if that is known."""
+    """The rows of points of a chunk ``(n, m)``; their parts are their rays, and their ground if that is known."""
 
-    def __init__(self, rows: Eliminated, cofactors: Cofactors) -> None:
-        self.problem, self.rows = rows.linear.problem, rows
-        self.design, self.misfit = rows.q @ rows.r, rows.misfit
-        self.parts = {c: np.arange(2 * c, 2 * c + 2) for c in range(rows.chunk.rays.shape[1])}
-        if rows.chunk.ground:
-            self.parts[_GROUND] = np.arange(self.misfit.shape[1] - 3, self.misfit.shape[1])
-        self.spread = np.tile(np.eye(self.misfit.shape[1]), (len(self.misfit), 1, 1))
-        for group in rows.chunk.groups:
-            _, real = rows.columns(group)
-            by_params = rows.design(group)[:, :, real]
-            own = cofactors.of_images(rows.chunk.images[group.start])
-            self.spread[group] += by_params @ own @ by_params.swapaxes(1, 2)
+    def __init__(self, chunk: Chunk, linear: Linear, cofactors: Cofactors) -> None:
+        self.problem, self.chunk = linear.problem, chunk
+        count, k = chunk.rays.shape
+        self.design = linear.by_point[chunk.rays].reshape(count, 2 * k, 3)
+        self.misfit = linear.misfits.rays[chunk.rays].reshape(count, 2 * k)
+        self.parts = {c: np.arange(2 * c, 2 * c + 2) for c in range(k)}
+        if chunk.ground:
+            self.design = np.concatenate([self.design, linear.ground_by_point[chunk.points]], axis=1)
+            self.misfit = np.concatenate([self.misfit, linear.misfits.ground[chunk.points]], axis=1)
+            self.parts[_GROUND] = np.arange(2 * k, 2 * k + 3)
+        self.spread = np.tile(np.eye(self.misfit.shape[1]), (count, 1, 1))
+        for a in range(k):
+            taken = linear.by_params[chunk.rays[:, a]]
+            for b in range(a, k):
+                between = cofactors.between(chunk.images[:, a], chunk.images[:, b])
+                part = taken @ between @ linear.by_params[chunk.rays[:, b]].swapaxes(1, 2)
+                self.spread[:, self.parts[a][:, None], self.parts[b]] += part
+                if b > a:
+                    self.spread[:, self.parts[b][:, None], self.parts[a]] += part.swapaxes(1, 2)
 
     def contradictions(self, without: int | None) -> tuple[Array, int]:
         """Return the squares ``(n,)`` by which all parts but one miss each other and the block, and their freedom."""
@@ -178,7 +184,7 @@ class _Suspects:
 
         None where parallel rays put it nowhere.
         """
-        sigmas = self.problem.ground_sigmas[self.rows.chunk.points[k]]
+        sigmas = self.problem.ground_sigmas[self.chunk.points[k]]
         axes = tuple(np.flatnonzero(np.isfinite(sigmas)).tolist())
         known = self.parts[_GROUND][list(axes)]
         rays = self._all_but(_GROUND)
@@ -200,7 +206,7 @@ class _Suspects:
 
         In metres for known ground, in pixels for rays.
         """
-        points, chunk = self.problem.points, self.rows.chunk
+        points, chunk = self.problem.points, self.chunk
         apart = self._apart(of, culprit)
         if culprit is None:
             rays = chunk.rays[of]
@@ -215,7 +221,7 @@ class _Suspects:
 
     def rejected(self, k: int, culprit: int | None, size: float) -> Rejected:
         """Return what is said of a point when a part of it, or an unknown one, is so far off."""
-        points, chunk = self.problem.points, self.rows.chunk
+        points, chunk = self.problem.points, self.chunk
         name = points.ids[chunk.points[k]]
         if culprit is None:
             known = _GROUND in self.parts
