@@ -13,6 +13,7 @@ from typing import Any
 import numba
 from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
+from numba.core.runtime import rtsys
 
 log = logging.getLogger(__name__)
 
@@ -20,7 +21,11 @@ _njit = functools.partial(numba.njit, nogil=True, error_model="numpy", boundsche
 
 
 def compiled(function: Callable[..., Any]) -> Any:
-    """Compile a function that runs without the interpreter lock; indices are not checked, and x / 0 is infinite."""
+    """Compile a function that runs without the interpreter lock; indices are not checked, and x / 0 is infinite.
+
+    Kernels are loops over numbers and arrays. Hashes (dictionaries, sets) and BLAS (``np.dot``, ``np.linalg``) are
+    missing when compiled code is loaded from its cache.
+    """
     made: Any = _njit()(function)
     try:
         made._cache = _Cache(function)  # as enable_caching() does with numba's own
@@ -44,6 +49,16 @@ class _Cache(FunctionCache):
 
     numba looks at the module of the function alone, not at those of functions that are compiled into it.
     """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Load what is compiled with the runtime that it calls, and nothing else.
+
+        numba would first load all that it can compile, SciPy's linear algebra too: a fifth of a small scene's time. It
+        does so by itself where something is to be compiled. What kernels may use is thereby narrow: see `compiled`.
+        """
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
         return (*super()._index_key(sig, codegen), _others(self._py_func.__module__))

@@ -1,10 +1,18 @@
 """Where no cache can be written, kernels are compiled in memory, and that is said once."""
 
+import ast
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+KERNELS = [
+    path
+    for path in sorted((Path(__file__).parents[2] / "ortho_pipeline").rglob("*.py"))
+    if "files.compiled import" in path.read_text(encoding="utf-8")
+]
 SCENE = Path(__file__).parents[2] / "sample_data/ikonos/po_39001_pan_0000000.tif"
 #: What numba does where neither the package's folder nor the home can be written: it finds no place for a cache.
 READ_ONLY = "import sys; from numba.core import caching; caching.CacheImpl._locator_classes = []\n"
@@ -58,3 +66,36 @@ def test_kept_code_is_made_again_when_a_function_of_another_module_changes(tmp_p
         command = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(tmp_path)!r}); {code}"]
         found.append(subprocess.run(command, env=surroundings, capture_output=True, text=True, check=True).stdout)
     assert found == ["2 0\n", "2 1\n", "40 0\n"]
+
+
+def test_kept_code_is_loaded_without_what_only_compiling_needs(tmp_path: Path) -> None:
+    """numba loads SciPy's linear algebra and a hundred modules of its own before it looks into the cache."""
+    (tmp_path / "one.py").write_text(
+        "from ortho_pipeline.files.compiled import compiled\n"
+        "@compiled\ndef total(x):\n    sum = 0.0\n    for k in range(x.size):\n        sum += x[k]\n    return sum\n"
+    )
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import numpy as np; from one import total\n"
+        "def say(x): print(total(x), sum(total.stats.cache_hits.values()), 'scipy.linalg' in sys.modules)\n"
+        "say(np.ones(3))\n"
+        "if len(sys.argv) > 1: say(np.ones(4, 'f4'))\n"  # the same process can still compile
+    )
+    surroundings = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", code, *more], env=surroundings, capture_output=True, text=True, check=True
+        )
+        for more in ((), ("compile",))
+    ]
+    assert [one.stdout for one in found] == ["3.0 0 True\n", "3.0 1 False\n4.0 1 True\n"]
+
+
+@pytest.mark.parametrize("path", KERNELS, ids=lambda path: path.name)
+def test_kernels_use_nothing_that_is_missing_when_they_are_loaded(path: Path) -> None:
+    """A symbol that is not there ends the process when the code is linked."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        assert not isinstance(node, ast.Dict | ast.Set | ast.DictComp | ast.SetComp | ast.MatMult), path
+        if isinstance(node, ast.Attribute):
+            assert ast.unparse(node).removeprefix("np.") not in ("dot", "vdot", "linalg", "matmul"), path
+        if isinstance(node, ast.Call):
+            assert ast.unparse(node.func) not in ("hash", "dict", "set", "frozenset"), path
