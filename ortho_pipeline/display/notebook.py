@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ from ortho_pipeline.errors import counted
 
 #: In a notebook, pages of reports are this high (CSS pixels).
 _PAGE_HEIGHT = 640
-#: Images and gross errors of a block that are listed.
+#: Images and gross errors of a block, and points of a table, that are listed.
 _LISTED = 20
 
 
@@ -57,6 +58,35 @@ def block_html(document: Mapping[str, Any]) -> str:
     if len(rejected) > _LISTED:
         said.append(f"and {counted(len(rejected) - _LISTED, 'more gross error')}")
     return render("display/notebook.html.j2", tables=tables, notes=said)
+
+
+def points_html(title: str, rows: Sequence[tuple[str, str, Sequence[float], Sequence[float]]]) -> str:
+    """Return points as HTML; a row has id, role, column and row, and x, y and height (NaN where it is not given)."""
+    head = ("", "role", "column", "row", "x", "y", "height")
+    texts = [
+        (name, role, *(f"{value:.2f}" for value in image), *("–" if math.isnan(v) else f"{v:.10g}" for v in ground))
+        for name, role, image, ground in rows[:_LISTED]
+    ]
+    rest = len(rows) - len(texts)
+    said = [f"and {counted(rest, 'more point')}"] if rest else []
+    return render("display/notebook.html.j2", tables=[_table(title, head, texts)], notes=said)
+
+
+def comparison_html(document: Mapping[str, Any]) -> str:
+    """Return the document of a comparison (`Comparison.to_json`) as HTML: RMSE of each model, and which to take."""
+
+    def total(rmse: Mapping[str, float] | None) -> str:
+        return f"{rmse['total']:.3f}" if rmse else "–"
+
+    rows = [
+        (row["model"], str(row["parameters"]), *(total(row["rmse"].get(kind)) for kind in ("check", "loo", "control")))
+        for row in document["rows"]
+    ]
+    advice = document["recommendation"]
+    said = [f"recommended: {advice['model'] or 'none'} ({advice['reason']})"]
+    said += [f"left out: point {one['id']} ({one['reason']})" for one in document["left_out"]] + document["warnings"]
+    head = ("", "parameters", "check points", "each left out in turn", "control points")
+    return render("display/notebook.html.j2", tables=[_table("RMSE, pixels", head, rows)], notes=said)
 
 
 def page_html(page: str) -> str:

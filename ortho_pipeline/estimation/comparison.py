@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.display.charts import rmse_axes
+from ortho_pipeline.display.notebook import comparison_html
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, OrthoError, counted
 from ortho_pipeline.estimation.family_fit import OWN, fit_family, fit_own
@@ -107,6 +108,9 @@ class Comparison:
     def best(self) -> Row | None:
         """The recommended row."""
         return next((row for row in self.rows if row.model == self.recommended), None)
+
+    def _repr_html_(self) -> str:
+        return comparison_html(self.to_json())
 
     def plot(self, axes: Any = None) -> Any:
         """Draw the RMSE of every model that could be fitted with matplotlib, on `axes` if given; return the axes."""

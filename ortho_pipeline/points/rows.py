@@ -10,14 +10,19 @@ import csv
 import math
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.options import PIXEL_ORIGINS
+
+Array = NDArray[np.float64]
 
 #: A point file beyond this is not read (bytes), nor a line beyond that (characters).
 MAX_FILE = 32_000_000
@@ -124,6 +129,43 @@ def plain_id(text: str) -> str:
 def is_writable(text: str) -> bool:
     """Tell whether text can stand in a UTF-8 file: no NUL and no half of a surrogate pair, which JSON can hold."""
     return "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)
+
+
+def numbered_ids(path: str | os.PathLike[str], rows: Sequence[Row]) -> tuple[str, ...]:
+    """Number the points without an id by their place in the file; refuse an id that stands twice."""
+    first: dict[str, str] = {}
+    for count, row in enumerate(rows, start=1):
+        row.id = row.id if row.id is not None else str(count)
+        if row.id in first:
+            raise InputError(
+                f"the id {row.id!r} stands twice, first in {first[row.id]}",
+                file=path,
+                field=row.where,
+                remedy="give each point an id of its own",
+            )
+        first[row.id] = row.where
+    return tuple(str(row.id) for row in rows)
+
+
+def refuse_duplicates(
+    path: str | os.PathLike[str], wheres: Sequence[str], image: Array, ground: Array, roles: Sequence[str]
+) -> None:
+    """Refuse points that stand twice: the same ground or the same pixel, to all digits that can matter."""
+    # A millimetre in degrees and in metres; pixels to a millionth.
+    digits = 8 if np.abs(ground[:, :2]).max(initial=0) <= 360 else 3
+    for what, keys in (("ground", np.round(ground, digits)), ("image", np.round(image, 6))):
+        first: dict[tuple[float, ...], int] = {}
+        for count, key in enumerate(map(tuple, np.nan_to_num(keys, nan=-1e9).tolist())):
+            other = first.setdefault(key, count)
+            if other != count:
+                both = sorted({roles[other], roles[count]})
+                as_both = f", as {' and '.join(both)}" if len(both) > 1 else ""
+                raise InputError(
+                    f"the same {what} coordinates as in {wheres[other]}{as_both}",
+                    file=path,
+                    field=wheres[count],
+                    remedy="remove one of the two",
+                )
 
 
 def origin_shift(path: str | os.PathLike[str], table: Table, origin: str) -> float:

@@ -13,12 +13,13 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
 
+from ortho_pipeline.display.notebook import points_html
 from ortho_pipeline.errors import InputError, counted, reads
 from ortho_pipeline.files import json_text, write_text
 from ortho_pipeline.geodesy.crs import (
@@ -28,6 +29,7 @@ from ortho_pipeline.geodesy.crs import (
     horizontal,
     parse_crs,
 )
+from ortho_pipeline.points.dataframes.geodataframe import frame_of, table_of
 from ortho_pipeline.points.formats import read_table
 from ortho_pipeline.points.geojson import feature_of
 from ortho_pipeline.points.ground import ground_of
@@ -52,10 +54,15 @@ from ortho_pipeline.points.rows import (
     Row,
     Table,
     is_writable,
+    numbered_ids,
     origin_shift,
     plain_id,
+    refuse_duplicates,
     short,
 )
+
+if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
 
 Array = NDArray[np.float64]
 
@@ -164,6 +171,10 @@ class Points:
         roles = ", ".join(f"{(self.roles == role).sum()} {role}" for role in ROLES if (self.roles == role).any())
         return f"<{counted(len(self.ids), 'point')}: {roles or 'none'}; {self.crs.name}; {self.source}>"
 
+    def _repr_html_(self) -> str:
+        rows = [(point.id, point.role, point.image, point.ground) for point in self]
+        return points_html(repr(self)[1:-1], rows)
+
     def __len__(self) -> int:
         return len(self.ids)
 
@@ -204,6 +215,33 @@ class Points:
         """
         measured = self.check & (self.groups < 0)
         return measured if measured.any() else self.check
+
+    def to_geodataframe(self) -> GeoDataFrame:
+        """Return the points as a GeoDataFrame, from which `from_geodataframe` makes them again, to the last bit.
+
+        Columns are those of CSV files: `col` and `row` (px, from the outer corner of the first pixel), `h` (metres
+        above the ellipsoid, NaN where it is not given), role and standard deviations, those in plan one by one. The
+        geometry is x, y in `crs`. It needs GeoPandas (``pip install 'ortho-pipeline[geopandas]'``).
+        """
+        return frame_of(self)
+
+    @classmethod
+    def from_geodataframe(
+        cls, frame: GeoDataFrame, *, crs: str | pyproj.CRS | None = None, vertical: str | Vertical | None = None
+    ) -> Points:
+        """Make points of a GeoDataFrame with the columns `col` and `row`; all others of `to_geodataframe` may be there.
+
+        Heights are column `h`, or those of the geometry. `crs` and `vertical` say what places and heights are in where
+        the frame does not: its CRS, or ``frame.attrs["vertical"]`` as `to_geodataframe` leaves it.
+
+        Raises
+        ------
+        InputError, CrsError, DatumError
+            Names the row and the column, and what to do.
+        """
+        table, sigmas = table_of(frame)
+        found = _points_of(str(frame.attrs.get("source", "GeoDataFrame")), table, crs, vertical)
+        return replace(found, sigma_ground=sigmas)
 
     def select(self, mask: ArrayLike) -> Points:
         """Return the points of a mask ``(N,)`` or of indices, in their order."""
@@ -290,25 +328,33 @@ def read_points(
         Names file, line and column, and what to do.
     """
     table = read_table(path, image_name, pieces)
-    ids = _ids(path, table.rows)
-    image = np.array([row.image for row in table.rows]) + origin_shift(path, table, pixel_origin)
-    pieces_of = np.array([row.piece for row in table.rows])
-    image = image * pieces_of[:, 2:] + pieces_of[:, :2]
+    return _points_of(path, table, crs, vertical, origin_shift(path, table, pixel_origin))
+
+
+def _points_of(
+    path: str | os.PathLike[str], table: Table, crs: str | pyproj.CRS | None, vertical: str | Vertical | None,
+    shift: float = 0.0,
+) -> Points:  # fmt: skip
+    """Return the points of the rows of a table; `shift` px is added to their places in the image."""
+    rows = table.rows
+    ids = numbered_ids(path, rows)
+    pieces = np.array([row.piece for row in rows]).reshape(-1, 3)
+    image = (np.array([row.image for row in rows]).reshape(-1, 2) + shift) * pieces[:, 2:] + pieces[:, :2]
     ground, plane = ground_of(path, table, crs, vertical)
-    _refuse_duplicates(path, [row.where for row in table.rows], image, ground, [row.role for row in table.rows])
-    sigma_image = sigmas_of(table.rows, DEFAULT_SIGMA_IMAGE)
+    refuse_duplicates(path, [row.where for row in rows], image, ground, [row.role for row in rows])
+    sigma_image = sigmas_of(rows, DEFAULT_SIGMA_IMAGE)
     return Points(
         ids=ids,
         image=image,
         ground=ground,
-        roles=np.array([row.role for row in table.rows], dtype="<U7"),
+        roles=np.array([row.role for row in rows], dtype="<U7"),
         sigma_image=sigma_image,
-        sigma_ground=np.array([[_or(row.sigma_xy, 0.0)] * 2 + [_or(row.sigma_h, 0.0)] for row in table.rows]),
+        sigma_ground=np.array([[row.sigma_xy or 0.0] * 2 + [row.sigma_h or 0.0] for row in rows]).reshape(-1, 3),
         crs=plane,
         source=os.fspath(path),
-        covariance_image=covariance_of(table.rows, sigma_image),
-        groups=groups_of(table.rows),
-        sigma_common=common_of(table.rows),
+        covariance_image=covariance_of(rows, sigma_image),
+        groups=groups_of(rows),
+        sigma_common=common_of(rows),
     )
 
 
@@ -345,7 +391,7 @@ def gcps_of_dataset(
         raise InputError("a ground control point is not finite", file=path, field="GCP")
     table = Table("GCPs", rows, crs=dataset.GetGCPProjection() or None)
     placed, plane = ground_of(path, table, crs, vertical)
-    _refuse_duplicates(path, [row.where for row in rows], image, placed, [row.role for row in rows])
+    refuse_duplicates(path, [row.where for row in rows], image, placed, [row.role for row in rows])
     return Points(
         ids=tuple(str(row.id) for row in rows),
         image=image,
@@ -356,47 +402,6 @@ def gcps_of_dataset(
         crs=plane,
         source=path,
     )
-
-
-def _or(value: float | None, default: float) -> float:
-    return default if value is None else value
-
-
-def _ids(path: str | os.PathLike[str], rows: Sequence[Row]) -> tuple[str, ...]:
-    """Number the points without an id by their place in the file; refuse an id that stands twice."""
-    first: dict[str, str] = {}
-    for count, row in enumerate(rows, start=1):
-        row.id = row.id if row.id is not None else str(count)
-        if row.id in first:
-            raise InputError(
-                f"the id {row.id!r} stands twice, first in {first[row.id]}",
-                file=path,
-                field=row.where,
-                remedy="give each point an id of its own",
-            )
-        first[row.id] = row.where
-    return tuple(str(row.id) for row in rows)
-
-
-def _refuse_duplicates(
-    path: str | os.PathLike[str], wheres: Sequence[str], image: Array, ground: Array, roles: Sequence[str]
-) -> None:
-    """Refuse points that stand twice: the same ground or the same pixel, to all digits that can matter."""
-    # A millimetre in degrees and in metres; pixels to a millionth.
-    digits = 8 if np.abs(ground[:, :2]).max(initial=0) <= 360 else 3
-    for what, keys in (("ground", np.round(ground, digits)), ("image", np.round(image, 6))):
-        first: dict[tuple[float, ...], int] = {}
-        for count, key in enumerate(map(tuple, np.nan_to_num(keys, nan=-1e9).tolist())):
-            other = first.setdefault(key, count)
-            if other != count:
-                both = sorted({roles[other], roles[count]})
-                as_both = f", as {' and '.join(both)}" if len(both) > 1 else ""
-                raise InputError(
-                    f"the same {what} coordinates as in {wheres[other]}{as_both}",
-                    file=path,
-                    field=wheres[count],
-                    remedy="remove one of the two",
-                )
 
 
 # -- writing ---------------------------------------------------------------------------------------------------------

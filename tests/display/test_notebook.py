@@ -28,6 +28,20 @@ def test_a_fit_shows_itself():
     assert "0.221" in html
 
 
+def test_points_and_a_comparison_show_themselves():
+    scene, points = op.open_scene(SAMPLE / "scene.tif"), op.read_points(SAMPLE / "gcps.geojson")
+    html = points._repr_html_()
+    assert html.count("<tr>") == 19
+    assert "12 control, 6 check" in html
+    assert ">136.44<" in html
+    many = op.Points.of([[k, k] for k in range(23)], [[30 + k, 40, float("nan")] for k in range(23)], "EPSG:4326")
+    assert "and 3 more points" in many._repr_html_()
+    found = op.compare(points, ["rpc+shift", "affine3d"], own=scene.model, size=(scene.width, scene.height))
+    html = found._repr_html_()
+    assert html.count("<tr>") == 3
+    assert "recommended: rpc+shift" in html
+
+
 def test_names_from_files_are_text_and_not_html():
     from ortho_pipeline.display.notebook import fit_html, text_html
 

@@ -1,0 +1,150 @@
+"""Points as a GeoDataFrame of GeoPandas, and back."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.points.image_errors import read_image_errors, says_more
+from ortho_pipeline.points.rows import CSV_ERRORS, Row, Table, number, role_of, sigma_of
+
+if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
+
+    from ortho_pipeline.points.table import Points
+
+#: What errors call a frame that does not say where its points come from.
+_FRAME = "GeoDataFrame"
+_SIGMAS = ("sigma_image", "sigma_x", "sigma_y", "sigma_h")
+_COLUMNS = ("id", "role", "col", "row", "h", *_SIGMAS, "sigma_xy", *CSV_ERRORS)
+
+
+def frame_of(points: Points) -> GeoDataFrame:
+    """Return points as a GeoDataFrame, as `Points.to_geodataframe` describes it.
+
+    Raises
+    ------
+    InputError
+        If GeoPandas is not installed.
+    """
+    try:
+        import geopandas
+    except ImportError as error:
+        raise InputError(
+            "a GeoDataFrame needs GeoPandas, which is not installed", field="points",
+            remedy="pip install 'ortho-pipeline[geopandas]'",
+        ) from error  # fmt: skip
+    columns: dict[str, Any] = {
+        "id": list(points.ids),
+        "role": points.roles.astype(object),
+        "col": points.image[:, 0],
+        "row": points.image[:, 1],
+        "h": points.ground[:, 2],
+        **dict(zip(_SIGMAS, (points.sigma_image, *points.sigma_ground.T), strict=True)),
+        **_error_columns(points),
+    }
+    frame = geopandas.GeoDataFrame(columns, geometry=_places(points), crs=points.crs)
+    frame.attrs.update(vertical="ellipsoid", source=points.source)
+    return frame
+
+
+def _places(points: Points) -> list[Any]:
+    import shapely
+
+    known = np.isfinite(points.ground[:, :2]).all(axis=1)
+    return [shapely.Point(x, y) if there else None for (x, y, _), there in zip(points.ground, known, strict=True)]
+
+
+def _error_columns(points: Points) -> dict[str, Any]:
+    """Return the columns `CSV_ERRORS` that say more than `sigma_image` does."""
+    found: dict[str, Any] = {}
+    more = says_more(points.covariance_image)
+    if more.any():
+        for name, i, j in zip(CSV_ERRORS[:3], (0, 1, 0), (0, 1, 1), strict=True):
+            found[name] = np.where(more, points.covariance_image[:, i, j], np.nan)
+    if (points.groups >= 0).any():
+        found[CSV_ERRORS[3]] = np.where(points.groups >= 0, points.groups, np.nan)
+    if points.sigma_common.any():
+        found[CSV_ERRORS[4]] = points.sigma_common
+    return found
+
+
+def table_of(frame: GeoDataFrame) -> tuple[Table, np.ndarray]:
+    """Return the rows of a GeoDataFrame, and standard deviations ``(N, 3)`` m of their ground (0 where not given).
+
+    Raises
+    ------
+    InputError
+        If it is no GeoDataFrame, or a column is missing or has another thing than it should.
+    """
+    if not hasattr(frame, "geometry") or not hasattr(frame, "columns"):
+        raise InputError(
+            f"{type(frame).__name__} has no geometry", file=_FRAME, field="frame", remedy="give a GeoDataFrame"
+        )
+    source = str(frame.attrs.get("source", _FRAME))
+    missing = [name for name in ("col", "row") if name not in frame.columns]
+    if missing:
+        raise InputError(
+            f"no column {' and '.join(missing)}", file=source, field="columns",
+            remedy="name the columns of the place in the image (px from the outer corner of the first pixel) so",
+        )  # fmt: skip
+    if not frame.columns.is_unique:
+        raise InputError("two columns of one name", file=source, field="columns", remedy="rename one of them")
+    table = Table(
+        _FRAME, crs=None if frame.crs is None else frame.crs.to_wkt(), vertical=frame.attrs.get("vertical")
+    )  # fmt: skip
+    # As objects, for the missing values of pandas are neither numbers nor None.
+    cells = {name: frame[name].astype(object).where(frame[name].notna(), None) for name in _COLUMNS if name in frame}
+    records = [dict(zip(cells, values, strict=True)) for values in zip(*cells.values(), strict=True)]
+    sigmas = np.zeros((len(records), 3))
+    for k, (record, place) in enumerate(zip(records, frame.geometry, strict=True)):
+        where = f"row {frame.index[k]}"
+        table.rows.append(_row(source, where, record, place))
+        sigmas[k] = [_sigma(source, where, record, name, zero=True) or 0.0 for name in _SIGMAS[1:]]
+    return table, sigmas
+
+
+def _row(source: str, where: str, record: dict[str, Any], place: Any) -> Row:
+    def cell(name: str) -> float:
+        return number(_plain(record[name]), source, f"{where}, {name}")
+
+    if place is not None and (place.geom_type != "Point" or place.is_empty):
+        raise InputError(f"{place.geom_type} is not the place of a point", file=source, field=f"{where}, geometry")
+    x, y = (math.nan, math.nan) if place is None else (place.x, place.y)
+    if record.get("h") is not None:
+        height = cell("h")
+    else:
+        height = place.z if place is not None and place.has_z and "h" not in record else math.nan
+    sigma_image = _sigma(source, where, record, "sigma_image", zero=False)
+    covariance, group, common = read_image_errors(
+        [_plain(record.get(name)) for name in CSV_ERRORS], source, [f"{where}, {name}" for name in CSV_ERRORS],
+        sigma_image,
+    )  # fmt: skip
+    name = _plain(record.get("id"))
+    return Row(
+        where=where,
+        id=None if name is None else str(name),
+        image=(cell("col"), cell("row")),
+        ground=(x, y, height),
+        role=role_of(record["role"], source, f"{where}, role") if record.get("role") is not None else "control",
+        sigma_image=sigma_image,
+        covariance=covariance,
+        group=group,
+        sigma_common=common,
+    )
+
+
+def _sigma(source: str, where: str, record: dict[str, Any], name: str, *, zero: bool) -> float | None:
+    """Return a standard deviation; ``sigma_xy`` of CSV files stands for both components in plan."""
+    value = record.get(name)
+    if value is None and name in ("sigma_x", "sigma_y"):
+        name = "sigma_xy"
+        value = record.get(name)
+    return None if value is None else sigma_of(_plain(value), source, f"{where}, {name}", zero=zero)
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
