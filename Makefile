@@ -7,6 +7,7 @@
 #   make check    formatting, lint, types, tests
 #   make fuzz     read damaged files with every reader (N=100000 of each, READER=name for one, KEEP=folder for results)
 #   make bench    speed and memory against gdalwarp, speed of adjustments and of many scenes
+#   make packages build sdist and wheel, install and try both in clean environments (PYTHONS=python3.12=wheel, more)
 #   make docs     do the tutorials and draw their pictures, then the documentation as a site in out/site, links checked
 #   make images   draw all pictures again: README.md, docs/measure.md, docs/report.md, the tutorials (Chromium)
 #   make clean    remove .venv, caches and out/
@@ -29,7 +30,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all faults check fuzz bench docs images clean
+.PHONY: help setup demo test test-all faults check fuzz bench packages docs images clean
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
@@ -77,6 +78,11 @@ bench: setup
 	$(BIN)/python benchmarks/batch.py
 	$(BIN)/python benchmarks/answers.py
 	$(BIN)/python benchmarks/measure.py
+
+# Which interpreters, each with the system's GDAL or the extra `wheel`.
+PYTHONS ?= $(PYTHON)=system
+packages:
+	@bash tools/clean_install.sh $(PYTHONS)
 
 docs: setup
 	@$(BIN)/python docs/make_tutorial_images.py
