@@ -54,8 +54,7 @@ def frame_of(points: Points) -> GeoDataFrame:
 def _places(points: Points) -> list[Any]:
     import shapely
 
-    known = np.isfinite(points.ground[:, :2]).all(axis=1)
-    return [shapely.Point(x, y) if there else None for (x, y, _), there in zip(points.ground, known, strict=True)]
+    return [shapely.Point(x, y) if np.isfinite((x, y)).all() else None for x, y, _ in points.ground.tolist()]
 
 
 def _error_columns(points: Points) -> dict[str, Any]:
