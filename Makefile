@@ -8,7 +8,8 @@
 #   make fuzz     read damaged files with every reader (N=100000 of each, READER=name for one, KEEP=folder for results)
 #   make bench    speed and memory against gdalwarp, speed of adjustments and of many scenes
 #   make packages build sdist and wheel, install and try both in clean environments (PYTHONS=python3.12=wheel, more)
-#   make docs     do the tutorials and draw their pictures, then the documentation as a site in out/site, links checked
+#   make docs     do the tutorials and draw their pictures, then the documentation as a site in out/site, links checked,
+#                 and manual pages in out/man
 #   make images   draw all pictures again: README.md, docs/measure.md, docs/report.md, the tutorials (Chromium)
 #   make clean    remove .venv, caches and out/
 #
@@ -87,8 +88,10 @@ packages:
 docs: setup
 	@$(BIN)/python docs/make_tutorial_images.py
 	$(BIN)/python docs/make_reference.py
+	$(BIN)/python docs/make_man.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	echo "Site:    $(CURDIR)/out/site/index.html"
+	echo "Manual:  man -l $(CURDIR)/out/man/ortho.1"
 
 images: setup
 	@$(BIN)/python docs/make_images.py
