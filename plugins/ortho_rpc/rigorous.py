@@ -11,6 +11,7 @@ import numpy as np
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.hookspecs import Piece
+from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.pushbroom.scanner import Pushbroom
 from ortho_pipeline.models.rational import RPC
 from ortho_rpc.dimap import has_dimap_pushbroom, images_of, read_dimap_pushbroom, tile_of
@@ -20,6 +21,11 @@ _DIMAP = re.compile(r"(DIM|PHRDIMAP)[\w.-]*\.XML", re.IGNORECASE)
 #: A vendor's RPC follows its rigorous model to a fraction of a pixel, a corrected one to some tens; beyond this (px)
 #: they are of two images.
 DISAGREEMENT = 100.0
+#: The same (px) of products whose look angles were not at hand to check from where they count.
+UNSEEN = {"PNEO_SENSOR": 2.0}
+#: Where models are compared: parts of the width, of the height, and of the heights of the RPC.
+_MIDDLE = np.array([[0.5, 0.5, 0.0]])
+_WITHIN = np.array([[x, y, h] for x in (0.05, 0.5, 0.95) for y in (0.05, 0.5, 0.95) for h in (-0.4, 0.0)])
 
 
 @dataclass(frozen=True)
@@ -68,7 +74,7 @@ def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:
             candidates[True].append(file)
         elif not named & names:
             candidates[False].append(file)
-    found: dict[Path, Pushbroom] = {}
+    found: dict[Path, tuple[Pushbroom, float | None]] = {}
     others: dict[str, str] = {}
     for file in candidates[True] or candidates[False]:
         try:
@@ -78,17 +84,19 @@ def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:
             continue
         its = (model.camera.width, model.camera.height)
         if its == size:
-            found[file.path] = model
+            found[file.path] = model, UNSEEN.get(file.said("Metadata_Identification/METADATA_PROFILE") or "")
         else:
             others[file.path.name] = "it is of {} x {} pixels, this image has {} x {}".format(*its, *size)
     if len(found) > 1:
         several = ", ".join(path.name for path in found)
         reason = f"several rigorous models of this size lie beside the image, none is taken: {several}"
         return Rigorous(left=left | {path.name: reason for path in found})
-    for path, model in found.items():
-        apart = _apart(model, rpc)
-        if apart > DISAGREEMENT:
-            left[path.name] = f"it is {apart:.0f} px off the RPC in the middle of the image: they are of two images"
+    for path, (model, limit) in found.items():
+        apart = _apart(model, rpc, _MIDDLE if limit is None else _WITHIN)
+        if apart > (DISAGREEMENT if limit is None else limit):
+            place = "in the middle of" if limit is None else "within"
+            why = "they are of two images" if limit is None else "no look angles of this product were at hand to check"
+            left[path.name] = f"it is {apart:.3g} px off the RPC {place} the image: {why}"
             return Rigorous(left=left)
         return Rigorous(model, path, left)
     return Rigorous(left=left | others)
@@ -131,8 +139,15 @@ def _reason(error: InputError) -> str:
     return "; ".join(filter(None, [f"{error.field}: {error.message}" if error.field else error.message, error.remedy]))
 
 
-def _apart(model: Pushbroom, rpc: RPC) -> float:
-    """Return by how many pixels model and RPC differ in the middle of the image; infinite where one sees nothing."""
-    middle = np.array([[model.camera.width / 2, model.camera.height / 2]])
-    apart = float(np.abs(rpc.ground_to_image(model.image_to_ground(middle, rpc.h_off)) - middle).max())
+def _apart(model: Pushbroom, rpc: RPC, places: Array) -> float:
+    """Return by how many pixels model and RPC differ at places of the image; infinite where one sees nothing.
+
+    Parameters
+    ----------
+    places : (N, 3)
+        Parts of its width and height, and of the heights of the RPC.
+    """
+    image = places[:, :2] * (model.camera.width, model.camera.height)
+    seen = rpc.ground_to_image(model.image_to_ground(image, rpc.h_off + places[:, 2] * rpc.h_scale))
+    apart = float(np.abs(seen - image).max())
     return apart if np.isfinite(apart) else np.inf

@@ -9,14 +9,22 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
+from ortho_pipeline.models.light import LightPath
 from ortho_pipeline.models.pushbroom.tables import rotations_of_quaternions
 from ortho_rpc.dimap_file import MOST_TERMS, DimapFile
 
 Array = NDArray[np.float64]
 
 FIRST, SECOND = "Geometric_Data/Sensor_Model_Characteristics", "Geometric_Data/Refined_Model"
-#: Products of version 2 whose conventions were checked against numbers of the vendor.
-PROFILES = ("PHR_SENSOR", "S6_SENSOR", "S7_SENSOR")
+_NO_LIGHT = LightPath()
+#: Products of version 2 whose conventions were checked against numbers of the vendor, and what light does on its way to
+#: the camera that their angles leave out: the RPC of Pleiades Neo bends with height as refraction does.
+PROFILES = {
+    "PHR_SENSOR": _NO_LIGHT,
+    "S6_SENSOR": _NO_LIGHT,
+    "S7_SENSOR": _NO_LIGHT,
+    "PNEO_SENSOR": LightPath(refraction=True),
+}
 #: Seconds of the units in which line periods stand; Pleiades names none.
 _UNITS = {None: 1e-3, "ms": 1e-3, "millisecond": 1e-3, "microsecond": 1e-6, "us": 1e-6}
 #: How often an attitude polynomial is sampled, and by how many cubic polynomials it is followed: to 1e-12 rad.
@@ -42,6 +50,8 @@ class Scan:
         Times and rotations around so many seconds from `first` on.
     pieces : int, optional
         By how many polynomials the attitude is followed; through all its rows without it.
+    light : LightPath
+        What the angles leave out.
     """
 
     columns: int
@@ -53,6 +63,7 @@ class Scan:
     orbit: tuple[Array, Array]
     attitude: Callable[[float, float], tuple[Array, Array]]
     pieces: int | None
+    light: LightPath = _NO_LIGHT
 
 
 def first_version(file: DimapFile) -> Scan:
@@ -95,7 +106,7 @@ def second_version(file: DimapFile) -> Scan:
     else:
         attitude, pieces = _listed_attitude(file, f"{base}/Quaternion_List"), None
     orbit = _orbit(file, f"{SECOND}/Ephemeris", "TIME", "LOCATION_XYZ")
-    return Scan(columns, rows, period, start, psi_x, psi_y, orbit, attitude, pieces)
+    return Scan(columns, rows, period, start, psi_x, psi_y, orbit, attitude, pieces, PROFILES[profile])
 
 
 def _look_angles(file: DimapFile, columns: int) -> tuple[Array, Array]:

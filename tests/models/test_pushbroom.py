@@ -577,6 +577,28 @@ def test_impossible_tables(table: str, what: str) -> None:
     assert caught.value.field == table
 
 
+@pytest.mark.parametrize("late", [0.009, 0.02])
+def test_an_orbit_may_begin_a_little_late(late: float) -> None:
+    """As Pleiades Neo's do: a hundredth of the image is followed backwards, more is not known."""
+    camera = scanner(12)
+    (times, positions, _), (turned_at, _, turns) = (
+        tables_of(camera, np.linspace(first, 1.6, 200) * camera.height) for first in (late, -0.6)
+    )
+
+    def made() -> Pushbroom:
+        return pushbroom_of_tables(
+            LineCamera(12_000, 12_000, 6000.0, 0.0, 277_857.0), line_period=camera.line_period, first_time=0.0,
+            orbit=(times, positions), attitude=(turned_at, turns),
+        )  # fmt: skip
+
+    if late > 0.01:
+        with pytest.raises(InputError, match="the image takes"):
+            made()
+        return
+    place, whole = made().rays([[5.0, 0.5]])[0], camera.rays(np.array([[5.0, 0.5]]))[0]
+    assert np.linalg.norm(place - whole) < 1e-3
+
+
 @pytest.mark.parametrize("spoil", [2.0, np.array([-1.0, 1.0, 1.0])])
 @pytest.mark.parametrize("mounting", [None, np.eye(3)])
 def test_tables_of_what_is_no_rotation(spoil: object, mounting: Array | None) -> None:

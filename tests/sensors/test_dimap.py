@@ -7,6 +7,7 @@ import math
 import random
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,16 +17,18 @@ from click.testing import CliRunner
 from ortho_rpc.dimap import has_dimap_pushbroom, read_dimap_pushbroom
 from osgeo import gdal
 from products import dimap_product
+from scipy.spatial.transform import Rotation
 from seeds import dimap_text
 
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
-from ortho_pipeline.exchange.rpc_files import read_rpc_text
+from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpc_txt
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
 from ortho_pipeline.models import RPC, Pushbroom
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.models.light import LightPath
 from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.testing import check_sensor_model
 
@@ -68,7 +71,7 @@ class Written:
             (self.seconds(entry.findtext("TIME")), [float(entry.findtext(f"Q{k}")) for k in range(4)])
             for entry in model.findall("Attitudes/Quaternion_List/Quaternion")
         ]
-        angles = next(model.iter("Polynomial_Look_Angles"))
+        angles = next(model.iter("Polynomial_Look_Angles"), ())
         self.x, self.y = ([float(e.text) for e in angles if e.tag.startswith(name)] for name in ("XLOS", "YLOS"))
 
     @staticmethod
@@ -78,6 +81,16 @@ class Written:
 
     def ray(self, column: float, row: float) -> tuple[Array, Array]:
         """Return position and direction (ECEF) of a place of the image, (1, 1) the centre of the first pixel."""
+        place, (w, x, y, z) = self.pose(row)
+        psi_x, psi_y = (sum(c * (column - 1) ** k for k, c in enumerate(terms)) for terms in (self.x, self.y))
+        if self.tangent:
+            psi_x, psi_y = math.tan(psi_x), math.tan(psi_y)
+        v, q = np.array([psi_y, -psi_x, 1.0]), np.array([x, y, z])
+        turned = (w * w - q @ q) * v + 2 * (q @ v) * q + 2 * w * np.cross(q, v)
+        return place, turned / np.linalg.norm(turned)
+
+    def pose(self, row: float) -> tuple[Array, tuple[float, ...]]:
+        """Return position (ECEF) and quaternion, scalar first, of a row counted from 1."""
         time = self.start + (row - 1) * self.period
         first = int(np.clip(np.searchsorted(self.times, time) - 4, 0, len(self.times) - 8))
         near = self.times[first : first + 8]
@@ -85,15 +98,8 @@ class Written:
         place = np.array(weights) @ self.places[first : first + 8]
         if self.listed:
             at = np.array([entry[0] for entry in self.listed])
-            w, x, y, z = (np.interp(time, at, [entry[1][k] for entry in self.listed]) for k in range(4))
-        else:
-            w, x, y, z = (np.polyval(part[::-1], (time - self.offset) / self.scale) for part in self.terms)
-        psi_x, psi_y = (sum(c * (column - 1) ** k for k, c in enumerate(terms)) for terms in (self.x, self.y))
-        if self.tangent:
-            psi_x, psi_y = math.tan(psi_x), math.tan(psi_y)
-        v, q = np.array([psi_y, -psi_x, 1.0]), np.array([x, y, z])
-        turned = (w * w - q @ q) * v + 2 * (q @ v) * q + 2 * w * np.cross(q, v)
-        return place, turned / np.linalg.norm(turned)
+            return place, tuple(np.interp(time, at, [entry[1][k] for entry in self.listed]) for k in range(4))
+        return place, tuple(np.polyval(part[::-1], (time - self.offset) / self.scale) for part in self.terms)
 
 
 def vertices(path: Path) -> Array:
@@ -224,7 +230,7 @@ def test_info_says_which_rigorous_model_is_not_read_and_why(real: Path, pleiades
     assert document["models"] == {"rpc": "rpc"}
     reasons = document["facts"]["rigorous_models_not_read"]
     assert set(reasons) == {neo.name, PLEIADES}
-    assert "PNEO_SENSOR" in reasons[neo.name]
+    assert "XLOS_0" in reasons[neo.name]  # this file was shortened
     assert "40000 x 15872 pixels, this image has 8000 x 15872" in reasons[PLEIADES]
     for name in reasons:
         assert f"{name} has a rigorous model that is left out: " in text
@@ -262,7 +268,7 @@ def test_directions_and_times_of_a_simple_flight(made: Path) -> None:
         ("<NROWS>400", "<NROWS>400.5", "NROWS"),
         ("<NROWS>400", "<NROWS>500", "Time_Range"),
         ("<NCOLS>300</NCOLS>", "", "NCOLS"),
-        ("PHR_SENSOR", "PNEO_SENSOR", "METADATA_PROFILE"),
+        ("PHR_SENSOR", "PER1_SENSOR", "METADATA_PROFILE"),
         ("<METADATA_PROFILE>PHR_SENSOR</METADATA_PROFILE>", "", "METADATA_PROFILE"),
         ("<OFFSET>43200.05", "<OFFSET>nan", "OFFSET"),
         ("<OFFSET>43200.05", "<OFFSET>1e400", "OFFSET"),
@@ -488,3 +494,84 @@ def test_rpc_of_pleiades_neo_and_its_vertices(real: Path) -> None:
     apart = rpc.ground_to_image(corners[:, :3]) - (corners[:, 3:] - 0.5)
     assert np.abs(apart[:2]).max() < 0.002
     assert np.abs(apart[2:]).max() < 0.16
+
+
+NEO_ROWS = (66, 665)
+"""The rows of the shortened file for which there are both positions and quaternions, counted from 0."""
+
+
+def look_angles(written: Written, rpc: RPC, row: int, light: LightPath) -> tuple[Array, Array]:
+    """Return columns counted from 0 and the angles (psi_X, psi_Y) under which a row sees what its RPC says."""
+    columns = np.linspace(0.0, 29392.0, 15)
+    ground = rpc.image_to_ground(np.column_stack([columns + 0.5, np.full(15, row + 0.5)]), rpc.h_off)
+    place, (w, x, y, z) = written.pose(row + 1)
+    velocity = (written.pose(row + 2)[0] - place) / written.period
+    line = light.apparent(
+        geocentric(ground) - place, np.tile(velocity, (15, 1)), enu_from_ecef(ground)[:, 2], ground[:, 2]
+    )
+    forward, right, down = Rotation.from_quat([x, y, z, w]).inv().apply(line).T
+    return columns, np.stack([-right / down, forward / down], axis=1)
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(("light", "most"), [({"refraction": True}, 0.01), ({}, 0.05)], ids=["refraction", "none"])
+def test_pleiades_neo_and_its_rpc(real: Path, tmp_path: Path, light: dict[str, bool], most: float) -> None:
+    """Orbit, attitude and times of the shortened file, with the four look angles that its RPC has in one row.
+
+    They are straight lines, as the format has them, to 0.002 px, and would not be with a tangent; with them the model
+    agrees with the RPC over all rows that have an attitude. Its change with height is that of refraction.
+    """
+    folder = real / "sensors" / "asp_plot" / "pleiades"
+    path, light_path = folder / "DIM_PNEO3_202111071029126_PAN_trimmed.XML", LightPath(**light)
+    rpc, written = read_rpc_text(folder / "RPC_PNEO3_202111071029126_PAN_trimmed.XML"), Written(path)
+    columns, angles = look_angles(written, rpc, 360, light_path)
+    lines = [np.polynomial.Polynomial.fit(columns, part, 1).convert() for part in angles.T]
+    pixel = abs(lines[0].coef[1])
+    assert max(np.abs(one(columns) - part).max() for one, part in zip(lines, angles.T, strict=True)) < 0.002 * pixel
+    bent = np.arctan(angles[:, 0])
+    assert np.abs(np.polynomial.Polynomial.fit(columns, bent, 1)(columns) - bent).max() > 0.1 * pixel
+    first, last = NEO_ROWS
+    start = written.start + first * written.period
+
+    def moment(seconds: float) -> str:
+        return f"2021-11-07T{int(seconds // 3600):02d}:{int(seconds // 60 % 60):02d}:{seconds % 60:013.10f}Z"
+
+    look = "".join(f"<{n}_{k}>{c!r}</{n}_{k}>" for n, one in zip(("XLOS", "YLOS"), lines, strict=True)
+                   for k, c in enumerate(one.coef.tolist()))  # fmt: skip
+    band = f"<Band_Calibration><Polynomial_Look_Angles>{look}</Polynomial_Look_Angles></Band_Calibration>"
+    text, rows = path.read_text(), last - first
+    for pattern, new in (
+        (r"<START>.*?</START>", f"<START>{moment(start)}</START>"),
+        (r"<END>.*?</END>", f"<END>{moment(start + rows * written.period)}</END>"),
+        (r"<NROWS>\d+", f"<NROWS>{rows}"),
+        (r"(?s)(<Geometric_Calibration>).*?(?=</Geometric_Calibration>)",
+         rf"\1<Instrument_Calibration><Band_Calibration_List>{band}</Band_Calibration_List></Instrument_Calibration>"),
+    ):  # fmt: skip
+        text = re.sub(pattern, new, text, count=1)
+    (tmp_path / path.name).write_text(text)
+    model = replace(read_dimap_pushbroom(tmp_path / path.name), light=light_path)
+    share = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), axis=-1).reshape(-1, 2)
+    image = 0.5 + share * (np.array(model.camera.size) - 1)
+    apart = np.array([rpc.ground_to_image(model.image_to_ground(image, rpc.h_off + h)) - image - (0, first)
+                      for h in (-200.0, 0.0, 200.0)])  # fmt: skip
+    assert apart.std(axis=(0, 1)).max() < most
+    assert np.abs(apart.mean(axis=(0, 1))).max() < 0.01
+    by_height = np.ptp(apart.mean(axis=1), axis=0).max()
+    assert by_height < 0.01 if light else 0.05 < by_height < 0.15
+
+
+@pytest.mark.parametrize("apart", [0.0, 5.0])
+def test_pleiades_neo_is_held_against_the_rpc_of_each_scene(tmp_path: Path, apart: float) -> None:
+    path = tmp_path / "DIM_A.XML"
+    path.write_text(dimap_text(listed=True).replace("S6_SENSOR", "PNEO_SENSOR"))
+    model = read_dimap_pushbroom(path).with_heights(190.0, 220.0)
+    assert model.light == LightPath(refraction=True)
+    centre, half = model.domain
+    box = (centre[0] - half[0], centre[1] - half[1], centre[0] + half[0], centre[1] + half[1])
+    rpc = fit_rpc(model, box, (190.0, 220.0), grid=(7, 7, 4)).rpc
+    image = _image(tmp_path / "a.tif", model)
+    write_rpc_txt(replace(rpc, col_off=rpc.col_off + apart), tmp_path / "a_RPC.TXT")
+    scene = open_scene(image, None, {"rpc": "sidecar"})
+    assert list(scene.models) == (["rpc"] if apart else ["rpc", "pushbroom"])
+    assert [notice.code for notice in scene.notices] == ["rigorous-left-out"] * bool(apart)
+    assert not apart or "it is 5 px off the RPC within the image" in scene.notices[0]

@@ -26,6 +26,9 @@ _NEIGHBOURS = 8
 #: A cubic polynomial follows an orbit for so long (seconds) to a micrometre.
 _PATH_PIECE = 2.5
 _CUBIC = SplineForm(3)
+#: By which part of an image's duration tables may be too short: orbits are smooth, and Pleiades Neo's begin some rows
+#: after the image.
+_BEYOND = {"orbit": 0.01, "attitude": 0.001}
 #: Positions (m) beyond this are damaged, and those between which nothing in an orbit gets so fast (m/s: twice what
 #: escapes from the Earth; metres by which tables are rounded).
 _FARTHEST, _FASTEST, _ROUNDED = 1e9, 22e3, 10.0
@@ -74,8 +77,8 @@ def pushbroom_of_tables(
         If a table is not ordered in time, too short, or does not cover the image.
     """
     degree, last = splines.degree, camera.height * line_period
-    slack = max(line_period, 1e-3 * last)
-    times, positions = _table(orbit, (3,), (first_time, last, slack), degree, "orbit")
+    needed = (first_time, last, line_period)
+    times, positions = _table(orbit, (3,), needed, degree, "orbit")
     if not (np.abs(positions) < _FARTHEST).all():
         raise InputError("a position of this table is no place of a satellite (ECEF metres)", field="orbit")
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
@@ -84,7 +87,7 @@ def pushbroom_of_tables(
             f"between two positions of this table lie {steps.max():.4g} m: no satellite is so fast", field="orbit",
             remedy="the file is damaged: copy it again; or give positions in ECEF metres at times in seconds",
         )  # fmt: skip
-    turn_times, turns = _table(attitude, (3, 3), (first_time, last, slack), degree, "attitude")
+    turn_times, turns = _table(attitude, (3, 3), needed, degree, "attitude")
     if not are_rotations(turns):
         raise InputError("a matrix of this table is not a rotation", field="attitude")
     # Half an image beyond both ends, as far as the tables go: points outside of the image are legal.
@@ -168,8 +171,9 @@ def _table(
     degree: int,
     name: str,
 ) -> tuple[Array, Array]:
-    """Return times after the first row and values of a table, checked; `needed`: first time, duration, slack (s)."""
-    first, last, slack = needed
+    """Return times after the first row and values of a table, checked; `needed`: first time, duration, row (s)."""
+    first, last, row = needed
+    slack = max(row, _BEYOND[name] * last)
     times, values = (np.asarray(part, dtype=np.float64) for part in table)
     if times.ndim != 1 or values.shape != (len(times), *shape) or len(times) <= degree:
         raise InputError(f"more than {degree} times with {shape} values each are needed", field=name)
