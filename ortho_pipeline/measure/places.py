@@ -22,6 +22,9 @@ from ortho_pipeline.surface.rays import meet_surface
 #: What a person may type for a CRS or a height datum: names and codes.
 _NAMED = r"[a-z]{2,12}:[0-9]{1,9}(\+[0-9]{1,9})?|ellipsoid|egm96|egm2008"
 
+#: So often a height is read where the last one puts a place: each is some ten times as near.
+_ROUNDS = 2
+
 
 class Geometry(Protocol):
     """What ground is shown in: pixels of an image by a model, or of a map."""
@@ -111,6 +114,19 @@ class Places:
         good = np.isfinite(met).all(axis=1)
         found[good] = ground_transform(self.model.crs, GROUND_CRS)(met[good])
         return found
+
+    def ground_about(self, image: ArrayLike, heights: ArrayLike) -> Array:
+        """Return the ground that image points ``(N, 2)`` see as `ground_of`, where its height ``(N,)`` is about known.
+
+        On slopes so steep that a ray meets the surface more than once this is one of these places.
+        """
+        given, height = np.asarray(image, dtype=float), np.asarray(heights, dtype=float)
+        to_ground = ground_transform(self.model.crs, GROUND_CRS)
+        for _ in range(_ROUNDS):
+            found = to_ground(self.model.image_to_ground(given, height))
+            there = self.surface.heights(found[:, :2], horizontal(parse_crs(GROUND_CRS)))
+            height = np.where(np.isfinite(there), there, height)
+        return to_ground(self.model.image_to_ground(given, height))
 
     def moved(self, shift: ArrayLike) -> Places:
         """Return the same where the model puts everything `shift` (column, row; px) farther."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +20,9 @@ from ortho_pipeline.surface.rays import meet_surface
 #: Places per side at which it is asked how certain the image is.
 _SIDE = 12
 #: Uncertainties within this part of the largest are alike: the place farthest from all points is taken then.
-_ALIKE = 0.1
+ALIKE = 0.1
 #: Places that are offered, the best first.
-_OFFERED = 6
+OFFERED = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,18 +42,18 @@ class Grid:
     everywhere: Array
 
     @classmethod
-    def over(cls, places: Places) -> Grid:
-        """Return the places of a scene."""
+    def over(cls, places: Places, side: int = _SIDE) -> Grid:
+        """Return the places of a scene, one in each of `side` x `side` cells."""
         width, height = places.view.size
-        steps = (np.arange(_SIDE) + 0.5) / _SIDE
+        steps = (np.arange(side) + 0.5) / side
         columns, rows = np.meshgrid(steps * width, steps * height)
         regular, ground = _shown(places, np.column_stack([columns.ravel(), rows.ravel()]))
         if not len(regular):
             return cls(regular, ground, ground)
-        cells = np.zeros((_SIDE, _SIDE), dtype=bool)
-        cells[tuple((regular / (width, height) * _SIDE).astype(int).T[::-1])] = True
+        cells = np.zeros((side, side), dtype=bool)
+        cells[tuple((regular / (width, height) * side).astype(int).T[::-1])] = True
         factor = chip_factor(places.view, places.references, regular)
-        origins, _ = candidates(places.view, (0, 0, width, height), (_SIDE, _SIDE), SIDE, factor, cells)
+        origins, _ = candidates(places.view, (0, 0, width, height), (side, side), SIDE, factor, cells)
         image, on_ground = _shown(places, np.asarray(origins + SIDE * factor / 2, dtype=np.float64))
         return cls(image, on_ground, ground) if len(image) else cls(regular, ground, ground)
 
@@ -74,16 +75,20 @@ def _shown(places: Places, image: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Next:
-    """Where to measure: column and row (px); and what is known there now, and would be everywhere with a point there.
+    """Where to measure: column and row (px) of image `number`; what is known there, and would be with a point there.
 
+    `height` (m) is that of the surface there, by the model as it was delivered.
     `sigma` (px) is the standard deviation (both axes together) of the prediction at this place, `largest` that at the
-    worst place of the scene, `then` the same after a measurement here; None where there is no fit yet.
+    worst place of the scene, `then` the same after a measurement of this `role` here; None where there is no fit yet.
     """
 
     image: tuple[float, float]
     sigma: float | None = None
     largest: float | None = None
     then: float | None = None
+    number: int = 0
+    height: float = math.nan
+    role: str = "control"
 
 
 def measure_next(grid: Grid, fit: Fit | None, taken: Array) -> list[Next]:
@@ -101,7 +106,7 @@ def measure_next(grid: Grid, fit: Fit | None, taken: Array) -> list[Next]:
     """
     grid = grid.without(taken)
     if fit is None or not len(fit.param_names):
-        return [Next(_pair(grid.image[k])) for k in _apart(grid.image, taken)]
+        return [Next(_pair(grid.image[k]), height=float(grid.ground[k, 2])) for k in apart(grid.image, taken)]
     partials, everywhere = fit.model.param_partials(grid.ground), fit.model.param_partials(grid.everywhere)
     variance = _variances(partials, fit.covariance)
     sigma = float(np.median(fit.points.sigma_image[fit.used])) if fit.used.any() else DEFAULT_SIGMA_IMAGE
@@ -109,13 +114,14 @@ def measure_next(grid: Grid, fit: Fit | None, taken: Array) -> list[Next]:
     largest = _root(_variances(everywhere, fit.covariance).max(initial=0.0))
     left = np.arange(len(grid.image))
     found: list[Next] = []
-    while len(left) and len(found) < _OFFERED:
-        alike = left[variance[left] >= (1 - _ALIKE) * variance[left].max()]
-        best = int(alike[_apart(grid.image[alike], taken)[0]])
+    while len(left) and len(found) < OFFERED:
+        alike = left[variance[left] >= (1 - ALIKE) * variance[left].max()]
+        best = int(alike[apart(grid.image[alike], taken)[0]])
         there = partials[best] @ fit.covariance
         gain = there.T @ np.linalg.solve(there @ partials[best].T + noise, there)
         then = _root(_variances(everywhere, fit.covariance - gain).max(initial=0.0))
-        found.append(Next(_pair(grid.image[best]), _root(variance[best]), largest, then))
+        height = float(grid.ground[best, 2])
+        found.append(Next(_pair(grid.image[best]), _root(variance[best]), largest, then, height=height))
         taken, left = np.concatenate([taken, grid.image[[best]]]), left[left != best]
     return found
 
@@ -129,13 +135,13 @@ def _root(variance: float) -> float:
     return float(np.sqrt(max(float(variance), 0.0)))
 
 
-def _apart(image: Array, taken: Array) -> NDArray[np.int_]:
+def apart(image: Array, taken: Array) -> NDArray[np.int_]:
     """Return some image points, each the farthest from those taken and chosen; without any taken the middle first."""
     chosen: list[int] = []
     distance = np.full(len(image), np.inf)
     for place in taken:
         distance = np.minimum(distance, ((image - place) ** 2).sum(axis=1))
-    while len(chosen) < min(_OFFERED, len(image)):
+    while len(chosen) < min(OFFERED, len(image)):
         if not len(taken) and not chosen:
             middle = (image.min(axis=0) + image.max(axis=0)) / 2
             chosen.append(int(np.argmin(((image - middle) ** 2).sum(axis=1))))

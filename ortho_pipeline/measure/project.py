@@ -6,12 +6,13 @@ import abc
 import datetime
 import os
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import write_json
 from ortho_pipeline.files.documents import json_position, json_value
@@ -91,6 +92,14 @@ class Project(abc.ABC):
     @abc.abstractmethod
     def _document(self) -> dict[str, Any]:
         """Return the GeoJSON of the points."""
+
+    @abc.abstractmethod
+    def compared(self) -> dict[str, Any]:
+        """Return the models, or corrections, that the points could be fitted with, compared, and the one to take."""
+
+    @abc.abstractmethod
+    def ortho(self, progress: Callable[[float], None], number: int = 0) -> Result:
+        """Make the ortho of an image with the saved points, in a folder beside them."""
 
     # -- beginning and end -------------------------------------------------------------------------------------------
 
@@ -172,6 +181,10 @@ class Project(abc.ABC):
         """Number of the models that references are rendered with now."""
 
     @abc.abstractmethod
+    def places_of(self, number: int) -> Places:
+        """Return the geometry of an image as it is adjusted now."""
+
+    @abc.abstractmethod
     def _figures(self) -> dict[str, Any]:
         """Return what is shown of the solution, as JSON values."""
 
@@ -197,15 +210,18 @@ class Project(abc.ABC):
             self._follow()
             marks, history, version = list(self.marks.by_id.values()), self._history, self.version
             shown, ahead = self._places(version, self._grounds(marks)), self._ahead()
-            there = self._geometries(version)["scene-0"].ground_of(
-                np.array([one.image for one in ahead], dtype=float).reshape(-1, 2)
-            )
+            there = np.full((len(ahead), 3), np.nan)
+            for number in {one.number for one in ahead}:
+                rows = [k for k, one in enumerate(ahead) if one.number == number]
+                there[rows] = self.places_of(number).ground_about(
+                    [ahead[k].image for k in rows], [ahead[k].height for k in rows]
+                )
             return {
                 "marks": [{**json_value(mark), "places": places} for mark, places in zip(marks, shown, strict=True)],
                 "version": version, "undo": history.can_undo, "redo": history.can_redo,
                 "actions": len(self.journal.actions), **self._figures(),
                 "next": [
-                    {**json_value(one), "places": {**places, "scene-0": json_position(one.image)}}
+                    {**json_value(one), "places": places}
                     for one, places in zip(ahead, self._places(version, there), strict=True)
                 ],
             }  # fmt: skip

@@ -126,6 +126,9 @@ class Session(Project):
 
     # -- places ------------------------------------------------------------------------------------------------------
 
+    def places_of(self, number: int) -> Places:
+        return self.places.by(self._solution.model)
+
     def at(self, version: int) -> Places:
         """Return the geometry that the reference was rendered with."""
         if not 0 <= version < len(self.rendered):
@@ -134,13 +137,13 @@ class Session(Project):
 
     def _geometries(self, version: int) -> dict[str, Geometry]:
         maps = {f"map-{number}": sheet for number, sheet in enumerate(self.sheets)}
-        return {"scene-0": self.places.by(self._solution.model), "reference-0": self.at(version), **maps}
+        return {"scene-0": self.places_of(0), "reference-0": self.at(version), **maps}
 
     def rendering(self, name: str, version: int) -> Places | None:
         return self.at(version) if name == "reference-0" else None
 
     def _sigma(self, ground: Array) -> list[float] | None:
-        fit, known = self._solution.fit, self.places.by(self._solution.model)
+        fit, known = self._solution.fit, self.places_of(0)
         if fit is None or not len(fit.param_names) or not np.isfinite(ground).all():
             return None
         return json_position(fit.image_sigma(known.model.image_to_ground(known.image_of(ground), ground[:, 2]))[0])
@@ -152,7 +155,7 @@ class Session(Project):
         expects it; without one, the ground of the click where the model, as well as it is known, puts it. `reason` says
         why a match is not to be believed, and is empty if it is.
         """
-        known = self.places.by(self._solution.model)
+        known = self.places_of(0)
         click = None if image is None else np.asarray(image, dtype=float)
         place = None if ground is None else np.asarray(ground, dtype=float)
         about = click if click is not None or place is None else known.image_of(place)[0]
@@ -163,7 +166,7 @@ class Session(Project):
         asked = PointOptions(gcps=self.marks.points(self._called), significance=self._options.significance)
         return compare(self.scene, asked).to_json()
 
-    def ortho(self, progress: Callable[[float], None]) -> Result:
+    def ortho(self, progress: Callable[[float], None], number: int = 0) -> Result:
         """Make what `ortho rectify` makes with the saved points, in a folder beside them."""
         from ortho_pipeline.commands.rectification import rectify
 

@@ -151,7 +151,7 @@ def test_without_a_reference_ties_alone_hold_the_images_together(
     [("tie", {"number": 2, "image": [1, 2]}), ("tie", {"number": 0, "image": [1]}), ("tie", {}),
      ("tie", {"number": 0, "image": [1, 2], "known": {"third": [1, 2]}}),
      ("tie", {"number": 0, "image": [1, 2], "known": 3}),
-     ("propose", {"image": [1, 2]}), ("compare", {}), ("make", {}), ("made", {}),
+     ("propose", {"image": [1, 2]}), ("make", {"number": 2}), ("make", {"number": -1}),
      ("predict", {"at": "scene-2", "place": [1, 2]})],
 )  # fmt: skip
 def test_what_several_images_have_not_is_refused_in_a_line(block_client: Any, what: str, given: dict[str, Any]) -> None:

@@ -7,6 +7,7 @@ searched; the tie is right all the same, as in `imaging.ties`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 from ortho_pipeline.files.documents import json_position, json_value
 from ortho_pipeline.imaging.matching import OtherScene
 from ortho_pipeline.measure.places import Places
-from ortho_pipeline.measure.proposals import NEAR, propose
+from ortho_pipeline.measure.proposals import NEAR, proposal_of, propose
 from ortho_pipeline.models.base import Array
 
 #: Height (m) over which the epipolar direction is asked for, and pixels over which derivatives are.
@@ -93,6 +94,81 @@ class Pair:
             "score": found.score, "scattered": found.scattered,
         })  # fmt: skip
         return told
+
+
+@dataclass(frozen=True, eq=False)
+class TieSearch:
+    """Looks for clicks in all images of a block.
+
+    Parameters
+    ----------
+    places : tuple of Places
+        By the models as they are now.
+    labels : tuple of str
+    reaches : tuple of float
+        How far (px) models may be off.
+    sigma_height : float
+        Of the heights (m).
+    referenced : bool
+        Whether there are references.
+    """
+
+    places: tuple[Places, ...]
+    labels: tuple[str, ...]
+    reaches: tuple[float, ...]
+    sigma_height: float
+    referenced: bool
+
+    def of_click(self, number: int, image: Sequence[float], known: Mapping[str, Sequence[float]]) -> dict[str, Any]:
+        """Return what the other images and the references show at a click in an image.
+
+        Parameters
+        ----------
+        number : int
+            Of the image.
+        known : mapping of label to (column, row)
+            Where the point was clicked already: with any, the first of them is looked for about the click.
+
+        Returns
+        -------
+        dict
+            `rays` by label: of the click itself its `covariance`; of the others as `Pair.proposal`. `ground`: as
+            `measure.proposals.proposal_of` for the references, null without any.
+        """
+        labels, click = self.labels, np.asarray(image, dtype=float)
+        rays: dict[str, Any] = {}
+        before = next((label for label in labels if label in known and label != labels[number]), None)
+        if before is not None:
+            pair = Pair(self.places[labels.index(before)], self.places[number])
+            rays[labels[number]] = pair.proposal(np.asarray(known[before], dtype=float), 0.0, 0.0, click)
+            return {"rays": rays, "ground": None}
+        own = []
+        for other, label in enumerate(labels):
+            if other != number:
+                pair = Pair(self.places[number], self.places[other])
+                rays[label] = pair.proposal(click, self.reaches[number], self.sigma_height)
+                if rays[label]["image"] is not None:
+                    own.append(rays[label]["own"])
+        rays[labels[number]] = {
+            "seen": True, "reason": "", "image": click.tolist(),
+            "covariance": np.mean(own, axis=0).tolist() if own else None,
+        }  # fmt: skip
+        ground = proposal_of(self.places[number], click, None, self.reaches[number]) if self.referenced else None
+        return {"rays": json_value(rays), "ground": ground}
+
+    def of_ground(self, ground: Sequence[float]) -> dict[str, Any]:
+        """Return where all images show a ground of the reference, by matching: `rays` as `of_click` has them."""
+        place, rays = np.asarray(ground, dtype=float), {}
+        for known, label, reach in zip(self.places, self.labels, self.reaches, strict=True):
+            there = known.image_of(place)[0]
+            if not (np.isfinite(there).all() and ((there >= 0) & (there <= known.view.size)).all()):
+                rays[label] = {"seen": False, "reason": "this image does not show this place", "image": None}
+            elif not self.referenced:
+                rays[label] = {"seen": True, "reason": "there is no reference to match with", "image": None}
+            else:
+                found = proposal_of(known, None, place, reach)
+                rays[label] = {**found, "image": None if found["reason"] else found["image"], "seen": True}
+        return {"rays": rays, "ground": None}
 
 
 def _three(covariance: Array) -> list[float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,24 +17,25 @@ from ortho_pipeline.commands.control.block_points import read_points
 from ortho_pipeline.commands.control.matching import search_of
 from ortho_pipeline.commands.control.ties import DEM_SIGMA, FLAT_SIGMA, names_of
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
+from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import sha256
-from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.geodesy.crs import horizontal, parse_crs
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.imaging.matching import OtherScene, Reference, View, open_references
+from ortho_pipeline.imaging.matching import Reference, View, open_references
 from ortho_pipeline.imaging.matching.targets import metres_per_pixel
-from ortho_pipeline.measure.block.proposals import Pair
+from ortho_pipeline.measure.block.comparison import compare_corrections
+from ortho_pipeline.measure.block.planning import BlockGrid, next_of_block
+from ortho_pipeline.measure.block.proposals import TieSearch
 from ortho_pipeline.measure.block.solution import BlockSolution, figures, solve
 from ortho_pipeline.measure.block.table import block_points, document, marks_of_block
 from ortho_pipeline.measure.marks import GROUND_CRS, Mark
 from ortho_pipeline.measure.places import Geometry, Places, Sheet
-from ortho_pipeline.measure.planning import Grid, Next, measure_next
+from ortho_pipeline.measure.planning import Next
 from ortho_pipeline.measure.project import Project, moved, now, points_file
-from ortho_pipeline.measure.proposals import proposal_of
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options import BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import CORRECTIONS, BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
@@ -72,11 +73,12 @@ class BlockSession(Project):
     def __init__(
         self, images: BlockImages, references: tuple[Reference, ...], output: Path, options: BlockOptions,
         opened: SceneOptions = SceneOptions(), match: MatchOptions = MatchOptions(),
+        heights: SurfaceOptions = SurfaceOptions(),
     ) -> None:  # fmt: skip
         surface = images.places[0].surface
         maps = [Sheet(one, surface) for one in references]
         super().__init__(output, surface, [one.view for one in images.places], maps)
-        self.images, self._options, self._opened = images, options, opened
+        self.images, self._options, self._opened, self._heights = images, options, opened, heights
         self._starts: dict[str | None, dict[str, Start]] = {}
         self._search = [
             search_of(scene, match, metres_per_pixel(one.view)).distance / metres_per_pixel(one.view)
@@ -85,8 +87,7 @@ class BlockSession(Project):
         usual = FLAT_SIGMA if surface.provenance.get("constant_height") is not None else DEM_SIGMA
         stated = typical_sigma(surface)
         self._sigma_height = usual if stated is None else stated
-        others = tuple(OtherScene(one.view.intensity, one.model) for one in images.places[1:])
-        self.grid = Grid.over(replace(images.places[0], references=others))
+        self.grid = BlockGrid.over(images.places, references)
         self._everywhere = [self._spread(one) for one in images.places]
         self.rendered: list[tuple[SensorModel, ...]] = [tuple(one.model for one in images.places)]
         self._solution = BlockSolution(dict(zip(images.labels, self.rendered[0], strict=True)))
@@ -177,9 +178,8 @@ class BlockSession(Project):
         return {"correction": self.marks.correction, **figures(self._solution, relative)}
 
     def _ahead(self) -> list[Next]:
-        first = self.images.labels[0]
-        taken = [mark.rays[first].image for mark in self.marks.by_id.values() if first in mark.rays and mark.counts]
-        return measure_next(self.grid, None, np.array(taken, dtype=float).reshape(-1, 2))
+        taken = self._grounds([mark for mark in self.marks.by_id.values() if mark.counts])
+        return next_of_block(self.grid, self._solution.fit, taken, tie=not self.sheets)
 
     def _grounds(self, marks: Sequence[Mark]) -> Array:
         """Return known ground, that of the adjustment for ties, and on the surface for what has one ray alone."""
@@ -191,7 +191,7 @@ class BlockSession(Project):
             found[k] = adjusted.get(mark.id, np.full(3, np.nan))
             if not np.isfinite(found[k]).all() and mark.rays:
                 label, ray = next(iter(mark.rays.items()))
-                found[k] = self._now(self.images.labels.index(label)).ground_of([ray.image])[0]
+                found[k] = self.places_of(self.images.labels.index(label)).ground_of([ray.image])[0]
         return found
 
     def _sigma(self, ground: Array) -> list[float] | None:
@@ -199,7 +199,7 @@ class BlockSession(Project):
 
     # -- places ------------------------------------------------------------------------------------------------------
 
-    def _now(self, number: int) -> Places:
+    def places_of(self, number: int) -> Places:
         return self.images.places[number].by(self._solution.models[self.images.labels[number]])
 
     def at(self, version: int, number: int = 0) -> Places:
@@ -211,7 +211,7 @@ class BlockSession(Project):
     def _geometries(self, version: int) -> dict[str, Geometry]:
         found: dict[str, Geometry] = {}
         for number in range(len(self.images.labels)):
-            found[f"scene-{number}"] = self._now(number)
+            found[f"scene-{number}"] = self.places_of(number)
             found[f"reference-{number}"] = self.at(version, number)
         return found | {f"map-{number}": sheet for number, sheet in enumerate(self.sheets)}
 
@@ -221,62 +221,49 @@ class BlockSession(Project):
 
     # -- proposals ---------------------------------------------------------------------------------------------------
 
+    @property
+    def _search_of_clicks(self) -> TieSearch:
+        models, fitted = self._solution.models, self._solution.fit is not None
+        places = tuple(self.places_of(number) for number in range(len(models)))
+        reaches = tuple([_HAND] * len(models) if fitted else self._search)
+        return TieSearch(places, self.images.labels, reaches, self._sigma_height, bool(self.sheets))
+
     def proposal(self, number: int, image: Sequence[float], known: Mapping[str, Sequence[float]]) -> dict[str, Any]:
-        """Return what the other images and the references show at a click in an image.
-
-        Parameters
-        ----------
-        number : int
-            Of the image.
-        known : mapping of label to (column, row)
-            Where the point was clicked already: with any, the first of them is looked for about the click.
-
-        Returns
-        -------
-        dict
-            `rays` by label: of the click itself its `covariance`; of the others as `Pair.proposal`. `ground`: as
-            `measure.proposals.proposal_of` for the references, null without any.
-        """
-        labels, click = self.images.labels, np.asarray(image, dtype=float)
-        rays: dict[str, Any] = {}
-        before = next((label for label in labels if label in known and label != labels[number]), None)
-        if before is not None:
-            pair = Pair(self._now(labels.index(before)), self._now(number))
-            rays[labels[number]] = pair.proposal(np.asarray(known[before], dtype=float), 0.0, 0.0, click)
-            return {"rays": rays, "ground": None}
-        own = []
-        for other, label in enumerate(labels):
-            if other != number:
-                rays[label] = Pair(self._now(number), self._now(other)).proposal(
-                    click, self._radius(number), self._sigma_height
-                )
-                if rays[label]["image"] is not None:
-                    own.append(rays[label]["own"])
-        rays[labels[number]] = {
-            "seen": True, "reason": "", "image": click.tolist(),
-            "covariance": np.mean(own, axis=0).tolist() if own else None,
-        }  # fmt: skip
-        ground = proposal_of(self._now(number), click, None, self._radius(number)) if self.sheets else None
-        return {"rays": json_value(rays), "ground": ground}
+        """Return what the other images and the references show at a click in an image, as `TieSearch.of_click`."""
+        return self._search_of_clicks.of_click(number, image, known)
 
     def of_ground(self, ground: Sequence[float]) -> dict[str, Any]:
-        """Return where all images show a ground of the reference, by matching: `rays` as `proposal` has them."""
-        place, rays = np.asarray(ground, dtype=float), {}
-        for number, label in enumerate(self.images.labels):
-            known = self._now(number)
-            there = known.image_of(place)[0]
-            if not (np.isfinite(there).all() and ((there >= 0) & (there <= known.view.size)).all()):
-                rays[label] = {"seen": False, "reason": "this image does not show this place", "image": None}
-            elif not self.sheets:
-                rays[label] = {"seen": True, "reason": "there is no reference to match with", "image": None}
-            else:
-                found = proposal_of(known, None, place, self._radius(number))
-                rays[label] = {**found, "image": None if found["reason"] else found["image"], "seen": True}
-        return {"rays": rays, "ground": None}
+        """Return where all images show a ground of the reference, as `TieSearch.of_ground`."""
+        return self._search_of_clicks.of_ground(ground)
 
-    def _radius(self, number: int) -> float:
-        """Return within how many px of the prediction a click is looked for."""
-        return self._search[number] if self._solution.fit is None else _HAND
+    # -- what comes of it --------------------------------------------------------------------------------------------
+
+    def _asked(self) -> BlockOptions:
+        """Return how `ortho adjust` is asked for the same with the saved points, which say all of themselves."""
+        return replace(
+            self._options, points=self.output, crs=None, vertical=None, pixel_origin="corner", check=None,
+            correction=self.marks.correction or self._options.correction,
+        )  # fmt: skip
+
+    def compared(self) -> dict[str, Any]:
+        """Return the corrections compared on the points as they are now."""
+        with self._lock:
+            table = block_points(self.marks, self.images.labels, self._called)
+        return compare_corrections(self.starts, CORRECTIONS, table, self._options.hold)
+
+    def ortho(self, progress: Callable[[float], None], number: int = 0) -> Result:
+        """Make what `ortho rectify` makes of an image with the model that `ortho adjust` has of the saved points."""
+        from ortho_pipeline.commands.block import adjust
+        from ortho_pipeline.commands.rectification import rectify
+
+        with self._lock:
+            self.save()
+            asked = self._asked()
+        label, folder = self.images.labels[number], self.output.with_name(f"{self.output.stem}_ortho")
+        block = adjust(self.images.paths, folder / "block", asked, self._opened)
+        opened = replace(self._opened, model=block.files[f"{label} model"])
+        path = self.images.paths[number]
+        return rectify(path, folder / label, scene=opened, surface=self._heights, progress=progress)
 
 
 def _nothing() -> Points:
@@ -322,4 +309,4 @@ def open_block_session(
         for one in scenes
     )  # fmt: skip
     known = BlockImages(tuple(os.fspath(image) for image in images), tuple(labels), tuple(names), scenes, places)
-    return BlockSession(known, references, path, points, scene, match)
+    return BlockSession(known, references, path, points, scene, match, surface)

@@ -85,11 +85,13 @@ function show(next) {
   const rendered = state && state.version !== next.version;
   state = next;
   const { headline } = state;
-  $('figure').textContent = headline.px === null ? 'Not tested' : `${headline.px.toFixed(3)} px${headline.m === null ? '' : `, ${headline.m.toFixed(3)} m`}`;
+  const figures = [[headline.px, 'px'], [headline.m, 'm']].filter(([value]) => value !== null);
+  $('figure').textContent = figures.map(([value, unit]) => `${value.toFixed(3)} ${unit}`).join(', ') || 'Not tested';
   $('what').textContent = state.error ? `${headline.what}: ${state.error}` : headline.what;
   $('undo').disabled = !state.undo || !facts.writes;
   $('redo').disabled = !state.redo || !facts.writes;
-  $('make').disabled = !facts.writes || !state.marks.some((mark) => mark.role === 'control' && !mark.off);
+  const counted = state.marks.filter((mark) => !mark.off);
+  $('make').disabled = !facts.writes || !(facts.labels ? Object.keys(state.points).length : counted.some((mark) => mark.role === 'control'));
   $('correction').value = state.correction ?? '';
   skipped = 0;
   tellNext();
@@ -106,8 +108,10 @@ function tellNext() {
   const place = nextPlace();
   if (!place) { $('gain').textContent = ''; return; }
   const [column, row] = place.image.map((value) => value.toFixed(0));
-  const gain = place.sigma === null ? '' : `: predicted to ±${place.sigma.toFixed(3)} px there; a point would make the worst place ±${place.then.toFixed(3)} px (now ±${place.largest.toFixed(3)})`;
-  $('gain').textContent = `Measure next at column ${column}, row ${row}${gain}.`;
+  const what = facts.labels ? `a ${place.role === 'tie' ? 'tie' : 'control point'}` : 'a point';
+  const known = facts.labels && place.role === 'tie' ? 'rays are predicted to miss each other by' : 'predicted to';
+  const gain = place.sigma === null ? '' : `: ${known} ±${place.sigma.toFixed(3)} px there; ${what} would make the worst place ±${place.then.toFixed(3)} px (now ±${place.largest.toFixed(3)})`;
+  $('gain').textContent = `Measure next at column ${column}, row ${row}${facts.labels ? ` of ${facts.labels[place.number]}` : ''}${gain}.`;
 }
 
 function fill() {
@@ -311,14 +315,23 @@ function choose(id) {
 
 const toggleOff = () => { const mark = selected && markOf(selected); if (mark) act({ do: 'put', mark: plain({ ...mark, off: !mark.off }), was: mark.id }).then(() => choose(mark.id)); };
 const remove = () => { if (selected) { const id = selected; cancel(); act({ do: 'remove', id }); } };
+/** Whether an image shows a place that is offered. */
+function shownWithin({ places }, number) {
+  const place = places[`scene-${number}`];
+  return Boolean(place) && place.every((value, axis) => value >= 0 && value <= facts.images[number].size[axis]);
+}
+
 /** Go to the place that tells most; from there to the second best, and so on. */
 function goNext() {
   if (!state.next.length) return;
-  const place = nextPlace();
   const [column, row] = views.middle('scene');
-  if (Math.hypot(place.image[0] - column, place.image[1] - row) < 1) skipped += 1;
+  const [x, y] = nextPlace().places[views.shows.scene] ?? [Infinity, Infinity];
+  if (Math.hypot(x - column, y - row) < 1) skipped += 1;
   cancel();
-  views.goTo(nextPlace().places, 1);
+  // In a block the left view is that of an image which shows the place.
+  const there = nextPlace();
+  if (facts.labels && !shownWithin(there, imageOf(views.shows.scene))) showIn('scene', `scene-${there.number}`);
+  views.goTo(there.places, 1);
   tellNext();
   say('The next place: press m at the feature in the middle, or click one. Press n again for another place.');
 }
@@ -360,12 +373,15 @@ const models = safely(async () => {
   say('Comparing models …');
   const { rows, recommendation } = await ask('compare');
   const total = (rmse, which) => number(rmse?.[which]?.total, 3);
+  const figures = facts.labels ? ['Check, m', 'Control left out, m', 'Rays left out, px'] : ['Control, px', 'Check, px', 'Left out, px'];
+  const values = facts.labels ? (one) => [one.check_m, one.loo_m, one.rays].map((value) => number(value, 3))
+    : ({ rmse }) => ['control', 'check', 'loo'].map((which) => total(rmse, which));
   const head = document.createElement('tr');
-  head.append(...cells(['Model', 'Parameters', 'Control, px', 'Check, px', 'Left out, px'], 'th'));
+  head.append(...cells([facts.labels ? 'Correction' : 'Model', 'Parameters', ...figures], 'th'));
   $('models').tHead.replaceChildren(head);
   $('models').tBodies[0].replaceChildren(...rows.map((one) => {
     const row = document.createElement('tr');
-    row.append(...cells(one.error ? [one.model, one.parameters, 'not fitted', '', ''] : [one.model, one.parameters, total(one.rmse, 'control'), total(one.rmse, 'check'), total(one.rmse, 'loo')], 'td'));
+    row.append(...cells([one.model, one.parameters, ...(one.error ? ['not fitted', '', ''] : values(one))], 'td'));
     if (one.error) row.title = one.error;
     return row;
   }));
@@ -385,19 +401,23 @@ const makeOrtho = safely(async () => {
   try {
     $('ortho-done').hidden = true;
     $('ortho-share').hidden = false;
-    let told = await ask('make');
+    // Of several images that which the left view shows, or is in the geometry of.
+    let told = await ask('make', { number: imageOf(geometryOf(views.shows.scene)) });
+    const of = facts.labels ? `${facts.images[told.number].name}: ` : '';
     while (told.state === 'running') {
       $('ortho-share').value = told.share;
-      $('ortho-said').textContent = told.share ? `${Math.round(100 * told.share)} % of the pixels are made. You can close this and go on measuring.` : 'Reading, fitting …';
+      $('ortho-said').textContent = of + (told.share ? `${Math.round(100 * told.share)} % of the pixels are made. You can close this and go on measuring.` : 'Reading, fitting …');
       await wait(300);
       told = await ask('made');
     }
     $('ortho-share').hidden = true;
     if (told.state !== 'done') { $('ortho-said').textContent = `No ortho: ${told.error}`; return; }
-    $('ortho-said').textContent = `${told.figure}: ${told.what}.`;
+    $('ortho-said').textContent = `${of}${told.figure}: ${told.what}.`;
     const again = Date.now();
     $('ortho-own').src = `made/ortho?${again}`;
-    $('ortho-reference').src = `made/reference?${again}`;
+    const compares = facts.maps.length > 0;
+    $('ortho-reference').hidden = $('ortho-mix').parentElement.hidden = !compares;
+    if (compares) $('ortho-reference').src = `made/reference?${again}`;
     $('ortho-report').href = `made/report?${again}`;
     $('ortho-files').replaceChildren(...told.files.map((name) => { const item = document.createElement('li'); item.textContent = name; return item; }));
     $('ortho-done').hidden = false;
@@ -441,7 +461,7 @@ function pressed(event) {
   const keys = {
     m: () => { const pane = target.id === 'reference' ? 'reference' : 'scene'; measure(pane, views.middle(pane)); },
     u: () => { const select = $('reference-shows'); showIn('reference', select.options[(select.selectedIndex + 1) % select.options.length].value); },
-    n: goNext, j: () => along(1), k: () => along(-1), o: toggleOff, Delete: remove, s: stretch, ...(facts.labels ? {} : { c: models, g: makeOrtho }),
+    n: goNext, j: () => along(1), k: () => along(-1), o: toggleOff, Delete: remove, s: stretch, c: models, g: makeOrtho,
     r: () => { const roles = ['control', 'check', 'tie']; $('role').value = roles[(roles.indexOf($('role').value) + 1) % 3]; if (pending) pending.role = $('role').value; say(`Role: ${$('role').value}.`); if (pending) fill(); },
     f: () => compare({ flicker: !compared.flicker, difference: false }), d: () => compare({ difference: !compared.difference, flicker: false }),
     z: () => act({ do: 'undo' }), Z: () => act({ do: 'redo' }), '?': () => $('keys').showModal(),
@@ -512,7 +532,6 @@ async function start(given = {}) {
       zoomed: () => { if (state && views.shows.reference) draw(); },
     });
     table = new Table($('table'), choose, Boolean(facts.labels));
-    $('compare').hidden = $('make').hidden = Boolean(facts.labels);
     if (facts.labels) $('role').value = 'tie';
     state = facts.state;
     for (const pane of PANES) {

@@ -13,19 +13,26 @@ const ONE = [
   ['By', (mark) => mark.how, (mark) => (hands[mark.how] ?? mark.how)],
 ];
 
-const rays = (mark) => Object.keys(mark.rays ?? {}).length;
-const longest = (mark) => (mark.residuals ? Math.max(...Object.values(mark.residuals).map(length)) : null);
-const plan = (values) => (values ? Math.hypot(values[0], values[1]) : null);
 const hands = { matched: 'match', manual: 'hand' };
+const rays = (mark) => Object.values(mark.rays ?? {});
+/** How many rays there are by each hand: 2 match, 1 hand. */
+function counted(mark) {
+  const found = {};
+  for (const { how } of rays(mark)) found[hands[how] ?? how] = (found[hands[how] ?? how] ?? 0) + 1;
+  return Object.entries(found).map(([how, count]) => `${count} ${how}`).join(', ');
+}
+const longest = (of) => { const found = Object.values(of ?? {}).map(length).filter((value) => value !== null); return found.length ? Math.max(...found) : null; };
+const plan = (values) => (values && values[0] !== null && values[1] !== null ? Math.hypot(values[0], values[1]) : null);
 const SEVERAL = [
   ['Point', (mark) => mark.id, (mark) => mark.id],
   ['Role', (mark) => mark.role, (mark) => (mark.off ? `${mark.role}, off` : mark.role)],
-  ['Rays', rays, (mark) => String(rays(mark))],
-  ['px', longest, (mark) => number(longest(mark))],
-  ['Plan, m', (mark) => plan(mark.residual_m), (mark) => number(plan(mark.residual_m), 2)],
-  ['h, m', (mark) => mark.residual_m?.[2] ?? null, (mark) => number(mark.residual_m?.[2], 2)],
+  ['Rays', (mark) => rays(mark).length, counted],
+  ['px', (mark) => longest(mark.residuals), (mark) => number(longest(mark.residuals), 2)],
+  ['Left out, px', (mark) => longest(mark.loo), (mark) => number(longest(mark.loo), 2)],
+  ['Plan, m', (mark) => plan(mark.loo_m), (mark) => number(plan(mark.loo_m), 2)],
+  ['h, m', (mark) => mark.loo_m?.[2] ?? null, (mark) => number(mark.loo_m?.[2], 2)],
   ['± h, m', (mark) => mark.sigma_m?.[2] ?? null, (mark) => number(mark.sigma_m?.[2], 2)],
-  ['By', (mark) => rays(mark), (mark) => [...new Set(Object.values(mark.rays ?? {}).map((ray) => hands[ray.how] ?? ray.how))].join(', ')],
+  ['w', (mark) => mark.w ?? null, (mark) => number(mark.w, 1)],
 ];
 
 export class Table {

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.measure.session import Session
+from ortho_pipeline.measure.project import Project
 from ortho_pipeline.raster.quicklook import preview_png, reduced_grid, shaded_png
 from ortho_pipeline.raster.regridded import Regridded
 from ortho_pipeline.raster.valid_area import grid_of
@@ -20,25 +20,36 @@ PICTURES = ("ortho", "reference")
 
 
 class Making:
-    """Makes orthos of one session."""
+    """Makes orthos of the images of a project."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Project) -> None:
         self._session, self._lock = session, threading.Lock()
-        self._told: dict[str, Any] = {"state": "none", "share": 0.0}
+        self._told: dict[str, Any] = {"state": "none", "share": 0.0, "number": 0}
         self._files: dict[str, Path] = {}
         self._thread: threading.Thread | None = None
 
-    def begin(self) -> dict[str, Any]:
-        """Begin, unless an ortho is being made already, and say how far it is."""
+    def begin(self, number: int = 0) -> dict[str, Any]:
+        """Begin with an image, unless an ortho is being made already, and say how far it is.
+
+        Raises
+        ------
+        InputError
+            If there is no such image.
+        """
+        if number >= len(self._session.views):
+            raise InputError("there is no such image", field="number")
         with self._lock:
             if self._told["state"] != "running":
-                self._told = {"state": "running", "share": 0.0}
-                self._thread = threading.Thread(target=self._make, name="ortho", daemon=True)
+                self._told = {"state": "running", "share": 0.0, "number": number}
+                self._thread = threading.Thread(target=self._make, args=(number,), name="ortho", daemon=True)
                 self._thread.start()
             return self._told
 
     def told(self) -> dict[str, Any]:
-        """Say how far it is: `state` is none, running, done or failed, `share` the part of the pixels that is made."""
+        """Say how far it is: `state` is none, running, done or failed, `share` the part of the pixels that is made.
+
+        `number` is the image that it is of.
+        """
         with self._lock:
             return self._told
 
@@ -53,7 +64,7 @@ class Making:
             return preview_png(self._file("ortho"), side=_SIDE)
         pixels = np.zeros((1, grid.height, grid.width), dtype=np.float32)
         valid = np.zeros(pixels.shape, dtype=bool)
-        for reference in self._session.places.references:
+        for reference in [sheet.reference for sheet in self._session.sheets]:
             # GDAL takes a lower resolution from overviews and averages the rest.
             part, good = Regridded(reference.path, grid, resampling="average").read(0, 0, grid.width, grid.height)
             fresh = good.all(axis=0) & ~valid[0]
@@ -63,9 +74,9 @@ class Making:
 
     # -- the work ----------------------------------------------------------------------------------------------------
 
-    def _make(self) -> None:
+    def _make(self, number: int) -> None:
         try:
-            made = self._session.ortho(self._advance)
+            made = self._session.ortho(self._advance, number)
         except OrthoError as error:
             self._tell({"state": "failed", "share": 0.0, "error": f"{error.message} ({error.remedy})"})
         except Exception as error:  # the page would wait for ever
@@ -85,7 +96,7 @@ class Making:
 
     def _tell(self, told: dict[str, Any]) -> None:
         with self._lock:
-            self._told = told
+            self._told = {"number": self._told["number"], **told}
 
     def _file(self, name: str) -> Path:
         with self._lock:

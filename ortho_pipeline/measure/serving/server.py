@@ -73,7 +73,7 @@ class _Answers:
 
     def __init__(self, session: Project, tiles: Tiles) -> None:
         self._session, self._tiles, self._windows = session, tiles, Windows()
-        self._making = Making(session) if isinstance(session, Session) else None
+        self.making = Making(session)
 
     @property
     def scene(self) -> Session:
@@ -87,13 +87,6 @@ class _Answers:
         if not isinstance(self._session, Session):
             raise InputError("this is asked of one scene", field="request", remedy=_REMEDY)
         return self._session
-
-    @property
-    def making(self) -> Making:
-        """What makes orthos of a single scene."""
-        if self._making is None:
-            raise InputError("orthos are made of one scene", field="request", remedy=_REMEDY)
-        return self._making
 
     def begin(self, given: dict[str, Any]) -> dict[str, Any]:
         """Say what does not change: sizes, names, bands."""
@@ -181,7 +174,7 @@ class _Answers:
 
     def compare(self, given: dict[str, Any]) -> dict[str, Any]:
         """Compare the models that the points could be fitted with."""
-        return self.scene.compared()
+        return self._session.compared()
 
     def save(self, given: dict[str, Any]) -> dict[str, Any]:
         """Write the points."""
@@ -189,9 +182,9 @@ class _Answers:
         return {}
 
     def make(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Begin to make the ortho."""
+        """Begin to make the ortho of an image."""
         self._require_writer(given)
-        return self.making.begin()
+        return self.making.begin(_whole(given.get("number", 0)))
 
     def made(self, given: dict[str, Any]) -> dict[str, Any]:
         """Say how far the ortho is."""
