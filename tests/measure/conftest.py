@@ -118,14 +118,30 @@ class Stereo:
 
 
 @pytest.fixture(scope="session")
+def third(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Stereo:
+    """One more from nearly above."""
+    path = tmp_path_factory.mktemp("third") / "third.tif"
+    return write_second(truth, path, FEATURES, off_nadir_deg=3.0, bias=np.array([4.0, 2.0]))
+
+
+@pytest.fixture(scope="session")
 def stereo(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Stereo:
     path = tmp_path_factory.mktemp("stereo") / "second.tif"
     return write_second(truth, path, FEATURES)
 
 
-def write_second(truth: Truth, path: Path, about: np.ndarray | None = None) -> Stereo:
+@pytest.fixture(scope="session")
+def whole_stereo(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Stereo:
+    """The same with all its pixels, which takes a while."""
+    return write_second(truth, tmp_path_factory.mktemp("stereo") / "second.tif")
+
+
+def write_second(
+    truth: Truth, path: Path, about: np.ndarray | None = None, *, off_nadir_deg: float = -14.0,
+    bias: np.ndarray = SECOND_BIAS,
+) -> Stereo:  # fmt: skip
     """Write a scene from 14 degrees on the other side, with a biased RPC; only about features if they are given."""
-    camera = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=-14.0, heights=(600.0, 1200.0))
+    camera = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=off_nadir_deg, heights=(600.0, 1200.0))
     second = Truth(camera, truth.terrain)
     landscape = Landscape(truth.terrain, _PIXEL, seed=7)
     dataset = gdal.GetDriverByName("GTiff").Create(str(path), camera.width, camera.height, 1, gdal.GDT_Byte)
@@ -145,8 +161,8 @@ def write_second(truth: Truth, path: Path, about: np.ndarray | None = None) -> S
     centre, half = camera.domain
     box = *(centre - 1.02 * half)[:2].tolist(), *(centre + 1.02 * half)[:2].tolist()
     rpc = fit_rpc(camera, box, (600.0, 1200.0)).rpc
-    column, row = SECOND_BIAS
+    column, row = bias
     write_rpc_txt(
-        replace(rpc, col_off=rpc.col_off - column, row_off=rpc.row_off - row), path.with_name("second_RPC.TXT")
+        replace(rpc, col_off=rpc.col_off - column, row_off=rpc.row_off - row), path.with_name(f"{path.stem}_RPC.TXT")
     )
     return Stereo(path, second)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 from ortho_pipeline.commands.block import adjust
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.measure.block.session import BlockSession, open_block_session
+from ortho_pipeline.measure.serving.guard import MAX_BODY
 from ortho_pipeline.measure.serving.tiles import Tiles
 from ortho_pipeline.options import BlockOptions, MatchOptions, SurfaceOptions
 
@@ -144,6 +146,92 @@ def test_without_a_reference_ties_alone_hold_the_images_together(
     assert state["marks"][-1]["places"]["scene-1"] is not None
     session.save()
     assert [one["id"] for one in json.loads(session.output.read_text())["left_out"]] == ["half"]
+
+
+def test_three_images_are_measured_judged_and_planned_together(
+    stereo: Any, third: Any, truth: Any, features: np.ndarray, tmp_path: Path
+) -> None:
+    """Ties of three rays by one click each, one of which is then moved; without a reference."""
+    session = open_block_session(
+        [SAMPLE / "scene.tif", stereo.path, third.path], tmp_path / "p.geojson", surface=SURFACE
+    )
+    others = {"second": stereo.truth, "third": third.truth}
+    for number, feature in enumerate(features[:5]):
+        found = session.proposal(0, feature.tolist(), {})["rays"]
+        ground = truth.ground_at(feature[None])
+        for label, other in others.items():
+            assert not found[label]["reason"]
+            assert np.hypot(*np.subtract(found[label]["image"], other.image_of(ground)[0])) < 0.2
+        state = session.act(put(f"P{number}", {"rays": found, "ground": None}, "tie"))
+    assert state["error"] == ""
+    assert all(set(one["loo"]) == {"scene", "second", "third"} for one in state["points"].values())
+    assert not any(one["suspicious"] for one in state["points"].values())
+    # The next place is one that two images show at least, and ties them by what is said.
+    best = state["next"][0]
+    assert (best["role"], best["number"]) == ("tie", 0)
+    assert 0 < best["then"] < best["largest"]
+    assert {"scene-0", "scene-1", "scene-2"} <= {name for name, place in best["places"].items() if place}
+    rows = session.compared()
+    assert [row["model"] for row in rows["rows"]] == ["none", "shift", "shift-drift", "affine"]
+    assert rows["recommendation"]["model"] == "shift"
+    assert rows["rows"][0]["rays"] > 5 * rows["rows"][1]["rays"], "the models are off by pixels"
+    # A ray that is moved by 3 px across is named at once.
+    mark = next(one for one in state["marks"] if one["id"] == "P2")
+    ray = mark["rays"]["third"]
+    wrong = {**ray, "image": [ray["image"][0], ray["image"][1] + 3.0]}
+    moved = {key: mark[key] for key in ("id", "role")} | {"rays": {**mark["rays"], "third": wrong}}
+    state = session.act({"do": "put", "mark": moved, "was": "P2"})
+    assert [name for name, one in state["points"].items() if one["suspicious"]] == ["P2"]
+    session.journal.close()
+
+
+@pytest.mark.slow
+def test_the_ortho_of_an_image_has_the_model_of_the_block(
+    block_client: Any, stereo: Any, truth: Any, features: np.ndarray
+) -> None:
+    def ask(what: str, **given: Any) -> Any:
+        return block_client.post(f"/token/api/{what}", json={"window": "window-one", **given}).json()
+
+    grounds = truth.ground_at(features)
+    there = stereo.truth.image_of(grounds)
+    for k, ground in enumerate(grounds.tolist()):
+        rays = {"scene": {"image": features[k].tolist()}, "second": {"image": there[k].tolist()}}
+        mark = {"id": f"P{k}", "role": "check" if k == 5 else "control", "rays": rays, "ground": ground,
+                "ground_from": "typed", "sigma_xy": 0.1, "sigma_h": 0.1}  # fmt: skip
+        state = ask("act", action={"do": "put", "mark": mark})
+    told = ask("make", number=1)
+    while told["state"] == "running":
+        time.sleep(0.1)
+        told = ask("made")
+    assert told["state"] == "done", told
+    assert told["number"] == 1
+    assert "whose ground took no part, in this image, when it was adjusted in a block" in told["what"]
+    ortho = next(Path(path) for path in told["files"] if path.endswith("second_ortho.tif"))
+    assert ortho.parent.name == "second"
+    said = json.loads((ortho.parents[1] / "block/block_report.json").read_text())["adjustment"]["images"]["second"]
+    for name, value in said["parameters"].items():
+        assert state["parameters"]["second"][name]["value"] == pytest.approx(value["value"], rel=0, abs=1e-9)
+    assert block_client.get("/token/made/ortho").content[:4] == b"\x89PNG"
+
+
+def test_a_block_is_guarded_as_one_scene_is(block_client: Any) -> None:
+    """Host, token, origin, long bodies, paths and images that there are not."""
+    url = "/token/api/tie"
+    given = {"window": "window-one", "number": 0, "image": [1.0, 2.0]}
+    for headers, status in (({"host": "evil.example"}, 421), ({"origin": "http://evil.example"}, 403)):
+        assert block_client.post(url, json=given, headers=headers).status_code == status
+    assert block_client.post("/tokem/api/tie", json=given).status_code == 404
+    assert block_client.post(url, content=b" " * (MAX_BODY + 1)).status_code == 413
+    for path in ("tiles/scene-2/0/1/0/0?l=0,1", "tiles/..%2fscene/0/1/0/0?l=0,1", "tiles/reference-0/0/1/0/0?l=0,1",
+                 "made/..%2f..%2fp.geojson", "made/nonsense", "../p.geojson", "scene.tif"):  # fmt: skip
+        answer = block_client.get(f"/token/{path}")
+        assert answer.status_code in (400, 404)
+        assert str(SAMPLE) not in answer.text
+    for wrong in ({"rays": {"../scene": {"image": [1, 2]}}}, {"rays": {"scene": {"image": [1, 2], "path": "/etc"}}}):
+        action = {"do": "put", "mark": {"id": "X", "role": "tie", **wrong}}
+        answer = block_client.post("/token/api/act", json={"window": "window-one", "action": action})
+        assert answer.status_code == 400
+    assert block_client.post("/token/api/make", json={"window": "another-window"}).status_code == 409
 
 
 @pytest.mark.parametrize(

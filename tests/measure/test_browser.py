@@ -246,18 +246,76 @@ def test_six_points_by_keyboard_alone(serve, whole_reference: Path, truth) -> No
 
 
 @pytest.mark.slow
+def test_six_points_of_a_pair_by_keyboard_alone(serve, whole_reference: Path, whole_stereo, truth) -> None:
+    """Ties and control at the places that are offered, a role changed, models compared: no mouse."""
+    served = serve(whole_reference, whole_stereo.path)
+    page = served.page
+    for _ in range(14):
+        page.keyboard.press("Tab")
+        if page.evaluate("() => document.activeElement.id") == "scene":
+            break
+    assert page.evaluate("() => document.activeElement.id") == "scene"
+    accepted = 0
+    for _ in range(14):
+        page.keyboard.press("n")
+        page.keyboard.press("m")
+        served.says("#said", "Matched: second|No match|The reference")
+        if "Enter accepts" not in page.inner_text("#said"):
+            page.keyboard.press("Escape")
+            continue
+        # Tie, control, check, and again.
+        page.keyboard.press("r")
+        accepted += 1
+        page.keyboard.press("Enter")
+        served.says("#said", f"P{accepted} accepted")
+        if accepted == 6:
+            break
+    served.says("#what", "check points? whose ground took no part, relative to the reference")
+    assert "control point would make the worst place" in page.inner_text("#gain")
+    roles = [row.split("\t")[1] for row in page.inner_text("#table tbody").strip().split("\n")]
+    assert sorted(roles) == ["check", "check", "control", "control", "tie", "tie"]
+    page.keyboard.press("c")
+    playwright.expect(page.locator("#compared")).to_be_visible(timeout=_SLOW_MACHINE)
+    assert "Recommended" in page.inner_text("#recommended")
+    page.keyboard.press("Escape")
+    page.keyboard.press("j")
+    served.says("#said", "P1: ")
+    before = page.inner_text("#table tbody")
+    page.keyboard.press("ArrowRight")
+    served.says("#said", "By hand")
+    page.keyboard.press("Escape")
+    assert page.inner_text("#table tbody") == before
+    points = served.end()
+    assert len(points) == 12
+    assert served.hosts == {served.address.split("/")[2]}, "a request left the page's own server"
+    assert not served.faults
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_nothing_serious_keeps_anybody_out(browser, serve, reference: Path, features: np.ndarray, scheme: str) -> None:
-    """axe-core finds no serious fault, with a point under way and with dialogues open."""
+@pytest.mark.parametrize("pair", [False, True])
+def test_nothing_serious_keeps_anybody_out(
+    browser, serve, reference: Path, stereo, features: np.ndarray, scheme: str, pair: bool
+) -> None:
+    """axe-core finds no serious fault, with a point under way and with dialogues open, of a scene and of a pair."""
     # The page's own policy would not let a script of the test in.
-    served = serve(reference, bypass_csp=True, color_scheme=scheme)
-    served.click("scene", features[2])
+    served = serve(reference, *([stereo.path] if pair else []), bypass_csp=True, color_scheme=scheme)
+    if pair:
+        for number, feature in enumerate(features[1:5]):
+            served.click("scene", feature)
+            served.says("#said", "Matched: second")
+            served.page.keyboard.press("Enter")
+            served.says("#said", f"P{number + 1} accepted")
+    served.click("scene", features[0 if pair else 2])
     served.says("#said", "Matched")
     axe = (Path(__file__).parent / "axe" / "axe.min.js").read_text(encoding="utf-8")
     served.page.evaluate(axe)
-    for opened in ("", "?"):
+    for opened in ("", "?", *("c" if pair else "")):
         if opened:
+            served.page.keyboard.press("Escape")
+            served.page.focus("#scene")
             served.page.keyboard.press(opened)
+            playwright.expect(served.page.locator("dialog[open]")).to_be_visible(timeout=_SLOW_MACHINE)
         found = served.page.evaluate("() => axe.run(document, {resultTypes: ['violations']})")
         serious = [
             (one["id"], [node["html"][:120] for node in one["nodes"]])
