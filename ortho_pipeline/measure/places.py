@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +24,8 @@ _NAMED = r"[a-z]{2,12}:[0-9]{1,9}(\+[0-9]{1,9})?|ellipsoid|egm96|egm2008"
 
 #: So often a height is read where the last one puts a place: each is some ten times as near.
 _ROUNDS = 2
+#: Pixels to either side by which it is asked how one geometry lies in another.
+_STEP = 8.0
 
 
 class Geometry(Protocol):
@@ -133,6 +135,19 @@ class Places:
         step = np.zeros(6)
         step[[0, 3]] = np.asarray(shift, dtype=float)
         return self.by(ImageCorrection(self.model, "shift", (0.0, 0.0), step))
+
+
+def linked(one: Geometry, other: Geometry, place: ArrayLike) -> dict[str, Any]:
+    """Return how a geometry lies in another one about a place: its `place` there and the partial derivatives.
+
+    Both are null where the place is not seen there.
+    """
+    steps = np.array([(0.0, 0.0), (-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)]) * _STEP
+    there = other.image_of(one.ground_of(np.asarray(place, dtype=float) + steps))
+    matrix = np.column_stack([there[2] - there[1], there[4] - there[3]]) / (2 * _STEP)
+    if not (np.isfinite(there).all() and abs(np.linalg.det(matrix)) > 1e-9):
+        return {"place": None, "matrix": None}
+    return {"place": there[0].tolist(), "matrix": matrix.tolist()}
 
 
 def ground_typed(values: Sequence[float | None], crs: str, vertical: str | None, surface: Surface) -> Array:

@@ -19,7 +19,7 @@ from ortho_pipeline.files.documents import json_position, json_value
 from ortho_pipeline.imaging.matching import View
 from ortho_pipeline.measure.journal import Journal
 from ortho_pipeline.measure.marks import GROUND_CRS, History, Mark, Marks
-from ortho_pipeline.measure.places import Geometry, Places, Sheet, ground_typed
+from ortho_pipeline.measure.places import Geometry, Places, Sheet, ground_typed, linked
 from ortho_pipeline.measure.planning import Next
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.surface.base import Surface
@@ -28,8 +28,6 @@ from ortho_pipeline.surface.base import Surface
 JOURNAL = ".journal"
 #: What is rendered by a model is rendered anew where it moves by more than this (px).
 _MOVED = 0.2
-#: Pixels to either side by which it is asked how one geometry lies in another.
-_STEP = 8.0
 
 
 class Project(abc.ABC):
@@ -271,18 +269,9 @@ class Project(abc.ABC):
         """Return the standard deviations (px) of the predicted image of ground ``(1, 3)``, if they are known."""
 
     def link(self, version: int, at: str, place: Sequence[float], to: str) -> dict[str, Any]:
-        """Return how one geometry lies in another about a place: its `place` there and the partial derivatives.
-
-        Both are null where the place is not seen there.
-        """
+        """Return how one geometry lies in another about a place, as `places.linked`."""
         with self._lock:
-            steps = np.array([(0.0, 0.0), (-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)]) * _STEP
-            ground = self._geometry(at, version).ground_of(np.asarray(place, dtype=float) + steps)
-            there = self._geometry(to, version).image_of(ground)
-        matrix = np.column_stack([there[2] - there[1], there[4] - there[3]]) / (2 * _STEP)
-        if not (np.isfinite(there).all() and abs(np.linalg.det(matrix)) > 1e-9):
-            return {"place": None, "matrix": None}
-        return {"place": there[0].tolist(), "matrix": matrix.tolist()}
+            return linked(self._geometry(at, version), self._geometry(to, version), place)
 
     def typed(self, values: Sequence[float | None], crs: str, vertical: str | None) -> list[float]:
         """Return typed coordinates as ground in `GROUND_CRS`."""
