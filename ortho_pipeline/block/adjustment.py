@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from ortho_pipeline.block.common_error import CommonError
-from ortho_pipeline.block.datum import by_control, with_datum
+from ortho_pipeline.block.datum import HOLD, by_control, with_datum
 from ortho_pipeline.block.determination import refuse_too_few, refuse_undetermined, uncertain_images
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
@@ -41,6 +41,8 @@ from ortho_pipeline.points import marks_warning
 
 #: Parameters that move by more than this part of their sigma with the sigmas that were found are solved for again.
 _MOVED, _WEIGHINGS = 0.02, 3
+#: Part of the points that gross errors of their own may lead out of the models; where it is more, the block is tilted.
+_ASTRAY = 0.05
 
 
 def adjust(
@@ -88,25 +90,45 @@ def adjust(
     common = CommonError.of(problem, state, selection)
     if common is not None:
         problem = common.applied(problem)
-    solved, selection = _solved(problem, state, selection)
+    solved = attempt(problem, state, selection)
+    held = _held(solved, state, selection) if robust else None
+    solved, inside = _checked(solved, selection) if held is None else (held, held.without_astray(selection))
     if problem.unstated.any():
-        solved = reweighed(solved, selection, estimate(solved))
+        solved = reweighed(solved, inside, estimate(solved))
     rejected: tuple[Rejected, ...] = ()
     if robust and problem.size and solved.unit_weight()[1] >= 4:
-        blunders = find_blunders(solved, selection)
+        blunders = find_blunders(solved, inside)
         rejected = blunders.rejected
         if blunders.undecided:
             notes.append(_undecided(blunders.undecided))
-        if rejected:
-            solved, selection = _solved(solved.problem, solved.state, blunders.kept)
-    gauge = gauge.replace(by_control(problem, begun), by_control(problem, selection))
+        inside = blunders.kept
+    if rejected or held is not None:
+        problem = replace(solved.problem, pseudo=problem.pseudo)
+        solved, inside = _checked(attempt(problem, solved.state, inside), inside)
+    gauge = gauge.replace(by_control(problem, begun), by_control(problem, inside))
     judged = _among(points, {one.point for one in rejected})
-    notes += _without(points, problem.active(begun) & ~problem.active(selection) & ~judged)
-    solved, found, common = _weighed(solved, selection, common)
+    notes += _without(points, problem.active(begun) & ~problem.active(inside) & ~judged)
+    solved, found, common = _weighed(solved, inside, common)
     notes += found.variances.notes()
-    notes += marks_warning(points.select(problem.active(selection) & selection.ground))
+    notes += marks_warning(points.select(problem.active(inside) & inside.ground))
     notes += uncertain_images(solved, points)
-    return _result(solved, found, common, selection, points, chosen, gauge, rejected, notes)
+    return _result(solved, found, common, inside, points, chosen, gauge, rejected, notes)
+
+
+def _held(solved: Solved, start: State, selection: Selection) -> Solved | None:
+    """Return a solution to look for gross errors from, where many points are led out of the models; None elsewhere.
+
+    Few control points leave a block so free that a gross error in one of them tilts it by hundreds of pixels. Held as
+    near to its start values as vendors' orientations are, it says where the errors are.
+    """
+    problem = solved.problem
+    if solved.astray is None or any(one.held for one in problem.pseudo):
+        return None
+    if solved.astray.sum() <= _ASTRAY * problem.active(selection).sum():
+        return None
+    held = attempt(with_datum(problem, start, selection, HOLD)[0], start, selection)
+    lost = 0 if held.astray is None else int(held.astray.sum())
+    return held if held.converged and lost < solved.astray.sum() else None
 
 
 def _among(points: BlockPoints, ids: Set[str]) -> Mask:
@@ -231,8 +253,8 @@ def _weighed(
     return solved, found, common
 
 
-def _solved(problem: BlockProblem, state: State, selection: Selection) -> tuple[Solved, Selection]:
-    """Return the solution and what takes part in it: not points whose rays lead out of the models.
+def _checked(solved: Solved, selection: Selection) -> tuple[Solved, Selection]:
+    """Return a solution and what takes part in it: not points whose rays lead out of the models.
 
     Raises
     ------
@@ -240,17 +262,14 @@ def _solved(problem: BlockProblem, state: State, selection: Selection) -> tuple[
         If the points leave parameters open, also where that is why no solution is found.
     NotConverged
     """
-    solved = attempt(problem, state, selection)
     refuse_undetermined(solved)
     if not solved.converged:
-        uncertain_images(solved, problem.points)
+        uncertain_images(solved, solved.problem.points)
         raise NotConverged(
-            "the adjustment did not converge", file=problem.points.source or None,
+            "the adjustment did not converge", file=solved.problem.points.source or None,
             remedy="give more control points, spread in plan and height, or a simpler model or correction",
         )  # fmt: skip
-    if solved.astray is None:
-        return solved, selection
-    return _solved(problem, solved.state, solved.without_astray(selection))
+    return solved, solved.without_astray(selection)
 
 
 def _result(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pyproj
@@ -824,6 +825,32 @@ def test_a_point_that_an_error_leads_out_of_the_models_does_not_keep_the_others(
     outside = {points.ids[k] for k in points.point[selection.rays & ~inside.rays]}
     assert outside
     assert outside <= set(lost)
+
+
+@pytest.mark.parametrize("control", [3, 4])
+def test_a_gross_error_that_tilts_a_block_out_of_its_models_is_found(
+    rpcs: dict[str, RPC], monkeypatch: pytest.MonkeyPatch, control: int
+) -> None:
+    """Control points in one corner leave the far side so free that one wrong ray lifts it out of the RPCs' heights."""
+    truth, ground = biased(rpcs, "affine"), places(120)
+    ground[:control, :2] = np.array([LON, LAT]) + 0.6 * REACH + 0.1 * (ground[:control, :2] - (LON, LAT))
+    points = measured(truth, ground, roles_of(control, 0, 120 - control), noise=0.3, sigma_ground=0.2)
+    points.measured[1] += (60.0, -40.0)
+    evaluated, at = [0], Linear.at.__func__
+
+    def counted(cls: type[Linear], *given: Any) -> Linear:
+        evaluated[0] += 1
+        return at(cls, *given)
+
+    monkeypatch.setattr(Linear, "at", classmethod(counted))
+    if control == 3:
+        with pytest.raises(DegeneratePoints, match=r"1 of 3 control points contradict the others \(p1\)"):
+            adjust(starts(truth), points)
+    else:
+        found = adjust(starts(truth), points)
+        assert [(one.point, one.what, one.image) for one in found.rejected] == [("p1", "ray", "left")]
+    # Points were left out one at a time before, over thousands of evaluations.
+    assert evaluated[0] < 200
 
 
 def test_what_does_not_converge_because_it_is_not_determined_says_so(

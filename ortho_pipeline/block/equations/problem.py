@@ -65,6 +65,10 @@ class Selection:
         """Return a selection of equal weights."""
         return cls(rays, ground, np.ones(len(rays)), np.ones(len(ground)))
 
+    def without(self, gone: Mask, point: Index) -> Selection:
+        """Return this selection without points ``(N,)``; `point` ``(M,)`` are the points of the rays."""
+        return replace(self, rays=self.rays & ~gone[point], ground=self.ground & ~gone)
+
 
 @dataclass(frozen=True, eq=False)
 class Misfits:

@@ -14,11 +14,14 @@ from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Selection, State
 from ortho_pipeline.block.equations.steps import Steps
 from ortho_pipeline.block.equations.unknowns import Mask
+from ortho_pipeline.block.intersection import meet, predict
 from ortho_pipeline.errors import InputError, NotConverged
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 from ortho_pipeline.models.base import Array
 
 _STEPS = 50
+#: Part of the points that a step may lead out of the models, and still be one to believe of the others.
+_FEW = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +29,8 @@ class Solved:
     """The observation equations at a minimum (or after one step), their points factored out, and the step there.
 
     `undetermined`: the points leave parameters open, whatever the condition of the step's equations is. Not
-    `converged`: at the place where the iteration ended without one. `astray` ``(N,)`` are points that were held where
-    they were, because their next steps lead out of the models; all else is to be solved for without them.
+    `converged`: at the place where the iteration ended without one. `astray` ``(N,)`` are points that took no part,
+    because their rays lead out of the models.
     """
 
     linear: Linear
@@ -64,8 +67,7 @@ class Solved:
         """Return a selection without the points that are led out of the models."""
         if self.astray is None:
             return selection
-        rays = selection.rays & ~self.astray[self.problem.points.point]
-        return replace(selection, rays=rays, ground=selection.ground & ~self.astray)
+        return selection.without(self.astray, self.problem.points.point)
 
     def unit_weight(self) -> tuple[float | None, float]:
         """Return the standard error of unit weight (None without redundancy), and the degrees of freedom.
@@ -133,15 +135,67 @@ def solve_inside(problem: BlockProblem, start: State, selection: Selection) -> t
 
 
 def attempt(problem: BlockProblem, start: State, selection: Selection) -> Solved:
-    """Minimise the squared misfits by Gauss-Newton, damped where that does not descend; see `Solved.converged`.
+    """Minimise the squared misfits of all points that have a place inside of their models; see `Solved`.
+
+    What a step leads out of them, as with nearly parallel rays or while the images are far from right, is left out at
+    once: nothing is known of it there, and it must not keep the others from where they belong. Where these have come to
+    rest, each such point whose rays meet takes part again, once.
 
     Raises
     ------
     NotConverged
         If nothing can be computed at the start.
     """
+    found = _inside(problem, start, selection)
+    gone = found.astray
+    if gone is None or not found.converged or found.undetermined:
+        return found
+    met = _met(found, gone, selection)
+    back = np.asarray(np.isfinite(met).all(axis=1))
+    if not back.any():
+        return found
+    state = replace(found.state, local=np.where(back[:, None], met, found.state.local))
+    gone = gone & ~back
+    again = _inside(problem, state, selection.without(gone, problem.points.point))
+    if not again.converged or again.undetermined:
+        return found
+    outside = gone if again.astray is None else gone | again.astray
+    iterations = found.iterations + again.iterations
+    return replace(again, iterations=iterations, astray=outside if outside.any() else None)
+
+
+def _met(found: Solved, gone: Mask, selection: Selection) -> Array:
+    """Return where points that were led astray are ``(N, 3)`` by the models of a solution; NaN for others and nowhere.
+
+    Known ground is where it is known to be.
+    """
+    problem, models = found.problem, found.state.models
+    of_ray = problem.points.point
+    rays = selection.rays & problem.active(selection)[of_ray] & gone[of_ray]
+    met = meet(problem.frame, models, problem.points, rays)
+    known = gone & selection.ground & np.isfinite(problem.target).all(axis=1)
+    met[known] = problem.target[known]
+    seen = np.asarray(np.isfinite(predict(problem.frame, models, problem.points, met)).all(axis=1))
+    met[of_ray[rays & ~seen]] = np.nan
+    met[~gone] = np.nan
+    return met
+
+
+def _inside(problem: BlockProblem, start: State, selection: Selection) -> Solved:
+    """Return the minimum without all points that were led out of their models on the way there."""
+    outside, iterations = np.zeros(len(problem.points), dtype=bool), 0
+    while True:
+        found = _descended(problem, start, selection.without(outside, problem.points.point))
+        iterations += found.iterations
+        if found.astray is None:
+            return replace(found, iterations=iterations, astray=outside if outside.any() else None)
+        outside, start = outside | found.astray, found.state
+
+
+def _descended(problem: BlockProblem, start: State, selection: Selection) -> Solved:
+    """Return the minimum by Gauss-Newton, damped where that does not descend, or where a step leads points `astray`."""
     ordering = problem.ordering(selection)
-    damping, steps, held = 0.0, Steps(), None
+    damping, steps = 0.0, Steps()
     linear = Linear.at(problem, start, selection, ordering)
     if not math.isfinite(square := linear.misfits.square):
         raise NotConverged("the start values put points outside of the models", remedy="give better start values")
@@ -149,48 +203,38 @@ def attempt(problem: BlockProblem, start: State, selection: Selection) -> Solved
         step = step_of(linear, damping)
         if not step.finite or (iteration == 1 and step.condition > CONDITION_LIMIT):
             # In a valley without a bottom the iteration would only wander: the caller says what is undetermined.
-            return Solved(linear, step, undetermined=True)
-        change, before = _change(step, held), steps.length
+            return Solved(linear, step, iteration, undetermined=True)
+        change, before = step.change.vector, steps.length
         promised = float(np.linalg.norm(change))
         length = math.sqrt(square) + math.sqrt(ordering.observations)
         # Close to the minimum steps are rounding: they do not get shorter any more, or do not descend.
         small = promised <= 1e-8 * length or (promised <= 1e-6 * length and promised > before / 4)
         if small and not damping:
-            return Solved(linear, step, iteration, astray=held)
+            return Solved(linear, step, iteration)
         whole = step.whole
         further = None if damping else steps.extrapolated(change, whole)
         ahead = _descent(linear, whole, further, square)
+        if ahead is not None and ahead.astray is not None:
+            return Solved(linear, step, iteration, astray=ahead.astray)
         if ahead is not None:
             if damping:
                 steps = Steps()
             else:
                 steps.made(change, whole, ahead.move)
-            linear, square, before_that, held = ahead.linear, ahead.square, held, ahead.held
-            if held is not None and before_that is not None and (held & before_that).any():
-                # The step reckons with them where they cannot go: the others have to be solved for without them.
-                return Solved(linear, step_of(linear), iteration, astray=held & before_that)
+            linear, square = ahead.linear, ahead.linear.misfits.square
             damping = damping / 10 if damping > 1e-6 else 0.0
             continue
         steps = Steps()
         if damping:
             step = step_of(linear)
-            promised = float(np.linalg.norm(_change(step, held)))
+            promised = float(np.linalg.norm(step.change.vector))
         if promised <= 1e-4 * length:
             # Rounding of the ground hides what so small a step would gain.
-            return Solved(linear, step, iteration, astray=held)
+            return Solved(linear, step, iteration)
         damping = max(10 * damping, 1e-3)
         if damping > 1e8:
             break
     return Solved(linear, step_of(linear), iteration, converged=False)
-
-
-def _change(step: Step, held: Mask | None) -> Array:
-    """Return what a step promises to take off, as one vector; nothing of points that are held."""
-    change = step.change
-    if held is not None:
-        change.rays[held[step.linear.problem.points.point]] = 0.0
-        change.ground[held] = 0.0
-    return change.vector
 
 
 def once(linear: Linear) -> tuple[Solved, Linear]:
@@ -201,47 +245,52 @@ def once(linear: Linear) -> tuple[Solved, Linear]:
     step = step_of(linear)
     left = replace(linear, misfits=linear.misfits.minus(step.change))
     ahead = _moved(linear, step.whole)
-    return Solved(left, step), linear if ahead is None else ahead.linear
+    if ahead is not None and ahead.astray is not None:
+        stay = np.where(ahead.astray[:, None], linear.state.local, ahead.linear.state.local)
+        ahead = replace(ahead, linear=ahead.linear.with_points_moved(stay, ahead.astray))
+    usable = ahead is not None and math.isfinite(ahead.linear.misfits.square)
+    return Solved(left, step), ahead.linear if ahead is not None and usable else linear
 
 
 @dataclass(frozen=True, eq=False)
 class _Ahead:
-    """The equations after a move, the sum of their squares, and the points ``(N,)`` that were held, if any."""
+    """The equations after a move, and the points ``(N,)`` that it leads out of their models, if any."""
 
     linear: Linear
-    square: float
     move: Array
-    held: Mask | None
+    astray: Mask | None
 
 
 def _descent(linear: Linear, whole: Array, further: Array | None, square: float) -> _Ahead | None:
-    """Return the equations after a move that descends: further than the step, the step, or a part of it."""
+    """Return the equations after a move that descends, further than the step, the step, or a part of it.
+
+    Or after one that leads a few points out of the models; one that does so with most of them is too long.
+    """
     moves = [] if further is None else [further]
     for move in (*moves, *(whole / 2.0**k for k in range(10))):
         ahead = _moved(linear, move)
+        if ahead is None:
+            continue
+        if ahead.astray is not None:
+            if move is not further and ahead.astray.sum() <= _FEW * linear.ordering.points:
+                return ahead
         # Coordinates are rounded to a billionth of a metre: what is added to a square by that is not an ascent.
-        if ahead is not None and ahead.square <= square * (1 + 1e-8):
+        elif ahead.linear.misfits.square <= square * (1 + 1e-8):
             return ahead
     return None
 
 
 def _moved(linear: Linear, move: Array) -> _Ahead | None:
-    """Return the equations after a move; points that it leads out of their models stay where they are.
-
-    A gross error sends a point whose rays are nearly parallel kilometres up or down. Nothing is known of it there, and
-    it must not keep all others from where they belong.
-    """
-    problem, state, held = linear.problem, linear.state, None
+    """Return the equations after a move; None where a correction cannot be inverted."""
+    problem = linear.problem
     try:
-        ahead = state.moved(move[: problem.size], move[problem.size :].reshape(-1, 3))
-        made = Linear.at(problem, ahead, linear.weights, linear.ordering)
-        if not math.isfinite(made.misfits.square):
-            held = np.zeros(len(problem.points), dtype=bool)
-            held[problem.points.point[~np.isfinite(made.misfits.rays).all(axis=1)]] = True
-            move = move.copy()
-            move[problem.size :].reshape(-1, 3)[held] = 0.0
-            made = made.with_points_moved(np.where(held[:, None], state.local, ahead.local), held)
-    except InputError:  # a correction that cannot be inverted
+        state = linear.state.moved(move[: problem.size], move[problem.size :].reshape(-1, 3))
+        made = Linear.at(problem, state, linear.weights, linear.ordering)
+    except InputError:
         return None
-    square = made.misfits.square
-    return _Ahead(made, square, move, held) if math.isfinite(square) else None
+    lost = ~np.isfinite(made.misfits.rays).all(axis=1)
+    if not lost.any():
+        return _Ahead(made, move, None)
+    astray = np.zeros(len(problem.points), dtype=bool)
+    astray[problem.points.point[lost]] = True
+    return _Ahead(made, move, astray)

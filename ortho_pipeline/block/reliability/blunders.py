@@ -113,7 +113,7 @@ def _trusted(problem: BlockProblem, starts: tuple[Solved, ...], selection: Selec
         return None
     found = estimate(solved)
     found = replace(found, image=max(found.image, SCALE_FLOOR))
-    return Trusted(reweighed(solved, others, found), found)
+    return Trusted(reweighed(solved, solved.without_astray(others), found), found)
 
 
 def _robust(
