@@ -59,7 +59,8 @@ class Piece:
     size : (int, int), optional
         Its columns and rows, where it has a model of its own.
     model : SensorModel, optional
-        In its own pixels, where the first model of the scene does not reach as far.
+        In its own pixels, where the first model of the scene does not reach as far; with another scale than 1, where
+        its pixels lie beside those of the scene by the ground alone (`sees_apart`).
     scale : float
         Width of one of its pixels in those of the scene; another than 1 where colours are coarser than panchromatic.
     """
@@ -69,6 +70,11 @@ class Piece:
     size: tuple[int, int] | None = None
     model: SensorModel | None = None
     scale: float = 1.0
+
+    @property
+    def sees_apart(self) -> bool:
+        """Whether it is an image of its own, as colours beside panchromatic: both models say what is where in both."""
+        return self.model is not None and self.scale != 1.0
 
 
 @dataclass(frozen=True)

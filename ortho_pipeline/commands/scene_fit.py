@@ -351,7 +351,7 @@ def shared_model(scene: Scene) -> SensorModel:
     """Return the model of a scene, with those of the other pieces of its acquisition where they have their own."""
     parts = {(0.0, 0.0): (scene.model, (scene.width, scene.height))}
     for piece in scene.pieces:
-        if piece.model is not None and piece.size is not None:
+        if piece.model is not None and piece.size is not None and not piece.sees_apart:
             # The bands of a component have the same geometry.
             parts.setdefault(piece.offset, (piece.model, piece.size))
     if len(parts) == 1:

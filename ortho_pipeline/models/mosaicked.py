@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
@@ -177,3 +178,21 @@ class Cropped(OverAnother):
     def linearised(self, ground: ArrayLike) -> tuple[Array, Array, Array]:
         image, by_ground, by_params = self.model.linearised(ground)
         return image - self.offset, by_ground, by_params
+
+
+def relative_scale(model: SensorModel, other: SensorModel, size: tuple[int, int]) -> float | None:
+    """Return the width of a pixel of another model in those of `model`; None where they see different ground.
+
+    Parameters
+    ----------
+    other : SensorModel
+        Of the same CRS.
+    size : (int, int)
+        Columns and rows of the image of `other`.
+    """
+    ground = other.image_to_ground([[size[0] / 2, size[1] / 2]], other.reference_height)
+    seen, wide, narrow = model.ground_to_image(ground), model.ground_partials(ground), other.ground_partials(ground)
+    areas = [abs(float(np.linalg.det(part[0, :, :2]))) for part in (wide, narrow)]
+    if not (np.isfinite(seen).all() and np.isfinite(areas).all() and min(areas) > 0):
+        return None
+    return math.sqrt(areas[0] / areas[1])

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 from osgeo import gdal
 
 from ortho_maxar.isd import Isd, Tile, read_isd_pushbroom
-from ortho_maxar.layout import metadata_of, parts_beside, tile_of, tiles_beside
+from ortho_maxar.layout import colours_beside, cut, metadata_of, parts_beside, tile_of, tiles_beside
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import has_rpc, rpc_of_dataset
@@ -71,9 +70,10 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
         text = f"{path.name} has a rigorous model that is left out: {error.field or 'model'}: {error.message}"
         warnings.append(Notice("rigorous-left-out", text, file=path.name))
     parts, said = parts_beside(isd, image, rigorous=found is None) if tile is None else ([], [])
+    colours = colours_beside(isd, image, next(iter(models.values())))
     return Scene(
         "maxar", name, *size, models, source, facts, (*warnings, *said),
-        pieces=(*tiles_beside(isd, image, tile), *parts),
+        pieces=(*tiles_beside(isd, image, tile), *parts, *colours),
         sources=(path,) if source != str(path) else (),
     )  # fmt: skip
 
@@ -84,10 +84,7 @@ def _rpc(dataset: gdal.Dataset, isd: Isd, choice: str | None, tile: Tile | None)
         return rpc_of_dataset(dataset, choice)
     if isd.rpc is None:
         return rpc_of_dataset(dataset) if has_rpc(dataset) else (None, str(isd.path))
-    if tile is None:
-        return isd.rpc, str(isd.path)
-    moved = replace(isd.rpc, col_off=isd.rpc.col_off - tile.left, row_off=isd.rpc.row_off - tile.top)
-    return moved, str(isd.path)
+    return cut(isd.rpc, tile), str(isd.path)
 
 
 def _compared(rigorous: Pushbroom, rpc: RPC | None) -> list[Notice]:

@@ -12,6 +12,8 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Piece
+from ortho_pipeline.models import RPC, SensorModel
+from ortho_pipeline.models.mosaicked import relative_scale
 
 _ISD = re.compile(rb"<(\w{1,20}:)?isd[\s>].*?<(\w{1,20}:)?IMD>", re.DOTALL)
 #: ``21FEB01005130-P1BS_R1C1-016263048010_01_P001``: time, kind of product, tile, order, part of a strip or of an order.
@@ -20,6 +22,8 @@ _PART = re.compile(
 )
 #: Parts whose rates or columns differ by more are two acquisitions.
 _SAME_RATE = 1e-4
+#: Bands whose pixels differ by less are registered in one image.
+_SAME_SCALE = 0.05
 
 
 def is_isd(path: Path) -> bool:
@@ -92,6 +96,48 @@ def parts_beside(isd: Isd, image: Path, rigorous: bool) -> tuple[list[Piece], li
             text = f"the part {path.name} is left out: {error.message}"
             notices.append(Notice("part-left-out", text, file=path.name))
     return pieces, notices
+
+
+def colours_beside(isd: Isd, image: Path, model: SensorModel) -> Iterator[Piece]:
+    """Yield the images of other bands that were taken with this one, panchromatic for colours or colours for it.
+
+    They lie in the same folder, or as they are delivered, in ``..._PAN`` and ``..._MUL`` beside each other.
+    """
+    for path in _of_other_bands(isd.path):
+        try:
+            other = Isd(path)
+            same = isd.file.said("IMD/IMAGE/CATID") == other.file.said("IMD/IMAGE/CATID") is not None
+            if not same or other.band == isd.band or other.rpc is None:
+                continue
+            scale = relative_scale(model, other.rpc, other.size)
+        except InputError:
+            continue
+        if scale is None or abs(scale - 1) < _SAME_SCALE:
+            continue
+        several = len(other.tiles) > 1
+        for tile in other.tiles if several else (Tile(f"{path.stem}{image.suffix}", 0, 0, *other.size),):
+            if (there := _file(path, tile.name)) is not None:
+                yield Piece(there, size=(tile.width, tile.height), model=cut(other.rpc, tile), scale=scale)
+
+
+def cut(rpc: RPC, tile: Tile | None) -> RPC:
+    """Return the RPC of a tile, in its own pixels."""
+    return rpc if tile is None else rpc.shifted(tile.left, tile.top)
+
+
+def _of_other_bands(path: Path) -> Iterator[Path]:
+    """Yield the ISD XML of an order's part in other bands, by their names."""
+    folders = [path.parent.absolute()]  # a folder that is entered has no name of its own
+    if found := re.fullmatch(r"(?i)(.*_)(PAN|MUL)", folders[0].name):
+        twin = folders[0].with_name(found[1] + ("MUL" if found[2].upper() == "PAN" else "PAN"))
+        folders += [twin] if twin.is_dir() else []
+    own = _PART.fullmatch(path.stem)
+    for one in (one for folder in folders for one in sorted(folder.iterdir()) if own):
+        other = _PART.fullmatch(one.stem) if one.suffix.lower() == ".xml" else None
+        if own is None or other is None or other["kind"].lower() == own["kind"].lower():
+            continue
+        if all(other[name].lower() == own[name].lower() for name in ("order", "part")) and is_isd(one):
+            yield one
 
 
 def _other_parts(path: Path) -> Iterator[Path]:

@@ -18,7 +18,8 @@ from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.models.rational import RPC
-from ortho_rpc.rigorous import Rigorous, rigorous_beside, rpc_of_dimap, tiles_beside
+from ortho_rpc.bundle import pieces_beside, rpc_of_dimap
+from ortho_rpc.rigorous import Rigorous, rigorous_beside
 
 # What GDAL's readers of vendor metadata agree on, and what it is called here.
 IMAGERY = {"SATELLITEID": "satellite", "ACQUISITIONDATETIME": "acquired", "CLOUDCOVER": "cloud_cover_percent"}
@@ -67,7 +68,7 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
         facts=_facts(dataset, model) | _facts_of(rigorous),
         warnings=(*_warnings(dataset, model), *rigorous.warnings),
         sources=() if rigorous.path is None else (rigorous.path,),
-        pieces=tiles_beside(place(dataset.GetDescription())),
+        pieces=pieces_beside(place(dataset.GetDescription()), model),
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,14 +9,13 @@ import numpy as np
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.hookspecs import Piece
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.pushbroom.scanner import Pushbroom
 from ortho_pipeline.models.rational import RPC
-from ortho_rpc.dimap import has_dimap_pushbroom, images_of, read_dimap_pushbroom, tile_of
+from ortho_rpc.bundle import DIMAP
+from ortho_rpc.dimap import has_dimap_pushbroom, images_of, read_dimap_pushbroom
 from ortho_rpc.dimap_file import DimapFile
 
-_DIMAP = re.compile(r"(DIM|PHRDIMAP)[\w.-]*\.XML", re.IGNORECASE)
 #: A vendor's RPC follows its rigorous model to a fraction of a pixel, a corrected one to some tens; beyond this (px)
 #: they are of two images.
 DISAGREEMENT = 100.0
@@ -63,7 +61,7 @@ def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:
     left: dict[str, str] = {}
     # Metadata that name this image go before those that name none; those that name another one are its own.
     candidates: dict[bool, list[DimapFile]] = {True: [], False: []}
-    for path in (path for path in beside if _DIMAP.match(path.name) and has_dimap_pushbroom(path)):
+    for path in (path for path in beside if DIMAP.match(path.name) and has_dimap_pushbroom(path)):
         try:
             file = DimapFile(path)
             named = set(images_of(file))
@@ -100,39 +98,6 @@ def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:
             return Rigorous(left=left)
         return Rigorous(model, path, left)
     return Rigorous(left=left | others)
-
-
-def rpc_of_dimap(path: Path) -> Path | None:
-    """Return the RPC file of DIMAP metadata that were named instead of an image; None without."""
-    if not _DIMAP.match(path.name):
-        return None
-    wanted = re.sub(r"(?i)^(PHR)?DIM(AP)?", "RPC", path.name).lower()
-    try:
-        return next((one for one in sorted(path.parent.iterdir()) if one.name.lower() == wanted), None)
-    except (OSError, ValueError):
-        return None
-
-
-def tiles_beside(image: Path) -> tuple[Piece, ...]:
-    """Return the other tiles of the scene that an image is a tile of, in the pixels of this one."""
-    try:
-        beside = {path.name.lower(): path for path in image.parent.iterdir()}
-    except (OSError, ValueError):
-        return ()
-    for path in (path for path in beside.values() if _DIMAP.match(path.name) and path.name != image.name):
-        try:
-            file = DimapFile(path)
-            names = images_of(file)
-            own = tile_of(file, image.name)
-            others = {name: tile_of(file, name) for name in names if name in beside and name != image.name.lower()}
-        except InputError:
-            continue
-        if own is not None:
-            return tuple(
-                Piece(beside[name], (tile[0] - own[0], tile[1] - own[1]), (tile[2], tile[3]))
-                for name, tile in others.items() if tile is not None
-            )  # fmt: skip
-    return ()
 
 
 def _reason(error: InputError) -> str:

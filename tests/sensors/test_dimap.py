@@ -9,6 +9,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -18,9 +19,13 @@ from ortho_rpc.dimap import has_dimap_pushbroom, read_dimap_pushbroom
 from osgeo import gdal
 from products import dimap_product
 from scipy.spatial.transform import Rotation
-from seeds import dimap_text
+from seeds import dimap_text, rpc_xml
+from seeds import rpc as seed_rpc
+from used import pixels
 
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.control import command
+from ortho_pipeline.commands.control.points import read_control
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpc_txt
@@ -29,6 +34,7 @@ from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
 from ortho_pipeline.models import RPC, Pushbroom
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.light import LightPath
+from ortho_pipeline.options import MatchOptions, PointOptions, SurfaceOptions
 from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.testing import check_sensor_model
 
@@ -575,3 +581,56 @@ def test_pleiades_neo_is_held_against_the_rpc_of_each_scene(tmp_path: Path, apar
     assert list(scene.models) == (["rpc"] if apart else ["rpc", "pushbroom"])
     assert [notice.code for notice in scene.notices] == ["rigorous-left-out"] * bool(apart)
     assert not apart or "it is 5 px off the RPC within the image" in scene.notices[0]
+
+
+def test_a_bundle_of_panchromatic_and_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Folders as they are delivered; a point that was measured in one image counts in the other, by both RPCs."""
+    strip = "<SOURCE_ID>DS_PHR1A_1</SOURCE_ID><SOURCE_TYPE>Strip_Source</SOURCE_TYPE>"
+    strip = f"<Dataset_Sources><Source_Identification>{strip}</Source_Identification></Dataset_Sources>"
+    images = []
+    for number, (band, scale) in enumerate((("P", 1), ("MS", 4)), 1):
+        folder = tmp_path / f"IMG_0{number}_PHR1A_{band}"
+        folder.mkdir()
+        settings = f"<Product_Settings><SPECTRAL_PROCESSING>{band}</SPECTRAL_PROCESSING></Product_Settings>"
+        (folder / f"DIM_PHR1A_{band}_1.XML").write_text(
+            "<Dimap_Document><Metadata_Identification><METADATA_PROFILE>PHR_SENSOR</METADATA_PROFILE>"
+            f"</Metadata_Identification><Processing_Information>{settings}</Processing_Information>{strip}<Raster_Data>"
+            f"<Raster_Dimensions><NROWS>{120 // scale}</NROWS><NCOLS>{160 // scale}</NCOLS></Raster_Dimensions>"
+            f'<Data_Access><Data_Files><Data_File><DATA_FILE_PATH href="IMG_PHR1A_{band}_1_R1C1.TIF"/></Data_File>'
+            "</Data_Files></Data_Access></Raster_Data></Dimap_Document>"
+        )
+        one = seed_rpc().scaled(scale)
+        (folder / f"RPC_PHR1A_{band}_1.XML").write_text(rpc_xml(one))
+        images.append(pixels(folder / f"IMG_PHR1A_{band}_1_R1C1.TIF", (160 // scale, 120 // scale)))
+        write_rpc_txt(one, images[-1].with_name(f"{images[-1].stem}_RPC.TXT"))
+    pan, colours = images
+    (here,), (there,) = open_scene(pan).pieces, open_scene(colours).pieces
+    assert (here.path, there.path) == (colours, pan)
+    assert (here.scale, there.scale) == pytest.approx((4.0, 0.25))
+    lon, lat, h = seed_rpc().image_to_ground([[100.0, 60.0]], 900.0)[0].tolist()
+    (tmp_path / "p.csv").write_text(f"id,image,col,row,x,y,h\n1,{pan.name},104,58,{lon},{lat},{h}\n")
+    options = PointOptions(gcps=tmp_path / "p.csv", crs="EPSG:4326", vertical="ellipsoid")
+    points = read_control(open_scene(colours), options)
+    np.testing.assert_allclose(points.image, [[104 / 4, 58 / 4]], atol=1e-6)
+    # Matches say in which image they were measured, and so serve the other one as well.
+    found = SimpleNamespace(matches=SimpleNamespace(points=points), to_json=dict, notices=(), summary=list)
+    monkeypatch.setattr(command, "match_scene", lambda *_: found)
+    (tmp_path / "matches").mkdir()
+    command.match(
+        colours, tmp_path / "matches" / "m.csv", MatchOptions(reference=(pan,)), surface=SurfaceOptions(height=900.0)
+    )
+    again = read_control(
+        open_scene(pan), replace(options, gcps=tmp_path / "matches" / "m.csv", crs=None, vertical=None)
+    )
+    np.testing.assert_allclose(again.image, [[104.0, 58.0]], atol=1e-4)
+    survey = json.loads(CliRunner().invoke(cli, ["info", str(tmp_path), "--json"]).stdout)
+    assert [one["path"] for one in survey["files"] if one["kind"] == "scene"] == [
+        str(one.relative_to(tmp_path)) for one in images
+    ]
+    # Another strip, or the same bands, are images of their own.
+    path = colours.with_name("DIM_PHR1A_MS_1.XML")
+    for old, new in (("DS_PHR1A_1", "DS_PHR1A_2"), (">MS<", ">P<")):
+        text = path.read_text()
+        path.write_text(text.replace(old, new))
+        assert open_scene(pan).pieces == ()
+        path.write_text(text)

@@ -13,7 +13,7 @@ from ortho_maxar.isd import Isd, read_isd_pushbroom
 from osgeo import gdal
 from products import isd_text, til_text
 from scipy.optimize import least_squares
-from used import pixels, used
+from used import pixels, ran, used
 
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
@@ -236,6 +236,55 @@ def test_points_of_another_part_adjust_this_one(folder: Path, whole: tuple[Pushb
     assert result.exit_code == 0, result.output
     bias = json.loads(result.stdout)["raw_bias"]
     assert (bias["col"], bias["row"]) == pytest.approx((3.0, 0.0), abs=0.05)
+
+
+ORDER = "016263048010_01_P001"
+
+
+@pytest.fixture
+def bundle(tmp_path: Path) -> list[Path]:
+    """Panchromatic and colour image of one pass, as they are delivered."""
+    delivery = tmp_path / "016263048010_01"
+    size = (SIZE[0] // 4, SIZE[1] // 4)
+    texts = {
+        "PAN": (f"21FEB01120000-P1BS-{ORDER}", SIZE, isd_text(size=SIZE)),
+        "MUL": (f"21FEB01120000-M1BS-{ORDER}", size, isd_text(size=size).replace("<BANDID>P<", "<BANDID>MS1<")
+                .replace("BAND_P>", "BAND_MS1>").replace("<DETPITCH>0.008", "<DETPITCH>0.032")
+                .replace(f"<DETORIGINY>{size[0] * 0.004}", f"<DETORIGINY>{size[0] * 0.016}")
+                .replace(f"{size[1] * 1e-4:.15e}", f"{size[1] * 4e-4:.15e}")),
+    }  # fmt: skip
+    images = []
+    for name, (stem, its, text) in texts.items():
+        folder = delivery / f"{ORDER}_{name}"
+        folder.mkdir(parents=True)
+        images.append(pixels(folder / f"{stem}.TIF", its))
+        xml = folder / f"{stem}.XML"
+        xml.write_text(text)
+        xml.write_text(text.replace("</isd>", isd_text(rpc=rpc_of(read_isd_pushbroom(xml))).partition("</GEO>")[2]))
+    return images
+
+
+def test_points_of_the_panchromatic_image_adjust_the_colours(bundle: list[Path]) -> None:
+    """They were measured 3 px to the right and 2 px above, each in a file of its own name; here that is a quarter."""
+    pan, colours = bundle
+    (here,), (there,) = open_scene(pan).pieces, open_scene(colours).pieces
+    assert (Path(here.path), Path(there.path)) == (colours, pan)
+    assert (here.scale, there.scale) == (pytest.approx(4.0, rel=1e-3), pytest.approx(0.25, rel=1e-3))
+    model = open_scene(pan).models["pushbroom"]
+    lines = ["id,image,col,row,x,y,h"]
+    for k, (x, y) in enumerate([(10, 30), (50, 35), (30, 48), (20, 5)]):
+        lon, lat, h = model.image_to_ground([[x, y]], 190.0 + 10 * k)[0].tolist()
+        lines.append(f"{k},{pan.name},{x + 3.0},{y - 2.0},{lon},{lat},{h}")
+    (pan.parent / "p.csv").write_text("\n".join(lines))
+    found = ran("fit", colours, "--gcps", pan.parent / "p.csv", "--points-crs", "EPSG:4326", "--points-vertical",
+                "ellipsoid", "--correction", "shift")  # fmt: skip
+    assert (found["raw_bias"]["col"], found["raw_bias"]["row"]) == pytest.approx((0.75, -0.5), abs=0.02)
+    assert found["rmse"]["control"]["total"] < 0.02
+    assert ran("info", pan)["same_acquisition"] == [colours.name]
+    info = ran("info", pan.parent.parent)
+    assert sorted(one["path"] for one in info["files"] if one["kind"] == "scene") == sorted(
+        str(one.relative_to(pan.parent.parent)) for one in (pan, colours)
+    )
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,7 @@ def info(image: str, scene: SceneOptions, as_json: bool) -> None:
         "UTM": document["utm"],
         "Corners": "lon,lat " + "  ".join("outside" if lon is None else f"{lon:.5f},{lat:.5f}" for lon, lat in
                                           document["corners_lon_lat"]),
+        **({"Belongs to": ", ".join(document["same_acquisition"])} if document["same_acquisition"] else {}),
         **{name: str(value) for name, value in document["facts"].items()},
     }  # fmt: skip
     for name, value in lines.items():

@@ -72,7 +72,10 @@ def match(
     record = inputs.provenance(
         opened, PointOptions(), heights, inputs.hashed(read), None, {"scene": scene, "surface": surface, "match": match}
     )  # fmt: skip
-    write_points(matched.matches.points, output)
+    points = matched.matches.points
+    # Those of a bundle or a strip serve its other images too, if they say where they were measured.
+    said = bool(opened.pieces) and files["points"].suffix.lower() != ".geojson"
+    write_points(points, output, images=[Path(opened.path).name] * len(points) if said else None)
     if adjusted is not None:
         _write_page(adjusted, heights, record, files)
     document = {"matching": matched.to_json(), "provenance": record, **to_document([*opened.notices, *matched.notices])}

@@ -8,15 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pyproj
+from numpy.typing import NDArray
 
 from ortho_pipeline.commands.control.matching import Matched, match_scene
 from ortho_pipeline.commands.inputs import OWN_POINTS, point_file
 from ortho_pipeline.errors import InputError, counted, of_option
 from ortho_pipeline.files.locations import located
-from ortho_pipeline.geodesy.crs import Vertical, parse_crs
-from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
+from ortho_pipeline.hookspecs import Piece, Scene
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions
 from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, read_points
+from ortho_pipeline.points.formats import read_table
+from ortho_pipeline.points.rows import OWN_IMAGE
 from ortho_pipeline.points.selection import select_control
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.surface.base import Surface
@@ -42,7 +45,7 @@ def control_of(
     """
     if not match.reference:
         refuse_idle(match)
-        return read_control(scene, options, opened), None
+        return read_control(scene, options, opened, surface), None
     chosen = next((name for name in ("select", "check") if getattr(options, name) is not None), None)
     if chosen is not None and options.gcps is None:
         raise InputError(
@@ -54,7 +57,7 @@ def control_of(
             f"`points.{chosen}` chooses among points that all check", field=f"points.{chosen}",
             remedy="leave it out, or give `match.gcps_as=control`",
         )  # fmt: skip
-    surveyed = None if options.gcps is None else read_control(scene, replace(options, correction=None), opened)
+    surveyed = None if options.gcps is None else read_control(scene, replace(options, correction=None), opened, surface)
     matched = match_scene(scene, match, surface, opened, threads, memory)
     points = matched.matches.points
     if surveyed is None:
@@ -109,8 +112,13 @@ def _joined(surveyed: Points, matches: Points) -> Points:
     )  # fmt: skip
 
 
-def read_control(scene: Scene, options: PointOptions, opened: SceneOptions = SceneOptions()) -> Points:
+def read_control(
+    scene: Scene, options: PointOptions, opened: SceneOptions = SceneOptions(), surface: Surface | None = None
+) -> Points:
     """Read the points of the options with their roles; none where none are given.
+
+    `surface` says at which height points lie that were measured in the other image of a bundle, where their file does
+    not.
 
     Raises
     ------
@@ -125,7 +133,7 @@ def read_control(scene: Scene, options: PointOptions, opened: SceneOptions = Sce
                 remedy="give a file of points",
             )
         return no_points()
-    points = _given_points(scene, options, opened)
+    points = _given_points(scene, options, opened, surface)
     if options.select is not None and options.check is not None:
         raise InputError(
             "`points.select` and `points.check` both say which points check",
@@ -137,7 +145,7 @@ def read_control(scene: Scene, options: PointOptions, opened: SceneOptions = Sce
     return points if options.check is None else assign_roles(points, options.check)
 
 
-def _given_points(scene: Scene, options: PointOptions, opened: SceneOptions) -> Points:
+def _given_points(scene: Scene, options: PointOptions, opened: SceneOptions, surface: Surface | None) -> Points:
     with of_option("points.crs"):
         crs = None if options.crs is None else parse_crs(options.crs)
     with of_option("points.vertical"):
@@ -154,9 +162,46 @@ def _given_points(scene: Scene, options: PointOptions, opened: SceneOptions) -> 
         if isinstance(options.gcps, Points):
             return options.gcps
         return gcps_of_dataset(raster.open_dataset(scene.path, **opened.access), crs=crs, vertical=vertical)
-    pieces = {Path(piece.path).name: (*piece.offset, piece.scale) for piece in scene.pieces}
+    pieces = {
+        Path(piece.path).name: OWN_IMAGE if piece.sees_apart else (*piece.offset, piece.scale) for piece in scene.pieces
+    }
     name, path = Path(scene.path).name, located(path, allow_network=opened.allow_network)
-    return read_points(path, crs=crs, vertical=vertical, pixel_origin=origin, image_name=name, pieces=pieces)
+    points = read_points(path, crs=crs, vertical=vertical, pixel_origin=origin, image_name=name, pieces=pieces)
+    apart = [piece for piece in scene.pieces if piece.sees_apart]
+    # The same rows in the same order: the table says in which image each of them was measured.
+    rows = read_table(path, name, pieces).rows if apart else []
+    named = np.array([Path(row.image_name).stem.lower() if row.image_name else "" for row in rows])
+    for piece in apart:
+        points = _taken_over(scene, piece, points, named == Path(piece.path).stem.lower(), surface)
+    return points
+
+
+def _taken_over(
+    scene: Scene, piece: Piece, points: Points, there: NDArray[np.bool_], surface: Surface | None
+) -> Points:
+    """Return points of which some were measured in another image of the acquisition, all in the pixels of the scene.
+
+    By how much the other image's model is off there, the scene's is, in pixels of its own width: what both have in
+    common are the errors of orbit and attitude. Their parallax is in the models.
+    """
+    if piece.model is None or not there.any():
+        return points
+    ground = with_heights(points, surface).ground if surface is not None else points.ground
+    ground = np.where(np.isnan(ground), [0.0, 0.0, scene.model.reference_height], ground)
+    ground = ground_transform(points.crs, scene.model.crs)(ground)
+    off = points.image - piece.model.ground_to_image(ground)
+    image = scene.model.ground_to_image(ground) + off * piece.scale
+    lost = there & ~np.isfinite(image).all(axis=1)
+    if lost.any():
+        raise InputError(
+            f"the point {points.ids[int(np.argmax(lost))]!r}, measured in {Path(piece.path).name}, is not seen here",
+            file=points.source, field="image", remedy="leave it out for this image",
+        )  # fmt: skip
+    scale = np.where(there, piece.scale, 1.0)
+    return replace(
+        points, image=np.where(there[:, None], image, points.image), sigma_image=points.sigma_image * scale,
+        covariance_image=points.covariance_image * (scale**2)[:, None, None],
+    )  # fmt: skip
 
 
 def no_points() -> Points:
