@@ -14,12 +14,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints, counted
 from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.statistics import squared_distances
@@ -30,6 +32,8 @@ from ortho_pipeline.points import Points
 BLUNDER_RISK = 0.001
 #: Chance that a set of good points has any that is named as outlying, for control and for check points.
 OUTLYING_RISK = 0.01
+#: Check points that are together so many times farther off than expected are told.
+_APART = 2.0
 #: From so many check points on their own scatter counts, where it is larger than that of the control points.
 _OWN_SCATTER = 5
 #: Measured check points that show where they lie together beside matches.
@@ -300,40 +304,103 @@ def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> l
     return found
 
 
-def _outlying_checks(
-    solution: Solution, points: Points, used: np.ndarray, sigma0: float, common: Array | None
-) -> list[Outlying]:
-    from scipy.special import fdtrc
+@dataclass(frozen=True)
+class _Checks:
+    """Check points that have an image: their rows, how far off they are ``(n, 2)`` px, and what that is in sigmas.
 
+    `partials` are those by the parameters in sigmas of the points, `spread` what is expected with a sigma0 of 1.
+    """
+
+    problem: Problem
+    miss: Array
+    standardised: Array
+    partials: Array
+    spread: Array
+
+    @property
+    def squares(self) -> Array:
+        """Squared distances ``(n,)`` in sigmas; 2 in the mean where sigma0 is 1."""
+        return squared_distances(self.standardised, self.spread)
+
+    def expected(self, scale: float) -> Array:
+        """Root mean square ``(n,)`` px of the distances of good points, where sigma0 squared is `scale`."""
+        return np.sqrt(scale * self.problem.errors.mean_square(self.spread))
+
+
+def _checks(solution: Solution, points: Points, used: np.ndarray, common: Array | None) -> _Checks | None:
     usable = points.check & np.isfinite(solution.model.ground_to_image(points.ground)).all(axis=1)
     if not usable.any():
-        return []
+        return None
     problem = Problem.of(solution.model, points, usable, {})
     miss = problem.image - solution.model.ground_to_image(problem.ground)
     measured = problem.points.groups < 0
     if common is None and measured.sum() >= _OWN_PLACE and (points.groups[used] >= 0).all():
         miss[measured] -= np.median(miss[measured], axis=0)
     if len(solution.model.params):
-        jacobian = problem.errors.whitened(solution.model.param_partials(problem.ground))
+        partials = problem.errors.whitened(solution.model.param_partials(problem.ground))
     else:
-        jacobian = np.zeros((len(miss), 2, 0))
-    spread = np.eye(2) + jacobian @ solution.cofactors @ jacobian.transpose(0, 2, 1)
-    standardised = problem.errors.whitened(miss)
-    squares = squared_distances(standardised, spread)
+        partials = np.zeros((len(miss), 2, 0))
+    spread = np.eye(2) + partials @ solution.cofactors @ partials.transpose(0, 2, 1)
+    return _Checks(problem, miss, problem.errors.whitened(miss), partials, spread)
+
+
+def _outlying_checks(
+    solution: Solution, points: Points, used: np.ndarray, sigma0: float, common: Array | None
+) -> list[Outlying]:
+    from scipy.special import fdtrc
+
+    checks = _checks(solution, points, used, common)
+    if checks is None:
+        return []
+    squares = checks.squares
     scale, freedom = max(sigma0, _SCALE_FLOOR) ** 2, max(solution.freedom, 1.0)
     own = float(np.median(squares)) / _MEDIAN_OF_TWO
     if len(squares) >= _OWN_SCATTER and own > scale:
         # The median of n is about as certain as a mean square of half as many.
         scale, freedom = own, float(len(squares))
     if common is not None:
-        apart = problem.points.sigma_common == 0
-        spread[apart] += (jacobian @ common @ jacobian.transpose(0, 2, 1))[apart] / scale
-        squares = squared_distances(standardised, spread)
+        apart = checks.problem.points.sigma_common == 0
+        shared = checks.partials @ common @ checks.partials.transpose(0, 2, 1) / scale
+        checks = replace(checks, spread=checks.spread + np.where(apart[:, None, None], shared, 0.0))
+        squares = checks.squares
     chances = fdtrc(2, freedom, squares / 2 / scale)
-    expected = np.sqrt(scale * problem.errors.mean_square(spread))
+    expected, rows = checks.expected(scale), checks.problem.rows
     return [
         Outlying(
-            points.ids[problem.rows[i]], "check", float(np.hypot(*miss[i])), float(expected[i]), float(chances[i]), 0.0
+            points.ids[rows[i]], "check", float(np.hypot(*checks.miss[i])), float(expected[i]), float(chances[i]), 0.0
         )
         for i in np.flatnonzero(chances < OUTLYING_RISK / len(chances)).tolist()
     ]
+
+
+def checks_apart(solution: Solution, points: Points, used: np.ndarray, said: Sequence[Outlying]) -> list[Notice]:
+    """Return a notice where check points, without those that are `said`, are farther off than the fit lets expect.
+
+    By the F test of their mean square against sigma0, where it is at least twice as far: several wrong check points
+    hide each other, and a model may follow its control points and nothing between them. Matches are left to what is
+    said of their reference.
+    """
+    from scipy.special import fdtrc
+
+    measured = points.groups < 0
+    if solution.sigma0 is None or not len(solution.model.params) or not measured[used].all():
+        return []
+    checks = _checks(solution, points.with_roles(np.where(points.check & ~measured, "tie", points.roles)), used, None)
+    if checks is None:
+        return []
+    names = {one.id for one in said}
+    good = np.array([points.ids[i] not in names for i in checks.problem.rows])
+    count = int(good.sum())
+    scale = max(float(solution.sigma0), _SCALE_FLOOR) ** 2
+    if not count:
+        return []
+    ratio = float(checks.squares[good].mean()) / 2 / scale
+    if ratio < _APART**2 or fdtrc(2 * count, max(solution.freedom, 1.0), ratio) > OUTLYING_RISK:
+        return []
+    found = float(np.sqrt((checks.miss[good] ** 2).sum(axis=1).mean()))
+    expected = float(np.sqrt((checks.expected(scale)[good] ** 2).mean()))
+    text = (
+        f"{counted(count, 'check point')} {'is' if count == 1 else 'are'} {found:.3g} px off (RMSE), where the control "
+        f"points let expect {expected:.2g} px: check points are wrong, or the model is poor between the control points"
+    )
+    return [Notice("checks-apart", text, count=count, rmse=found, expected=expected)]

@@ -17,7 +17,7 @@ from ortho_pipeline.display.charts import residual_axes
 from ortho_pipeline.display.notebook import fit_html
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import DegeneratePoints, InputError, ModelError, counted
-from ortho_pipeline.estimation.blunders import REJECTED_LIMIT, Outlying, find_blunders, outlying
+from ortho_pipeline.estimation.blunders import REJECTED_LIMIT, Outlying, checks_apart, find_blunders, outlying
 from ortho_pipeline.estimation.determinacy import (
     EXTRAPOLATION_WARNING,
     UNSTABLE,
@@ -308,10 +308,12 @@ def fit(
     used = np.zeros(len(points), dtype=bool)
     used[problem.rows[keep]] = True
     seen = _without(common, model, points)
+    said = outlying(solution, seen, used, None if common is None else common.covariance)
+    if common is None:
+        warnings += checks_apart(solution, seen, used, said)
     found = _result(
         solution, seen, used, raw, {**known_bad, **rejected}, warnings, name, strength, problem.priors, common
     )
-    said = outlying(solution, seen, used, None if common is None else common.covariance)
     return replace(found, points=points, corner_ratio=ratio, outlying=said)
 
 

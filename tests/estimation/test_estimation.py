@@ -349,6 +349,29 @@ def test_a_model_that_is_poor_everywhere_makes_no_check_point_wrong(rpc):
     found = fit(start(rpc), points.with_roles(roles))
     assert found.rmse("check")["total"] > 3 * found.rmse("control")["total"]
     assert not [one for one in found.outlying if one.role == "check"]
+    (notice,) = [one for one in found.warnings if one.code == "checks-apart"]
+    assert notice.fields["rmse"] == pytest.approx(found.rmse("check")["total"])
+
+
+def test_several_wrong_check_points_that_hide_each_other_are_told(rpc):
+    # Three of six: their median is no scale to find any of them by.
+    points = with_roles(make_points(rpc, count=18), 6)
+    wrong = points
+    for name, by in (("p12", (14.0, 0.0)), ("p13", (0.0, -9.0)), ("p14", (0.0, 6.0))):
+        wrong = moved(wrong, name, by)
+    found = fit(start(rpc), wrong)
+    (notice,) = [one for one in found.warnings if one.code == "checks-apart"]
+    assert notice.fields["count"] == 6 - len(found.outlying)
+    # As accurate as a point and the mean of twelve: 0.3 px in both axes.
+    assert notice.fields["expected"] == pytest.approx(0.3 * np.sqrt(2) * np.sqrt(13 / 12), rel=0.5)
+    assert notice.fields["rmse"] > 5
+
+
+@pytest.mark.parametrize("checks", [1, 3, 12])
+def test_good_check_points_are_not_told_to_be_apart(rpc, checks):
+    for seed in range(20):
+        found = fit(start(rpc), with_roles(make_points(rpc, count=12 + checks, seed=seed), checks))
+        assert not [one for one in found.warnings if one.code == "checks-apart"]
 
 
 def test_an_outlying_control_point_that_stays_is_named_with_its_leverage(rpc):
