@@ -397,10 +397,13 @@ def checks_apart(solution: Solution, points: Points, used: np.ndarray, said: Seq
     ratio = float(checks.squares[good].mean()) / 2 / scale
     if ratio < _APART**2 or fdtrc(2 * count, max(solution.freedom, 1.0), ratio) > OUTLYING_RISK:
         return []
-    found = float(np.sqrt((checks.miss[good] ** 2).sum(axis=1).mean()))
+    sizes = np.hypot(*checks.miss.T)
+    found = float(np.sqrt((sizes[good] ** 2).mean()))
+    worst = [points.ids[checks.problem.rows[i]] for i in np.argsort(-np.where(good, sizes, 0.0))[: min(3, count)]]
     expected = float(np.sqrt((checks.expected(scale)[good] ** 2).mean()))
     text = (
         f"{counted(count, 'check point')} {'is' if count == 1 else 'are'} {found:.3g} px off (RMSE), where the control "
-        f"points let expect {expected:.2g} px: check points are wrong, or the model is poor between the control points"
+        f"points let expect {expected:.2g} px, farthest {', '.join(worst)}: check points are wrong, or the model is "
+        "poor between the control points"
     )
-    return [Notice("checks-apart", text, count=count, rmse=found, expected=expected)]
+    return [Notice("checks-apart", text, count=count, rmse=found, expected=expected, points=worst)]

@@ -365,6 +365,8 @@ def test_several_wrong_check_points_that_hide_each_other_are_told(rpc):
     # As accurate as a point and the mean of twelve: 0.3 px in both axes.
     assert notice.fields["expected"] == pytest.approx(0.3 * np.sqrt(2) * np.sqrt(13 / 12), rel=0.5)
     assert notice.fields["rmse"] > 5
+    assert notice.fields["points"] == ["p12", "p13", "p14"]
+    assert "farthest p12, p13, p14" in notice
 
 
 @pytest.mark.parametrize("checks", [1, 3, 12])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from ortho_pipeline.display.numbers import px
@@ -43,8 +43,9 @@ def card(
     """Return the card of an image of a report; `rays` are those in it."""
     image, roles = report.images[label], {point.id: point.role for point in report.adjustment.points}
     used = [ray for ray in rays if ray.used]
-    found = [f"{number} {role}" for role in ROLES if (number := sum(roles[ray.id] == role for ray in used))]
-    left = len(rays) - len(used)
+    wrong = {
+        (one.point, label) for one in report.adjustment.rejected if one.what != "ground" and one.image in (None, label)
+    }
     sizes = [(math.hypot(*ray.residual), ray.id) for ray in used if is_known(ray.residual)]
     view = None
     if image.incidence_deg is not None:
@@ -56,11 +57,32 @@ def card(
         picture=None if png is None else base64.b64encode(png).decode(),
         plot=plot,
         place=place,
-        rays=", ".join(found or ["none"]) + (f"; {counted(left, 'measurement')} left out" if left else ""),
+        rays=rays_text(rays, roles, wrong),
         view=view,
         covered=image.covered,
         worst=f"{max(sizes)[1]}, {px(max(sizes)[0])}" if sizes else None,
     )
+
+
+def rays_text(rays: Sequence[Ray], roles: Mapping[str, str], wrong: Collection[tuple[str, str]]) -> str:
+    """Say how many rays of an image took part, by the roles of their points, and why others did not.
+
+    Parameters
+    ----------
+    wrong : collection of (str, str)
+        Point and image of measurements that were left out as gross errors.
+    """
+    found = [f"{number} {role}" for role in ROLES if (number := sum(roles[ray.id] == role for ray in rays if ray.used))]
+    unused = [ray for ray in rays if not ray.used]
+    left = sum((ray.id, ray.image) in wrong for ray in unused)
+    # Matches that check take part in nothing, so that they test what the others make.
+    held = sum(roles[ray.id] == "check" and (ray.id, ray.image) not in wrong for ray in unused)
+    said = [", ".join(found or ["none"])]
+    said += [f"{held} held out to check"] if held else []
+    said += [f"{counted(left, 'measurement')} left out as wrong"] if left else []
+    if rest := len(unused) - left - held:
+        said.append(f"{rest} that {'determines' if rest == 1 else 'determine'} nothing")
+    return "; ".join(said)
 
 
 def rays_by_image(report: BlockReport) -> Mapping[str, tuple[Ray, ...]]:

@@ -14,6 +14,8 @@ from ortho_pipeline.report.block_records import BlockReport
 
 #: Longer side of the drawing and its margin, CSS px; points, pairs and names beyond which none are drawn.
 _SIDE, _MARGIN, _POINTS, _PAIRS, _NAMES = 560.0, 26.0, 800, 400, 24
+#: Between images that lie on each other a line (px) would be a speck.
+_SHORT = 16.0
 
 
 def plot_network(report: BlockReport) -> Drawing | None:
@@ -82,6 +84,8 @@ def _draw_pairs(drawing: Drawing, report: BlockReport, middles: dict[str, Array]
     most = max((one.points for one in pairs), default=1)
     for one in sorted(pairs, key=lambda one: -one.points)[:_PAIRS]:
         (x1, y1), (x2, y2) = (middles[name].tolist() for name in (one.first, one.second))
+        if math.hypot(x2 - x1, y2 - y1) < _SHORT:
+            continue
         text = f"{one.first} – {one.second}: {counted(one.points, 'point')} in common, rays {one.angle_deg:.1f}° apart"
         with drawing.titled(text):
             drawing.line("link-wide" if one.points > most / 2 else "link", x1, y1, x2, y2)

@@ -26,7 +26,7 @@ _LOOK: dict[str, str] = {
     "left-out": "Look at it in the image and at its coordinates: measure it again, or leave it out of the file.",
     "more-left-out": "So many gross errors mean that the points or the model do not suit the scene: see both.",
     "contradicting-point": "Look at it in the image and at its coordinates: measure it again, or take it out.",
-    "checks-apart": "Look at the check points that are farthest off. If all are off alike, check their CRS and "
+    "checks-apart": "Look at these in the image and at their coordinates. If all are off alike, check their CRS and "
     "heights; if those far from control are the worst, add control there.",
     "no-projection": "Give the points a height, and check their CRS.",
     "takes-no-part": "Measure these points in one more image.",
