@@ -158,6 +158,11 @@ def _folders(job: Job) -> list[str | os.PathLike[str]]:
 
 def _states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:
     """Return all files that a scene depends on: those of `roles`, and small companions of the image."""
+    known = _with_companions(job, roles)
+    return tuple(FileState.of(role, Path(path), _digests) for path, role in sorted(known.items()))
+
+
+def _with_companions(job: Job, roles: Mapping[str, str]) -> dict[str, str]:
     known = dict(roles)
     stem = job.image.stem
     for entry in os.scandir(job.image.parent) if isinstance(job.image, Path) else ():
@@ -165,7 +170,7 @@ def _states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:
         belongs = rest != entry.name and rest[:1] in ("_", ".", "-") and entry.path not in known
         if belongs and entry.is_file() and entry.stat().st_size <= _COMPANION_BYTES:
             known[entry.path] = "companion"
-    return tuple(FileState.of(role, Path(path), _digests) for path, role in sorted(known.items()))
+    return known
 
 
 def _restated(outputs: Sequence[FileState], folder: Path) -> tuple[FileState, ...]:
@@ -290,7 +295,7 @@ def list_scenes(config: str | os.PathLike[str] | Plan) -> list[dict[str, Any]]:
         record = Record.read(job.record)
         state = "new" if record is None else record.status
         if state == "done" and record is not None and not _untouched(record, job, listings):
-            state = "changed"
+            state = "done" if _reads_the_same(record, job) else "changed"
         listed.append({"name": job.name, "image": str(job.image), "state": state})
     return listed
 
@@ -468,10 +473,28 @@ def _outcome(job: Job, future: Future[Outcome]) -> Outcome:
 
 def _untouched(record: Record, job: Job, listings: dict[Path, list[str]]) -> bool:
     """Tell whether nothing that a scene depends on has another size, date or neighbour than when it was made."""
+    return _files_untouched(record, job) and record.siblings == siblings(_folders(job), listings)
+
+
+def _files_untouched(record: Record, job: Job) -> bool:
     return (
         record.status == "done"
         and all(one.untouched() for one in record.inputs)
         and all(one.untouched(job.folder) for one in record.outputs)
-        and record.siblings == siblings(_folders(job), listings)
         and record.key == key_of(record.inputs, job.configuration, job.versions)
     )
+
+
+def _reads_the_same(record: Record, job: Job) -> bool:
+    """Tell whether a scene among other neighbours than before would be made from the same files."""
+    if not _files_untouched(record, job):
+        return False
+    try:
+        with confined(job.output):
+            found = inputs.files_read(
+                job.image, job.scene, job.points, job.surface, job.match, fill_from=job.ortho.fill_from
+            )
+    except OrthoError:
+        return False
+    known = {one.path for one in record.inputs}
+    return set(_with_companions(job, {str(path): role for path, role in found.items()})) <= known

@@ -402,6 +402,11 @@ def test_everything_once(block):
     assert block.digests() == before
     assert times == {path: path.stat().st_mtime_ns for path in block.out.rglob("*ortho.tif")}
     assert [scene["state"] for scene in batch.list_scenes(block.file)] == ["done"] * 3
+    # Another file in their folder changes nothing, one that belongs to an image does.
+    (block.folder / "raw" / "notes.txt").write_text("cloudy")
+    assert [scene["state"] for scene in batch.list_scenes(block.file)] == ["done"] * 3
+    (block.folder / "raw" / "s1.tif.aux.xml").write_text("<PAMDataset/>")
+    assert [scene["state"] for scene in batch.list_scenes(block.file)] == ["done", "changed", "done"]
 
 
 def _touch(block: Block) -> None:

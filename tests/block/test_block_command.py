@@ -248,7 +248,7 @@ def test_the_report_is_one_page_in_both_lights(stereo: Stereo, tmp_path: Path) -
     # The network of the images, and a card of each with its picture.
     assert page.count('data-plot="network"') == 1
     assert page.count('src="data:image/png;base64,') == 2
-    assert "aft_BAND – fore_BAND: 30 points in common, rays" in page
+    assert '<tr><td>aft_BAND</td><td>fore_BAND</td><td class="n">30</td>' in page
     assert "Fit for maps of 1 :" in page
     network = report["network"]
     assert [(one["first"], one["second"], one["points"]) for one in network["pairs"]] == [("aft_BAND", "fore_BAND", 30)]
