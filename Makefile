@@ -5,6 +5,7 @@
 #   make test-all the same with those marked slow
 #   make faults   commands limited, killed, cut off: no broken or mixed outputs (N=400 write limits, 3/4 as many kills)
 #   make check    formatting, lint, types, tests
+#   make page-types  the types of the scripts of `ortho measure`, by TypeScript (npx fetches it)
 #   make fuzz     read damaged files with every reader (N=100000 of each, READER=name for one, KEEP=folder for results)
 #   make bench    speed and memory against gdalwarp, speed of adjustments and of many scenes
 #   make packages build sdist and wheel, install and try both in clean environments (PYTHONS=python3.12=wheel, more)
@@ -31,7 +32,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all faults check fuzz bench packages docs images clean
+.PHONY: help setup demo test test-all faults check page-types fuzz bench packages docs images clean
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
@@ -68,6 +69,9 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(PYTEST) -m "not slow"
+
+page-types:
+	@npx --yes -p typescript@5.9 tsc -p tests/measure/types
 
 fuzz: setup
 	@$(BIN)/python tests/attack/fuzz.py -n $(N) -j $(WORKERS) $(addprefix --reader ,$(READER)) $(addprefix --keep ,$(KEEP))

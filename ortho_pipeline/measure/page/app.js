@@ -2,16 +2,21 @@
 import { Table } from './table.js';
 import { PANES, Views, geometryOf } from './views.js';
 
+/** An element of the page, of whatever kind: that it is there is a test's. @type {(id: string) => any} */
 const $ = (id) => document.getElementById(id);
 const windowName = crypto.randomUUID();
-let facts, state, views, table;
-let selected = null;
-let pending = null; // {image, ground, shown, ...}: the point under way
+/** @type {Facts} */ let facts;
+/** @type {State} */ let state;
+/** @type {Views} */ let views;
+/** @type {Table} */ let table;
+/** @type {string|null} */ let selected = null;
+/** The point under way. @type {Pending|null} */ let pending = null;
 let skipped = 0; // places that were offered and passed over
 let turn = 0; // answers to requests that something newer overtook are not shown
-const looks = {}; // of each view: bands and contrast
+/** Of each view: bands and contrast. @type {{[view: string]: Look}} */ const looks = {};
 const compared = { flicker: false, difference: false, swipe: 0 };
 
+/** @template {keyof Answers} W @param {W} what @param {object} [given] @returns {Promise<Answers[W]>} */
 async function ask(what, given = {}) {
   const response = await fetch(`api/${what}`, { method: 'POST', headers: { 'content-type': 'application/json' }, body: JSON.stringify({ window: windowName, ...given }) });
   const answer = await response.json().catch(() => ({ error: { message: `the server answers ${response.status}` } }));
@@ -25,10 +30,10 @@ function say(text, bad = false) {
   $('said').className = bad ? 'bad' : '';
 }
 
-/** Run what may fail, and say so where it does. */
+/** Run what may fail, and say so where it does. @template {any[]} G, T @param {(...given: G) => Promise<T>} work @returns {(...given: G) => Promise<T|undefined>} */
 const safely = (work) => async (...given) => {
   try { return await work(...given); } catch (error) {
-    say(error instanceof TypeError ? 'The server does not answer: nothing that was accepted is lost. Start ortho measure again.' : error.message, true);
+    say(error instanceof TypeError ? 'The server does not answer: nothing that was accepted is lost. Start ortho measure again.' : String(error instanceof Error ? error.message : error), true);
     return undefined;
   }
 };
@@ -85,8 +90,8 @@ function show(next) {
   const rendered = state && state.version !== next.version;
   state = next;
   const { headline } = state;
-  const figures = [[headline.px, 'px'], [headline.m, 'm']].filter(([value]) => value !== null);
-  $('figure').textContent = figures.map(([value, unit]) => `${value.toFixed(3)} ${unit}`).join(', ') || 'Not tested';
+  const figures = [headline.px === null ? '' : `${headline.px.toFixed(3)} px`, headline.m === null ? '' : `${headline.m.toFixed(3)} m`];
+  $('figure').textContent = figures.filter(Boolean).join(', ') || 'Not tested';
   $('what').textContent = state.error ? `${headline.what}: ${state.error}` : headline.what;
   $('undo').disabled = !state.undo || !facts.writes;
   $('redo').disabled = !state.redo || !facts.writes;
@@ -115,7 +120,7 @@ function tellNext() {
 }
 
 function fill() {
-  const mark = pending ?? {};
+  const mark = pending ?? /** @type {Partial<Pending>} */ ({});
   $('name').value = mark.id ?? '';
   $('role').value = mark.role ?? (facts.labels ? $('role').value : 'control');
   $('sigma').value = mark.sigma_image ?? '';
@@ -137,7 +142,7 @@ function freeName() {
 }
 
 function begin() {
-  pending ??= { id: freeName(), role: $('role').value || 'control', how: 'manual', ground_from: null, sigma_xy: 0, sigma_h: 0, note: '', rays: {}, first: null };
+  pending ??= { id: freeName(), role: $('role').value || 'control', off: false, ground: null, how: 'manual', ground_from: null, sigma_xy: 0, sigma_h: 0, note: '', rays: {}, first: null };
 }
 
 function cancel() {
@@ -423,7 +428,7 @@ const makeOrtho = safely(async () => {
     $('ortho-done').hidden = false;
   } catch (error) {
     $('ortho-share').hidden = true;
-    $('ortho-said').textContent = error.message;
+    $('ortho-said').textContent = error instanceof Error ? error.message : String(error);
     throw error;
   } finally { making = false; }
 });
@@ -497,8 +502,11 @@ function bandChoices(pane) {
   const select = $(`${pane}-bands`);
   const name = views.shows[pane];
   const count = facts.bands[name];
-  const offered = [[[0], count > 1 ? 'mean' : '1'], ...(count >= 3 ? [[[1, 2, 3], '1, 2, 3'], [[3, 2, 1], '3, 2, 1']] : []),
-    ...(count > 1 ? Array.from({ length: count }, (_, index) => [[index + 1], String(index + 1)]) : [])];
+  /** @type {(...bands: number[]) => [number[], string]} */
+  const together = (...bands) => [bands, bands.join(', ')];
+  /** @type {[number[], string][]} */
+  const offered = [[[0], count > 1 ? 'mean' : '1'], ...(count >= 3 ? [together(1, 2, 3), together(3, 2, 1)] : []),
+    ...(count > 1 ? Array.from({ length: count }, (_, index) => together(index + 1)) : [])];
   select.replaceChildren(...offered.map(([, title]) => new Option(title)));
   select.selectedIndex = Math.max(0, offered.findIndex(([bands]) => String(bands) === String(look(name).bands)));
   select.onchange = () => { looks[name] = { bands: offered[select.selectedIndex][0], limits: null }; safely(showTiles)([name]); };

@@ -2,6 +2,9 @@
 
 const number = (value, digits = 3) => (value === null || value === undefined ? '–' : value.toFixed(digits).replace(/^-(0\.?0*)$/, '$1'));
 const length = (pair) => (pair ? Math.hypot(...pair) : null);
+/** A heading, what it sorts by, and what a cell shows. @typedef {[string, (mark: Shown) => string|number|null, (mark: Shown) => string]} Column */
+
+/** @type {Column[]} */
 const ONE = [
   ['Point', (mark) => mark.id, (mark) => mark.id],
   ['Role', (mark) => mark.role, (mark) => (mark.off ? `${mark.role}, off` : mark.role)],
@@ -23,6 +26,7 @@ function counted(mark) {
 }
 const longest = (of) => { const found = Object.values(of ?? {}).map(length).filter((value) => value !== null); return found.length ? Math.max(...found) : null; };
 const plan = (values) => (values && values[0] !== null && values[1] !== null ? Math.hypot(values[0], values[1]) : null);
+/** @type {Column[]} */
 const SEVERAL = [
   ['Point', (mark) => mark.id, (mark) => mark.id],
   ['Role', (mark) => mark.role, (mark) => (mark.off ? `${mark.role}, off` : mark.role)],
@@ -57,6 +61,7 @@ export class Table {
     table.tHead.replaceChildren(row);
   }
 
+  /** @param {Shown[]} marks @param {string|null} selected */
   draw(marks, selected) {
     this.marks = marks;
     this.selected = selected;
@@ -64,8 +69,8 @@ export class Table {
     const size = (mark) => { const value = key(mark); return typeof value === 'number' ? Math.abs(value) : value; };
     const sorted = [...marks].sort((one, other) => {
       const [first, second] = [size(one), size(other)];
-      if (first === null || second === null) return (first === null) - (second === null);
-      const order = typeof first === 'number' ? first - second : String(first).localeCompare(String(second), undefined, { numeric: true });
+      if (first === null || second === null) return Number(first === null) - Number(second === null);
+      const order = typeof first === 'number' && typeof second === 'number' ? first - second : String(first).localeCompare(String(second), undefined, { numeric: true });
       return this.down ? -order : order;
     });
     this.order = sorted.map((mark) => mark.id);

@@ -5,7 +5,9 @@
 
 const SHAPES = { control: 3, check: 0, tie: 4 };
 const COLOURS = { control: '#ffb000', check: '#35c3ff', tie: '#8be04e' };
+/** @param {Pair} place */
 const at = ([column, row]) => [column, -row];
+/** @param {Pair} place */
 export const pixel = ([x, y]) => [x, -y];
 /** Which geometry a view is in. */
 export const geometryOf = (name) => name.replace(/^reference-/, 'scene-');
@@ -48,7 +50,7 @@ const NEXT = new ol.style.Style({ image: new ol.style.Circle({ radius: 16, strok
 
 export class Views {
   /**
-   * @param {{images: {size: number[]}[], maps: {size: number[]}[], tile: number}} facts
+   * @param {Facts} facts
    * @param {{clicked: (pane: string, place: number[], hit: string|null) => void, dragged: (pane: string, id: string, place: number[]) => void,
    *   linked: (at: string, to: string, place: number[]) => Promise<{place: number[]|null, matrix: number[][]|null}|undefined>, zoomed: () => void}} told
    */

@@ -271,7 +271,7 @@ class _Given:
         from starlette.responses import JSONResponse, Response
 
         what = request.path_params["what"]
-        work = getattr(self._answers, what) if what in _ASKED else None
+        work = getattr(self._answers, what) if what in ASKED else None
         if work is None:
             return Response("refused\n", 404)
         try:
@@ -286,7 +286,8 @@ class _Given:
         return JSONResponse(done, headers={"cache-control": "no-store"})
 
 
-_ASKED = (
+#: What the page may ask: methods of `_Answers`.
+ASKED = (
     "begin", "leave", "act", "state", "predict", "link", "propose", "tie", "typed", "stretch", "compare", "save",
     "make", "made",
 )  # fmt: skip

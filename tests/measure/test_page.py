@@ -1,0 +1,40 @@
+"""The page as text: what its scripts name is there, and their types hold."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+PAGE = Path(__file__).resolve().parents[2] / "ortho_pipeline/measure/page"
+SCRIPTS = {name: (PAGE / name).read_text(encoding="utf-8") for name in ("app.js", "views.js", "table.js")}
+
+
+def test_every_element_that_a_script_names_is_in_the_page() -> None:
+    elements = re.findall(r' id="([^"]+)"', (PAGE / "index.html").read_text(encoding="utf-8"))
+    assert len(elements) == len(set(elements))
+    named = {name for text in SCRIPTS.values() for name in re.findall(r"\$\('([\w-]+)'\)", text)}
+    assert named <= set(elements)
+    assert len(named) > 40
+
+
+def test_everything_that_the_page_asks_is_answered() -> None:
+    from ortho_pipeline.measure.serving.server import ASKED
+
+    asked = {name for text in SCRIPTS.values() for name in re.findall(r"ask(?:\)\()?\(?'(\w+)'", text)}
+    assert asked <= set(ASKED)
+    assert {"begin", "act", "tie", "compare", "make"} <= asked
+
+
+@pytest.mark.slow
+def test_the_types_of_the_scripts_hold(tmp_path: Path) -> None:
+    """TypeScript checks the JSDoc comments, if it is on this machine; `make page-types` fetches it."""
+    tsc = shutil.which("tsc")
+    if tsc is None:
+        pytest.skip("there is no TypeScript (tsc) on this machine")
+    project = Path(__file__).parent / "types"
+    found = subprocess.run([tsc, "-p", str(project)], capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stdout
