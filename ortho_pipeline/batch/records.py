@@ -24,6 +24,7 @@ import pydantic
 
 from ortho_pipeline import files
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.folders import listing
 
 SCHEMA_VERSION = 1
 DOCUMENT = "ortho-pipeline scene record"
@@ -143,13 +144,13 @@ def key_of(inputs: Sequence[FileState], configuration: Mapping[str, Any], versio
     return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
-def siblings(paths: Sequence[str | os.PathLike[str]], cache: dict[Path, list[str]] | None = None) -> str:
+def siblings(paths: Sequence[str | os.PathLike[str]], cache: dict[Path, Sequence[str]] | None = None) -> str:
     """Return a digest of the names in the folders of some files; `cache` holds listings of this run."""
-    listed: dict[Path, list[str]] = {} if cache is None else cache
+    listed: dict[Path, Sequence[str]] = {} if cache is None else cache
     digest = hashlib.sha256()
     for folder in sorted({Path(path).parent for path in paths}):
         if folder not in listed:
-            listed[folder] = sorted(entry.name for entry in os.scandir(folder)) if folder.is_dir() else []
+            listed[folder] = listing(folder).names if folder.is_dir() else ()
         digest.update("\0".join([str(folder), *listed[folder], ""]).encode(errors="surrogateescape"))
     return digest.hexdigest()
 

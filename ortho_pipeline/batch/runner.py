@@ -29,6 +29,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.mosaic.assembly import assemble
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
+from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import is_far
 from ortho_pipeline.report.page.run import write_run_page
 from ortho_pipeline.report.stac import write_catalog
@@ -165,11 +166,11 @@ def _states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:
 def _with_companions(job: Job, roles: Mapping[str, str]) -> dict[str, str]:
     known = dict(roles)
     stem = job.image.stem
-    for entry in os.scandir(job.image.parent) if isinstance(job.image, Path) else ():
-        rest = entry.name.removeprefix(stem)
-        belongs = rest != entry.name and rest[:1] in ("_", ".", "-") and entry.path not in known
-        if belongs and entry.is_file() and entry.stat().st_size <= _COMPANION_BYTES:
-            known[entry.path] = "companion"
+    for name in listing(job.image.parent).beginning(stem) if isinstance(job.image, Path) else ():
+        path, rest = job.image.parent / name, name.removeprefix(stem)
+        belongs = rest != name and rest[:1] in ("_", ".", "-") and str(path) not in known
+        if belongs and path.is_file() and path.stat().st_size <= _COMPANION_BYTES:
+            known[str(path)] = "companion"
     return known
 
 
@@ -277,8 +278,8 @@ def run(
 def _refuse_unshared(planned: Plan) -> None:
     if planned.mosaic is not None:
         raise InputError(
-            "a mosaic is made of orthos in a folder, not in a store of objects", file=planned.path, field="mosaic",
-            remedy="take it out of the file, and make it of the orthos with `ortho mosaic`",
+            "workers that share a store make no mosaic", file=planned.path, field="mosaic",
+            remedy="take it out of the file, and make it of the orthos with `ortho mosaic` afterwards",
         )  # fmt: skip
 
 
@@ -289,7 +290,7 @@ def _run_id() -> str:
 def list_scenes(config: str | os.PathLike[str] | Plan) -> list[dict[str, Any]]:
     """Return name, image and state (new, started, done, changed, failed) of each scene, without making any."""
     planned = config if isinstance(config, Plan) else plan(config)
-    listings: dict[Path, list[str]] = {}
+    listings: dict[Path, Sequence[str]] = {}
     listed = []
     for job in planned.jobs:
         record = Record.read(job.record)
@@ -363,7 +364,7 @@ class _Run:
         """Yield the jobs that dates and sizes alone do not show to be done."""
         # A run that was killed just after it wrote a record leaves the lock of that.
         left = any(name.endswith(".part") for name in os.listdir(self.planned.output / STATE))
-        listings: dict[Path, list[str]] = {}
+        listings: dict[Path, Sequence[str]] = {}
         for job in jobs:
             record = None if self.verify else Record.read(job.record)
             if record is not None and _untouched(record, job, listings):
@@ -390,7 +391,7 @@ class _Run:
         if not self.part:
             files |= {kind: self.planned.output / RUN_FILES[kind] for kind in ("summary", "index")}
         if made is not None and "file" in made:
-            files |= {"mosaic": Path(made["file"]), "seams": self.planned.output / RUN_FILES["seams"],
+            files |= {"mosaic": self.planned.output / made["file"], "seams": self.planned.output / RUN_FILES["seams"],
                       "mosaic page": self.planned.output / RUN_FILES["page"]}  # fmt: skip
         result = BatchResult(ordered, files, time.monotonic() - self.begin, made)
         if not self.part:
@@ -471,7 +472,7 @@ def _outcome(job: Job, future: Future[Outcome]) -> Outcome:
     return future.result() if error is None else Outcome(job.name, "failed", error=error_document(error))
 
 
-def _untouched(record: Record, job: Job, listings: dict[Path, list[str]]) -> bool:
+def _untouched(record: Record, job: Job, listings: dict[Path, Sequence[str]]) -> bool:
     """Tell whether nothing that a scene depends on has another size, date or neighbour than when it was made."""
     return _files_untouched(record, job) and record.siblings == siblings(_folders(job), listings)
 

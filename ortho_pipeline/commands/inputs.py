@@ -8,12 +8,12 @@ import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import pyproj
 
+import ortho_pipeline
 from ortho_pipeline import plugins
 from ortho_pipeline.commands.heights.surfaces import dem_files, sigma_file
 from ortho_pipeline.errors import InputError, OrthoError
@@ -350,7 +350,7 @@ def provenance(
         "surface": None if surface is None else dict(surface.provenance),
         "options": {name: _as_asked(value) for name, value in asked.items()},
         "software": {
-            "ortho-pipeline": metadata.version("ortho-pipeline"),
+            "ortho-pipeline": ortho_pipeline.__version__,
             "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
             "proj": pyproj.proj_version_str,
         },

@@ -26,6 +26,7 @@ from ortho_pipeline.exchange.rpc_files import (
     write_rpc_txt,
 )
 from ortho_pipeline.exchange.rpc_fit import RpcExport, box_grid, domain_box, fit_rpc
+from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import VsiPath, place
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
@@ -149,7 +150,8 @@ def _unreadable_beside(path: Path) -> list[str]:
     """Return the names of files that ought to hold the RPC of an image, by their names."""
     if not path.parent.is_dir():
         return []
-    return sorted(file.name for file in path.parent.iterdir() if file.stem.startswith(path.stem) and _is_rpc_file(file))
+    beside = (path.parent / name for name in listing(path.parent).beginning(path.stem))
+    return sorted(file.name for file in beside if file.stem.startswith(path.stem) and _is_rpc_file(file))
 
 
 def _own_fields(dataset: gdal.Dataset) -> dict[str, str]:

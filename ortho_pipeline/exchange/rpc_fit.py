@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import math
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ import numpy as np
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.geodesy.crs import GroundTransform
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.rational import RPC, rpc_terms
 from ortho_pipeline.models.rpc_box import has_pole
@@ -143,7 +142,7 @@ def _samples(
 ) -> tuple[Array, Array]:
     ground = box_grid(box, height_range, grid)
     with np.errstate(all="ignore"):
-        image = model.ground_to_image(_transform("EPSG:4979", model.crs)(ground))
+        image = model.ground_to_image(ground_transform("EPSG:4979", model.crs)(ground))
     good = np.isfinite(image).all(axis=1)
     if good.mean() < 0.5:
         raise InputError(
@@ -152,11 +151,6 @@ def _samples(
             remedy="give a box within the scene",
         )
     return ground[good], image[good]
-
-
-@functools.lru_cache(maxsize=8)
-def _transform(source: str, target: str) -> GroundTransform:
-    return GroundTransform(source, target)
 
 
 def _centre_and_half(box: tuple[float, float, float, float], height_range: tuple[float, float]) -> tuple[Array, Array]:
@@ -180,7 +174,7 @@ def domain_box(model: SensorModel) -> tuple[tuple[float, float, float, float], t
     """Return the domain of a model as a box in longitude and latitude, and its heights."""
     centre, half = model.domain
     signs = np.stack(np.meshgrid(*[(-1.0, 0.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    ground = _transform(model.crs, "EPSG:4979")(centre + signs * half)
+    ground = ground_transform(model.crs, "EPSG:4979")(centre + signs * half)
     # Unwrapped about the middle: a scene across the antimeridian is one box.
     lon = ground[13, 0] + np.remainder(ground[:, 0] - ground[13, 0] + 180.0, 360.0) - 180.0
     lat = ground[:, 1]

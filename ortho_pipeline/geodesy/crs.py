@@ -479,9 +479,13 @@ def _warn_of_better(used: Transformer, source: pyproj.CRS, target: pyproj.CRS, s
         )
 
 
-@functools.lru_cache(maxsize=64)
 def ground_transform(source: str | pyproj.CRS, target: str | pyproj.CRS) -> GroundTransform:
-    """Return a `GroundTransform`, the same one for the same pair."""
+    """Return a `GroundTransform`, the same one for the same pair: PROJ takes ten milliseconds to make one."""
+    return _ground_transform(*(one if isinstance(one, str) else one.srs for one in (source, target)))
+
+
+@functools.lru_cache(maxsize=64)  # by the texts that systems are made of: a CRS writes its WKT to be hashed
+def _ground_transform(source: str, target: str) -> GroundTransform:
     return GroundTransform(source, target)
 
 

@@ -24,6 +24,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.beside import ask_beside
+from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, VsiPath, in_local_archive, network_is_closed, place, within
 from ortho_pipeline.raster.references import NAMES_OF, PLAIN_VRT, Named
 
@@ -116,7 +117,6 @@ class _Gate:
             self._roots = [folder.resolve() for folder in (*folders, *map(Path, roots))]
         self._seen: set[str] = set()
         self.block = DecodedUnit(0, os.fspath(path))
-        self._folders: dict[str, list[str]] = {}
 
     def open(self, path: AnyPath, drivers: Sequence[str], siblings: bool = True) -> gdal.Dataset:
         """Open a file that the user named, with the files that it leads to seen."""
@@ -177,14 +177,14 @@ class _Gate:
 
     def _see_folder(self, folder: Any) -> None:
         """See to the product in a folder that the user named."""
-        for name in self._names(folder):
+        for name in listing(folder).names:
             if re.fullmatch(r"metadata\.dim|vol_.*\.xml", name.lower()):
                 self._must_be_inside(folder / name, folder, name)
                 self._see_named(folder / name, "DIMAP", frozenset())
 
     def _product_in(self, folder: Any) -> Any:
         """Return the DIMAP 2 metadata in a folder, which GDAL does not look for; None where it finds its own."""
-        names = [name for name in self._names(folder) if re.fullmatch(r"(dim_|vol_|metadata\.dim).*", name.lower())]
+        names = [name for name in listing(folder).names if re.match(r"(dim_|vol_|metadata\.dim)", name.lower())]
         found = [name for name in names if re.fullmatch(r"dim_.*\.xml", name.lower())]
         if len(found) > 1:
             raise InputError(
@@ -196,9 +196,9 @@ class _Gate:
     def _see_side_cars(self, path: Any) -> None:
         """See to what GDAL takes up as overviews and masks because of its name."""
         name, stem = path.name.lower(), path.stem.lower()
-        for other in self._names(path.parent, path.name):
+        for other in self._beside(path):
             lower = other.lower()
-            if not lower.startswith(stem) or lower == name:
+            if lower == name:
                 continue
             rest = lower.removeprefix(name) if lower.startswith(name) else lower.removeprefix(stem)
             if rest == ".aux.xml":
@@ -272,16 +272,14 @@ class _Gate:
             file=by, field=field, remedy=_OUTSIDE.format(root=root),
         )  # fmt: skip
 
-    def _names(self, folder: Any, image: str = "") -> list[str]:
-        """Return the names of the files in a folder; behind a URL, those of the side-cars that are there."""
-        key = str(folder)
-        if isinstance(folder, VsiPath) and not (in_local_archive(key) and folder.is_dir()):
-            endings = (".ovr", ".msk", ".aux", ".aux.xml")
-            return [image + ending for ending in endings if (folder / (image + ending)).exists()]
-        if key not in self._folders:
-            names = (one.name for one in folder.iterdir()) if isinstance(folder, VsiPath) else os.listdir(folder)
-            self._folders[key] = list(names)
-        return self._folders[key]
+    @staticmethod
+    def _beside(path: Any) -> list[str]:
+        """Return the names beside a file that begin as its own; behind a URL, those of the side-cars that are there."""
+        folder = path.parent
+        if isinstance(folder, VsiPath) and not (in_local_archive(str(folder)) and folder.is_dir()):
+            names = (path.name + ending for ending in (".ovr", ".msk", ".aux", ".aux.xml"))
+            return [name for name in names if (folder / name).exists()]
+        return listing(folder).beginning(path.stem)
 
     # -- what GDAL tells ---------------------------------------------------------------------------------------------
 

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files.locations import VsiPath, archive_of, check_path, in_local_archive, located, members
+from ortho_pipeline.files.folders import listing
+from ortho_pipeline.files.locations import AnyPath, VsiPath, archive_of, check_path, in_local_archive, located, members
 from ortho_pipeline.files.process_limits import require_memory
 from ortho_pipeline.options import PIXEL_TYPES
 from ortho_pipeline.raster.block_cache import keep_blocks
@@ -41,8 +42,6 @@ MEMORY = 512_000_000
 #: Endings of files beside an image that GDAL's readers of metadata look for.
 _SIDE_CARS = (".xml", ".txt", ".imd", ".rpb", ".pvl", ".met", ".att", ".eph", ".tfw", ".wld", ".prj", ".hdr", ".ovr",
               ".msk", ".rpc", ".dim")  # fmt: skip
-
-
 _WHOLE = "give a whole raster of a format that GDAL reads ('ortho doctor' lists the allowed ones); copy it again"
 
 
@@ -142,20 +141,18 @@ def _opened(
 def _refuse_pipes(path: Path) -> None:
     """Refuse an image beside whose metadata or side-cars lies a pipe or a device: GDAL would wait for it for ever."""
     folder = path if path.is_dir() else path.parent
-    with contextlib.suppress(OSError), os.scandir(folder) as entries:
-        for entry in entries:
-            related = path.stem in entry.name or Path(entry.name).suffix.lower() in _SIDE_CARS
-            if related and not entry.is_file() and not entry.is_dir() and entry.name != path.name:
-                try:
-                    kind = stat.S_IFMT(entry.stat().st_mode)
-                except OSError:
-                    # A link that leads nowhere: there is nothing to read.
-                    continue
-                if kind in (stat.S_IFIFO, stat.S_IFCHR, stat.S_IFBLK):
-                    raise InputError(
-                        "a pipe or a device lies beside this image where its metadata would be", file=path,
-                        field=entry.name, remedy="remove it",
-                    )  # fmt: skip
+    with contextlib.suppress(OSError):
+        for name in listing(folder).special:
+            related = path.stem in name or os.path.splitext(name)[1].lower() in _SIDE_CARS
+            kind = 0
+            if related and name != path.name:
+                with contextlib.suppress(OSError):  # a link that leads nowhere: there is nothing to read
+                    kind = stat.S_IFMT(os.stat(folder / name).st_mode)
+            if kind in (stat.S_IFIFO, stat.S_IFCHR, stat.S_IFBLK):
+                raise InputError(
+                    "a pipe or a device lies beside this image where its metadata would be", file=path,
+                    field=name, remedy="remove it",
+                )  # fmt: skip
 
 
 def _check_size(dataset: gdal.Dataset, name: str) -> None:
@@ -255,6 +252,8 @@ class _RasterFile:
         self, path: str | os.PathLike[str], access: Mapping[str, Any], numbers: Sequence[int] | None = None
     ) -> None:
         self.path = os.fspath(path)
+        # A place that is no file of this machine was allowed when it was located; its name alone is not.
+        self.place = path if isinstance(path, VsiPath) else self.path
         self._access = access
         self._local = threading.local()
         dataset = self.dataset
@@ -291,7 +290,7 @@ class _RasterFile:
     def dataset(self) -> gdal.Dataset:
         """The GDAL dataset of the calling thread."""
         if not hasattr(self._local, "dataset"):
-            self._local.dataset, self.block = open_pixels(self.path, **self._access)
+            self._local.dataset, self.block = open_pixels(self.place, **self._access)
         return self._local.dataset
 
     @property
@@ -400,10 +399,10 @@ class RasterSource:
         kinds = {file.validity for file in self._files}
         self.validity = kinds.pop() if len(kinds) == 1 else "mask"
 
-    def _chosen(self, bands: Sequence[int]) -> list[tuple[str, list[int]]]:
+    def _chosen(self, bands: Sequence[int]) -> list[tuple[AnyPath, list[int]]]:
         """Return the files, in the order wanted, with the numbers of their bands; a file may come twice."""
-        places = [(file.path, number) for file in self._files for number in file.numbers]
-        chosen: list[tuple[str, list[int]]] = []
+        places = [(file.place, number) for file in self._files for number in file.numbers]
+        chosen: list[tuple[AnyPath, list[int]]] = []
         for band in bands:
             if not 1 <= band <= len(places):
                 raise InputError(

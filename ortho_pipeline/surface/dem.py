@@ -233,7 +233,10 @@ class DemSurface(Surface):
 
     def heights(self, xy: ArrayLike, crs: str | pyproj.CRS | None = None) -> Array:
         """Return heights ``(N,)`` at positions ``(N, 2)``: see `Surface.heights`."""
-        u, v = self._places(xy, crs)
+        return self.heights_at(*self._places(xy, crs))
+
+    def heights_at(self, u: Array, v: Array) -> Array:
+        """Return heights ``(N,)`` at sample coordinates, by the same rules."""
         out = self._interpolated(u, v, filled=False)
         if self.fill in ("error", "mask"):
             return out
@@ -271,11 +274,12 @@ class DemSurface(Surface):
         rows, columns = self.shape
         with np.errstate(invalid="ignore"):
             index = np.flatnonzero((u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1))
-        tiles = np.stack([v[index] // TILE, u[index] // TILE], axis=1).astype(int)
-        unique, member = np.unique(tiles, axis=0, return_inverse=True)
-        order = np.argsort(member.ravel(), kind="stable")
-        ends = np.cumsum(np.bincount(member.ravel(), minlength=len(unique)))
-        for (row, column), these in zip(unique.tolist(), np.split(index[order], ends[:-1]), strict=False):
+        across = columns // TILE + 1
+        tiles = (v[index] // TILE).astype(int) * across + (u[index] // TILE).astype(int)
+        order = np.argsort(tiles, kind="stable")
+        unique, first = np.unique(tiles[order], return_index=True)
+        for number, these in zip(unique.tolist(), np.split(index[order], first[1:]), strict=False):
+            row, column = divmod(number, across)
             # One sample more than the step, for the neighbours of the last ones.
             window = column * TILE, row * TILE, TILE + 1, TILE + 1
             tile = self._tiles.get((row, column, filled), functools.partial(self._window, *window, filled))

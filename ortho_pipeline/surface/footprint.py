@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import share
 from ortho_pipeline.errors import CoverageError, InputError, counted
-from ortho_pipeline.geodesy.crs import GroundTransform, ground_transform, utm_crs
+from ortho_pipeline.geodesy.crs import ground_transform, utm_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
@@ -359,7 +359,7 @@ def choose_grid(
     step = (resolution, resolution) if isinstance(resolution, int | float) else (resolution[0], resolution[1])
     if extent is not None:
         return Grid.of_extent(crs, extent, step, align=align)
-    ground = _continuous(GroundTransform(model.crs, crs)(found.reach), crs)
+    ground = _continuous(ground_transform(model.crs, crs)(found.reach), crs)
     if not np.isfinite(ground).any():
         raise InputError(
             f"the scene does not lie in the domain of {crs.name!r}", field="output.crs", remedy="choose another CRS"
@@ -378,7 +378,7 @@ def scene_pixels(model: SensorModel, found: Footprint, grid: Grid) -> float:
     """
     import shapely
 
-    ground = _continuous(GroundTransform(model.crs, grid.crs)(found.reach), grid.crs)
+    ground = _continuous(ground_transform(model.crs, grid.crs)(found.reach), grid.crs)
     ground = ground[np.isfinite(ground).all(axis=1), :2]
     xmin, ymin, xmax, ymax = grid.extent
     if grid.crs.is_geographic and len(ground):

@@ -1,8 +1,9 @@
 """Where the rays of image points meet a surface.
 
-Few points are followed one step after the other with the exact model. Many points share a lattice over the image that
-gives DEM coordinates as polynomials in height, verified against the exact model; compiled code marches along it, and
-the exact model has the last word: it gives the ground point at the height found.
+The ray of each of a few points is a parabola in height through three exact positions; where what it finds is not on the
+terrain by the exact model, that is followed step by step. Many points share a lattice over the image that gives DEM
+coordinates as polynomials in height, verified against the exact model; compiled code marches along it. The exact model
+has the last word: it gives the ground point at the height found.
 """
 
 from __future__ import annotations
@@ -62,8 +63,19 @@ def meet_surface(model: SensorModel, image: ArrayLike, surface: Surface, *, tole
     # The window ends where the DEM does; a fill rule goes on beyond.
     many = len(image) >= MANY and surface.fill in ("error", "mask")
     height = _march_many(ray, window, low, high, tolerance) if many else None
-    if height is None:
-        height = _narrow(ray, *_bracket(ray, low, high), tolerance)
+    if height is not None:
+        return _ground_at(model, image, height)
+    curve = _Parabolas(ray, low, high)
+    ground = _ground_at(model, image, _narrow(curve, *_bracket(curve, low, high), tolerance / 2))
+    with np.errstate(invalid="ignore"):
+        left = np.flatnonzero(~(np.abs(ray.above(ground)) <= tolerance))
+    if len(left):
+        exact = _Ray(model, image[left], surface)
+        ground[left] = _ground_at(model, image[left], _narrow(exact, *_bracket(exact, low, high), tolerance))
+    return ground
+
+
+def _ground_at(model: SensorModel, image: Array, height: Array) -> Array:
     ground = model.image_to_ground(image, height)
     ground[np.isnan(height)] = np.nan
     return ground
@@ -98,17 +110,24 @@ class _Ray:
         self.low = np.array([column.min(initial=np.inf) for column in columns])
         self.high = np.array([column.max(initial=-np.inf) for column in columns])
 
-    def plan(self, index: NDArray[np.intp], height: Array) -> Array:
-        """Positions in the surface's CRS ``(n, 2)``."""
-        return self._transform(self.model.image_to_ground(self.image[index], height))[:, :2]
+    def places(self, index: NDArray[np.intp], height: Array) -> Array:
+        """Sample coordinates ``(n, 2)`` in the DEM of some of the points at heights."""
+        return self.samples(self.image[index], height)
 
     def samples(self, image: Array, height: Array) -> Array:
         """Sample coordinates ``(n, 2)`` in the DEM of image points at heights."""
-        return self.surface.samples_at(self._transform(self.model.image_to_ground(image, height))[:, :2])
+        return self._samples_of(self.model.image_to_ground(image, height))
+
+    def _samples_of(self, ground: Array) -> Array:
+        return self.surface.samples_at(self._transform(ground)[:, :2])
+
+    def above(self, ground: Array) -> Array:
+        """Height ``(n,)`` of ground points in the model's CRS above the terrain; NaN off the DEM."""
+        return ground[:, 2] - self.surface.heights_at(*self._samples_of(ground).T)
 
     def clearance(self, index: NDArray[np.intp], height: Array) -> Array:
         """Height of the ray above the terrain; NaN off the DEM."""
-        return height - self.surface.heights(self.plan(index, height))
+        return height - self.surface.heights_at(*self.places(index, height).T)
 
     def reach(self) -> tuple[tuple[int, int, int, int], tuple[float, float]] | None:
         """Samples (column, row, columns, rows) of the DEM that the rays may meet, and the range of heights there.
@@ -150,6 +169,21 @@ class _Ray:
         if (last - first < 2).any():
             return None
         return int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1])
+
+
+class _Parabolas(_Ray):
+    """The same, but for parabolas in height through three exact positions of each point."""
+
+    def __init__(self, ray: _Ray, low: float, high: float) -> None:
+        vars(self).update(vars(ray))
+        self._middle, self._half = (low + high) / 2, (high - low) / 2
+        heights = np.repeat([low, self._middle, high], len(ray.image))
+        below, self._at, above = ray.samples(np.tile(ray.image, (3, 1)), heights).reshape(3, -1, 2)
+        self._slope, self._bend = (above - below) / 2, (above + below) / 2 - self._at
+
+    def places(self, index: NDArray[np.intp], height: Array) -> Array:
+        t = ((height - self._middle) / self._half)[:, None]
+        return self._at[index] + t * (self._slope[index] + t * self._bend[index])
 
 
 def _march_many(
@@ -208,7 +242,7 @@ def _bracket(ray: _Ray, low: float, high: float) -> tuple[Array, Array]:
     """Return heights above and below the first intersection; NaN where there is none."""
     count = len(ray.image)
     every = np.arange(count)
-    ends = [ray.surface.samples_at(ray.plan(every, np.full(count, height))) for height in (low, high)]
+    ends = [ray.places(every, np.full(count, height)) for height in (low, high)]
     length = np.hypot(*(ends[1] - ends[0]).T)
     # A ray whose ends are not known (beyond the model) is still worth a try, at the pace of the others.
     typical = float(np.nanmax(length)) if np.isfinite(length).any() else 1.0

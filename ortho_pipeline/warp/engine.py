@@ -301,6 +301,10 @@ def _in_order(
 
     Threads begin work in the order in which it is handed to them: what a tile waits for has begun.
     """
+    if len(tiles) == 1 and not ahead:
+        # A thread of its own would open the files again, and ask PROJ for its transformations anew.
+        yield job.make(tiles[0])
+        return
     with ThreadPoolExecutor(threads, thread_name_prefix="warp") as pool:
         prepared = deque(pool.submit(job.prepare, tile) for tile in tiles[:ahead])
         pending: deque[Future[Any]] = deque()

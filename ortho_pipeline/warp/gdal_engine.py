@@ -33,7 +33,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.exchange.rpc_fit import REFUSE_ERROR, RpcExport
 from ortho_pipeline.files.process_limits import Resources
-from ortho_pipeline.geodesy.crs import GroundTransform, parse_crs
+from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
 from ortho_pipeline.raster.output import gdal_errors, written
@@ -121,7 +121,7 @@ class Exact:
         x, y = self.grid.xy(columns, rows)
         heights = self.surface.heights(np.column_stack([x, y]), self.grid.crs)
         return self.model.ground_to_image(
-            GroundTransform(self.grid.crs, self.model.crs)(np.column_stack([x, y, heights]))
+            ground_transform(self.grid.crs, self.model.crs)(np.column_stack([x, y, heights]))
         )
 
     def error(self, transformer: Transformer, image: gdal.Dataset) -> float:

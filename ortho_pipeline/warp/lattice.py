@@ -40,7 +40,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.errors import CoverageError
-from ortho_pipeline.geodesy.crs import GroundTransform
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface, Window
@@ -93,7 +93,7 @@ class _Exact:
 
     def __init__(self, model: SensorModel, surface: Surface, grid: Grid) -> None:
         self._model, self._grid = model, grid
-        self._to_model = GroundTransform(grid.crs, model.crs)
+        self._to_model = ground_transform(grid.crs, model.crs)
         self._samples = surface.sampler(grid.crs)
         self._flat = self._ignores_height()
 
@@ -110,7 +110,7 @@ class _Exact:
         steps = np.linspace(-1.0, 1.0, 33)
         x, y = np.meshgrid(centre[0] + half[0] * steps, centre[1] + half[1] * steps)
         box = np.stack([x.ravel(), y.ravel(), np.full(x.size, centre[2])], axis=1)
-        ground = GroundTransform(self._model.crs, self._grid.crs)(box)
+        ground = ground_transform(self._model.crs, self._grid.crs)(box)
         ground = ground[np.isfinite(ground).all(axis=1)]
         if not len(ground):
             return -np.inf, -np.inf, np.inf, np.inf

@@ -13,6 +13,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.csm import has_csm, read_csm
 from ortho_pipeline.exchange.rpc_files import read_rpc_text
 from ortho_pipeline.files import read_bounded
+from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models import SensorModel
@@ -44,11 +45,11 @@ def camera_of(name: str) -> Path | None:
         return None
     try:
         image = place(name)
-        names = {one.name.lower(): one for one in image.parent.iterdir()}
+        beside = listing(image.parent)
     except (OSError, ValueError, InputError):
         return None
-    found = (names.get(f"{image.stem}{ending}".lower()) for ending in ENDINGS)
-    return next((one for one in found if one is not None and one.is_file() and _kind(one)), None)
+    found = (image.parent / name for ending in ENDINGS for name in beside.named(f"{image.stem}{ending}"))
+    return next((one for one in found if one.is_file() and _kind(one)), None)
 
 
 def _kind(path: Path) -> str | None:

@@ -50,7 +50,9 @@ def recognises(dataset: gdal.Dataset) -> bool:
     """Tell whether an imaging survey lies beside the image."""
     try:
         # A dataset in memory has no name: ValueError.
-        return read_bounded(survey_of(dataset.GetDescription()), len(MARK)).startswith(MARK.encode())
+        survey = survey_of(dataset.GetDescription())
+        # A refusal of what is not there looks for names like it among all of its folder.
+        return survey.is_file() and read_bounded(survey, len(MARK)).startswith(MARK.encode())
     except (InputError, ValueError):
         return False
 

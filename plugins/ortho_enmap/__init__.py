@@ -20,6 +20,7 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.exchange.rpc_files import rpc_of_fields
 from ortho_pipeline.files import read_bounded
+from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.files.xml_fields import XmlFields
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
@@ -67,7 +68,7 @@ def metadata_of(name: str) -> tuple[Path, str] | None:
         return None
     try:
         wanted = f"{start}-METADATA.XML"
-        found = next((one for one in image.parent.iterdir() if one.name.upper() == wanted), None)
+        found = next((image.parent / one for one in listing(image.parent).named(wanted)), None)
     except (OSError, ValueError, InputError):
         return None
     return None if found is None else (found, detector)

@@ -14,6 +14,7 @@ from osgeo import gdal
 from ortho_ikonos.metadata import Component, Delivery, Placement, read_header
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.geodesy.crs import same_crs
 
@@ -55,9 +56,9 @@ class ImageFile:
 
     def others(self) -> Iterator[ImageFile]:
         """Yield the other images of the order, by name."""
-        for path in sorted(self.path.parent.iterdir()):
-            other = ImageFile.of(path)
-            if other is not None and path.name != self.path.name and other.order.lower() == self.order.lower():
+        for name in listing(self.path.parent).names:
+            other = ImageFile.of(self.path.parent / name)
+            if other is not None and name != self.path.name and other.order.lower() == self.order.lower():
                 yield other
 
 
@@ -66,7 +67,7 @@ def beside(path: Path, name: str) -> Path:
     exact = path.with_name(name)
     if exact.exists() or not path.parent.is_dir():
         return exact
-    return next((one for one in path.parent.iterdir() if one.name.lower() == name.lower()), exact)
+    return next((path.parent / one for one in listing(path.parent).named(name)), exact)
 
 
 def rpc_file(path: Path) -> Path | None:

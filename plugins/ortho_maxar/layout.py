@@ -10,6 +10,7 @@ from ortho_maxar.isd import Isd, Tile, read_isd_pushbroom
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded
+from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Piece
 from ortho_pipeline.models import RPC, SensorModel
@@ -24,6 +25,7 @@ _PART = re.compile(
 _SAME_RATE = 1e-4
 #: Bands whose pixels differ by less are registered in one image.
 _SAME_SCALE = 0.05
+_XML = re.compile(r".+\.xml$", re.IGNORECASE | re.DOTALL)
 
 
 def is_isd(path: Path) -> bool:
@@ -40,7 +42,7 @@ def metadata_of(name: str) -> Path | None:
         return None
     try:
         image = place(name)
-        beside = [one for one in sorted(image.parent.iterdir()) if one.suffix.lower() == ".xml"]
+        beside = [image.parent / one for one in listing(image.parent).matching(_XML)]
     except (OSError, ValueError, InputError):
         return None
     own = [one for one in beside if one.stem.lower() == image.stem.lower() and is_isd(one)]
@@ -132,8 +134,8 @@ def _of_other_bands(path: Path) -> Iterator[Path]:
         twin = folders[0].with_name(found[1] + ("MUL" if found[2].upper() == "PAN" else "PAN"))
         folders += [twin] if twin.is_dir() else []
     own = _PART.fullmatch(path.stem)
-    for one in (one for folder in folders for one in sorted(folder.iterdir()) if own):
-        other = _PART.fullmatch(one.stem) if one.suffix.lower() == ".xml" else None
+    for one in (folder / name for folder in folders for name in listing(folder).matching(_XML) if own):
+        other = _PART.fullmatch(one.stem)
         if own is None or other is None or other["kind"].lower() == own["kind"].lower():
             continue
         if all(other[name].lower() == own[name].lower() for name in ("order", "part")) and is_isd(one):
@@ -143,8 +145,8 @@ def _of_other_bands(path: Path) -> Iterator[Path]:
 def _other_parts(path: Path) -> Iterator[Path]:
     """Yield the ISD XML of the other parts of one order, by their names."""
     own = _PART.fullmatch(path.stem)
-    for one in sorted(path.parent.iterdir()) if own else ():
-        other = _PART.fullmatch(one.stem) if one.suffix.lower() == ".xml" else None
+    for one in (path.parent / name for name in listing(path.parent).matching(_XML)) if own else ():
+        other = _PART.fullmatch(one.stem)
         if own is None or other is None or other["part"] == own["part"]:
             continue
         if all(other[name].lower() == own[name].lower() for name in ("kind", "order")) and is_isd(one):
@@ -153,4 +155,4 @@ def _other_parts(path: Path) -> Iterator[Path]:
 
 def _file(image: Path, name: str) -> Path | None:
     """Return the file of this name beside an image, whatever the case of its letters."""
-    return next((one for one in sorted(image.parent.iterdir()) if one.name.lower() == name.lower()), None)
+    return next((image.parent / one for one in listing(image.parent).named(name)), None)

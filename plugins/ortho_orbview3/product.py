@@ -15,6 +15,7 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.exchange.rpc import read_rpc
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, rpc_of_fields
+from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.rational import RPC
@@ -100,7 +101,7 @@ def _beside(image: Path, end: str) -> Path | None:
         if exact.is_file():
             return exact
         # Archives that went through other systems come in capitals.
-        return next((path for path in sorted(image.parent.iterdir()) if path.name.lower() == wanted), None)
+        return next((image.parent / name for name in listing(image.parent).named(wanted)), None)
     except (OSError, ValueError):
         return None
 

@@ -6,6 +6,7 @@ strip are images of their own: `ortho adjust` takes them together.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,12 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.exchange.rpc import has_rpc, rpc_of_dataset
 from ortho_pipeline.files import read_bounded, read_json
+from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 
 MAX_SIZE = 5_000_000
+_METADATA = re.compile(r".*_metadata\.json$", re.IGNORECASE | re.DOTALL)
 _REMEDY = "download the item's metadata again"
 #: What of an item is worth showing, and what it is called here.
 _TEXTS = {"acquired": "acquired", "satellite_id": "satellite", "instrument": "instrument", "item_type": "item_type",
@@ -48,7 +51,7 @@ def metadata_of(name: str) -> Path | None:
         return None
     try:
         image = place(name)
-        found = [one for one in sorted(image.parent.iterdir()) if one.name.lower().endswith("_metadata.json")]
+        found = [image.parent / one for one in listing(image.parent).matching(_METADATA)]
     except (OSError, ValueError, InputError):
         return None
     its = [one for one in found if image.stem.lower().startswith(one.name[: -len("_metadata.json")].lower())]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc_files import read_rpc_text
+from ortho_pipeline.files.folders import Listing, listing
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Piece
 from ortho_pipeline.models import SensorModel
@@ -30,11 +31,13 @@ def rpc_of_dimap(path: Path) -> Path | None:
     if not DIMAP.match(path.name):
         return None
     wanted = re.sub(r"(?i)^(PHR)?DIM(AP)?", "RPC", path.name).lower()
-    return _files(path.parent).get(wanted)
+    return next((path.parent / name for name in _names(path.parent).named(wanted)), None)
 
 
 def pieces_beside(image: Path, model: SensorModel) -> tuple[Piece, ...]:
     """Return the other tiles of an image's scene, in its pixels, and the images of other bands of the same strip."""
+    if not _names(image.parent).matching(DIMAP):
+        return ()
     beside = _files(image.parent)
     for path in _metadata(beside):
         if path.name == image.name:
@@ -64,7 +67,7 @@ def _other_bands(file: DimapFile, model: SensorModel) -> Iterator[Piece]:
     folder = place(file.path).parent.absolute()  # a folder that is entered has no name of its own
     near = [folder]
     if folder.name.upper().startswith("IMG_"):
-        others = (one for one in _entries(folder.parent) if one.name.upper().startswith("IMG_") and one != folder)
+        others = (folder.parent / one for one in _names(folder.parent).beginning("IMG_") if one != folder.name)
         near += [one for one in islice(others, _MOST) if one.is_dir()]
     for beside in (_files(one) for one in near) if strip and bands else ():
         for path in _metadata(beside):
@@ -101,11 +104,11 @@ def _metadata(beside: dict[str, Path]) -> list[Path]:
 
 def _files(folder: Path) -> dict[str, Path]:
     """Return the files of a folder by their names in lower case; none where it cannot be read."""
-    return {path.name.lower(): path for path in _entries(folder)}
+    return {name.lower(): folder / name for name in _names(folder).names}
 
 
-def _entries(folder: Path) -> list[Path]:
+def _names(folder: Path) -> Listing:
     try:
-        return sorted(folder.iterdir())
+        return listing(folder)
     except (OSError, ValueError):
-        return []
+        return Listing(())

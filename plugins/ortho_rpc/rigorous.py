@@ -9,6 +9,7 @@ import numpy as np
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.folders import listing
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.pushbroom.scanner import Pushbroom
 from ortho_pipeline.models.rational import RPC
@@ -54,14 +55,13 @@ class Rigorous:
 def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:
     """Return the rigorous model of an image of this size, from DIMAP metadata beside it."""
     try:
-        beside = sorted(image.parent.iterdir())
+        beside = listing(image.parent)
     except (OSError, ValueError):
         return Rigorous()
-    names = {path.name.lower() for path in beside}
     left: dict[str, str] = {}
     # Metadata that name this image go before those that name none; those that name another one are its own.
     candidates: dict[bool, list[DimapFile]] = {True: [], False: []}
-    for path in (path for path in beside if DIMAP.match(path.name) and has_dimap_pushbroom(path)):
+    for path in filter(has_dimap_pushbroom, (image.parent / name for name in beside.matching(DIMAP))):
         try:
             file = DimapFile(path)
             named = set(images_of(file))
@@ -70,7 +70,7 @@ def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:
             continue
         if image.name.lower() in named or path.name == image.name:
             candidates[True].append(file)
-        elif not named & names:
+        elif not any(beside.named(one) for one in named):
             candidates[False].append(file)
     found: dict[Path, tuple[Pushbroom, float | None]] = {}
     others: dict[str, str] = {}

@@ -14,6 +14,7 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.problem import Prior
 from ortho_pipeline.files import read_bounded
+from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_spot.dimap import read_spot
@@ -46,8 +47,9 @@ def metadata_of(name: str) -> Path | None:
         if there.suffix.lower() == ".dim":
             return there if there.is_file() else None
         folder = there if there.is_dir() else there.parent
-        wanted = ("metadata.dim", f"{there.stem}.dim".lower())
-        return next((one for one in sorted(folder.iterdir()) if one.name.lower() in wanted and one.is_file()), None)
+        there_are = listing(folder)
+        names = sorted({*there_are.named("metadata.dim"), *there_are.named(f"{there.stem}.dim")})
+        return next((folder / name for name in names if (folder / name).is_file()), None)
     except (OSError, ValueError, InputError):
         return None
 

@@ -104,6 +104,36 @@ def test_a_fill_rule_goes_on_beyond_the_dem_for_many_points_too(model, surface, 
     assert np.isfinite(ground).all()
 
 
+def test_few_rays_are_parabolas_of_three_exact_positions(model, surface, monkeypatch):
+    """Every step along a ray asked the model: 26 times for a scene, now three times, and once for the answer."""
+    image = np.random.default_rng(4).uniform(20, 580, (1350, 2))
+    asked = []
+    original = RPC.image_to_ground
+    monkeypatch.setattr(RPC, "image_to_ground", lambda self, at, h: asked.append(len(at)) or original(self, at, h))
+    ground = meet_surface(model, image, surface)
+    frames = 4 * 81  # those of the window
+    assert sum(asked) <= 4 * len(image) + frames
+    np.testing.assert_allclose(model.ground_to_image(ground), image, atol=1e-5)
+    assert np.abs(surface.above(ground, model.crs)).max() <= 1e-3
+
+
+def test_rays_that_are_no_parabolas_are_followed_by_the_exact_model(model, surface, monkeypatch):
+    """A model that swings along its rays, far within the range of heights: nothing of it is in three positions."""
+    original = RPC.image_to_ground
+
+    def swinging(self, image, height):
+        ground = original(self, image, height)
+        ground[:, 0] += 0.001 * np.sin(np.asarray(height) / 15.0)
+        return ground
+
+    monkeypatch.setattr(RPC, "image_to_ground", swinging)
+    image = np.random.default_rng(5).uniform(100, 500, (200, 2))
+    ground = meet_surface(model, image, surface)
+    assert np.isfinite(ground).all()
+    np.testing.assert_allclose(ground, swinging(model, image, ground[:, 2]), atol=1e-9)
+    assert np.abs(surface.above(ground, model.crs)).max() <= 1e-3
+
+
 @pytest.mark.parametrize("count", [3, 5, 7])
 def test_polynomials_in_height_go_through_their_values(count):
     values = np.random.default_rng(count).normal(size=(2, 3, count, 2))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.process_limits import Resources
-from ortho_pipeline.geodesy.crs import GroundTransform
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, classes_profile
 from ortho_pipeline.raster.source import Grid
@@ -79,7 +79,7 @@ class AnglesResult:
 
 def true_north(grid: Grid) -> Callable[[Array, Array], Array]:
     """Return the function from output positions to the bearing (radians) of true north on the map ``(n,)``."""
-    there, back = GroundTransform(grid.crs, "EPSG:4979"), GroundTransform("EPSG:4979", grid.crs)
+    there, back = ground_transform(grid.crs, "EPSG:4979"), ground_transform("EPSG:4979", grid.crs)
 
     def found(columns: Array, rows: Array) -> Array:
         x, y = grid.xy(columns, rows)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ortho_pipeline.geodesy.crs import GroundTransform
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import units_per_metre
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.source import Grid
@@ -50,7 +50,7 @@ class Sight:
 
     def __init__(self, model: SensorModel, grid: Grid) -> None:
         self.model, self.grid = model, grid
-        self._to_model = GroundTransform(grid.crs, model.crs)
+        self._to_model = ground_transform(grid.crs, model.crs)
 
     def on(self, grid: Grid) -> Sight:
         """Return the same for another grid in the same CRS."""

@@ -1,0 +1,29 @@
+"""What a scene costs besides its pixels: things that are the same for all scenes of a process are made once."""
+
+from __future__ import annotations
+
+import email.parser
+import importlib.metadata
+
+import pyproj
+
+from ortho_pipeline import commands
+from ortho_pipeline.options import SurfaceOptions
+
+
+def test_a_second_scene_asks_proj_and_the_package_for_nothing_that_is_known(tiny, tmp_path, monkeypatch) -> None:
+    """Each scene had five transformations made, ten milliseconds each, and the package's metadata parsed twice."""
+    asked: list[str] = []
+
+    def counted(owner, name):
+        original = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda *given, **named: asked.append(name) or original(*given, **named))
+
+    surface = SurfaceOptions(dem=tiny.dem, vertical="ellipsoid")
+    commands.rectify(tiny.image, tmp_path / "first", surface=surface)
+    counted(pyproj.transformer, "_Transformer")
+    counted(pyproj.CRS, "to_3d")
+    counted(importlib.metadata, "version")
+    counted(email.parser.Parser, "parsestr")
+    commands.rectify(tiny.image, tmp_path / "second", surface=surface)
+    assert asked == []
