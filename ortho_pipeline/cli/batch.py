@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ortho_pipeline.cli.flags import as_typed
-from ortho_pipeline.cli.options import json_option, mosaic_options
+from ortho_pipeline.cli.options import json_option, mosaic_options, network_option
 from ortho_pipeline.cli.parsing import Command, Megabytes
 from ortho_pipeline.cli.printing import print_json, print_result, progress
 from ortho_pipeline.errors import counted
-from ortho_pipeline.options import EXECUTORS, MosaicOptions
+from ortho_pipeline.options import EXECUTORS, MosaicOptions, SceneOptions
 
 if TYPE_CHECKING:
     from ortho_pipeline.batch.plan import Plan
@@ -148,8 +148,9 @@ def run(
     help="The mosaic: .tif (a COG) or .vrt. Its record (.json) and its page (.html) lie beside it.",
 )  # fmt: skip
 @mosaic_options
+@network_option
 @json_option
-def mosaic(orthos: tuple[str, ...], output: str, mosaic: MosaicOptions, as_json: bool) -> None:
+def mosaic(orthos: tuple[str, ...], output: str, mosaic: MosaicOptions, scene: SceneOptions, as_json: bool) -> None:
     """Make one raster of ORTHOs that lie on one grid, and measure how well they agree.
 
     Pixels are taken over, not resampled. What one ortho leaves empty another fills.
@@ -157,7 +158,7 @@ def mosaic(orthos: tuple[str, ...], output: str, mosaic: MosaicOptions, as_json:
     from ortho_pipeline.commands.mosaic.assembly import mosaic as command
 
     options = dataclasses.replace(mosaic, format="VRT" if output.lower().endswith(".vrt") else "COG")
-    print_result(command(orthos, output, options), as_json)
+    print_result(command(orthos, output, options, allow_network=scene.allow_network), as_json)
 
 
 def _check(planned: Plan, only: Sequence[str], shard: tuple[int, int] | None, as_json: bool) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from ortho_pipeline import plugins
 from ortho_pipeline.commands import inputs
-from ortho_pipeline.commands.results import Result
+from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import states, together, whole_or_nothing, write_json
@@ -22,6 +22,7 @@ from ortho_pipeline.options import SceneOptions
 SCHEMA_VERSION = 1
 
 
+@to_store(folder="bands")
 def register(
     images: Sequence[str | os.PathLike[str]],
     folder: str | os.PathLike[str],

@@ -24,7 +24,7 @@ from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, start_of
 from ortho_pipeline.commands.control.block_points import gather, read_points, relative_to_reference
-from ortho_pipeline.commands.results import Result, block_to_store
+from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, OrthoError, counted
@@ -47,7 +47,7 @@ _PICTURED = 400_000_000
 
 
 @with_items
-@block_to_store
+@to_store(folder="block")
 def adjust(
     images: Sequence[str | os.PathLike[str]],
     folder: str | os.PathLike[str],
@@ -122,6 +122,7 @@ def adjust(
 
 
 @with_items
+@to_store(output=None)
 def intersect(
     images: Sequence[str | os.PathLike[str]],
     points: BlockOptions,

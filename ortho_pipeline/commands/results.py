@@ -8,7 +8,7 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, ParamSpec, TypeVar, cast
 
 from ortho_pipeline.commands.control.matching import Matched
@@ -159,37 +159,60 @@ def outputs_together(command: Callable[_P, _R]) -> Callable[_P, _R]:
             return command(*given, **named)
         if address_of(bound["folder"]) is not None:
             name = Path(next(iter(bound.values()))).stem
-            return _to_store(wrapper, signature.bind(*given, **named), name)
+            return _to_store(wrapper, signature.bind(*given, **named), "folder", name)
         with together(bound["folder"], Path(next(iter(bound.values()))).stem):
             return command(*given, **named)
 
     return wrapper
 
 
-def block_to_store(command: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Let the outputs of a command on many images (`folder`) go to a store of objects too."""
-    signature = inspect.signature(command)
+def to_store(**outputs: str | None) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
+    """Let outputs of a command go to a store of objects too.
 
-    @functools.wraps(command)
-    def wrapper(*given: _P.args, **named: _P.kwargs) -> _R:
-        bound = signature.bind(*given, **named)
-        if address_of(bound.arguments["folder"]) is None:
+    Parameters
+    ----------
+    **outputs : str or None
+        Parameters of the command that name a folder, with what its outputs are called together; or (None) a file,
+        after which they are called, and with which what is written beside it goes along.
+    """
+
+    def decorate(command: Callable[_P, _R]) -> Callable[_P, _R]:
+        signature = inspect.signature(command)
+
+        @functools.wraps(command)
+        def wrapper(*given: _P.args, **named: _P.kwargs) -> _R:
+            bound = signature.bind(*given, **named)
+            for parameter, name in outputs.items():
+                address = address_of(bound.arguments.get(parameter))
+                if address is not None:
+                    called = name or PurePosixPath(address).stem
+                    return cast(_R, _to_store(wrapper, bound, parameter, called, is_file=name is None))
             return command(*given, **named)
-        return cast(_R, _to_store(command, bound, "block"))
 
-    return wrapper
+        return wrapper
+
+    return decorate
 
 
-def _to_store(command: Callable[..., Any], bound: inspect.BoundArguments, name: str) -> Any:
+def _to_store(
+    command: Callable[..., Any], bound: inspect.BoundArguments, parameter: str, name: str, *, is_file: bool = False
+) -> Any:
     """Run a command in a folder of this machine, upload what it wrote, and return its result with the addresses."""
-    address = str(bound.arguments["folder"]).rstrip("/")
-    allowed = bound.arguments.get("scene", SceneOptions()).allow_network
+    address, file = str(bound.arguments[parameter]).rstrip("/"), ""
+    if is_file:
+        address, _, file = address.rpartition("/")
+    own = bound.arguments.get("allow_network", False)
+    allowed = own or bound.arguments.get("scene", SceneOptions()).allow_network
     with delivered(address, name, allow_network=allowed, keep=_goes_along) as folder:
-        bound.arguments["folder"] = folder
+        bound.arguments[parameter] = folder / file
         result = command(*bound.args, **bound.kwargs)
-        files = {role: path for role, path in result.files.items() if _goes_along(Path(path))}
-        names = {role: Path(path).relative_to(folder).as_posix() for role, path in files.items()}
-    return replace(result, files={role: f"{address}/{one}" for role, one in names.items()})
+        files: dict[str, Any] = {}
+        for role, path in result.files.items():
+            if not isinstance(path, Path) or not path.is_relative_to(folder):
+                files[role] = path
+            elif _goes_along(path):
+                files[role] = f"{address}/{path.relative_to(folder).as_posix()}"
+    return replace(result, files=files)
 
 
 def _goes_along(path: Path) -> bool:

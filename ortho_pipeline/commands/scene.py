@@ -19,6 +19,7 @@ from ortho_pipeline.errors import InputError, completed, counted
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files import write_json, write_text
 from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.locations import located
 from ortho_pipeline.files.storage import kept
 from ortho_pipeline.geodesy.crs import crs_text, ground_transform
 from ortho_pipeline.geodesy.proj_grids import fetch_missing, grids, proj_info
@@ -84,7 +85,13 @@ def models() -> list[dict[str, Any]]:
 
 
 @outputs_together
-def write_plots(report_file: str | os.PathLike[str], folder: str | os.PathLike[str], kind: str = "svg") -> Result:
+def write_plots(
+    report_file: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    kind: str = "svg",
+    *,
+    allow_network: bool = False,
+) -> Result:
     """Write the plots of a report again, each as a picture of its own.
 
     Parameters
@@ -99,7 +106,7 @@ def write_plots(report_file: str | os.PathLike[str], folder: str | os.PathLike[s
         If it is not a report, or PNG is asked for and matplotlib is not installed.
     """
     with completed(report_file, remedy="give a <stem>_report.json as it was written, or make it again"):
-        made = report.read_report(report_file)
+        made = report.read_report(located(report_file, allow_network=allow_network))
         stem = Path(report_file).stem
         files = report.write_plots(made, Path(folder), stem, kind)
     return Result(

@@ -180,6 +180,12 @@ def test_what_adjust_writes_goes_to_a_store(stereo: Stereo, tmp_path: Path, monk
         assert there["files"] == {
             kind: path.replace(str(tmp_path), "s3://blocks") for kind, path in here["files"].items()
         }
+        rays = ("intersect", *stereo.images, "--points", stereo.write(), "--allow-network", "--json", "-o")
+        assert json.loads(run(*rays, "s3://blocks/rays/all.csv"))["files"] == {"points": "s3://blocks/rays/all.csv"}
+        run(*rays, tmp_path / "all.csv")
+        rays_there = Objects("s3://blocks/rays", allow_network=True)
+        assert {name for name, _ in rays_there.names()} == {"all.csv", "all_delivery.json"}
+        assert rays_there.read("all.csv", 1 << 20)[0] == (tmp_path / "all.csv").read_bytes()
 
 
 def test_an_adjustment_starts_from_saved_models(stereo: Stereo, tmp_path: Path) -> None:

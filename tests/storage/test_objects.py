@@ -17,14 +17,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from osgeo import gdal
 from servers import FaultyWay, moto_server, on_a_faulty_way, serving
 
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import export, rectify
 from ortho_pipeline.errors import InputError, OrthoError, StorageError
 from ortho_pipeline.files.storage import objects
 from ortho_pipeline.files.storage.objects import Conflict, Objects
-from ortho_pipeline.options import SceneOptions, SurfaceOptions
+from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.source import RasterSource
 
 gdal.UseExceptions()
@@ -221,6 +223,46 @@ def test_an_ortho_from_a_bucket_to_a_bucket(
     listed = {one["name"]: one["sha256"] for one in record["files"]}
     assert set(listed) | {"tiny_delivery.json"} == {name for name, _ in out.names()}
     assert listed["tiny_ortho.tif"] == hashlib.sha256(ortho.read_bytes()).hexdigest()
+
+
+def test_orthos_of_a_bucket_are_a_mosaic_in_a_bucket(
+    moto: Address, tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`ortho mosaic`, and the plots of a report, read and write where `ortho rectify -o s3://...` wrote."""
+    at(f"http://{moto[0]}:{moto[1]}", monkeypatch)
+    runner, surface = CliRunner(), SurfaceOptions(dem=str(tiny.dem), vertical="ellipsoid")
+
+    def ortho(*words: str, code: int = 0) -> str:
+        result = runner.invoke(cli, list(words))
+        assert result.exit_code == code, result.output
+        return str(result.output)
+
+    whole = rectify(tiny.image, tmp_path / "whole", surface=surface, output=OutputOptions(resolution=5.0, align=True))
+    left, bottom, right, top = (round(value) for value in whole.document["report"]["ortho"]["extent"])
+    for name, box in (("a", (left, bottom, left + 1000, top)), ("b", (left + 800, bottom, right, top))):
+        image = tiny.image.with_name(f"{name}.tif")
+        shutil.copy(tiny.image, image)
+        output = OutputOptions(resolution=5.0, extent=tuple(map(float, box)))
+        for folder in (tmp_path / name, f"s3://bucket/orthos/{name}"):
+            rectify(image, folder, surface=surface, output=output, scene=SceneOptions(allow_network=True))
+    there = [f"s3://bucket/orthos/{name}/{name}_ortho.tif" for name in "ab"]
+    assert "--allow-network" in ortho("mosaic", *there, "-o", str(tmp_path / "no.tif"), code=2)
+    assert "--allow-network" in ortho("mosaic", str(tmp_path / "a/a_ortho.tif"), "-o", "s3://bucket/m.tif", code=2)
+    assert "its own folder" in ortho("mosaic", *there, "-o", str(tmp_path / "m.vrt"), "--allow-network", code=2)
+    made = json.loads(ortho("mosaic", *there, "-o", "s3://bucket/all/m.tif", "--allow-network", "--json"))
+    here = json.loads(ortho("mosaic", *(str(tmp_path / f"{one}/{one}_ortho.tif") for one in "ab"),
+                            "-o", str(tmp_path / "m.tif"), "--json"))  # fmt: skip
+    assert made["files"] == {
+        kind: path.replace(str(tmp_path), "s3://bucket/all") for kind, path in here["files"].items()
+    }
+    assert made["mosaic"] == here["mosaic"]
+    store = Objects("s3://bucket/all", allow_network=True)
+    for name in ("m.tif", "m.json"):
+        assert store.read(name, 1 << 30)[0] == (tmp_path / name).read_bytes()
+    assert {name for name, _ in store.names()} == {"m.tif", "m.json", "m.html", "m_delivery.json"}
+    # Without points there is nothing to plot: an empty delivery.
+    ortho("report", "s3://bucket/orthos/a/a_report.json", "--plots", "s3://bucket/plots", "--allow-network")
+    assert [name for name, _ in Objects("s3://bucket/plots", allow_network=True).names()] == ["a_report_delivery.json"]
 
 
 def test_outputs_that_could_not_be_uploaded_are_those_of_the_record_or_have_none(

@@ -11,6 +11,7 @@ from ortho_pipeline.cli.options import (
     image_argument,
     json_option,
     match_options,
+    network_option,
     output_options,
     point_options,
     scene_options,
@@ -118,9 +119,10 @@ def export(
 @click.option(
     "--kind", type=click.Choice(["svg", "png"]), default="svg", show_default=True, help="PNG needs matplotlib."
 )
+@network_option
 @json_option
-def report(report_file: str, folder: str, kind: str, as_json: bool) -> None:
+def report(report_file: str, folder: str, kind: str, scene: SceneOptions, as_json: bool) -> None:
     """Write the plots of a report, each as a picture of its own."""
     from ortho_pipeline import commands
 
-    print_result(commands.write_plots(report_file, folder, kind), as_json)
+    print_result(commands.write_plots(report_file, folder, kind, allow_network=scene.allow_network), as_json)

@@ -10,7 +10,7 @@ from typing import Any
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.matching import match_scene
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
-from ortho_pipeline.commands.results import Result
+from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust, on_surface
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import to_document
@@ -25,6 +25,7 @@ _SUFFIXES = (".geojson", ".csv", ".tsv")
 
 
 @with_items
+@to_store(output=None, report=None)
 def match(
     image: str | os.PathLike[str],
     output: str | os.PathLike[str],

@@ -18,7 +18,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of
 from ortho_pipeline.commands.control.matching import search_of
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
-from ortho_pipeline.commands.results import Result
+from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
@@ -181,6 +181,7 @@ def _few(ties: Ties, names: tuple[str, ...]) -> list[Notice]:
 
 
 @with_items
+@to_store(output=None)
 def ties(
     images: Sequence[str | os.PathLike[str]],
     output: str | os.PathLike[str],

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.commands.inputs import refuse_changed
-from ortho_pipeline.commands.results import ENDINGS, Result
+from ortho_pipeline.commands.results import ENDINGS, Result, to_store
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import states, together, write_json
+from ortho_pipeline.files.locations import is_far, located, place
 from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.options import MosaicOptions
 from ortho_pipeline.report.document import read_report
@@ -32,12 +33,14 @@ from ortho_pipeline.warp.mosaic import (
 Measure = Callable[[Sequence[Overlap]], list[dict[str, Any]]]
 
 
+@to_store(path=None)
 def mosaic(
     orthos: Sequence[str | os.PathLike[str]],
     path: str | os.PathLike[str],
     options: MosaicOptions | None = None,
     *,
     resources: Resources | None = None,
+    allow_network: bool = False,
 ) -> Result:
     """Make one raster of orthos that share a grid.
 
@@ -48,22 +51,34 @@ def mosaic(
     ----------
     path : path
         Of the mosaic; its record and its page lie beside it.
+    allow_network : bool
+        Whether orthos and the mosaic may lie at addresses; a VRT may not.
 
     Raises
     ------
     InputError
         If an ortho is given twice or would be overwritten, and as `warp.mosaic.lay_out`.
     """
-    paths, path = [Path(ortho) for ortho in orthos], Path(path)
+    paths = [place(located(ortho, allow_network=allow_network)) for ortho in orthos]
+    options, path = options or MosaicOptions(format="COG"), Path(path)
+    if options.format == "VRT":
+        _refuse_far(paths)
     files = {"mosaic": path, "seams": path.with_suffix(".json"), "page": path.with_suffix(".html")}
     _check_paths(paths, files)
     layers = [_ortho(one, name) for one, name in zip(paths, _names(paths), strict=True)]
     begun = states([*paths, *(one.accuracy for one in layers if one.accuracy)])
     with together(path.parent, path.stem):
-        document = assemble(layers, files, options or MosaicOptions(format="COG"), resources=resources)
+        document = assemble(layers, files, options, resources=resources)
         write_json(files["seams"], document)
         refuse_changed(begun)
     return Result(files, {"mosaic": document}, summary_text(document))
+
+
+def _refuse_far(orthos: Sequence[Path]) -> None:
+    for ortho in orthos:
+        if is_far(ortho):
+            raise InputError("a VRT refers to orthos below its own folder", file=ortho, field="output",
+                             remedy="let the name of the mosaic end in .tif")  # fmt: skip
 
 
 def _check_paths(orthos: Sequence[Path], files: Mapping[str, Path]) -> None:
@@ -127,7 +142,7 @@ def assemble(
             after = along_seams(placed, owners.owners, owners.cell, balance, memory=memory)
             seams = [{**seam, "before": _of(before, seam), "after": _of(after, seam)} for seam in seams]
     document = {
-        "file": str(files["mosaic"]),
+        "file": files["mosaic"].name,
         **mosaic_document(placed, seams, balance, owners if options.seamlines else None, clamped),
     }
     write_page(document, files["page"], files["mosaic"], owners)
