@@ -120,11 +120,10 @@ if not TYPE_CHECKING:  # a checker knows the names from above, and no others
         if name == "__version__":
             from importlib.metadata import version
 
-            value: Any = version("ortho-pipeline")
-        elif name in _HOMES:
-            value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-        else:
+            return version("ortho-pipeline")
+        if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
         globals()[name] = value
         return value
 

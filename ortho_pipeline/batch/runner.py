@@ -164,8 +164,7 @@ def _states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:
 
 
 def _with_companions(job: Job, roles: Mapping[str, str]) -> dict[str, str]:
-    known = dict(roles)
-    stem = job.image.stem
+    known, stem = dict(roles), job.image.stem
     for name in listing(job.image.parent).beginning(stem) if isinstance(job.image, Path) else ():
         path, rest = job.image.parent / name, name.removeprefix(stem)
         belongs = rest != name and rest[:1] in ("_", ".", "-") and str(path) not in known

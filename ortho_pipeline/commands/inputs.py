@@ -13,7 +13,6 @@ from typing import Any
 
 import pyproj
 
-import ortho_pipeline
 from ortho_pipeline import plugins
 from ortho_pipeline.commands.heights.surfaces import dem_files, sigma_file
 from ortho_pipeline.errors import InputError, OrthoError
@@ -21,6 +20,7 @@ from ortho_pipeline.exchange import crop
 from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.exchange.rpc import files_of
 from ortho_pipeline.files import sha256, states
+from ortho_pipeline.files.documents import software_version
 from ortho_pipeline.files.locations import archive_of, located
 from ortho_pipeline.files.process_limits import startable_threads
 from ortho_pipeline.files.traffic import bytes_read
@@ -350,7 +350,7 @@ def provenance(
         "surface": None if surface is None else dict(surface.provenance),
         "options": {name: _as_asked(value) for name, value in asked.items()},
         "software": {
-            "ortho-pipeline": ortho_pipeline.__version__,
+            "ortho-pipeline": software_version(),
             "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
             "proj": pyproj.proj_version_str,
         },

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import ortho_pipeline
 from ortho_pipeline.errors import InputError, PluginError, reads
 from ortho_pipeline.files import read_json, write_json
+from ortho_pipeline.files.documents import software_version
 from ortho_pipeline.models import model_from_dict, require_view
 from ortho_pipeline.models.base import SensorModel
 
@@ -75,7 +75,7 @@ def write_model_file(saved: SavedModel, path: str | os.PathLike[str]) -> None:
     document = {
         "document": DOCUMENT,
         "schema_version": SCHEMA_VERSION,
-        "software": f"ortho-pipeline {ortho_pipeline.__version__}",
+        "software": f"ortho-pipeline {software_version()}",
         "sensor": saved.sensor,
         "model_source": saved.model_source,
         "size": None if saved.size is None else list(saved.size),

@@ -14,6 +14,7 @@ import os
 import types
 import typing
 from collections.abc import Callable, Mapping
+from importlib import metadata
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
 import numpy as np
@@ -46,6 +47,12 @@ def json_position(values: Any) -> list[float] | None:
     """Return a place, or a vector ``(N,)``, as numbers; null as a whole where any of them is not finite."""
     found: list[float] = np.asarray(values, dtype=np.float64).tolist()
     return found if all(map(math.isfinite, found)) else None
+
+
+@functools.cache
+def software_version() -> str:
+    """Return the version of this package, for documents that say what made them; its metadata are parsed once."""
+    return metadata.version("ortho-pipeline")
 
 
 # -- records ---------------------------------------------------------------------------------------------------------

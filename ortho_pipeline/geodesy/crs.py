@@ -370,9 +370,6 @@ class GroundTransform:
     def __reduce__(self):
         return GroundTransform, (self.source, self.target)
 
-    def __repr__(self) -> str:
-        return f"GroundTransform({self.source.name!r} -> {self.target.name!r})"
-
     @property
     def is_identity(self) -> bool:
         """True if points come back unchanged."""
@@ -479,14 +476,13 @@ def _warn_of_better(used: Transformer, source: pyproj.CRS, target: pyproj.CRS, s
         )
 
 
+#: By the texts that systems are made of: a CRS writes its WKT to be hashed.
+_made_once = functools.lru_cache(maxsize=64)(GroundTransform)
+
+
 def ground_transform(source: str | pyproj.CRS, target: str | pyproj.CRS) -> GroundTransform:
     """Return a `GroundTransform`, the same one for the same pair: PROJ takes ten milliseconds to make one."""
-    return _ground_transform(*(one if isinstance(one, str) else one.srs for one in (source, target)))
-
-
-@functools.lru_cache(maxsize=64)  # by the texts that systems are made of: a CRS writes its WKT to be hashed
-def _ground_transform(source: str, target: str) -> GroundTransform:
-    return GroundTransform(source, target)
+    return _made_once(*(one if isinstance(one, str) else one.srs for one in (source, target)))
 
 
 # -- what is installed -----------------------------------------------------------------------------------------------

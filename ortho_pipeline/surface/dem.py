@@ -10,7 +10,7 @@ import functools
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -274,12 +274,7 @@ class DemSurface(Surface):
         rows, columns = self.shape
         with np.errstate(invalid="ignore"):
             index = np.flatnonzero((u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1))
-        across = columns // TILE + 1
-        tiles = (v[index] // TILE).astype(int) * across + (u[index] // TILE).astype(int)
-        order = np.argsort(tiles, kind="stable")
-        unique, first = np.unique(tiles[order], return_index=True)
-        for number, these in zip(unique.tolist(), np.split(index[order], first[1:]), strict=False):
-            row, column = divmod(number, across)
+        for row, column, these in _by_tile(u, v, index, columns // TILE + 1):
             # One sample more than the step, for the neighbours of the last ones.
             window = column * TILE, row * TILE, TILE + 1, TILE + 1
             tile = self._tiles.get((row, column, filled), functools.partial(self._window, *window, filled))
@@ -416,6 +411,15 @@ def _undulations(vertical: Vertical, grid: SampleGrid, window: tuple[int, int, i
     across, down = (u % step) / step, ((v % step) / step)[:, None]
     along = nodes[:, i] * (1 - across) + nodes[:, i + 1] * across
     return along[j] * (1 - down) + along[j + 1] * down
+
+
+def _by_tile(u: Array, v: Array, index: NDArray[np.intp], across: int) -> Iterator[tuple[int, int, NDArray[np.intp]]]:
+    """Yield row and column of each tile that some of the positions lie in, and which; `across` tiles are a row."""
+    tiles = (v[index] // TILE).astype(int) * across + (u[index] // TILE).astype(int)
+    order = np.argsort(tiles, kind="stable")
+    unique, first = np.unique(tiles[order], return_index=True)
+    for number, these in zip(unique.tolist(), np.split(index[order], first[1:]), strict=False):
+        yield *divmod(number, across), these
 
 
 def _bilinear(heights: Array, u: Array, v: Array) -> Array:
