@@ -18,6 +18,7 @@ from ortho_pipeline.block.equations.image_pairs import ImagePairs, Levels
 from ortho_pipeline.block.equations.level_factor import LevelFactor
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
+from ortho_pipeline.block.equations.solver import solve
 from ortho_pipeline.block.equations.unknowns import Columns
 from ortho_pipeline.block.intersection import frame_of, meet
 from ortho_pipeline.block.points import BlockPoints
@@ -255,6 +256,48 @@ def test_what_control_tells_nothing_of_needs_no_part_in_the_grid(monkeypatch: py
     np.testing.assert_allclose((one.image, *one.redundancy), (other.image, *other.redundancy), rtol=1e-8)
     if not stated:
         np.testing.assert_allclose((one.sigma_xy, one.sigma_h), (other.sigma_xy, other.sigma_h), rtol=1e-8)
+
+
+def test_nodes_are_the_least_squares_problems_with_their_variances() -> None:
+    """Cofactors, solution and restricted likelihood of a node, by one dense problem of all unknowns."""
+    models, points = strip(6, 120)
+    points = replace(points, sigma_ground=np.where(np.arange(len(points))[:, None] % 16 == 0, 0.0, points.sigma_ground))
+    ordered, frame = tuple(models.values()), frame_of(tuple(models.values()), points)
+    known = np.where(points.control[:, None], points.ground, np.nan)
+    problem = BlockProblem(points, ordered, frame, known, (Pseudo(0, 1.0, 4.0),), assumed=(0.4, 0.7))
+    rays = np.ones(points.rays, dtype=bool)
+    local = meet(frame, ordered, points, rays)
+    rays &= np.isfinite(local).all(axis=1)[points.point]
+    solved = solve(problem, State(ordered, local), Selection.of(rays, points.control))
+    linear, equations = solved.linear, control_equations.ControlEquations(solved)
+    design, misfits = dense(linear)
+    count, grounded = linear.ordering.observations, linear.ordering.grounded
+    found, wanted = [], []
+    for image, plan, height in ((1.0, 0.16, 0.49), (1.7, 0.01, 4.0)):
+        # The ground was weighted by 0.4 and 0.7 m where it states no sigma; its misfits follow the node's.
+        factor = np.ones(len(misfits))
+        factor[:count] = image**-0.5
+        own = np.where(equations.unstated, np.sqrt([0.16 / plan, 0.16 / plan, 0.49 / height]), 1.0)
+        factor[count : count + 3 * len(grounded)] = own.ravel()
+        a, r = design * factor[:, None], misfits * factor
+        cofactors = np.linalg.inv(a.T @ a)
+        whole = cofactors @ (a.T @ r)
+        left = r - a @ whole
+        wanted.append(np.log(factor).sum() + 0.5 * np.linalg.slogdet(cofactors)[1] - 0.5 * left @ left)
+        node = np.array([image, plan, height])
+        solution = equations.at(node)
+        found.append(equations.likelihoods(node[None])[0])
+        size = problem.size
+        sigmas = np.sqrt(np.diag(cofactors))[:size]
+        np.testing.assert_allclose(equations.root @ solution.z / sigmas, whole[:size] / sigmas, rtol=0, atol=1e-7)
+        parts = equations.root @ solution.cofactors @ equations.root.T / np.outer(sigmas, sigmas)
+        np.testing.assert_allclose(parts, cofactors[:size, :size] / np.outer(sigmas, sigmas), rtol=0, atol=1e-8)
+        assert solution.square == pytest.approx(left @ left - linear.misfits.pseudo @ linear.misfits.pseudo, rel=1e-9)
+        first = size + 3 * int(np.flatnonzero(linear.ordering.numbers == grounded[0])[0])
+        turn = problem.enu[grounded[0]]
+        of_point = turn @ cofactors[first : first + 3, first : first + 3] @ turn.T
+        np.testing.assert_allclose(solution.ground[0], of_point, rtol=0, atol=1e-8 * of_point.max())
+    assert found[1] - found[0] == pytest.approx(wanted[1] - wanted[0], abs=1e-6)
 
 
 def test_equations_with_a_few_points_elsewhere_are_those_of_the_state(linear: Linear) -> None:

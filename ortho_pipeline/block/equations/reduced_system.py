@@ -61,11 +61,9 @@ class NormalSystem:
 
     def solve(self, damping: float) -> Solution:
         """Return the solution; with `damping`, steps are shortened relative to the diagonal."""
-        from scipy.linalg import LinAlgError
-
         right = self.right[self.levels.columns.padded >= 0]
         try:
             factor = LevelFactor(self.levels, self.blocks, damping)
-        except (LinAlgError, ValueError):  # a ValueError says that something is not finite
+        except np.linalg.LinAlgError:
             return Solution(np.full_like(right, np.nan), self.levels, None)
         return Solution(factor.solve(right), self.levels, factor)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +14,9 @@ from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.variances.components import diagonal
 from ortho_pipeline.models.base import Array
+
+if TYPE_CHECKING:
+    from ortho_pipeline.block.variances import node_kernel
 
 #: No measurement is taken as better than this (px), whatever residuals say: those of simulations may be rounding alone.
 _FINEST = 1e-4
@@ -22,15 +27,19 @@ _FAR_LESS, _TOLD = 0.5, 1e-13
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """Solutions at nodes: log likelihood ``(b,)``, parameters, cofactors, shifts of control and what made them."""
+    """Solution at a node, or the mean of several: parameters ``(m,)``, cofactors, shifts and covariances of control.
 
-    likelihood: Array
+    `weights` ``(n, 3)`` are those of the ground, `square` that of all misfits, less what
+    pseudo-observations have of it without a step; of several nodes they, the parameters
+    and the shifts are those of the last.
+    """
+
     z: Array
     cofactors: Array
     shift: Array
-    inverse: Array
-    taken: Array
+    ground: Array
     weights: Array
+    square: float
 
 
 class ControlEquations:
@@ -95,49 +104,54 @@ class ControlEquations:
         apart = np.where(np.isfinite(problem.known[self.rows]), apart, 0.0)
         return u, by_params[:, :, : self.size], ue, apart
 
-    def weights_at(self, nodes: Array) -> Array:
-        """Return the weights ``(b, n, 3)`` of the ground with variances ``(b, 3)`` of image, plan and height."""
-        own = 1.0 / nodes[:, None, [1, 1, 2]]
-        return np.where(self.unstated, own, self.weights)
+    @cached_property
+    def _compiled(self) -> node_kernel.Equations:
+        """These equations for compiled code."""
+        from ortho_pipeline.block.variances import node_kernel
 
-    def at(self, nodes: Array) -> Node:
-        """Return the solutions with variances ``(b, 3)`` of image, plan and height."""
-        size, scale = self.rank, nodes[:, 0]
-        weights = self.weights_at(nodes)
-        m = self.u / scale[:, None, None, None] + diagonal(weights)
-        inverse = np.asarray(np.linalg.inv(m), dtype=float)
-        b = self.ue / scale[:, None, None] + weights * self.d
-        met = (inverse @ b[..., None])[..., 0]
-        taken = np.asarray(inverse @ self.k / scale[:, None, None, None], dtype=float)
-        flat = self.k.reshape(3 * len(self.rows), size).T
-        normal = self.image - flat @ taken.reshape(len(nodes), 3 * len(self.rows), size)
-        normal = normal / scale[:, None, None] + self.pseudo
-        right = self.image_right - met.reshape(len(nodes), 3 * len(self.rows)) @ flat.T
-        right = right / scale[:, None] + self.pseudo_right
-        cofactors = np.asarray(np.linalg.inv(normal) if size else normal, dtype=float)
-        z = (cofactors @ right[:, :, None])[:, :, 0]
-        shift = met - (taken @ z[:, None, :, None])[..., 0]
-        square = self.square / scale + (weights * self.d**2).sum(axis=(1, 2))
-        square -= (b * met).sum(axis=(1, 2)) + (right * z).sum(axis=1)
+        flat = self.k.reshape(3 * len(self.rows), self.rank).T
         ties = self.points - len(self.rows)
-        spread = (self.observations - 3 * ties) * np.log(scale) + np.linalg.slogdet(m)[1].sum(axis=1)
-        of_ground = np.log(np.where(self.unstated, weights, 1.0)).sum(axis=(1, 2))
-        spread += (np.linalg.slogdet(normal)[1] if size else 0.0) - self.rest * np.log(scale) - of_ground
-        return Node(-0.5 * (spread + square), z, cofactors, shift, inverse, taken, weights)
+        counts = np.array([self.observations - 3 * ties, self.rest, self.square], dtype=float)
+        parts = (
+            self.u, self.k, flat, self.ue, self.d, self.weights, self.unstated, self.image, self.image_right,
+            self.pseudo, self.pseudo_right, counts,
+        )  # fmt: skip
+        return node_kernel.Equations(*(np.ascontiguousarray(part) for part in parts))
+
+    def likelihoods(self, nodes: Array) -> Array:
+        """Return the log likelihoods ``(b,)`` with variances ``(b, 3)`` of image, plan and height."""
+        from ortho_pipeline.block.variances import node_kernel
+
+        found = np.empty(len(nodes))
+        node_kernel.likelihoods(self._compiled, nodes, found)
+        return found
+
+    def at(self, node: Array) -> Node:
+        """Return the solution with variances ``(3,)`` of image, plan and height."""
+        return self._over(node[None], np.ones(1), moved=False)
+
+    def over(self, nodes: Array, chances: Array) -> Node:
+        """Return the mean over variances ``(b, 3)`` of some chances ``(b,)``; its cofactors have how solutions move."""
+        return self._over(nodes, chances, moved=True)
+
+    def _over(self, nodes: Array, chances: Array, *, moved: bool) -> Node:
+        from ortho_pipeline.block.variances import node_kernel
+
+        count, size = len(self.rows), self.rank
+        weights, z, shift = np.empty((count, 3)), np.empty(size), np.empty((count, 3))
+        cofactors, ground = np.zeros((size, size)), np.zeros((count, 3, 3))
+        square = node_kernel.means(
+            self._compiled, nodes, chances, moved, weights, z, cofactors, shift, ground
+        )  # fmt: skip
+        return Node(z, cofactors, shift, ground, weights, square)
 
     def redundancy(self, node: Node) -> tuple[float, float, float]:
         """Return the parts of the redundancy of measurements, and of unstated ground in plan and height, at a node."""
-        spread = self.ground(node)[0]
-        hat = node.weights[0] * np.diagonal(spread, axis1=1, axis2=2)
+        hat = node.weights * np.diagonal(node.ground, axis1=1, axis2=2)
         of_ground = np.where(self.unstated, 1.0 - hat, 0.0).sum(axis=0)
-        of_pseudo = float((self.pseudo * node.cofactors[0]).sum())
+        of_pseudo = float((self.pseudo * node.cofactors).sum())
         image = self.observations - (self.size + 3 * self.points - float(hat.sum()) - of_pseudo)
         return image, float(of_ground[:2].sum()), float(of_ground[2])
-
-    def ground(self, node: Node) -> Array:
-        """Return the covariances ``(b, n, 3, 3)`` of the control points at nodes."""
-        taken = node.taken
-        return np.asarray(node.inverse + taken @ node.cofactors[:, None] @ taken.swapaxes(2, 3))
 
 
 def _root(cofactors: Cofactors, own: Array, by_params: Array, pseudo: Array) -> Array:

@@ -19,7 +19,7 @@ Source: Patterson and Thompson 1971 (restricted likelihood); Gelman 2006 (priors
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -41,10 +41,12 @@ _ALIKE = math.log(2.0)
 _IMAGE_LOW, _IMAGE_HIGH = 0.1, 10.0
 #: Step of the grid in log sigma; how much less likely than the best (log) a node may be to count.
 _COARSE, _COUNTS = 0.5, 12.0
-#: Matrices of points by nodes that are worth while; parameters beyond which nodes are dear; nodes of one pass.
-_BUDGET, _DEAR, _PASS = 40_000, 100, 256
+#: Matrices of points by nodes that are worth while; parameters beyond which nodes are dear.
+_BUDGET, _DEAR = 40_000, 100
 #: With so much redundancy the measurements' factor is as good as known.
 _KNOWN = 200.0
+#: How far (log) the ground's best sigmas may move when the measurements' factor does.
+_NEAR = 2.1
 #: Below this redundancy a component is not estimated.
 _LEAST = 0.5
 #: Steps of the factor of the measurements to its best value, the ground's sigmas being given.
@@ -53,15 +55,26 @@ _ROUNDS = 4
 _SAME = 0.03
 
 
+_grids: WeakKeyDictionary[Solved, tuple[_Grid, Variances]] = WeakKeyDictionary()
+
+
 def estimate(solved: Solved) -> Variances:
     """Return the variance components at a solution, which was found with sigmas near enough to linearise there."""
-    return _Grid(solved).variances()
+    return _grid_of(solved)[1]
 
 
 def posterior(solved: Solved) -> Posterior:
     """Return the variance components at a solution, and covariances with their uncertainty."""
-    grid = _Grid(solved)
-    return grid.posterior(grid.variances())
+    grid, variances = _grid_of(solved)
+    return grid.posterior(variances)
+
+
+def _grid_of(solved: Solved) -> tuple[_Grid, Variances]:
+    """Return the grid at a solution, made once for it: the search for gross errors and the result ask for the same."""
+    if solved not in _grids:
+        grid = _Grid(solved)
+        _grids[solved] = grid, grid.variances()
+    return _grids[solved]
 
 
 def reweighed(solved: Solved, selection: Selection, variances: Variances) -> Solved:
@@ -86,7 +99,7 @@ class _Grid:
         self.equations = equations = ControlEquations(solved)
         self.free = [bool(equations.unstated[:, :2].any()), bool(equations.unstated[:, 2].any())]
         self.separable = True
-        far = np.log([[1.0, 1e3 * equations.pixel, 1e3 * equations.pixel]])
+        far = np.log([1.0, 1e3 * equations.pixel, 1e3 * equations.pixel])
         alone = equations.redundancy(self._at(far))[0]
         if any(self.free) and alone < _LEAST:
             # One image, or no redundancy: an error of the ground is one of the measurement.
@@ -94,11 +107,16 @@ class _Grid:
         self.unseen = self._unseen()
         self.centre = self._centre()
 
-    def _at(self, logs: Array) -> Node:
+    def _variances(self, logs: Array) -> Array:
+        """Return the variances ``(..., 3)`` at nodes."""
         nodes = np.exp(2.0 * logs)
         if not self.separable:
-            nodes[:, 1:] = PERFECT_GROUND**2
-        return self.equations.at(nodes)
+            nodes[..., 1:] = PERFECT_GROUND**2
+        return np.asarray(nodes)
+
+    def _at(self, logs: Array) -> Node:
+        """Return the solution at a node ``(3,)``."""
+        return self.equations.at(self._variances(logs))
 
     def _unseen(self) -> float:
         """Return the sigma (m) of ground below which nothing could be seen of it, times the factor of measurements."""
@@ -119,28 +137,24 @@ class _Grid:
             found = found - 0.5 * ((logs[:, 1] - logs[:, 2]) / _ALIKE) ** 2
         return np.asarray(found)
 
-    def passes(self, logs: Array) -> Iterator[tuple[slice, Node]]:
-        """Solve at nodes ``(b, 3)``, some at a time."""
-        step = max(1, min(_PASS, int(4e6 / (max(len(self.equations.rows), 1) * 3 * (self.equations.rank + 3)))))
-        for begin in range(0, len(logs), step):
-            part = slice(begin, min(begin + step, len(logs)))
-            yield part, self._at(logs[part])
-
     def chances(self, logs: Array) -> Array:
         """Return log likelihood plus log prior ``(b,)`` at nodes ``(b, 3)``."""
-        found = np.concatenate([node.likelihood for _, node in self.passes(logs)]) + self._prior(logs)
+        found = self.equations.likelihoods(self._variances(logs)) + self._prior(logs)
         return np.where(np.isfinite(found), found, -np.inf)
 
     def _centre(self) -> Array:
         """Return the logs ``(3,)`` near the best, found by turns for the ground and for the measurements."""
         equations = self.equations
-        redundancy = max(equations.redundancy(self._at(np.zeros((1, 3))))[0], 1.0)
+        redundancy = max(equations.redundancy(self._at(np.zeros(3)))[0], 1.0)
         centre = np.array([self._log_of(equations.square / redundancy), 0.0, 0.0])
-        for _ in range(_ROUNDS):
+        for number in range(_ROUNDS):
             if any(self.free):
                 logs = self._plane(centre[0], self._span(centre[0]))
+                if number:
+                    # Another factor of the measurements moves the best ones a little.
+                    logs = logs[(np.abs(logs[:, 1:] - centre[1:]) < _NEAR).all(axis=1)]
                 centre = logs[int(np.argmax(self.chances(logs)))]
-            node = self._at(centre[None])
+            node = self._at(centre)
             redundancy = equations.redundancy(node)[0]
             if redundancy < _LEAST:
                 return np.array([0.0, *centre[1:]])
@@ -156,19 +170,11 @@ class _Grid:
 
     def _image_square(self, node: Node, logs: Array) -> float:
         """Return the sum of squares of the measurements' misfits (over the sigmas they have) at a node."""
-        equations, z = self.equations, node.z[0]
-        left = (equations.d - node.shift[0]) ** 2 * node.weights[0]
+        equations, z = self.equations, node.z
+        left = (equations.d - node.shift) ** 2 * node.weights
         ground = float(left[equations.observed].sum())
-        scale = math.exp(2.0 * logs[0])
-        # The quadratic form of everything, less the ground's and the pseudo-observations' parts.
-        total = equations.square / scale + float((node.weights[0] * equations.d**2).sum())
-        b = equations.ue / scale + node.weights[0] * equations.d
-        met = (node.inverse[0] @ b[:, :, None])[:, :, 0]
-        flat = equations.k.reshape(met.size, equations.rank)
-        right = (equations.image_right - met.ravel() @ flat) / scale + equations.pseudo_right
-        total -= float((b * met).sum()) + float(right @ z)
         pseudo = float(z @ equations.pseudo @ z) - 2.0 * float(z @ equations.pseudo_right)
-        return max(total - ground - pseudo, 0.0) * scale
+        return max(node.square - ground - pseudo, 0.0) * math.exp(2.0 * logs[0])
 
     def _span(self, image: float) -> tuple[Array, Array]:
         low = math.log(self.unseen / 8.0) + image
@@ -186,7 +192,7 @@ class _Grid:
 
     def _nodes(self) -> tuple[Array, Array]:
         """Return the nodes ``(b, 3)`` that count, and their weights ``(b,)``, which sum up to one."""
-        redundancy = self.equations.redundancy(self._at(self.centre[None]))[0]
+        redundancy = self.equations.redundancy(self._at(self.centre))[0]
         known = redundancy > _KNOWN or redundancy < _LEAST
         images = np.zeros(1) if known else np.linspace(-3.5, 3.5, 7) / math.sqrt(2.0 * redundancy)
         if not any(self.free) and not known:
@@ -215,7 +221,7 @@ class _Grid:
         self.logs, self.chance = self._nodes()
         self.mean = np.array([self.centre[0], *(self.chance @ self.logs)[1:]])
         equations = self.equations
-        node = self._at(self.mean[None])
+        node = self._at(self.mean)
         xy, h = (float(math.exp(value)) if free else None for value, free in zip(self.mean[1:], self.free, strict=True))
         unstated = int(equations.unstated[:, :2].any(axis=1).sum()), int(equations.unstated[:, 2].sum())
         parts = equations.redundancy(node)
@@ -246,21 +252,15 @@ class _Grid:
     def posterior(self, variances: Variances) -> Posterior:
         """Return covariances that contain the uncertainty of the components."""
         equations = self.equations
-        middle = self._at(self.mean[None])
-        # About the solution itself, not about the mean: what is added is how far that may be from the best.
-        cofactors = np.zeros((equations.rank, equations.rank))
-        ground = np.zeros((len(equations.rows), 3, 3))
+        middle = self._at(self.mean)
         counts = self.chance > 1e-6
         logs, chance = self.logs[counts], self.chance[counts] / self.chance[counts].sum()
-        for part, node in self.passes(logs):
-            w = chance[part]
-            apart, shift = node.z, node.shift
-            cofactors += np.tensordot(w, node.cofactors, 1) + (apart * w[:, None]).T @ apart
-            ground += np.tensordot(w, equations.ground(node) + shift[..., None] * shift[..., None, :], 1)
+        # About the solution itself, not about the mean: what is added is how far that may be from the best.
+        mean = equations.over(self._variances(logs), chance)
         image_square = float(chance @ np.exp(2.0 * logs[:, 0]))
         # Of what control tells nothing, the measurements tell all.
         others = image_square if equations.rest else 0.0
-        covariance = self.cofactors.mixed(others, equations.root, cofactors - others * np.eye(equations.rank))
+        covariance = self.cofactors.mixed(others, equations.root, mean.cofactors - others * np.eye(equations.rank))
         return Posterior(
-            variances, covariance, image_square, equations.rows, ground, float(np.abs(middle.z).max(initial=0.0))
+            variances, covariance, image_square, equations.rows, mean.ground, float(np.abs(middle.z).max(initial=0.0))
         )
