@@ -18,6 +18,7 @@ from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.models.rational import RPC
+from ortho_rpc import geolocation
 from ortho_rpc.bundle import pieces_beside, rpc_of_dimap
 from ortho_rpc.rigorous import Rigorous, rigorous_beside
 
@@ -27,13 +28,21 @@ IMAGERY = {"SATELLITEID": "satellite", "ACQUISITIONDATETIME": "acquired", "CLOUD
 
 @hookimpl
 def ortho_sensors() -> Iterable[Sensor]:
-    """Offer the sensor ``rpc``."""
+    """Offer the sensors ``rpc`` and ``geolocation``: what images say in GDAL's own words."""
     yield Sensor(
         "rpc",
         "any image with an RPC (tag, .RPB, _RPC.TXT, DIMAP, NITF, VRT)",
         recognises,
         open_scene,
         options={"rpc": "which RPC to use: tag, sidecar, or an RPC file"},
+        fallback=True,
+    )
+    yield Sensor(
+        "geolocation",
+        "images with geolocation arrays (GDAL's domain, or files of longitudes and latitudes), as a start for matching",
+        lambda dataset: geolocation.has_arrays(dataset) and not has_rpc(dataset),
+        geolocation.open_scene,
+        options=geolocation.OPTIONS,
         fallback=True,
     )
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from osgeo import gdal
 from scipy.spatial.transform import Rotation
-from seeds import dimap_text, rpc_xml
+from seeds import dimap_text, rpc_xml, vrt
 
 from ortho_pipeline.exchange.rpc_files import SCALARS, rpc_metadata
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
@@ -245,6 +245,34 @@ def dimap_product(folder: Path, rpc: RPC | None = None) -> tuple[Path, Path]:
     if rpc is not None:
         (folder / "RPC_A.XML").write_text(rpc_xml(rpc))
     return folder / names[0], folder / names[1]
+
+
+def bundle_text(band: str, size: tuple[int, int]) -> str:
+    """Return DIMAP metadata of one image of a bundle, without a rigorous model."""
+    strip = "<SOURCE_ID>DS_PHR1A_1</SOURCE_ID><SOURCE_TYPE>Strip_Source</SOURCE_TYPE>"
+    return (
+        "<Dimap_Document><Metadata_Identification><METADATA_PROFILE>PHR_SENSOR</METADATA_PROFILE>"
+        "</Metadata_Identification><Processing_Information><Product_Settings><SPECTRAL_PROCESSING>"
+        f"{band}</SPECTRAL_PROCESSING></Product_Settings></Processing_Information><Dataset_Sources>"
+        f"<Source_Identification>{strip}</Source_Identification></Dataset_Sources><Raster_Data><Raster_Dimensions>"
+        f"<NROWS>{size[1]}</NROWS><NCOLS>{size[0]}</NCOLS></Raster_Dimensions><Data_Access><Data_Files><Data_File>"
+        f'<DATA_FILE_PATH href="IMG_PHR1A_{band}_1_R1C1.TIF"/></Data_File></Data_Files></Data_Access></Raster_Data>'
+        "</Dimap_Document>"
+    )
+
+
+def geolocation_text(folder: Path) -> str:
+    """Return a VRT of `one.tif` in `folder` with geolocation arrays, which are written beside it."""
+    for name, step in (("lon", (0.001, 1e-5)), ("lat", (2e-5, -0.001))):
+        dataset = gdal.GetDriverByName("GTiff").Create(str(folder / f"{name}.tif"), 12, 10, 1, gdal.GDT_Float64)
+        rows, columns = np.mgrid[0:10, 0:12]
+        dataset.WriteArray((33.0 if name == "lon" else 38.0) + step[0] * columns + step[1] * rows)
+        dataset = None
+    text = (folder / "one.vrt").read_text() if (folder / "one.vrt").exists() else vrt(folder)
+    fields = {"X_DATASET": "lon.tif", "Y_DATASET": "lat.tif", "X_BAND": 1, "Y_BAND": 1, "PIXEL_OFFSET": 0,
+              "LINE_OFFSET": 0, "PIXEL_STEP": 4, "LINE_STEP": 3.5, "SRS": "EPSG:4326"}  # fmt: skip
+    listed = "".join(f'<MDI key="{key}">{value}</MDI>' for key, value in fields.items())
+    return text.replace("</VRTDataset>", f'<Metadata domain="GEOLOCATION">{listed}</Metadata></VRTDataset>')
 
 
 def enmap_text(size: tuple[int, int], rpcs: tuple[RPC, ...]) -> str:

@@ -26,6 +26,7 @@ from ortho_planet import read_item
 from ortho_rpc.dimap import read_dimap_pushbroom
 from ortho_sar import read_extended
 from ortho_spot.dimap import read_spot
+from osgeo import gdal
 
 from ortho_pipeline import commands
 from ortho_pipeline.batch import plan as batch_plan
@@ -35,7 +36,7 @@ from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.exchange.csm import csm_text, read_csm
 from ortho_pipeline.exchange.model_file import read_model_file, save_model
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
-from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpb
+from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpb, write_rpc_txt
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.stac.collection import Collection
 from ortho_pipeline.files.stac.item import read_item as read_stac_item
@@ -320,6 +321,34 @@ def _frame_model(folder: Path) -> bytes:
     return (folder / "m").read_bytes()
 
 
+def _bundle_seed(folder: Path) -> bytes:
+    """Write the panchromatic image of a bundle, whose pieces the metadata of the colours beside it give."""
+    pan, colours = "IMG_PHR1A_P_1_R1C1.TIF", "IMG_PHR1A_MS_1_R1C1.TIF"
+    for name, size in ((pan, (40, 32)), (colours, (10, 8))):
+        dataset = gdal.GetDriverByName("GTiff").Create(str(folder / name), *size)
+        dataset.GetRasterBand(1).Fill(1)
+        dataset = None
+    (folder / "DIM_PHR1A_P_1.XML").write_text(products.bundle_text("P", (40, 32)))
+    (folder / "RPC_X_MS.XML").write_text(seeds.rpc_xml(seeds.rpc().scaled(4.0)))
+    write_rpc_txt(seeds.rpc(), folder / f"{Path(pan).stem}_RPC.TXT")
+    return products.bundle_text("MS", (10, 8)).encode()
+
+
+def _bundle(path: Path) -> Any:
+    scene = open_scene(path.with_name("IMG_PHR1A_P_1_R1C1.TIF"))
+    return [*scene.models.values(), scene.facts, *((piece.scale, piece.model) for piece in scene.pieces)]
+
+
+def _geolocation_seed(folder: Path) -> bytes:
+    seeds.image(folder / "one.tif", tag=False)
+    return products.geolocation_text(folder).encode()
+
+
+def _opened(path: Path) -> Any:
+    scene = open_scene(path, SceneOptions(sensor="geolocation"))
+    return [*scene.models.values(), scene.facts]
+
+
 def _tsai(path: Path) -> Any:
     return read_tsai(path, seeds.SIZE)
 
@@ -409,6 +438,8 @@ READERS = (
     Reader("rpc-tag", "tiff", "one.tif", _tiff(seeds.image), _tagged),
     Reader("dimap-polynomials", "xml", "DIM_X.XML", _text(seeds.dimap_text()), read_dimap_pushbroom),
     Reader("dimap-lists", "xml", "DIM_X.XML", _text(seeds.dimap_text(listed=True)), read_dimap_pushbroom),
+    Reader("dimap-bundle", "xml", "DIM_X_MS.XML", _bundle_seed, _bundle),
+    Reader("geolocation", "xml", "one.vrt", _geolocation_seed, _opened),
     Reader("csm-line-scanner", "json", "one.json", _csm_seed, read_csm),
     Reader("csm-frame", "json", "one.json", _csm_frame_seed, read_csm),
     Reader("asp-pinhole", "text", "one.tsai", _text(products.tsai_text()), _tsai),

@@ -28,6 +28,8 @@ DEAR = {
     "dimap-polynomials": 60,
     "maxar-isd": 40,
     "enmap-metadata": 60,
+    "dimap-bundle": 60,
+    "geolocation": 60,
     "csm-line-scanner": 60,
     "asp-aster": 60,
     "spot-metadata": 40,

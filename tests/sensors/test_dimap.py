@@ -17,7 +17,7 @@ import pytest
 from click.testing import CliRunner
 from ortho_rpc.dimap import has_dimap_pushbroom, read_dimap_pushbroom
 from osgeo import gdal
-from products import dimap_product
+from products import bundle_text, dimap_product
 from scipy.spatial.transform import Rotation
 from seeds import dimap_text, rpc_xml
 from seeds import rpc as seed_rpc
@@ -585,20 +585,11 @@ def test_pleiades_neo_is_held_against_the_rpc_of_each_scene(tmp_path: Path, apar
 
 def test_a_bundle_of_panchromatic_and_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Folders as they are delivered; a point that was measured in one image counts in the other, by both RPCs."""
-    strip = "<SOURCE_ID>DS_PHR1A_1</SOURCE_ID><SOURCE_TYPE>Strip_Source</SOURCE_TYPE>"
-    strip = f"<Dataset_Sources><Source_Identification>{strip}</Source_Identification></Dataset_Sources>"
     images = []
     for number, (band, scale) in enumerate((("P", 1), ("MS", 4)), 1):
         folder = tmp_path / f"IMG_0{number}_PHR1A_{band}"
         folder.mkdir()
-        settings = f"<Product_Settings><SPECTRAL_PROCESSING>{band}</SPECTRAL_PROCESSING></Product_Settings>"
-        (folder / f"DIM_PHR1A_{band}_1.XML").write_text(
-            "<Dimap_Document><Metadata_Identification><METADATA_PROFILE>PHR_SENSOR</METADATA_PROFILE>"
-            f"</Metadata_Identification><Processing_Information>{settings}</Processing_Information>{strip}<Raster_Data>"
-            f"<Raster_Dimensions><NROWS>{120 // scale}</NROWS><NCOLS>{160 // scale}</NCOLS></Raster_Dimensions>"
-            f'<Data_Access><Data_Files><Data_File><DATA_FILE_PATH href="IMG_PHR1A_{band}_1_R1C1.TIF"/></Data_File>'
-            "</Data_Files></Data_Access></Raster_Data></Dimap_Document>"
-        )
+        (folder / f"DIM_PHR1A_{band}_1.XML").write_text(bundle_text(band, (160 // scale, 120 // scale)))
         one = seed_rpc().scaled(scale)
         (folder / f"RPC_PHR1A_{band}_1.XML").write_text(rpc_xml(one))
         images.append(pixels(folder / f"IMG_PHR1A_{band}_1_R1C1.TIF", (160 // scale, 120 // scale)))
