@@ -54,7 +54,10 @@ def measured(page: Any, points: int) -> None:
             continue
         count += 1
         if count > points:
-            return  # one more is under way
+            # One more is under way; from farther off the others are seen too.
+            page.focus("#scene")
+            page.keyboard.press("-")
+            return
         page.select_option("#role", "check" if count % 3 == 0 else "control")
         page.focus("#scene")
         page.keyboard.press("Enter")

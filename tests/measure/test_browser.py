@@ -190,6 +190,10 @@ def test_a_stereo_pair_is_tied_by_clicks_in_either_image(
         served.says("#said", f"P{number + 1} accepted")
         page.keyboard.press("Escape")
     served.says("#what", "1 check point whose ground took no part, relative to the reference")
+    scrolled, shown = page.evaluate(
+        "() => { const box = document.querySelector('aside > .scroll'); return [box.scrollWidth, box.clientWidth]; }"
+    )
+    assert scrolled <= shown, "the last column is cut off"
     page.select_option("#role", "tie")
     page.select_option("#scene-shows", "scene-1")
     page.select_option("#reference-shows", "scene-0")

@@ -124,7 +124,9 @@ function fill() {
   $('name').value = mark.id ?? '';
   $('role').value = mark.role ?? (facts.labels ? $('role').value : 'control');
   $('sigma').value = mark.sigma_image ?? '';
-  $('sigma').placeholder = mark.covariance ? Math.sqrt((mark.covariance[0] + mark.covariance[1]) / 2).toFixed(3) : '0.5';
+  const covariances = [mark, ...Object.values(mark.rays ?? {})].map((one) => one.covariance).filter(Boolean);
+  const variance = covariances.reduce((sum, [column, row]) => sum + (column + row) / 2, 0) / covariances.length;
+  $('sigma').placeholder = covariances.length ? Math.sqrt(variance).toFixed(3) : '0.5';
   $('note').value = mark.note ?? '';
   $('sigma-xy').value = mark.sigma_xy || '';
   $('sigma-h').value = mark.sigma_h || '';
