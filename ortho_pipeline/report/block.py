@@ -35,7 +35,7 @@ from ortho_pipeline.report.network.facts import found_network, network_record, p
 from ortho_pipeline.report.page.advice import WORDS, signals
 from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import plot_locator
-from ortho_pipeline.report.records import MapScaleRecord, RpcRecord
+from ortho_pipeline.report.records import NOT_TESTED, MapScaleRecord, RpcRecord
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, FEW, fitness
 
 if TYPE_CHECKING:
@@ -118,11 +118,11 @@ def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHea
     if adjustment.object_rms.control and control:
         notes.append("No check points were kept apart.")
         if not adjustment.redundancy:
-            return said("Not tested", "nothing is left over to test the fit with")
+            return said(NOT_TESTED, "nothing is left over to test the fit with")
         what = f"RMSE of {counted(control.n, 'measurement')} of control points in the images{to}: the fit, not a test"
         return said(px(control.total), what)
     sizes = [math.hypot(*ray.residual) for ray in adjustment.rays if ray.used and is_known(ray.residual)]
-    figure = px(float(np.median(sizes))) if sizes else "Not tested"
+    figure = px(float(np.median(sizes))) if sizes else NOT_TESTED
     return said(
         figure, f"median residual of {counted(len(sizes), 'ray')}: how well the images agree, not how right they are"
     )
@@ -190,7 +190,7 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
     places = [place for image in report.images.values() for place in image.outline or ()]
     where = plot_locator((places[0][0], places[0][1])) if places else None
     provenance = {key: value for key, value in json_value(report.provenance).items() if key != "inputs"}
-    said = signals(report.warnings, report.notices)
+    said = signals(report.warnings, report.notices, tested=report.headline.figure != NOT_TESTED)
     return render(
         "report/block.html.j2",
         report=report,

@@ -12,7 +12,7 @@ from ortho_pipeline.files.documents import record_of
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
 from ortho_pipeline.report.adjustment_records import Adjustment
-from ortho_pipeline.report.records import Headline
+from ortho_pipeline.report.records import NOT_TESTED, Headline
 from ortho_pipeline.report.wording import headline
 
 
@@ -34,7 +34,7 @@ def accuracy_before(scene: Scene) -> Headline:
 
 
 def _untested(*notes: str, what: str = "there were no ground control points") -> Headline:
-    return Headline(figure="Not tested", metres=None, what=what, notes=notes)
+    return Headline(figure=NOT_TESTED, metres=None, what=what, notes=notes)
 
 
 def _of_scene(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:

@@ -190,6 +190,10 @@ class ControlHull:
     outline: tuple[Pair, ...]
 
 
+#: The figure of what nothing tests.
+NOT_TESTED = "Not tested"
+
+
 @record
 class Headline:
     """The accuracy in words: a figure, the same in metres, a phrase that follows, and reservations."""

@@ -10,7 +10,7 @@ from ortho_pipeline.display.numbers import metres, plain_size, px, share, short,
 from ortho_pipeline.errors import counted
 from ortho_pipeline.report.adjustment_records import Adjustment, Bias, Parameter, Rmse, RmseOnGround, RmsesOnGround
 from ortho_pipeline.report.matching import MatchingRecord, Tested, is_relative
-from ortho_pipeline.report.records import Dem, FlatGround, Headline, MapScaleRecord, SceneReport
+from ortho_pipeline.report.records import NOT_TESTED, Dem, FlatGround, Headline, MapScaleRecord, SceneReport
 
 #: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
 ENOUGH_CHECK_POINTS = 30
@@ -52,9 +52,7 @@ def headline(
         Where points were matched: their figures are relative to the reference.
     """
     if not adjustment.points:
-        return before or Headline(
-            figure="Not tested", metres=None, what="there were no ground control points", notes=()
-        )
+        return before or Headline(figure=NOT_TESTED, metres=None, what="there were no ground control points", notes=())
     rmse, ground = adjustment.rmse, rmse_m or RmsesOnGround(control=None, check=None, loo=None)
     notes = [*_fit_notes(adjustment), *_outlying_notes(adjustment)]
     if matching is not None and matching.relative is not None:
@@ -78,14 +76,14 @@ def headline(
         what = f"RMSE when each of {counted(rmse.loo.n, 'control point')} is left out in turn{to}"
         return _headline(rmse.loo, ground.loo, what, notes)
     what = "nothing is left over to test the fit with"
-    return Headline(figure="Not tested", metres=None, what=what, notes=tuple(notes))
+    return Headline(figure=NOT_TESTED, metres=None, what=what, notes=tuple(notes))
 
 
 def verdict(report: SceneReport) -> str:
     """Say in one sentence what the accuracy suffices for, and under which conditions."""
     found = report.map_scale
     if found is None:
-        if report.headline.figure == "Not tested":
+        if report.headline.figure == NOT_TESTED:
             return "What it is fit for nobody can say: no point tests it."
         return "What it is fit for depends on the reference: no measured point tests it."
     return fitness(found)

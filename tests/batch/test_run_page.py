@@ -46,6 +46,11 @@ def test_what_failed_stands_first_and_then_the_least_accurate(tmp_path, ortho):
     rows = re.findall(r"<tr[ >].*?</tr>", page.split("<tbody>")[1], re.DOTALL)
     assert ["Failed" in rows[0], "untested" in rows[1], "bad" in rows[2], "good" in rows[3]] == [True] * 4
     assert "1 of 4 scenes failed" in page
+    assert "june: 3 scenes made; 2 with an RMSE of 0.20 to 3.00 px at check points; 1 that nothing tests." in page
+    # What to look at stands in the row, gravest first, and that nothing tests a scene is the first of all.
+    assert "Nothing tests how accurate this is." in rows[1]
+    assert "only check, or an orthoimage" in rows[1]
+    assert "Look." in rows[2]
     write_run_page(tmp_path / "part.html", "june", [{**scene("late"), "status": "missing", "facts": {}}])
     assert "nobody has made this scene yet" in (tmp_path / "part.html").read_text(encoding="utf-8")
     assert "Give a DEM." in rows[0]

@@ -25,7 +25,7 @@ from ortho_pipeline.report.gallery.points import SIDE, point_chips
 from ortho_pipeline.report.page.advice import WORDS, advised, signals
 from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import degrees, plot_ortho
-from ortho_pipeline.report.records import SceneReport
+from ortho_pipeline.report.records import NOT_TESTED, SceneReport
 from ortho_pipeline.report.wording import verdict
 from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
 from ortho_pipeline.simulation.terrain import Terrain
@@ -212,3 +212,17 @@ def test_places_of_points_are_in_the_json(tmp_path):
     report.write_report_json(made(points), tmp_path / "r.json")
     found = json.loads((tmp_path / "r.json").read_text())["adjustment"]["points"]
     assert [one["lon_lat"] for one in found] == pytest.approx(points.ground[:, :2], abs=1e-9)
+
+
+def test_a_scene_that_nothing_tests_is_not_said_to_be_fine(tmp_path):
+    tested = made(measured())
+    head = dataclasses.replace(tested.headline, figure=NOT_TESTED)
+    empty = dataclasses.replace(tested, headline=head, warnings=(), notices=())
+    report.write_report_html(empty, tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "Nothing to complain of" not in page
+    assert '<li class="look">' in page
+    assert "Nothing tests how accurate this is." in page
+    assert [one.text for one in signals((), [{"code": "no-redundancy", "text": "none left"}], tested=False)] == [
+        "None left"
+    ]

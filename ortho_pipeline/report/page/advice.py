@@ -96,6 +96,13 @@ class Signal:
     to_do: str
 
 
+#: Of a result that no point tests.
+UNTESTED = Signal(
+    "look", "Nothing tests how accurate this is.",
+    "Give points of known ground that only check, or an orthoimage of the place to match with.",
+)  # fmt: skip
+
+
 def advised(code: str) -> tuple[Level, str]:
     """Return how much a notice of a code matters, and what to do about it."""
     for level, found in _LEVELS:
@@ -104,11 +111,19 @@ def advised(code: str) -> tuple[Level, str]:
     return "look", _UNKNOWN
 
 
-def signals(warnings: Sequence[str], notices: Sequence[Mapping[str, Any]]) -> list[Signal]:
-    """Return the notices of a document, the gravest first; of earlier versions, which have no codes, the texts."""
+def signals(
+    warnings: Sequence[str], notices: Sequence[Mapping[str, Any]], *, tested: bool = True
+) -> list[Signal]:  # fmt: skip
+    """Return the notices of a document, the gravest first; of earlier versions, which have no codes, the texts.
+
+    Of a result that is not `tested` that is the first thing to look at.
+    """
     if not notices:
         notices = [{"code": "from-sensor", "text": text} for text in warnings]
     found = [Signal(*_of(one)) for one in notices]
+    # No redundancy says it too, and why.
+    if not tested and not any(one["code"] == "no-redundancy" for one in notices):
+        found.insert(0, UNTESTED)
     order = list(WORDS)
     return sorted(found, key=lambda one: order.index(one.level))
 

@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from ortho_pipeline.display.numbers import fixed, px
 from ortho_pipeline.display.pages import render
-from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.errors import OrthoError, counted
 from ortho_pipeline.files import write_text
 from ortho_pipeline.raster.quicklook import preview_png
+from ortho_pipeline.report.page.advice import WORDS, Signal, signals
 from ortho_pipeline.report.page.behaviour import policy, script
 
 #: Longer side of a thumbnail, px, and how many scenes have one: a page of thousands would be no page.
@@ -23,12 +25,18 @@ _SIDE, _MOST = 88, 300
 #: Of a scene that no run has finished.
 _NOT_MADE = {"message": "nobody has made this scene yet", "file": None, "field": None, "remedy": "run it"}
 #: The evidence that scenes are ordered by, the best first.
-_EVIDENCE = ("check", "matched", "loo", "control")
+EVIDENCE = {
+    "check": "check points", "matched": "held-out matches", "loo": "control points left out in turn",
+    "control": "control points: the fit",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Row:
-    """A scene of the page; `page` is the address of its report from here, `rmse` px of the best `evidence` there is."""
+    """A scene of the page; `page` is the address of its report from here, `rmse` px of the best `evidence` there is.
+
+    `signal` is the gravest of its notices, if it is to be looked at.
+    """
 
     name: str
     error: Mapping[str, Any] | None
@@ -37,6 +45,7 @@ class Row:
     evidence: str | None
     rmse: float | None
     metres: float | None
+    signal: Signal | None = None
     thumbnail: str | None = None
 
 
@@ -60,9 +69,25 @@ def write_run_page(path: str | os.PathLike[str], title: str, scenes: Sequence[Ma
     code = script()
     page = render(
         "report/run.html.j2", title=title, rows=shown, key=key, script=code, policy=policy(code), thumbnails=_MOST,
-        failed=sum(row.error is not None for row in rows),
+        failed=sum(row.error is not None for row in rows), levels=WORDS, evidence=EVIDENCE, said=_summary(rows),
     )  # fmt: skip
     write_text(path, page)
+
+
+def _summary(rows: Sequence[Row]) -> str:
+    """Say how accurate the scenes are that were made, and how many nothing tests."""
+    made = [row for row in rows if row.error is None]
+    if not made:
+        return "None was made."
+    parts = [f"{counted(len(made), 'scene')} made"]
+    for kind, name in EVIDENCE.items():
+        sizes = [row.rmse for row in made if row.evidence == kind and row.rmse is not None]
+        if sizes:
+            span = px(sizes[0]) if len(sizes) == 1 else f"{fixed(min(sizes))} to {px(max(sizes))}"
+            parts.append(f"{len(sizes)} with an RMSE of {span} at {name}")
+    if untested := sum(row.evidence is None for row in made):
+        parts.append(f"{untested} that nothing tests")
+    return f"{'; '.join(parts)}."
 
 
 def _is_of(path: Path, key: str) -> bool:
@@ -79,7 +104,7 @@ def _row(scene: Mapping[str, Any], folder: Path) -> Row:
         error = _NOT_MADE
     rmses, metres = facts.get("rmse_px") or {}, facts.get("rmse_m") or {}
     if not error:
-        found = next((kind for kind in _EVIDENCE if rmses.get(kind) is not None), None)
+        found = next((kind for kind in EVIDENCE if rmses.get(kind) is not None), None)
     page = scene["files"].get("html")
     return Row(
         name=scene["name"],
@@ -89,7 +114,13 @@ def _row(scene: Mapping[str, Any], folder: Path) -> Row:
         evidence=found,
         rmse=None if found is None else rmses[found],
         metres=None if found is None else metres.get(found),
+        signal=None if error else _gravest(facts, tested=found is not None),
     )
+
+
+def _gravest(facts: Mapping[str, Any], *, tested: bool) -> Signal | None:
+    said = signals(facts.get("warnings") or (), facts.get("notices") or (), tested=tested)
+    return next((one for one in said if one.level != "know"), None)
 
 
 def _order(row: Row) -> tuple[Any, ...]:

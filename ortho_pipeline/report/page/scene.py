@@ -20,7 +20,7 @@ from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import plot_ortho
 from ortho_pipeline.report.plots import plots
-from ortho_pipeline.report.records import Provenance, SceneReport
+from ortho_pipeline.report.records import NOT_TESTED, Provenance, SceneReport
 from ortho_pipeline.report.wording import FEW, verdict
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def write_report_html(
     png = ortho if isinstance(ortho, bytes) or ortho is None else preview_png(ortho, side=_SIDE)
     adjustment, code = report.adjustment, script()
     over_ortho, where = plot_ortho(report) if png else None, plot_locator(place_of(report))
-    said = signals(report.warnings, report.notices)
+    said = signals(report.warnings, report.notices, tested=report.headline.figure != NOT_TESTED)
     page = render(
         "report/report.html.j2",
         report=report,
