@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
+import io
 import json
 import random
 import shutil
@@ -19,7 +21,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from osgeo import gdal
-from servers import FaultyWay, moto_server, on_a_faulty_way, serving
+from servers import FaultyWay, moto_server, on_a_faulty_way, running, serving
 
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import export, rectify
@@ -143,6 +145,66 @@ def test_nothing_is_asked_without_leave_and_no_secret_is_told(moto: Address, mon
     assert not {"the-secret", "the-key", "127.0.0.1"} & set(
         str(caught.value).replace("/", " ").replace(":", " ").split()
     )
+
+
+class EncryptedStore(FaultyWay):
+    """S3 with keys of its own: ETags are no checksums, and an upload whose SHA-256 is another is refused."""
+
+    def __init__(self, target: Address) -> None:
+        super().__init__(target, 1, share=0.0)
+        self.own_tags: dict[str, str] = {}
+
+    def answer(self, handler: Any) -> None:
+        """Verify what is uploaded as S3 does."""
+        body = handler.rfile.read(int(handler.headers.get("Content-Length") or 0))
+        stated = handler.headers.get("x-amz-checksum-sha256")
+        if handler.command == "PUT" and stated != base64.b64encode(hashlib.sha256(body).digest()).decode():
+            return self.say(handler, 400, [], b"<Error><Code>BadDigest</Code></Error>")
+        handler.rfile = io.BytesIO(body)
+        if "If-Match" in handler.headers:
+            handler.headers.replace_header("If-Match", self.own_tags[handler.headers["If-Match"]])
+        return super().answer(handler)
+
+    def say(self, handler: Any, status: int, headers: list[tuple[str, str]], data: bytes, *, cut: bool = False) -> None:
+        """Answer with ETags that say nothing of the content."""
+        told = []
+        for key, value in headers:
+            given = value
+            if key.lower() == "etag":
+                given = f'"{hashlib.md5(value.encode()).hexdigest()}"'
+                self.own_tags[given] = value
+            told.append((key, given))
+        super().say(handler, status, told, data, cut=cut)
+
+
+def test_encrypted_objects_are_checked_by_the_store_and_by_what_is_noted(
+    moto: Address, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bits that turn on the way there are found by the store, those that turn on the way back by us."""
+    with running(EncryptedStore(moto)) as kms:
+        kms_at = "127.0.0.1", int(kms.address.rpartition(":")[2])
+        with on_a_faulty_way(kms_at, 2, share=0.0) as way:
+            at(way.address, monkeypatch)
+            secret = random.Random(1).randbytes(2000)
+            with pytest.raises(StorageError, match="HTTP status 400"):
+                Objects("s3://bucket/kms", allow_network=True).put("undeclared", secret)
+            monkeypatch.setenv("AWS_SERVER_SIDE_ENCRYPTION", "aws:kms")
+            store = Objects("s3://bucket/kms", allow_network=True)
+            assert store.put("a", secret).sha256 == hashlib.sha256(secret).hexdigest()
+            assert store.read("a", 2000)[0] == secret
+            lease = store.put("lease", b"mine", new=True)
+            assert store.put("lease", b"still", replacing=lease.e_tag).sha256 == hashlib.sha256(b"still").hexdigest()
+            with pytest.raises(Conflict):
+                store.put("lease", b"yours", new=True)
+            way.KINDS, way.share = ("flipped request",), 1.0
+            with pytest.raises(StorageError):
+                store.put("b", bytes(1000))
+            assert not Objects("s3://bucket/kms", allow_network=True).exists("b")
+            for kind in ("flipped", "truncated"):
+                # What is cut at the same place each time is no less wrong for that.
+                way.KINDS = (kind,)
+                with pytest.raises(StorageError, match="checksum"):
+                    store.read("a", 2000)
 
 
 # -- a way on which things go wrong ------------------------------------------------------------------------------------
