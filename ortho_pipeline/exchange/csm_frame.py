@@ -18,7 +18,7 @@ from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import ECCENTRICITY_SQUARED, SEMI_MAJOR, enu_from_ecef, geocentric
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.frame.camera import FrameCamera
-from ortho_pipeline.models.frame.orientation import geocentric_of_map
+from ortho_pipeline.models.frame.orientation import geocentric_of_map, heights_below
 from ortho_pipeline.models.frame.working_frame import GEOGRAPHIC, MAP
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.tables import rotations_of_quaternions
@@ -59,7 +59,7 @@ def read_frame(state: State) -> FrameCamera:
     )
     turn = rotations_of_quaternions(values[None, 3:], scalar="last")[0]
     return FrameCamera.from_geocentric(
-        interior, values[:3], _OURS_FROM_THEIRS @ turn.T, heights=state.heights(HEIGHTS)
+        interior, values[:3], _OURS_FROM_THEIRS @ turn.T, heights=heights_below(values[:3], state.heights(HEIGHTS))
     )  # fmt: skip
 
 

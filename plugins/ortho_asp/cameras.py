@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import decoded, read_bounded
 from ortho_pipeline.files.xml_fields import XmlFields
+from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
 from ortho_pipeline.models import SensorModel, require_view
 from ortho_pipeline.models.frame.camera import FrameCamera
+from ortho_pipeline.models.frame.orientation import heights_below
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
 from ortho_pipeline.models.pushbroom.rotations import are_rotations
@@ -75,7 +77,8 @@ def read_tsai(path: PathLike[str], size: tuple[int, int]) -> FrameCamera:
         width, height, fu, pitch, pitch_y,
         x0=(cu / pitch + 0.5 - width / 2) * pitch, y0=(height / 2 - cv / pitch - 0.5) * pitch_y,
     )  # fmt: skip
-    model = FrameCamera.from_geocentric(interior, centre, np.diag([1.0, -1.0, -1.0]) @ turn.T, heights=HEIGHTS)
+    model = FrameCamera.from_geocentric(interior, centre, np.diag([1.0, -1.0, -1.0]) @ turn.T,
+                                        heights=heights_below(centre, HEIGHTS))  # fmt: skip
     require_view(model)
     return model
 
@@ -136,6 +139,13 @@ def adjusted(model: SensorModel, translation: Array, rotation: Array) -> SensorM
     InputError
         If it is neither a line scanner nor a frame over geographic ground.
     """
+    if isinstance(model, FrameCamera):
+        # Of a camera file all are topocentric.
+        place = geocentric(model.perspective_centre[None])[0]
+        turn = model.rotation @ enu_from_ecef(np.array([model.origin]))[0] @ rotation.T
+        return FrameCamera.from_geocentric(
+            model.interior, place + translation, turn, heights=model.heights, refraction=model.refraction
+        )
     if isinstance(model, Pushbroom):
         first = model.flight.positions(np.array([0.5 * model.line_period]), 0)[0]
         origin = rotation @ (model.origin - first) + first + translation

@@ -141,6 +141,17 @@ def test_a_frame_in_the_library() -> None:
     assert np.abs([library.pixel(point) for point in geocentric(ground)] - image).max() < 1e-6
 
 
+def test_the_ground_of_an_aeroplanes_frame_lies_below_it(tmp_path: Path) -> None:
+    """A state need not say how high the ground is; mountains do not reach above the camera."""
+    text = csm_text(frame())[0]
+    name, _, body = text.partition("\n")
+    fields = {key: value for key, value in json.loads(body).items() if key not in ("m_minElevation", "m_maxElevation")}
+    (tmp_path / "one.json").write_text(f"{name}\n{json.dumps(fields)}")
+    model = read_csm(tmp_path / "one.json")
+    assert model.reference_height < 3000.0
+    assert np.isfinite(model.image_to_ground([[200.0, 150.0]], model.reference_height)).all()
+
+
 def test_what_has_no_state(tmp_path: Path) -> None:
     lens = replace(frame(), interior=replace(frame().interior, k1=3.0))
     with pytest.raises(InputError, match="px off the model"):

@@ -13,7 +13,7 @@ from used import pixels, ran, used
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.csm import read_csm, write_csm
-from ortho_pipeline.geodesy.ellipsoid import geocentric, meet_height
+from ortho_pipeline.geodesy.ellipsoid import geocentric, geodetic, meet_height
 from ortho_pipeline.models import Pushbroom
 from ortho_pipeline.plugins import open_scene
 
@@ -97,13 +97,38 @@ def test_a_pinhole(folder: Path) -> None:
     ground = turn.reshape(3, 3) @ ray + centre
     seen = [(float(fields[f"f{a}"]) * ray[k] / ray[2] + float(fields[f"c{a}"])) / float(fields["pitch"]) + 0.5
             for k, a in enumerate("uv")]  # fmt: skip
-    from ortho_pipeline.geodesy.ellipsoid import geodetic
-
     assert np.abs(model.ground_to_image(geodetic(ground[None])) - seen).max() < 1e-5
     assert open_scene(image).sensor == "asp"
     (folder / "one.tsai").write_text(tsai_text().replace("NULL", "TSAI\nk1 = 0.1"))
     with pytest.raises(InputError, match="distortion TSAI"):
         open_scene(image)
+
+
+@pytest.mark.parametrize("kind", ["tsai", "aster"])
+def test_every_command_with_a_pinhole_or_a_lattice(folder: Path, kind: str) -> None:
+    image = pixels(folder / "one.tif", SIZE)
+    if kind == "tsai":
+        (folder / "one.tsai").write_text(tsai_text())
+        truth, height = read_tsai(folder / "one.tsai", SIZE), 200.0
+    else:
+        (folder / "one.xml").write_text(aster_text(SIZE))
+        truth, height = read_aster(folder / "one.xml"), 500.0
+    used(image, truth, SIZE, sensor="asp", height=height,
+         correction="shift" if kind == "tsai" else "model")  # fmt: skip
+
+
+def test_an_adjustment_of_a_pinhole(folder: Path) -> None:
+    """Its centre moves by the translation, and it turns about itself."""
+    (folder / "one.tsai").write_text(tsai_text())
+    (folder / "one.adjust").write_text("3.0 -4.0 12.0\n0.9999995 0.0006 -0.0008 0\n")
+    scene = open_scene(pixels(folder / "one.tif", SIZE), None, {"adjust": str(folder / "one.adjust")})
+    translation, turn = read_adjust(folder / "one.adjust")
+    plain, fields = read_tsai(folder / "one.tsai", SIZE), tsai_text().partition("C = ")[2]
+    centre = np.array(fields.partition("\n")[0].split(), dtype=float)
+    image = np.array([[10.0, 40.0], [55.0, 3.0]])
+    ground = geocentric(plain.image_to_ground(image, 100.0))
+    moved = (ground - centre) @ turn.T + centre + translation
+    assert np.abs(scene.model.ground_to_image(geodetic(moved)) - image).max() < 1e-6
 
 
 def test_aster_beside_an_image(folder: Path) -> None:

@@ -21,7 +21,7 @@ from products import bundle_text, dimap_product
 from scipy.spatial.transform import Rotation
 from seeds import dimap_text, rpc_xml
 from seeds import rpc as seed_rpc
-from used import pixels
+from used import pixels, used
 
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.control import command
@@ -477,6 +477,12 @@ def test_metadata_or_folder_in_place_of_an_image(tiled: tuple[Path, Path, Pushbr
     assert list(scene.models) == ["rpc", "pushbroom"]
     ground = model.image_to_ground([[250.0, 100.0]], 205.0)
     assert np.abs(scene.model.ground_to_image(ground) - [250.0, 100.0]).max() < 1e-3
+
+
+def test_every_command_takes_the_folder(tiled: tuple[Path, Path, Pushbroom]) -> None:
+    first, _, model = tiled
+    info = used(first.parent, model, (300, 400), sensor="rpc", height=200.0, correction="model")
+    assert info["models"] == {"rpc": "rpc", "pushbroom": "pushbroom"}
 
 
 def test_a_folder_of_two_products_names_them(tiled: tuple[Path, Path, Pushbroom]) -> None:

@@ -22,6 +22,9 @@ from ortho_pipeline.models.frame.working_frame import GEOGRAPHIC
 #: Parameters of the exterior orientation: metres and radians in the working frame.
 EXTERIOR = ("X_L", "Y_L", "Z_L", "omega", "phi", "kappa")
 
+#: How far up to its camera ground may reach of which nothing is known: an aeroplane's ground is not on its wings.
+_BELOW = 0.9
+
 
 def exterior_of_geocentric(
     position: ArrayLike, camera_from_ecef: Array | None
@@ -35,6 +38,21 @@ def exterior_of_geocentric(
     axes = enu_from_ecef(np.array([[lon, lat]]))[0]
     angles = (0.0, 0.0, 0.0) if camera_from_ecef is None else angles_of_rotation(camera_from_ecef @ axes.T)
     return np.array([0.0, 0.0, height, *angles]), (lon, lat, 0.0)
+
+
+def heights_below(position: ArrayLike, heights: tuple[float, float]) -> tuple[float, float]:
+    """Return a range of heights (m) of the ground whose upper end is clearly below a camera at a position in ECEF.
+
+    Raises
+    ------
+    InputError
+        If the camera lies below all of it.
+    """
+    low, high = heights
+    altitude = float(geodetic(np.asarray(position, dtype=np.float64)[None])[0, 2])
+    if not altitude > low:
+        raise InputError(f"a camera {altitude:.0f} m high sees no ground", field="position")
+    return low, min(high, low + _BELOW * (altitude - low))
 
 
 def geocentric_of_map(crs: str, exterior: Array) -> tuple[Array, Array]:
