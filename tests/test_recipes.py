@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
+import pytest
 import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -19,6 +24,23 @@ def test_the_conda_recipe_has_the_requirements_of_the_package():
     assert set(recipe["requirements"]["run"]) == wanted | own
     assert recipe["context"]["version"] == PROJECT["version"]
     assert recipe["build"]["python"]["entry_points"] == [f"ortho = {PROJECT['scripts']['ortho']}"]
+
+
+def test_the_conda_recipe_is_one_for_those_who_build_it():
+    """rattler-build's own reader takes it, and what it makes of it is this package."""
+    rattler_build = pytest.importorskip("rattler_build", reason="rattler-build is not installed")
+    recipe = rattler_build.Stage0Recipe.from_file(ROOT / "conda" / "recipe.yaml")
+    (rendered,) = recipe.render(rattler_build.VariantConfig())
+    package = rendered.recipe().package if callable(rendered.recipe) else rendered.recipe.package
+    assert (str(package.name), str(package.version)) == (PROJECT["name"], PROJECT["version"])
+
+
+def test_the_dockerfile_has_no_faults_that_linters_know():
+    hadolint = shutil.which("hadolint", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    if hadolint is None:
+        pytest.skip("hadolint is not installed")
+    done = subprocess.run([hadolint, ROOT / "Dockerfile"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "")
 
 
 def test_the_citation_is_of_this_version():
