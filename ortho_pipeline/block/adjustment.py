@@ -32,7 +32,7 @@ from ortho_pipeline.block.variances.components import Posterior
 from ortho_pipeline.block.variances.grid import estimate, posterior, reweighed
 from ortho_pipeline.block.variances.shared_errors import SharedByImage
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError, NotConverged, counted
+from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, counted
 from ortho_pipeline.estimation.problem import Prior
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
 from ortho_pipeline.geodesy.crs import ground_transform
@@ -43,6 +43,8 @@ from ortho_pipeline.points import marks_warning
 _MOVED, _WEIGHINGS = 0.02, 3
 #: Part of the points that gross errors of their own may lead out of the models; where it is more, the block is tilted.
 _ASTRAY = 0.05
+#: Part of the points beyond which it is not they that are wrong, but where the images lie.
+_MOST = 0.5
 
 
 def adjust(
@@ -81,18 +83,21 @@ def adjust(
     unknown = sorted(set(exclude) - set(points.ids))
     if unknown:
         raise InputError(f"there is no point {unknown[0]!r} to leave out", field="exclude")
-    problem, state, selection, notes = _prepared(chosen, points, priors or {}, exclude)
+    problem, state, whole = _prepared(chosen, points, priors or {}, exclude)
+    # What starts nowhere says nothing yet; where the images come right, it takes part.
+    nowhere = np.asarray(~np.isfinite(state.local).all(axis=1))
+    selection, notes = whole.without(nowhere, points.point), list[Notice]()
     problem, gauge = with_datum(problem, state, selection, hold)
-    begun = selection
     refuse_too_few(problem, selection)
     if problem.unstated.any():
         problem = _started(problem, state, selection)
     common = CommonError.of(problem, state, selection)
     if common is not None:
         problem = common.applied(problem)
-    solved = attempt(problem, state, selection)
-    held = _held(solved, state, selection) if robust else None
-    solved, inside = _checked(solved, selection) if held is None else (held, held.without_astray(selection))
+    solved = attempt(problem, state, whole)
+    held = _held(solved, state, selection, whole) if robust else None
+    _refuse_many_outside(solved if held is None else held, whole)
+    solved, inside = _checked(solved, whole) if held is None else (held, held.without_astray(whole))
     if problem.unstated.any():
         solved = reweighed(solved, inside, estimate(solved))
     rejected: tuple[Rejected, ...] = ()
@@ -105,9 +110,9 @@ def adjust(
     if rejected or held is not None:
         problem = replace(solved.problem, pseudo=problem.pseudo)
         solved, inside = _checked(attempt(problem, solved.state, inside), inside)
-    gauge = gauge.replace(by_control(problem, begun), by_control(problem, inside))
+    gauge = gauge.replace(by_control(problem, selection), by_control(problem, inside))
     judged = _among(points, {one.point for one in rejected})
-    notes += _without(points, problem.active(begun) & ~problem.active(inside) & ~judged)
+    notes += _without(points, ~_among(points, set(exclude)) & ~problem.active(inside) & ~judged)
     solved, found, common = _weighed(solved, inside, common)
     notes += found.variances.notes()
     notes += marks_warning(points.select(problem.active(inside) & inside.ground))
@@ -115,7 +120,7 @@ def adjust(
     return _result(solved, found, common, inside, points, chosen, gauge, rejected, notes)
 
 
-def _held(solved: Solved, start: State, selection: Selection) -> Solved | None:
+def _held(solved: Solved, start: State, selection: Selection, whole: Selection) -> Solved | None:
     """Return a solution to look for gross errors from, where many points are led out of the models; None elsewhere.
 
     Few control points leave a block so free that a gross error in one of them tilts it by hundreds of pixels. Held as
@@ -124,11 +129,29 @@ def _held(solved: Solved, start: State, selection: Selection) -> Solved | None:
     problem = solved.problem
     if solved.astray is None or any(one.held for one in problem.pseudo):
         return None
-    if solved.astray.sum() <= _ASTRAY * problem.active(selection).sum():
+    if solved.astray.sum() <= _ASTRAY * problem.active(whole).sum():
         return None
-    held = attempt(with_datum(problem, start, selection, HOLD)[0], start, selection)
+    held = attempt(with_datum(problem, start, selection, HOLD)[0], start, whole)
     lost = 0 if held.astray is None else int(held.astray.sum())
     return held if held.converged and lost < solved.astray.sum() else None
+
+
+def _refuse_many_outside(solved: Solved, whole: Selection) -> None:
+    """Refuse a block without control whose rays mostly meet outside of the models: then their heights say nothing."""
+    problem = solved.problem
+    of = problem.active(whole)
+    if solved.astray is None or (problem.active(solved.without_astray(whole)) & whole.ground).any():
+        return
+    number = int((solved.astray & of).sum())
+    if number > _MOST * of.sum():
+        low, high = (side(model.height_limits[k] for model in problem.models) for k, side in ((0, max), (1, min)))
+        raise DegeneratePoints(
+            f"the rays of {number} of {counted(int(of.sum()), 'point')} are parallel or meet outside of their models "
+            f"(heights {low:.0f} to {high:.0f} m): without control the heights are as right as the images lie to each "
+            "other, and that is not enough here",
+            file=problem.points.source or None,
+            remedy="give control points: one that is seen in two images says how high the block lies",
+        )
 
 
 def _among(points: BlockPoints, ids: Set[str]) -> Mask:
@@ -146,8 +169,8 @@ def _prepared(
     points: BlockPoints,
     priors: Mapping[str, Mapping[str, Prior]],
     exclude: Collection[str],
-) -> tuple[BlockProblem, State, Selection, list[Notice]]:
-    """Return the problem, its start, what takes part, and what people ought to know of that."""
+) -> tuple[BlockProblem, State, Selection]:
+    """Return the problem, its start, and what may take part; points whose rays do not meet yet are NaN."""
     frame = frame_of(models, points)
     known = np.full((len(points), 3), np.nan)
     plan = points.ground.copy()
@@ -160,10 +183,11 @@ def _prepared(
     local = meet(frame, models, points, rays)
     problem = BlockProblem(points, models, frame, known, _priors(models, points, priors))
     local = _at_known(problem, local, rays)
-    rays &= np.isfinite(points.measured - predict(frame, models, points, local)).all(axis=1)
-    selection = Selection.of(rays, points.control & takes_part)
-    notes = _without(points, takes_part & ~problem.active(selection))
-    return problem, State(models, local), selection, notes
+    seen = rays & np.isfinite(predict(frame, models, points, local)).all(axis=1)
+    ground = points.control & takes_part
+    nowhere = ~problem.active(Selection.of(seen, ground))
+    local[nowhere] = np.nan
+    return problem, State(models, local), Selection.of(seen | (rays & nowhere[points.point]), ground)
 
 
 def _without(points: BlockPoints, lost: Mask) -> list[Notice]:

@@ -817,7 +817,7 @@ def test_a_point_that_an_error_leads_out_of_the_models_does_not_keep_the_others(
     for name in truth:
         assert found.models[name].params == pytest.approx(left.models[name].params, rel=1e-6, abs=1e-9)
     # In the search for gross errors, too, where it is what is left of a point that was judged.
-    problem, state, selection, _ = _prepared(tuple(starts(truth).values()), points, {}, ())
+    problem, state, selection = _prepared(tuple(starts(truth).values()), points, {}, ())
     with pytest.raises(NotConverged):
         solve(problem, state, selection)
     solved, inside = solve_inside(problem, state, selection)
@@ -825,6 +825,29 @@ def test_a_point_that_an_error_leads_out_of_the_models_does_not_keep_the_others(
     outside = {points.ids[k] for k in points.point[selection.rays & ~inside.rays]}
     assert outside
     assert outside <= set(lost)
+
+
+@pytest.mark.parametrize("control", [6, 0])
+def test_ties_that_start_outside_of_the_models_take_part_once_images_come_right(
+    rpcs: dict[str, RPC], control: int
+) -> None:
+    """Images that lie a kilometre of height apart: rays meet beyond the RPCs' heights until control says where."""
+    moved = {"left": (250.0, 5.0), "right": (-250.0, 5.0)}
+    truth = {name: identity(rpcs[name], "shift").with_params(shift) for name, shift in moved.items()}
+    points = measured(truth, places(60), roles_of(control, 0, 60 - control), noise=0.3, sigma_ground=0.3)
+    if not control:
+        with pytest.raises(DegeneratePoints, match="meet outside of their models") as caught:
+            adjust(starts(truth), points)
+        assert "give control points" in str(caught.value.remedy)
+        return
+    found = adjust(starts(truth), points)
+    assert found.used_rays.all()
+    assert not found.rejected
+    for name, model in truth.items():
+        assert found.models[name].params == pytest.approx(model.params, abs=1.0)
+    # They are as good as ties that start where they belong.
+    near = adjust(truth, points)
+    np.testing.assert_allclose(found.ground, near.ground, rtol=0, atol=1e-8 * 90)
 
 
 @pytest.mark.parametrize("control", [3, 4])

@@ -139,7 +139,7 @@ def attempt(problem: BlockProblem, start: State, selection: Selection) -> Solved
 
     What a step leads out of them, as with nearly parallel rays or while the images are far from right, is left out at
     once: nothing is known of it there, and it must not keep the others from where they belong. Where these have come to
-    rest, each such point whose rays meet takes part again, once.
+    rest, each such point whose rays meet takes part again, once; so does what has no place at the start (NaN).
 
     Raises
     ------
@@ -182,8 +182,8 @@ def _met(found: Solved, gone: Mask, selection: Selection) -> Array:
 
 
 def _inside(problem: BlockProblem, start: State, selection: Selection) -> Solved:
-    """Return the minimum without all points that were led out of their models on the way there."""
-    outside, iterations = np.zeros(len(problem.points), dtype=bool), 0
+    """Return the minimum without points that have no place at the start, or were led out of their models since."""
+    outside, iterations = problem.active(selection) & ~np.isfinite(start.local).all(axis=1), 0
     while True:
         found = _descended(problem, start, selection.without(outside, problem.points.point))
         iterations += found.iterations
