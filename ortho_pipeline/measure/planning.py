@@ -59,9 +59,7 @@ class Grid:
 
     def without(self, taken: Array) -> Grid:
         """Return the places at which there is no point: a second one of the same pixels tells nothing new."""
-        near = np.zeros(len(self.image), dtype=bool)
-        for place in taken:
-            near |= np.abs(self.image - place).max(axis=1) < SIDE / 2
+        near = (np.abs(self.image[:, None] - taken).max(axis=2) < SIDE / 2).any(axis=1)
         return Grid(self.image[~near], self.ground[~near], self.everywhere)
 
 
@@ -116,7 +114,7 @@ def measure_next(grid: Grid, fit: Fit | None, taken: Array) -> list[Next]:
     found: list[Next] = []
     while len(left) and len(found) < OFFERED:
         alike = left[variance[left] >= (1 - ALIKE) * variance[left].max()]
-        best = int(alike[apart(grid.image[alike], taken)[0]])
+        best = int(alike[apart(grid.image[alike], taken, 1)[0]])
         there = partials[best] @ fit.covariance
         gain = there.T @ np.linalg.solve(there @ partials[best].T + noise, there)
         then = _root(_variances(everywhere, fit.covariance - gain).max(initial=0.0))
@@ -135,13 +133,13 @@ def _root(variance: float) -> float:
     return float(np.sqrt(max(float(variance), 0.0)))
 
 
-def apart(image: Array, taken: Array) -> NDArray[np.int_]:
+def apart(image: Array, taken: Array, count: int = OFFERED) -> NDArray[np.int_]:
     """Return some image points, each the farthest from those taken and chosen; without any taken the middle first."""
     chosen: list[int] = []
     distance = np.full(len(image), np.inf)
-    for place in taken:
-        distance = np.minimum(distance, ((image - place) ** 2).sum(axis=1))
-    while len(chosen) < min(OFFERED, len(image)):
+    if len(taken):
+        distance = ((image[:, None] - taken) ** 2).sum(axis=2).min(axis=1)
+    while len(chosen) < min(count, len(image)):
         if not len(taken) and not chosen:
             middle = (image.min(axis=0) + image.max(axis=0)) / 2
             chosen.append(int(np.argmin(((image - middle) ** 2).sum(axis=1))))

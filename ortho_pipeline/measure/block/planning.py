@@ -85,10 +85,8 @@ class BlockGrid:
     def without(self, taken: Array) -> BlockGrid:
         """Return the places at which there is no point, of those whose ground is `taken` ``(k, 3)``."""
         here, points = self.plan(self.ground), self.plan(taken)
-        near = np.zeros(len(here), dtype=bool)
-        for place in points[np.isfinite(points).all(axis=1)]:
-            near |= np.abs(here - place).max(axis=1) < self.reach
-        kept = ~near
+        points = points[np.isfinite(points).all(axis=1)]
+        kept = ~(np.abs(here[:, None] - points).max(axis=2) < self.reach).any(axis=1)
         return replace(self, number=self.number[kept], image=self.image[kept], ground=self.ground[kept],
                        seen=self.seen[kept])  # fmt: skip
 
@@ -127,7 +125,7 @@ def next_of_block(grid: BlockGrid, fit: BlockFit | None, taken: Array, *, tie: b
     found: list[Next] = []
     while len(free) and len(found) < OFFERED:
         alike = free[sigmas[free] ** 2 >= (1 - ALIKE) * sigmas[free].max() ** 2]
-        best = int(alike[apart(places[alike], points)[0]])
+        best = int(alike[apart(places[alike], points, 1)[0]])
         then = everywhere.largest(rows.after(fit.covariance, best))
         told = replace(_next(left, best), sigma=float(sigmas[best]), largest=largest, then=then)
         found.append(replace(told, role="tie" if tie else "control"))
@@ -157,7 +155,7 @@ class _Batch:
     def sigmas(self, covariance: Array) -> Array:
         """Return the root mean square over the images of how far predictions err ``(n,)``, px."""
         own = covariance[np.ix_(self.columns, self.columns)]
-        square = np.einsum("nip,pq,niq->n", self.missing, own, self.missing, optimize=True)
+        square = ((self.missing @ own) * self.missing).sum(axis=(1, 2))
         return np.asarray(np.sqrt(np.maximum(square, 0.0) / self.rays))
 
 
