@@ -1,4 +1,4 @@
-"""How fluid `ortho measure` is: tiles of a large scene, the rendered reference, the live solution, the first answer.
+"""How fluid `ortho measure` is: tiles of a large scene, the rendered reference, live solutions, the first answer.
 
 python benchmarks/measure.py [SIDE]     a scene of 12000 pixels a side unless another is given; prints milliseconds
 
@@ -20,6 +20,7 @@ from osgeo import gdal, osr
 
 from ortho_pipeline.exchange.rpc import write_rpc_txt
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
+from ortho_pipeline.measure.block.session import open_block_session
 from ortho_pipeline.measure.serving.tiles import Tiles
 from ortho_pipeline.measure.session import open_session
 from ortho_pipeline.options import MatchOptions, SurfaceOptions
@@ -30,14 +31,23 @@ gdal.UseExceptions()
 LON, LAT, CRS, GSD = 33.35, 37.25, "EPSG:32636", 1.0
 
 
-def write(folder: Path, side: int) -> None:
-    """Write a scene of noise with its RPC, a rough DEM of 30 m, and a reference of noise."""
+def write_model(path: Path, side: int, off_nadir_deg: float) -> None:
+    """Write the RPC of a scene beside it."""
     camera = LineScanner.over(
-        LON, LAT, 850.0, image_width=side, image_height=side, gsd=GSD, off_nadir_deg=15.0, heights=(600.0, 1400.0)
-    )
+        LON, LAT, 850.0, image_width=side, image_height=side, gsd=GSD, off_nadir_deg=off_nadir_deg,
+        heights=(600.0, 1400.0),
+    )  # fmt: skip
     centre, half = camera.domain
     west, south, east, north = *(centre - 1.05 * half)[:2], *(centre + 1.05 * half)[:2]
-    write_rpc_txt(fit_rpc(camera, (west, south, east, north), (600.0, 1400.0)).rpc, folder / "scene_RPC.TXT")
+    rpc = fit_rpc(camera, (west, south, east, north), (600.0, 1400.0)).rpc
+    write_rpc_txt(rpc, path.with_name(f"{path.stem}_RPC.TXT"))
+
+
+def write(folder: Path, side: int) -> None:
+    """Write a scene of noise with its RPC, a rough DEM of 30 m, a reference of noise, and a second scene, empty."""
+    write_model(folder / "scene.tif", side, 15.0)
+    write_model(folder / "second.tif", side, -15.0)
+    gdal.GetDriverByName("GTiff").Create(str(folder / "second.tif"), side, side, 1, gdal.GDT_Byte, ["SPARSE_OK=YES"])
     random = np.random.default_rng(1)
     noise = random.integers(100, 2000, (1024, 1024), dtype=np.uint16)
     x, y = pyproj.Transformer.from_crs("EPSG:4326", CRS, always_xy=True).transform(LON, LAT)
@@ -120,6 +130,34 @@ def main(side: int) -> None:
             wall = waited(lambda _, job=job: job(), 20)
             print(f"{what:<44} {wall:8.0f} ms, CPU {worked(job, 20):.0f} ms{f' (asked: {asked})' if asked else ''}")
         session.close()
+        for stated in (True, False):
+            pair(folder, stated)
+
+
+def pair(folder: Path, stated: bool) -> None:
+    """Measure the bundle adjustment of a pair after each action: half of 100 points ties, the others known."""
+    session = open_block_session(
+        [folder / "scene.tif", folder / "second.tif"], folder / f"pair-{stated}.geojson",
+        surface=SurfaceOptions(dem=folder / "dem.tif"),
+    )  # fmt: skip
+    random = np.random.default_rng(3)
+    first, second = session.images.places
+    image = random.uniform(0.1, 0.9, (100, 2)) * first.view.size
+    ground = first.ground_of(image)
+    rays = {"scene": image, "second": second.image_of(ground)}
+    sigmas = {"sigma_xy": 0.3, "sigma_h": 0.5} if stated else {}
+    known = ground + random.normal(0, 1, ground.shape) * (0.3 / 88_000, 0.3 / 111_000, 0.5)
+    for number in range(100):
+        placed = {
+            name: {"image": (places[number] + random.normal(0, 0.2, 2)).tolist()} for name, places in rays.items()
+        }
+        role = ("control", "tie", "check", "tie")[number % 4]
+        of = {} if role == "tie" else {"ground": known[number].tolist(), "ground_from": "typed", **sigmas}
+        session.act({"do": "put", "mark": {"id": f"P{number}", "role": role, "rays": placed, **of}})
+    what = "ground with sigmas" if stated else "ground without sigmas"
+    for name, job in ((f"pair of 100 points, {what}", session._solve), ("all that is shown of them", session.state)):
+        print(f"{name:<44} {waited(lambda _, job=job: job(), 20):8.0f} ms, CPU {worked(job, 20):.0f} ms")
+    session.close()
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -80,6 +81,12 @@ class Mark:
         if self.role == "tie" or self.ground is None:
             return self.role == "tie" and len(self.rays) >= 2
         return self.role == "control" or len(self.rays) >= 2
+
+    @cached_property
+    def values(self) -> dict[str, Any]:
+        """All of it as JSON values: after an action nearly all marks are as they were."""
+        told: dict[str, Any] = json_value(self)
+        return told
 
     @property
     def counts(self) -> bool:
@@ -212,7 +219,7 @@ class Marks:
                 "measured": mark.how, "ground_from": mark.ground_from, "score": mark.score, "at": mark.at,
                 **({"note": mark.note} if mark.note else {}),
             }  # fmt: skip
-        left = [json_value(mark) for mark in self.by_id.values() if not mark.counts]
+        left = [mark.values for mark in self.by_id.values() if not mark.counts]
         return {"type": "FeatureCollection", "features": features, **({"left_out": left} if left else {})}
 
 

@@ -54,7 +54,6 @@ class Project(abc.ABC):
         self._saved = -1
         self.journal = Journal(output.with_name(output.name + JOURNAL))
         self._history = History()
-        self._written: dict[str, tuple[Mark, dict[str, Any]]] = {}
 
     # -- what differs ------------------------------------------------------------------------------------------------
 
@@ -216,7 +215,7 @@ class Project(abc.ABC):
                     [ahead[k].image for k in rows], [ahead[k].height for k in rows]
                 )
             return {
-                "marks": [{**self._json(mark), "places": places} for mark, places in zip(marks, shown, strict=True)],
+                "marks": [{**mark.values, "places": places} for mark, places in zip(marks, shown, strict=True)],
                 "version": version, "undo": history.can_undo, "redo": history.can_redo,
                 "actions": len(self.journal.actions), **self._figures(),
                 "next": [
@@ -224,12 +223,6 @@ class Project(abc.ABC):
                     for one, places in zip(ahead, self._places(version, there), strict=True)
                 ],
             }  # fmt: skip
-
-    def _json(self, mark: Mark) -> dict[str, Any]:
-        """Return a mark as JSON values, made once: after an action nearly all of them are as they were."""
-        if mark.id not in self._written or self._written[mark.id][0] is not mark:
-            self._written[mark.id] = mark, json_value(mark)
-        return self._written[mark.id][1]
 
     # -- places ------------------------------------------------------------------------------------------------------
 
