@@ -22,6 +22,7 @@ from osgeo import gdal
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.exchange.rpc import has_rpc
 from ortho_pipeline.files import read_bounded, read_json
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geodetic
@@ -66,8 +67,10 @@ def metadata_of(name: str) -> Path | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether extended metadata of Capella lie beside an image."""
+    """Tell whether extended metadata of Capella lie beside an image, or it has complex values that nothing places."""
     path = metadata_of(dataset.GetDescription())
+    if path is None and _is_slant(dataset) and not has_rpc(dataset):
+        return True
     try:
         return path is not None and b'"center_pixel"' in read_bounded(path, MAX_SIZE)
     except InputError:
@@ -79,6 +82,10 @@ def open_scene(
 ) -> Scene:
     """Open an image on a plane; refuse one in slant range."""
     name, size = dataset.GetDescription(), (dataset.RasterXSize, dataset.RasterYSize)
+    if _is_slant(dataset):
+        raise InputError(
+            "complex values, no map geometry: this is in slant range (SLC, SICD)", file=name, remedy=_PLANE
+        )
     path = metadata_of(name)
     facts = {} if path is None else read_extended(path)
     product = facts.get("product", "GEC")
@@ -105,6 +112,13 @@ def open_scene(
     )  # fmt: skip
     facts["relief_px_per_100_m"] = round(100 * math.hypot(*model.relief) / pixel[0], 2)
     return Scene("sar", name, *size, {"geo": model}, str(path or name), facts, _warnings(path is not None))
+
+
+def _is_slant(dataset: gdal.Dataset) -> bool:
+    """Tell whether an image has complex values, which only a radar in its own geometry gives, and no map geometry."""
+    band = dataset.GetRasterBand(1) if dataset.RasterCount else None
+    complex_ = band is not None and bool(gdal.DataTypeIsComplex(band.DataType))
+    return complex_ and dataset.GetGeoTransform(can_return_null=True) is None
 
 
 @reads(_REMEDY)

@@ -110,3 +110,11 @@ def test_slant_range_is_refused(image: Path) -> None:
     bare = pixels(image.parent / "bare.tif", SIZE)
     with pytest.raises(InputError, match="no map geometry"):
         open_scene(bare, "sar", {"incidence": "35", "azimuth": "80", "plane": "100"})
+
+
+def test_complex_values_are_slant_range(tmp_path: Path) -> None:
+    """SLC and SICD of any vendor, which nothing else knows."""
+    gdal.GetDriverByName("GTiff").Create(str(tmp_path / "slc.tif"), *SIZE, 1, gdal.GDT_CFloat32).FlushCache()
+    with pytest.raises(InputError, match="this is in slant range") as caught:
+        open_scene(tmp_path / "slc.tif")
+    assert "GEC" in caught.value.remedy
