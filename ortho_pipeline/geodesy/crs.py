@@ -429,12 +429,12 @@ def _promoted(crs: pyproj.CRS) -> pyproj.CRS:
     return crs if crs.is_geocentric else crs.to_3d()
 
 
+@functools.lru_cache(maxsize=64)  # 5 ms of PROJ each; a scene asks nine times for two pairs of systems
 def _transformer(source: pyproj.CRS, target: pyproj.CRS) -> Transformer:
     try:
         return Transformer.from_crs(source, target, always_xy=True, only_best=True, allow_ballpark=False)
     except (ProjError, CRSError) as error:
-        grid = _grid_of_message(str(error))
-        raise _way_error(source, target, grid) from error
+        raise _way_error(source, target, _grid_of_message(str(error))) from error
 
 
 def _way_error(source: pyproj.CRS, target: pyproj.CRS, grid: str | None) -> OrthoError:

@@ -44,6 +44,21 @@ def test_a_crs_in_words_and_as_it_is_read_again() -> None:
     assert pyproj.CRS(crs_definition(own)) == own
 
 
+def test_a_pair_of_systems_is_set_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PROJ takes milliseconds for it, and `ortho rectify` asked nine times for two pairs."""
+    made = []
+    plain = pyproj.Transformer.from_crs
+
+    def counted(*systems: object, **more: object) -> pyproj.Transformer:
+        made.append(systems)
+        return plain(*systems, **more)
+
+    monkeypatch.setattr(module.Transformer, "from_crs", counted)
+    ways = [GroundTransform("EPSG:4979", crs) for crs in ("EPSG:32637", pyproj.CRS.from_epsg(32637), utm_crs(39, 1))]
+    assert len(made) <= 1
+    assert np.array_equal(*(way(np.array([[39.0, 1.0, 50.0]])) for way in ways[::2]))
+
+
 # -- heights
 
 
