@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ortho_pipeline.files.compiled import compiled, inlined
-from ortho_pipeline.warp.kernels import Resampling, SourceWindow, cubic_weights, row_inside, row_with_edges
+from ortho_pipeline.warp.kernels import Resampling, Scratch, SourceWindow, cubic_weights, row_inside, row_with_edges
 
 #: From this many output pixels per DEM sample on, pixels are taken together that lie between the same samples.
 _RUN = 6.0
@@ -52,15 +52,17 @@ class DemWindow(NamedTuple):
 
 
 class Target(NamedTuple):
-    """Where pixels go: rows first … last - 1 and columns of a block, and its part of the ortho ``(bands, h, w)``.
+    """Where pixels go: rows first … last - 1 and columns of a block, and the tile ``(bands, h, w)`` that it is part of.
 
-    `pixels` and `valid` (whether they have a value) begin with the first row and column.
+    `row` and `column` are the place of the first row and column in `pixels` and `valid` (whether they have a value).
     """
 
     first_row: int
     last_row: int
     first_column: int
     last_column: int
+    row: int
+    column: int
     pixels: Any
     valid: Any
 
@@ -147,17 +149,23 @@ def _row_heights(dem, u0, du, v0, dv, spacing, tx, out):
     k = 0
     while k < count:
         west, north = np.floor(u0 + du * tx[k]), np.floor(v0 + dv * tx[k])
-        end = k + 1
-        while end < count and np.floor(u0 + du * tx[end]) == west and np.floor(v0 + dv * tx[end]) == north:
-            end += 1
+        # Coordinates do not turn back along a row, nor does their rounding.
+        end, beyond = k + 1, count
+        while end < beyond:
+            middle = (end + beyond) >> 1
+            if np.floor(u0 + du * tx[middle]) == west and np.floor(v0 + dv * tx[middle]) == north:
+                end = middle + 1
+            else:
+                beyond = middle
         i, j = int(west) - dem_left, int(north) - dem_top
         smooth = 0 <= i < dem_columns - 1 and 0 <= j < dem_rows - 1
         if smooth:
             h00, h10, h01 = heights[j, i], heights[j, i + 1] - heights[j, i], heights[j + 1, i] - heights[j, i]
             h11 = heights[j + 1, i + 1] - heights[j + 1, i] - h10
             smooth = h11 + h01 == h11 + h01  # no void among them
+        # Of unsigned places the compiler knows that they are not Python's negative ones, and takes several at once.
         if smooth:
-            for m in range(k, end):
+            for m in range(np.uint64(k), np.uint64(end)):
                 fu, fv = u0 + du * tx[m] - west, v0 + dv * tx[m] - north
                 out[m] = (h00 + h10 * fu) + (h01 + h11 * fu) * fv
         else:
@@ -199,8 +207,8 @@ def _dem_height(heights, i, j, fu, fv, cubic_dem):
         return bilinear
     if not (i >= 1 and j >= 1 and i + 2 < heights.shape[1] and j + 2 < heights.shape[0]):
         return bilinear
-    a0, a1, a2, a3 = cubic_weights(fu)
-    b0, b1, b2, b3 = cubic_weights(fv)
+    a0, a1, a2, a3 = cubic_weights(fu, np.float64)
+    b0, b1, b2, b3 = cubic_weights(fv, np.float64)
     total = 0.0
     for k in range(4):
         b = b0 if k == 0 else b1 if k == 1 else b2 if k == 2 else b3
@@ -226,6 +234,7 @@ def warp_block(source: SourceWindow, lattice: Lattice, dem: DemWindow, resamplin
     for k in range(first, last):
         ticks[k] = (k % lattice.spacing) / lattice.spacing
     pixels, left, top, out, out_valid = source.pixels, source.left, source.top, target.pixels, target.valid
+    scratch = _scratch(last - first, pixels, resampling.real)
     bands, window_height, window_width = pixels.shape
     # Points within these bounds have all neighbours both in the source and in the window.
     low_col = left + reach if left > 0 else reach
@@ -234,7 +243,7 @@ def warp_block(source: SourceWindow, lattice: Lattice, dem: DemWindow, resamplin
     short = 0
     for row in range(target.first_row, target.last_row):
         block_coordinates(row, first, last, lattice, dem, ticks, columns, rows)
-        line, count, done = row - target.first_row, last - first, 0
+        line, start, count, done = row - target.first_row + target.row, target.column, last - first, 0
         while done < count:
             # Parts of the row in which no neighbour is missing are made fast, the others with care.
             if source.masked:
@@ -243,16 +252,26 @@ def warp_block(source: SourceWindow, lattice: Lattice, dem: DemWindow, resamplin
                 begin, end = _span(columns, rows, low_col, high_col, low_row, high_row, done)
             if begin > done:
                 short += row_with_edges(
-                    resampling, source, columns[done:begin], rows[done:begin], out[:, line, done:begin],
-                    out_valid[:, line, done:begin],
+                    resampling, source, columns[done:begin], rows[done:begin],
+                    out[:, line, start + done : start + begin], out_valid[:, line, start + done : start + begin],
                 )  # fmt: skip
             for band in range(bands if end > begin else 0):
                 row_inside(
-                    resampling, pixels[band], columns[begin:end], rows[begin:end], left, top, out[band, line, begin:end]
-                )
-            out_valid[:, line, begin:end] = True
+                    resampling, pixels[band], columns[begin:end], rows[begin:end], left, top, scratch,
+                    out[band, line, start + begin : start + end],
+                )  # fmt: skip
+                out_valid[band, line, start + begin : start + end] = True
             done = end
     return short
+
+
+@inlined
+def _scratch(count, pixels, real):
+    return Scratch(
+        np.empty(count, dtype=np.uint64), np.empty(count, dtype=real.dtype), np.empty(count, dtype=real.dtype),
+        np.empty((4, count), dtype=pixels.dtype), np.empty((8, count), dtype=real.dtype),
+        np.empty(count, dtype=real.dtype),
+    )  # fmt: skip
 
 
 @compiled
@@ -265,7 +284,7 @@ def _span(columns, rows, low_col, high_col, low_row, high_row, done):
     while end > begin and not (low_col <= columns[end - 1] < high_col and low_row <= rows[end - 1] < high_row):
         end -= 1
     inside = begin < end
-    for k in range(begin, end):
+    for k in range(np.uint64(begin), np.uint64(end)):
         inside &= (columns[k] >= low_col) & (columns[k] < high_col) & (rows[k] >= low_row) & (rows[k] < high_row)
     return (begin, end) if inside else (count, count)
 

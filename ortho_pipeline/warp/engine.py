@@ -345,7 +345,7 @@ class TileMaker:
         )  # fmt: skip
         self.cubic_dem, self.window_bytes = cubic_dem, window_bytes
         self.profile = profile
-        self.resampling = kernels.Resampling(kernel, 0, (1.0, 1.0), *value_range(source.dtype, profile))
+        self.resampling = kernels.Resampling(kernel, 0, (1.0, 1.0), *value_range(source.dtype, profile), real=None)
         self.any_band = profile.validity == "nodata" or profile.dtype.kind == "f"
         self._lock = threading.Lock()
         self.valid_pixels = 0
@@ -428,8 +428,11 @@ class TileMaker:
                 self._warp_block(block, _window(self.source, *window, reach=block.reach), dem, tile.target(block, cell))
 
     def _warp_block(self, block: OutputBlock, window: kernels.SourceWindow, dem: DemWindow, target: Target) -> None:
-        resampling = self.resampling._replace(reach=block.reach, box=block.box)
-        while target.pixels.size and warp_block(window, block.lattice, dem, resampling, target):
+        # An array that threads shared would have them wait for each other's counts of its references.
+        real = kernels.mixing(self.source.dtype)
+        resampling = self.resampling._replace(reach=block.reach, box=block.box, real=real)
+        empty = target.first_row >= target.last_row or target.first_column >= target.last_column
+        while not empty and warp_block(window, block.lattice, dem, resampling, target):
             window = _wider(self.source, window, block.reach)
 
 
@@ -447,8 +450,8 @@ class _Tile:
         top, left = block.row * BLOCK - self.top, block.column * BLOCK - self.left
         _, height, width = self.pixels.shape
         first_row, last_row, first, last = area[0], min(area[1], height - top), area[2], min(area[3], width - left)
-        part = (..., slice(top + first_row, top + last_row), slice(left + first, left + last))
-        return Target(first_row, last_row, first, last, self.pixels[part], self.valid[part])
+        place = top + first_row, left + first
+        return Target(first_row, last_row, first, last, *place, self.pixels, self.valid)
 
 
 def _window(source: RasterSource, left: int, top: int, right: int, bottom: int, *, reach: int) -> kernels.SourceWindow:

@@ -385,6 +385,39 @@ def test_output_is_the_same_for_any_memory_and_threads(scene, tmp_path, kernel):
         np.testing.assert_array_equal(valid, outputs[0][1])
 
 
+@pytest.mark.parametrize("kernel", ["bilinear", "cubic"])
+def test_integers_of_16_bits_are_mixed_to_a_fiftieth_and_the_same_for_any_memory(scene, tmp_path, kernel):
+    """Neighbours as far apart as they can be; a pixel is made in a whole row, or with care at an edge of the window."""
+    pixels = np.random.default_rng(5).choice([0, 1, 32767, 65534, 65535], (1, HEIGHT, WIDTH)).astype(np.uint16)
+    surface, grid, made = scene.surface(), grid_of(), []
+    holed = np.full(pixels.shape[1:], 255, np.uint8)
+    for row, column in np.ndindex(3, 3):
+        holed[row::40, column::40] = 0
+    for name, values, mask, memory in [
+        ("exact", pixels.astype(np.float64), None, 512_000_000),
+        ("ours", pixels, None, 512_000_000),
+        ("little", pixels, None, 300_000),
+        ("masked", pixels, holed, 512_000_000),
+        ("little masked", pixels, holed, 300_000),
+    ]:
+        source, path = RasterSource(scene.write(values, f"{name}.tif", mask=mask)), tmp_path / "o.tif"
+        rectify(
+            scene.model, source, surface, grid, path, resampling=kernel, resources=Resources(memory), driver="GTiff"
+        )
+        made.append(read(path))
+    (exact, valid), (ours, _), (little, _), (masked, whole), (little_masked, _) = made
+    # Half a digital number of rounding, and that of Float32: 2^-24 of 65535 in each of some ten steps.
+    off = np.abs(ours - np.clip(exact, 0, 65535))[:, valid]
+    assert off.max() <= 0.52
+    assert valid.sum() > 100_000
+    np.testing.assert_array_equal(little, ours)
+    np.testing.assert_array_equal(little_masked, masked)
+    # Far from an invalid pixel those are the same, too.
+    far = whole & (minimum_filter(whole, 15) > 0)
+    assert far.sum() > 50_000
+    np.testing.assert_array_equal(masked[:, far], ours[:, far])
+
+
 def test_output_does_not_depend_on_the_size_of_the_tiles(scene, tmp_path, monkeypatch):
     source, surface, grid = RasterSource(scene.write(texture(np.float32))), scene.surface(), grid_of()
     pixels = []
