@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -81,12 +80,6 @@ class Mark:
         if self.role == "tie" or self.ground is None:
             return self.role == "tie" and len(self.rays) >= 2
         return self.role == "control" or len(self.rays) >= 2
-
-    @cached_property
-    def values(self) -> dict[str, Any]:
-        """All of it as JSON values: after an action nearly all marks are as they were."""
-        told: dict[str, Any] = json_value(self)
-        return told
 
     @property
     def counts(self) -> bool:
@@ -219,8 +212,21 @@ class Marks:
                 "measured": mark.how, "ground_from": mark.ground_from, "score": mark.score, "at": mark.at,
                 **({"note": mark.note} if mark.note else {}),
             }  # fmt: skip
-        left = [mark.values for mark in self.by_id.values() if not mark.counts]
+        left = [json_value(mark) for mark in self.by_id.values() if not mark.counts]
         return {"type": "FeatureCollection", "features": features, **({"left_out": left} if left else {})}
+
+
+class Written:
+    """Marks as JSON values, each made once: after an action nearly all of them are as they were."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, tuple[Mark, dict[str, Any]]] = {}
+
+    def of(self, mark: Mark) -> dict[str, Any]:
+        """Return a mark as JSON values."""
+        if mark.id not in self._known or self._known[mark.id][0] is not mark:
+            self._known[mark.id] = mark, json_value(mark)
+        return self._known[mark.id][1]
 
 
 def marks_of(points: Points, at: str) -> list[Mark]:

@@ -18,7 +18,7 @@ from ortho_pipeline.files import write_json
 from ortho_pipeline.files.documents import json_position, json_value
 from ortho_pipeline.imaging.matching import View
 from ortho_pipeline.measure.journal import Journal
-from ortho_pipeline.measure.marks import GROUND_CRS, History, Mark, Marks
+from ortho_pipeline.measure.marks import GROUND_CRS, History, Mark, Marks, Written
 from ortho_pipeline.measure.places import Geometry, Places, Sheet, ground_typed, linked
 from ortho_pipeline.measure.planning import Next
 from ortho_pipeline.models.base import Array, SensorModel
@@ -53,7 +53,7 @@ class Project(abc.ABC):
         self._lock = threading.RLock()
         self._saved = -1
         self.journal = Journal(output.with_name(output.name + JOURNAL))
-        self._history = History()
+        self._history, self._written = History(), Written()
 
     # -- what differs ------------------------------------------------------------------------------------------------
 
@@ -214,8 +214,9 @@ class Project(abc.ABC):
                 there[rows] = self.places_of(number).ground_about(
                     [ahead[k].image for k in rows], [ahead[k].height for k in rows]
                 )
+            told = [self._written.of(mark) for mark in marks]
             return {
-                "marks": [{**mark.values, "places": places} for mark, places in zip(marks, shown, strict=True)],
+                "marks": [{**mark, "places": places} for mark, places in zip(told, shown, strict=True)],
                 "version": version, "undo": history.can_undo, "redo": history.can_redo,
                 "actions": len(self.journal.actions), **self._figures(),
                 "next": [
