@@ -20,7 +20,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.errors import InputError, StorageError
+from ortho_pipeline.errors import InputError, OrthoError, StorageError
 from ortho_pipeline.files.locations import require_network
 from ortho_pipeline.files.traffic import count
 
@@ -202,7 +202,8 @@ class Objects:
                 wrong = "" if there.sha256 == content.sha256 else "it is another content"
             if not wrong:
                 return replace(content, e_tag=stored["e_tag"])
-        self.delete(name)
+        with contextlib.suppress(OrthoError):
+            self.delete(name)
         gone = "could not be removed" if self.exists(name) else "was removed"
         raise StorageError(
             f"{wrong} after it was written, {_ATTEMPTS} times; it {gone}", file=self.of(name),
