@@ -92,8 +92,8 @@ def timed_on_dask(folder: Path, few: Path, workers: int = 2) -> dict[str, float]
     import dask
     from distributed import LocalCluster
 
-    # docs/scale.md: dask's own settings of the allocator cost 15 %.
-    dask.config.set({"distributed.nanny.pre-spawn-environ": ALLOCATOR})
+    # docs/scale.md: dask's own settings of the allocator and its profiler cost some 15 % each.
+    dask.config.set({"distributed.nanny.pre-spawn-environ": ALLOCATOR, "distributed.worker.profile.enabled": False})
     with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
         work = functools.partial(run, executor="dask", scheduler=cluster.scheduler_address)
         timed(few, work)

@@ -6,11 +6,14 @@ Nothing heavy is imported at the top: a worker process sets its budget of thread
 from __future__ import annotations
 
 import contextlib
+import itertools
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from multiprocessing import connection
 from multiprocessing.context import SpawnContext, SpawnProcess
@@ -22,6 +25,8 @@ from ortho_pipeline.options import EXECUTORS
 
 #: Jobs that are handed over before their turn, so that no worker waits for the next one.
 _AHEAD = 256
+#: Seconds of work that travel together to a scheduler, and jobs of them at most.
+_TOGETHER, _MOST_TOGETHER = 1.0, 64
 #: Environment variables that bound the threads of numerical libraries.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -112,6 +117,74 @@ class Processes:
         self._spawned.clear()
 
 
+class InGroups:
+    """An executor to which short jobs travel together, as many as take about a second.
+
+    A task of a scheduler costs some milliseconds, whatever it does: messages, bookkeeping, a future.
+
+    Parameters
+    ----------
+    executor : Executor
+        Not shut down here.
+    """
+
+    def __init__(self, executor: Executor) -> None:
+        self._executor = executor
+
+    def completed(self, work: Callable[[Job], Outcome], jobs: Iterable[Job]) -> Iterator[tuple[Job, Future[Outcome]]]:
+        """Yield jobs and their finished futures, group by group in the order in which they end.
+
+        The jobs of a group that was lost are done again one by one: only a job that kills its worker ends with
+        `WorkerDied`.
+        """
+        rest, alone, size = iter(jobs), deque[Job](), 1
+        waiting: dict[Future[Any], tuple[Job, ...]] = {}
+        try:
+            while True:
+                while len(waiting) < _AHEAD:
+                    group = (alone.popleft(),) if alone else tuple(itertools.islice(rest, size))
+                    if not group:
+                        break
+                    waiting[_submitted(self._executor, _work_through, (work, group))] = group
+                if not waiting:
+                    return
+                done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+                for future in done:
+                    group = waiting.pop(future)
+                    if future.exception() is None:
+                        seconds, futures = future.result()
+                        size = max(1, min(_MOST_TOGETHER, int(_TOGETHER * len(group) / max(seconds, 1e-6))))
+                        yield from zip(group, map(_finished, futures), strict=True)
+                    elif len(group) > 1:
+                        alone.extend(group)
+                    else:
+                        yield group[0], _died(future)
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def _work_through(given: tuple[Callable[[Job], Outcome], Sequence[Job]]) -> tuple[float, list[tuple[Any, Any]]]:
+    """Do some jobs one after the other; return the seconds of all, and of each its result or its exception."""
+    work, jobs = given
+    begin, done = time.monotonic(), []
+    for job in jobs:
+        future = Sequential().submit(work, job)
+        error = future.exception()
+        done.append((future.result() if error is None else None, error))
+    return time.monotonic() - begin, done
+
+
+def _finished(done: tuple[Any, BaseException | None]) -> Future[Any]:
+    future: Future[Any] = Future()
+    result, error = done
+    if error is None:
+        future.set_result(result)
+    else:
+        future.set_exception(error)
+    return future
+
+
 class _Spawning(SpawnContext):
     """Spawns processes and remembers them, to be able to end them."""
 
@@ -147,14 +220,18 @@ def _end_with(sentinel: int) -> None:
     os._exit(1)
 
 
+#: Who does the work of a run.
+Crew = Executor | Processes | InGroups
+
+
 def completed(
-    executor: Executor | Processes, work: Callable[[Job], Outcome], jobs: Iterable[Job]
+    executor: Crew, work: Callable[[Job], Outcome], jobs: Iterable[Job]
 ) -> Iterator[tuple[Job, Future[Outcome]]]:
     """Yield jobs and their finished futures, in the order in which they end; a job's exception is its future's.
 
     An executor of the caller that breaks takes the rest of the jobs with it.
     """
-    if isinstance(executor, Processes):
+    if isinstance(executor, Processes | InGroups):
         yield from executor.completed(work, jobs)
         return
     ahead = 1 if isinstance(executor, Sequential) else _AHEAD
@@ -235,7 +312,7 @@ def dask_executor(scheduler: str) -> Any:
 @contextlib.contextmanager
 def crew_of(
     executor: str | Executor | None, workers: int | None, threads: int | None, scheduler: str | None, jobs: int
-) -> Iterator[tuple[Executor | Processes, int | None]]:
+) -> Iterator[tuple[Crew, int | None]]:
     """Yield who does the work, and the threads of each scene."""
     if scheduler is not None and executor not in ("dask", None):
         raise InputError("a scheduler is for dask", field="scheduler", remedy="leave out `executor`, or say dask")
@@ -247,7 +324,7 @@ def crew_of(
                              remedy="for example tcp://host:8786")  # fmt: skip
         client, pool = dask_executor(scheduler)
         with client:
-            yield pool, threads or 1
+            yield InGroups(pool), threads or 1
     elif executor == "sequential":
         yield Sequential(), threads
     elif executor in ("processes", None):

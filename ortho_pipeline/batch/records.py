@@ -111,6 +111,8 @@ class Record:
     @classmethod
     def read(cls, path: Path) -> Record | None:
         """Return the record, or None where there is none of this version that can be understood."""
+        if not path.is_file():
+            return None
         try:
             document = files.read_json(path, _MAX_BYTES, "run again")
             if (document.pop("document"), document.pop("schema_version")) != (DOCUMENT, SCHEMA_VERSION):

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline import commands
-from ortho_pipeline.batch.executors import Processes, Sequential, completed, crew_of
+from ortho_pipeline.batch.executors import Crew, Processes, Sequential, completed, crew_of
 from ortho_pipeline.batch.plan import RUN_FILES, STATE, Job, Plan, for_run, plan, versions
 from ortho_pipeline.batch.records import Digests, FileState, Record, key_of, locked, siblings
 from ortho_pipeline.batch.results import BatchResult, Outcome
@@ -335,7 +335,7 @@ class _Run:
         self.log_path = planned.output / RUN_FILES["log"]
         self.outcomes: dict[str, Outcome] = {}
 
-    def make(self, crew: Executor | Processes, jobs: Sequence[Job]) -> BatchResult:
+    def make(self, crew: Crew, jobs: Sequence[Job]) -> BatchResult:
         self.log("run started", scenes=len(jobs), file=str(self.planned.path), versions=versions())
         try:
             changed = list(self._without_unchanged(jobs))
@@ -348,7 +348,7 @@ class _Run:
             raise
         return self._finish(jobs, made)
 
-    def _mosaic(self, crew: Executor | Processes, jobs: Sequence[Job]) -> dict[str, Any]:
+    def _mosaic(self, crew: Crew, jobs: Sequence[Job]) -> dict[str, Any]:
         """Make the mosaic of the scenes that there are; what is wrong with it is in the document."""
         present = [job for job in jobs if self.outcomes[job.name].status != "failed"]
         try:
@@ -436,7 +436,7 @@ class _Mosaic:
         order = {ortho.name: ortho.relief_displacement for ortho in self.orthos}
         self.key = key_of(self.inputs, {**asdict(self.settings), "order": list(order.items())}, versions())
 
-    def make(self, crew: Executor | Processes) -> dict[str, Any]:
+    def make(self, crew: Crew) -> dict[str, Any]:
         record = Record.read(self.record)
         if record is not None and record.key == self.key and record.intact(self.output):
             # A record may lie: what it vouches for is read as any other file, and made again if it is not a report.
@@ -455,7 +455,7 @@ class _Mosaic:
         Record("mosaic", self.key, "done", self.inputs, made).write(self.record)
         return {**document, "status": "done"}
 
-    def _seams(self, pairs: Sequence[Overlap], crew: Executor | Processes) -> list[dict[str, Any]]:
+    def _seams(self, pairs: Sequence[Overlap], crew: Crew) -> list[dict[str, Any]]:
         # New processes for a few seams take longer than these.
         crew = Sequential() if isinstance(crew, Processes) and len(pairs) < _MANY_SEAMS else crew
         found = {id(pair): future.result() for pair, future in completed(crew, measure_seam, pairs)}

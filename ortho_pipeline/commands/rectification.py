@@ -222,10 +222,10 @@ def _of_earlier_run(folder: Path, stem: str, files: Mapping[str, Path], *, all_o
 
     Without its report, only `all_of_them` takes files of such names for its own.
     """
-    ours = all_of_them
-    if not ours:
+    ours, before = all_of_them, folder / f"{stem}{ENDINGS['report']}"
+    if not ours and before.is_file():
         with contextlib.suppress(InputError):
-            ours = bool(report.read_report_json(folder / f"{stem}{ENDINGS['report']}"))
+            ours = bool(report.read_report_json(before))
     left = [folder / f"{stem}{ending}" for ending in ENDINGS.values()] if ours else []
     return [*(path for path in left if path not in files.values()), *inputs.old_side_cars(files["ortho"])]
 

@@ -20,6 +20,7 @@ from typing import Annotated, Any, TypeVar, dataclass_transform
 import numpy as np
 
 _T = TypeVar("_T")
+_PLAIN = frozenset({str, int, bool, type(None)})
 
 
 def json_value(value: Any) -> Any:
@@ -28,6 +29,11 @@ def json_value(value: Any) -> Any:
     A number that is not finite is null, by itself or within an array; NumPy's numbers are Python's; arrays, tuples and
     sets are lists; mappings and dataclasses are objects; paths and whatever else is not known are text.
     """
+    kind = type(value)
+    if kind in _PLAIN:  # most of a document, which is asked nothing more
+        return value
+    if kind is dict:
+        return {key if type(key) is str else str(key): json_value(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, os.PathLike):

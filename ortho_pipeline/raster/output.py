@@ -126,8 +126,8 @@ def png_bytes(pixels: NDArray[np.uint8]) -> bytes:
     memory.WriteArray(pixels)
     path = f"/vsimem/ortho_png_{secrets.token_hex(8)}.png"
     try:
-        # More effort makes such a picture hardly smaller, and takes four times as long.
-        close(gdal.GetDriverByName("PNG").CreateCopy(path, memory, options=["ZLEVEL=4"]))
+        # More effort takes twice (4) to six times (6) as long, and makes such a picture 6 % smaller.
+        close(gdal.GetDriverByName("PNG").CreateCopy(path, memory, options=["ZLEVEL=2"]))
         return VsiPath(path).read_bytes()
     finally:
         gdal.Unlink(path)

@@ -10,7 +10,7 @@ import shutil
 import signal
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from click.testing import CliRunner
 from osgeo import gdal
 
 from ortho_pipeline.batch import runner as batch
+from ortho_pipeline.batch.executors import InGroups, WorkerDied, completed
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
@@ -110,3 +111,42 @@ def test_on_the_command_line(folder, cluster):
 def test_no_scheduler(folder):
     with pytest.raises(InputError, match="no dask scheduler answers"):
         batch.run(folder / "p.yaml", executor="dask", scheduler="tcp://127.0.0.1:1")
+
+
+class Counting(ThreadPoolExecutor):
+    """A pool that notes what it is given, and loses a task as dask does whose worker dies."""
+
+    def __init__(self, lost: int = -1) -> None:
+        super().__init__(1)
+        self.tasks: list[tuple[Any, ...]] = []
+        self.lost = lost
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        self.tasks.append(args)
+        if self.lost in args[0][1]:
+            gone: Future[Any] = Future()
+            gone.set_exception(BrokenExecutor())
+            return gone
+        return super().submit(fn, *args, **kwargs)
+
+
+def one_over(number: int) -> float:
+    return 1 / (number - 100)
+
+
+def test_short_jobs_travel_together_and_each_has_its_own_result() -> None:
+    with Counting() as pool:
+        found = dict(completed(InGroups(pool), one_over, range(3000)))
+        assert len(found) == 3000
+        assert isinstance(found.pop(100).exception(), ZeroDivisionError)
+        assert all(future.result() == one_over(job) for job, future in found.items())
+        assert len(pool.tasks) < 600  # the first 256 alone, the others up to 64 together
+
+
+def test_of_a_group_that_is_lost_only_the_job_that_loses_it_has_failed() -> None:
+    with Counting(lost=2000) as pool:
+        found = dict(completed(InGroups(pool), float, range(3000)))
+        assert isinstance(found.pop(2000).exception(), WorkerDied)
+        assert sorted(future.result() for future in found.values()) == [
+            float(job) for job in range(3000) if job != 2000
+        ]

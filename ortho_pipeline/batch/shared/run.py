@@ -11,11 +11,11 @@ import functools
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.batch.executors import Processes, completed
+from ortho_pipeline.batch.executors import Crew, completed
 from ortho_pipeline.batch.plan import STATE, Job, Plan
 from ortho_pipeline.batch.records import key_of
 from ortho_pipeline.batch.results import BatchResult, Outcome
@@ -116,7 +116,7 @@ def run_shared(
     planned: Plan,
     own: Sequence[Job],
     where: SharedFolder,
-    crew: Executor | Processes,
+    crew: Crew,
     make: Make,
     progress: Callable[[float], None] | None = None,
 ) -> BatchResult:
