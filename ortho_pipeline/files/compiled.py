@@ -1,4 +1,8 @@
-"""How kernels are compiled: once per machine where a cache can be written, in the memory of each process elsewhere."""
+"""How kernels are compiled: once per machine where a cache can be written, in the memory of each process elsewhere.
+
+What was compiled before, in a folder that cannot be written any more (an image of a container, a package that somebody
+else installed), is taken from there.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +10,14 @@ import functools
 import hashlib
 import inspect
 import logging
+import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core.caching import FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator, UserProvidedCacheLocator
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime import rtsys
 
@@ -27,12 +33,22 @@ def compiled(function: Callable[..., Any]) -> Any:
     missing when compiled code is loaded from its cache.
     """
     made: Any = _njit()(function)
-    try:
-        made._cache = _Cache(function)  # as enable_caching() does with numba's own
-    except RuntimeError:
+    own, shared = _cache_of(_Cache, function), _cache_of(_Shared, function)
+    if own is None and shared is None:
         # Neither the package's folder nor the user's cache can be written, as in many containers.
         _say_once()
+        return made
+    if own is not None and shared is not None and own.cache_path != shared.cache_path:
+        own.shared = shared
+    made._cache = own or shared  # as enable_caching() does with numba's own
     return made
+
+
+def _cache_of(kind: type[_Cache], function: Callable[..., Any]) -> _Cache | None:
+    try:
+        return kind(function)
+    except RuntimeError:
+        return None
 
 
 def inlined(function: Callable[..., Any]) -> Any:
@@ -50,6 +66,8 @@ class _Cache(FunctionCache):
     numba looks at the module of the function alone, not at those of functions that are compiled into it.
     """
 
+    shared: _Cache | None = None
+
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load what is compiled with the runtime that it calls, and nothing else.
 
@@ -58,10 +76,43 @@ class _Cache(FunctionCache):
         """
         rtsys.initialize(target_context)
         with self._guard_against_spurious_io_errors():
-            return self._load_overload(sig, target_context)
+            found = self._load_overload(sig, target_context)
+        return self.shared.load_overload(sig, target_context) if found is None and self.shared is not None else found
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
         return (*super()._index_key(sig, codegen), _others(self._py_func.__module__))
+
+
+def _must_hold_code(place: Any) -> None:
+    """Refuse a folder that holds nothing of a module; numba's own places have to be writable instead."""
+    stem = Path(place._py_file).stem
+    if not any(name.startswith(f"{stem}.") and name.endswith(".nbi") for name in os.listdir(place.get_cache_path())):
+        raise FileNotFoundError
+
+
+class _Named(UserProvidedCacheLocator):
+    """The folder of NUMBA_CACHE_DIR, where it is only read."""
+
+    ensure_cache_path = _must_hold_code
+
+
+class _BesideSources(InTreeCacheLocator):
+    """The folder of the package, where it is only read."""
+
+    ensure_cache_path = _must_hold_code
+
+
+class _SharedPlace(CompileResultCacheImpl):
+    _locator_classes: Any = (_Named, _BesideSources)
+
+
+class _Shared(_Cache):
+    """Machine code that somebody else has kept; what is compiled is not."""
+
+    _impl_class: Any = _SharedPlace
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep nothing."""
 
 
 @functools.cache

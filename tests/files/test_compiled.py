@@ -16,10 +16,12 @@ KERNELS = [
 SCENE = Path(__file__).parents[2] / "sample_data/ikonos/po_39001_pan_0000000.tif"
 #: What numba does where neither the package's folder nor the home can be written: it finds no place for a cache.
 READ_ONLY = "import sys; from numba.core import caching; caching.CacheImpl._locator_classes = []\n"
+#: And nobody has compiled before.
+NOWHERE = READ_ONLY + "from ortho_pipeline.files import compiled; compiled._SharedPlace._locator_classes = ()\n"
 
 
 def run(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", READ_ONLY + code], capture_output=True, text=True, check=False)
+    return subprocess.run([sys.executable, "-c", NOWHERE + code], capture_output=True, text=True, check=False)
 
 
 def test_a_command_runs_where_no_cache_can_be_written() -> None:
@@ -99,3 +101,37 @@ def test_kernels_use_nothing_that_is_missing_when_they_are_loaded(path: Path) ->
             assert ast.unparse(node).removeprefix("np.") not in ("dot", "vdot", "linalg", "matmul"), path
         if isinstance(node, ast.Call):
             assert ast.unparse(node.func) not in ("hash", "dict", "set", "frozenset"), path
+
+
+def test_what_was_compiled_before_is_taken_from_where_nothing_can_be_written(tmp_path: Path) -> None:
+    """As in an image of a container that is run by another user, or whose files are read-only: no need to compile."""
+    (tmp_path / "one.py").write_text(
+        "from ortho_pipeline.files.compiled import compiled\n@compiled\ndef double(x):\n    return 2 * x\n"
+    )
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from one import double\n"
+        "print(double(21), sum(double.stats.cache_hits.values()), double(0.5), sum(double.stats.cache_hits.values()))"
+    )
+    surroundings = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
+    elsewhere = (
+        "from numba.core import caching\n"
+        "class Home(caching.UserWideCacheLocator):\n"
+        f"    def get_cache_path(self): return {str(tmp_path / 'home')!r}\n"
+        "caching.CacheImpl._locator_classes = [Home]\n"
+    )
+
+    def output(before: str) -> str:
+        command = [sys.executable, "-c", before + code.replace(", double(0.5)", "" if before else ", 1.0")]
+        done = subprocess.run(command, env=surroundings, capture_output=True, text=True, check=True)
+        return done.stdout + done.stderr
+
+    assert output("") == "42 0 1.0 0\n"
+    kept = {path.name: path.read_bytes() for path in (tmp_path / "cache").rglob("*.nb*")}
+    for before in (READ_ONLY, elsewhere):
+        assert output(before) == "42 1 1\n"
+    assert {path.name: path.read_bytes() for path in (tmp_path / "cache").rglob("*.nb*")} == kept
+    # Code that is not there is compiled, and kept where that is possible.
+    code = code.replace("double(21)", "double(0.25)")
+    assert output(READ_ONLY) == "0.5 0 0\n"
+    assert output(elsewhere) == "0.5 0 0\n"
+    assert output(elsewhere) == "0.5 1 1\n"
