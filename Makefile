@@ -7,7 +7,7 @@
 #   make check    formatting, lint, types, tests
 #   make page-types  the types of the scripts of `ortho measure`, by TypeScript (npx fetches it)
 #   make fuzz     read damaged files with every reader (N=100000 of each, READER=name for one, KEEP=folder for results)
-#   make bench    speed and memory against gdalwarp, speed of adjustments and of many scenes
+#   make bench    speed and memory against gdalwarp, of adjustments, of many scenes: docs/performance.json (an hour)
 #   make packages build sdist and wheel, install and try both in clean environments (PYTHONS=python3.12=wheel, more)
 #   make docs     do the tutorials and draw their pictures, then the documentation as a site in out/site, links checked,
 #                 and manual pages in out/man
@@ -77,12 +77,7 @@ fuzz: setup
 	@$(BIN)/python tests/attack/fuzz.py -n $(N) -j $(WORKERS) $(addprefix --reader ,$(READER)) $(addprefix --keep ,$(KEEP))
 
 bench: setup
-	@$(BIN)/python benchmarks/warp.py
-	$(BIN)/python benchmarks/fit.py
-	$(BIN)/python benchmarks/adjust.py
-	$(BIN)/python benchmarks/batch.py
-	$(BIN)/python benchmarks/answers.py
-	$(BIN)/python benchmarks/measure.py
+	@$(BIN)/python benchmarks/collect.py
 
 # Which interpreters, each with the system's GDAL or the extra `wheel`.
 PYTHONS ?= $(PYTHON)=system

@@ -27,27 +27,19 @@ from pathlib import Path
 
 import numpy as np
 from osgeo import gdal
-from warp import Job, api, machine, measure, ours
+from warp import API, Job, machine, measure, ours, warped
 
 HOME = Path(__file__).resolve().parents[1]
 #: What is slower by more than this is a regression.
 TOLERATED = 1.05
 
-#: The warp alone, its kernels loaded; each commit has its own, which knows the names of its modules.
-WARP_CPU = """
-import sys, time, pyproj
-from pathlib import Path
-from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
-from ortho_pipeline.exchange.rpc import rpc_of_dataset
-from ortho_pipeline.warp.engine import rectify
-image, dem, out, step, *extent = sys.argv[1:]
-grid = Grid.of_extent(pyproj.CRS("EPSG:32735"), [float(value) for value in extent], (float(step), float(step)))
-model = rpc_of_dataset(open_dataset(image))[0]
+#: After `API` of a commit's warp.py, which knows the names of its modules: the CPU time of its warp, kernels loaded.
+TIMED = """
+import os, time
 for name in ("warm", "counted"):
     begin = time.process_time()
-    rectify(model, RasterSource(image), Surface.open(dem, "ellipsoid"), grid, out, driver="GTiff")
-    Path(out).unlink()
+    make()
+    os.unlink(out)
 print(time.process_time() - begin)
 """
 
@@ -74,14 +66,15 @@ class Checkout:
 
     @property
     def warp_code(self) -> str:
-        """Its own `WARP_CPU`, here or, before there was this file, in warp.py."""
-        for name in ("regress.py", "warp.py"):
+        """A program that prints the CPU time of its warp; commits before this one had it whole, as `WARP_CPU`."""
+        texts = {}
+        for name in ("warp.py", "regress.py"):
             path = self.home / "benchmarks" / name
             tree = ast.parse(path.read_text(encoding="utf-8")) if path.exists() else ast.Module([], [])
             for node in tree.body:
-                if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "WARP_CPU":
-                    return str(ast.literal_eval(node.value))
-        return WARP_CPU
+                if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
+                    texts[ast.unparse(node.targets[0])] = str(node.value.value)
+        return texts.get("WARP_CPU", texts.get("API", API) + TIMED)
 
 
 @contextlib.contextmanager
@@ -132,7 +125,7 @@ def jobs(job: Job) -> dict[str, Callable[[Checkout], float]]:
         return one.cpu([str(with_invalid_pixels(job)) if part == str(job.image) else part for part in command], folder)
 
     def warp(one: Checkout) -> float:
-        return float(one.output([sys.executable, "-c", one.warp_code, *api(job, folder / "warp.tif")[3:]], folder))
+        return float(one.output([sys.executable, "-c", one.warp_code, *warped(job, folder / "warp.tif")], folder))
 
     def block(one: Checkout) -> float:
         # That of this checkout, which measures the code of the other.

@@ -1,7 +1,7 @@
 """Orthorectification speed beside GDAL (and OTB where it is installed), in one run, alternating.
 
     python benchmarks/warp.py                  the 12000 x 12000 job, three rounds: a table
-    python benchmarks/warp.py --scaling        time and memory from 1000² to 24000²
+    python benchmarks/warp.py --scaling        1000² to 40000², 32 bands, Float32, JPEG 2000, one thread
     python benchmarks/warp.py --kernels        by kernel, number of bands and sensor model
     python benchmarks/warp.py --layers         what layers beside the ortho cost, as shares of the warp alone
     python benchmarks/warp.py --accuracy       every output pixel of a ramp against an independent exact evaluation
@@ -22,8 +22,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import pyproj
@@ -40,6 +44,7 @@ from ortho_pipeline.warp.layers.hiding import Hiding
 from ortho_pipeline.warp.layers.sight import Sight
 
 gdal.UseExceptions()
+_T = TypeVar("_T")
 
 LON, LAT, HEIGHT = 24.4, -33.65, 700.0
 GSD = 0.5
@@ -59,7 +64,8 @@ class Job:
 
     @property
     def image(self) -> Path:
-        return self.folder / f"scene_{self.side}_{self.bands}_{self.kind}.tif"
+        end = "jp2" if self.kind == "jp2" else "tif"
+        return self.folder / f"scene_{self.side}_{self.bands}_{self.kind}.{end}"
 
     @property
     def dem(self) -> Path:
@@ -93,14 +99,19 @@ class Job:
 
     def make(self, *, sparse: bool = False) -> Job:
         """Write scene and DEM, unless they are there."""
-        if not self.image.exists():
+        if not self.image.exists() and self.kind == "jp2":
+            gdal.Translate(
+                str(self.image), str(Job(self.folder, self.side, self.bands).make().image), format="JP2OpenJPEG",
+                creationOptions=["QUALITY=100", "REVERSIBLE=YES", "BLOCKXSIZE=1024", "BLOCKYSIZE=1024"],
+            )  # fmt: skip
+        elif not self.image.exists():
             self._write_image(sparse)
         if not self.dem.exists():
             self.write_dem()
         return self
 
     def _write_image(self, sparse: bool) -> None:
-        kind = {"uint16": gdal.GDT_UInt16, "ramp": gdal.GDT_Float32}[self.kind]
+        kind = gdal.GDT_UInt16 if self.kind == "uint16" else gdal.GDT_Float32
         bands = 2 if self.kind == "ramp" else self.bands
         options = [*TILED, "SPARSE_OK=TRUE"] if sparse else list(TILED)
         dataset = gdal.GetDriverByName("GTiff").Create(str(self.image), self.side, self.side, bands, kind, options)
@@ -115,7 +126,8 @@ class Job:
             field = 1000 + 400 * np.sin(columns / 37) * np.cos(rows / 53) + 200 * np.sin((columns + 2 * rows) / 7)
             for band in range(bands):
                 noise = random.normal(0, 20, field.shape)
-                dataset.GetRasterBand(band + 1).WriteArray((field + noise).astype(np.uint16), 0, top)
+                values = (field + noise).astype(np.uint16 if self.kind == "uint16" else np.float32)
+                dataset.GetRasterBand(band + 1).WriteArray(values, 0, top)
 
     def write_dsm(self) -> Path:
         """Write a surface model of 1 m: the rough terrain, smoothed, with blocks of houses of 6 to 40 m."""
@@ -163,6 +175,12 @@ class Run:
     memory: float
 
 
+def apart(work: Callable[..., _T], *given: Any, **more: Any) -> _T:
+    """Return what a function returns in a process of its own: Linux counts the peak of a parent as its children's."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(work, *given, **more).result()
+
+
 def measure(command: list[str], surroundings: dict[str, str] | None = None, folder: Path | None = None) -> Run:
     """Run a program in a folder; its own resource usage comes from the kernel when it ends."""
     begin = time.perf_counter()
@@ -187,6 +205,7 @@ def ours(job: Job, out: Path, kernel: str = "bilinear", *extra: str) -> list[str
     ]  # fmt: skip
 
 
+#: The warp alone, as a program calls it: `make()`. Read by regress.py as text, from the commits that it compares.
 API = """
 import sys, pyproj
 from ortho_pipeline.surface.base import Surface
@@ -196,13 +215,19 @@ from ortho_pipeline.warp.engine import rectify
 image, dem, out, step, *extent = sys.argv[1:]
 grid = Grid.of_extent(pyproj.CRS("EPSG:32735"), [float(value) for value in extent], (float(step), float(step)))
 model = rpc_of_dataset(open_dataset(image))[0]
-rectify(model, RasterSource(image), Surface.open(dem, "ellipsoid"), grid, out, driver="GTiff")
+def make():
+    rectify(model, RasterSource(image), Surface.open(dem, "ellipsoid"), grid, out, driver="GTiff")
 """
 
 
 def api(job: Job, out: Path) -> list[str]:
     """A process that does no more than the other programs: open, warp, write; no checksums, models, or report."""
-    return [sys.executable, "-c", API, str(job.image), str(job.dem), str(out), str(GSD), *map(str, job.extent)]
+    return [sys.executable, "-c", f"{API}make()", *warped(job, out)]
+
+
+def warped(job: Job, out: Path) -> list[str]:
+    """Return the words for `API`: image, DEM, output, resolution, extent."""
+    return [str(job.image), str(job.dem), str(out), str(GSD), *map(str, job.extent)]
 
 
 def gdalwarp(job: Job, out: Path, kernel: str, *extra: str) -> list[str]:
@@ -263,13 +288,13 @@ def otb_works(job: Job, out: Path) -> bool:
     return works
 
 
-def headline(job: Job, rounds: int) -> dict[str, list[Run]]:
-    """Alternate all programs; the first call of ours, which may compile, is not counted."""
+def headline(job: Job, rounds: int, programs: list[str] | None = None) -> dict[str, list[Run]]:
+    """Alternate all programs, or those named; the first call of ours, which may compile, is not counted."""
     folder, runs = job.folder, {}
     measure(ours(job, folder / "warm", "bilinear"))
     measure(ours(job, folder / "warm", "cubic"))
     reference = folder / "warm" / f"{job.image.stem}_ortho.tif"
-    with_otb = otb_works(job, folder / "otb.tif")
+    with_otb = not programs and otb_works(job, folder / "otb.tif")
     for number in range(rounds):
         turn = {
             "ortho rectify, bilinear": ours(job, folder / "ours", "bilinear"),
@@ -282,7 +307,7 @@ def headline(job: Job, rounds: int) -> dict[str, list[Run]]:
             "OTB OrthoRectification": otb(job, folder / "otb.tif") if with_otb else None,
         }
         for name, command in turn.items():
-            if command is not None:
+            if command is not None and (not programs or name in programs):
                 runs.setdefault(name, []).append(measure(command))
         walls = ", ".join(f"{name} {found[-1].wall:.2f} s" for name, found in runs.items())
         print(f"round {number + 1}: {walls}", file=sys.stderr)
@@ -321,22 +346,51 @@ def alone(job: Job, model: SensorModel | None = None, kernel: str = "bilinear") 
     return result.seconds
 
 
-def scaling(folder: Path) -> dict[str, list[Run]]:
-    """From 1000² to 24000² source pixels; the largest source is sparse."""
-    runs: dict[str, list[Run]] = {}
-    alone(Job(folder, 1000).make())
-    print("  source     Mpx out   warp alone   whole process   peak memory")
-    for side in (1000, 2000, 4000, 8000, 12000, 24000):
-        job = Job(folder, side).make(sparse=side > 12000)
-        warp = statistics.median(alone(job) for _ in range(3))
-        runs[f"{side}"] = [measure(ours(job, folder / "ours")) for _ in range(3)]
-        wall = statistics.median(run.wall for run in runs[f"{side}"])
-        memory = max(run.memory for run in runs[f"{side}"])
-        print(
-            f"{side:6d}²  {job.megapixels:9.1f}   {warp / job.megapixels * 1e3:5.1f} ns/px   {wall:8.2f} s"
-            f"   {memory:10.0f} MB"
-        )
-    return runs
+def scaling(folder: Path, rounds: int = 3) -> dict[str, dict[str, Any]]:
+    """Whole processes from 1000² to 40000² source pixels, of other kinds, and with one thread; the largest are sparse.
+
+    The fixed cost is that of the smallest scene; what a pixel costs beyond it is compared with 12000² in each round.
+    """
+    jobs = {f"{side}²": Job(folder, side) for side in (400, 1000, 4000, 12000, 24000, 40000)}
+    jobs |= {
+        "12000², one thread": jobs["12000²"], "2000², 32 bands": Job(folder, 2000, 32),
+        "8000², Float32": Job(folder, 8000, kind="float32"), "4000², JPEG 2000": Job(folder, 4000, kind="jp2"),
+    }  # fmt: skip
+    found: dict[str, list[Run]] = {name: [] for name in jobs}
+    for job in jobs.values():
+        apart(job.make, sparse=job.side > 12000)
+    for number in range(-1, rounds):
+        for name, job in jobs.items():
+            if number < 0 and job.side > 4000:
+                continue  # the first round compiles
+            words = ("--threads", "1") if name.endswith("one thread") else ()
+            run = measure(ours(job, folder / "ours", "bilinear", *words))
+            shutil.rmtree(folder / "ours")
+            if number >= 0:
+                found[name].append(run)
+    return {name: _cost(found, jobs, name) for name in jobs}
+
+
+def _cost(found: dict[str, list[Run]], jobs: dict[str, Job], name: str) -> dict[str, Any]:
+    """Return what a job of `scaling` took, beyond the smallest one too, and print it."""
+    values, base = jobs[name].megapixels * jobs[name].bands, jobs["12000²"].megapixels
+    each = []
+    for run, small, usual in zip(found[name], found["400²"], found["12000²"], strict=True):
+        wall, cpu = (run.wall - small.wall) / values * 1e3, (run.cpu - small.cpu) / values * 1e3
+        each.append((wall, cpu, wall / ((usual.wall - small.wall) / base * 1e3)))
+    walls, cpus, shares = (statistics.median(column) for column in zip(*each, strict=True))
+    memory = max(run.memory for run in found[name])
+    told = {
+        "megapixels": round(jobs[name].megapixels, 1), "bands": jobs[name].bands, "wall_ns": walls, "cpu_ns": cpus,
+        "wall_ratio": shares, "memory": memory, "runs": [asdict(run) for run in found[name]],
+    }  # fmt: skip
+    wall = statistics.median(run.wall for run in found[name])
+    print(
+        f"{name:20s} {told['megapixels']:8.1f} Mpx {wall:8.2f} s  {walls:6.2f} ns and {cpus:6.2f} ns of CPU a value, "
+        f"{shares:5.2f} of 12000²  {memory:5.0f} MB",
+        flush=True,
+    )
+    return told
 
 
 def layers(job: Job, pairs: int) -> dict[str, list[tuple[float, float]]]:
@@ -479,6 +533,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="where scenes are kept between runs (default: a temporary one)")
     parser.add_argument("--json", type=Path, help="write all runs there")
     parser.add_argument("--pairs", type=int, default=5, help="of runs, with --layers")
+    parser.add_argument("--program", action="append", help="of the table, only this one; may be repeated")
     for option in ("scaling", "kernels", "accuracy", "layers"):
         parser.add_argument(f"--{option}", action="store_true")
     arguments = parser.parse_args()
@@ -487,7 +542,7 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         document: dict[str, object] = {"machine": machine()}
         if arguments.scaling:
-            document["scaling"] = {name: [asdict(run) for run in runs] for name, runs in scaling(folder).items()}
+            document["scaling"] = scaling(folder, arguments.rounds)
         elif arguments.kernels:
             document["kernels"] = {name: [asdict(run) for run in runs] for name, runs in kernels(folder).items()}
         elif arguments.layers:
@@ -495,8 +550,9 @@ def main() -> None:
         elif arguments.accuracy:
             document["accuracy"] = accuracy(folder, arguments.side)
         else:
-            job = Job(folder, arguments.side).make()
-            runs = headline(job, arguments.rounds)
+            job = Job(folder, arguments.side)
+            apart(job.make)
+            runs = headline(job, arguments.rounds, arguments.program)
             print(f"{job.side} x {job.side} UInt16, {job.megapixels:.0f} Mpx out; {document['machine']}\n")
             print(table(runs, job.megapixels, "ortho rectify, bilinear"))
             document["headline"] = {name: [asdict(run) for run in found] for name, found in runs.items()}
