@@ -88,7 +88,8 @@ docs: setup
 	@$(BIN)/python docs/make_tutorial_images.py
 	$(BIN)/python docs/make_reference.py
 	$(BIN)/python docs/make_man.py
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	rm -rf docs/__pycache__
+	$(BIN)/zensical build --strict --clean
 	echo "Site:    $(CURDIR)/out/site/index.html"
 	echo "Manual:  man -l $(CURDIR)/out/man/ortho.1"
 
