@@ -314,13 +314,19 @@ def test_the_state_of_a_worldview_3_is_explained_effect_by_effect(real: Path) ->
 
 
 @pytest.mark.realdata
-def test_real_states_in_the_library_and_there_and_back(real: Path, tmp_path: Path) -> None:
-    path = real / STATES / "1040010074793300.json"
+@pytest.mark.parametrize(
+    "name", ["1040010074793300.json", "1040010074793300.adjusted_state.json",
+             "../jitter/uyuni/csm-1040010014761800.r100.adjusted_state.json"],
+    ids=["as made", "adjusted", "with solved jitter"],
+)  # fmt: skip
+def test_real_states_in_the_library_and_there_and_back(real: Path, tmp_path: Path, name: str) -> None:
+    path = real / STATES / name
     model, library = read_csm(path), Library(path.read_text())
-    image = np.random.default_rng(2).uniform(0.0, 1.0, (20, 2)) * (42500, 38116)
-    ground = geocentric(model.image_to_ground(image, 100.0))
-    for (column, row), point in zip(image, ground, strict=True):
-        place, direction = library.ray(row, column)
-        apart = np.linalg.norm(np.cross(point - place, direction))
-        assert apart < 0.01 * np.linalg.norm(point - place) / 2002252.25
+    image = np.random.default_rng(2).uniform(0.0, 1.0, (20, 2)) * model.camera.size
+    place = model.image_to_ground(image, 100.0)
+    for (column, row), point in zip(image, geocentric(place), strict=True):
+        origin, direction = library.ray(row, column)
+        apart = np.linalg.norm(np.cross(point - origin, direction))
+        assert apart < 0.01 * np.linalg.norm(point - origin) / library.s["m_focalLength"]
     assert write_csm(model, tmp_path / "one.json") < 1e-6
+    assert np.abs(read_csm(tmp_path / "one.json").ground_to_image(place) - image).max() < 1e-6

@@ -70,6 +70,12 @@ def test_every_command_with_a_state(folder: Path, model: Pushbroom) -> None:
     assert found["csm"]["max_error_px"] < 1e-6
     (again,) = (folder / "again").iterdir()
     assert again.name == "one_csm.json"
+    # Adjusted by points that are 3 px to the right and 2 px above, in its own parameters.
+    points = ("--gcps", folder / "used" / "p.csv", "--points-crs", "EPSG:4326", "--points-vertical", "ellipsoid")
+    ran("export", image, *points, "--correction", "model", "--format", "csm", "-o", folder / "adjusted")
+    inner = np.random.default_rng(1).uniform(0.1, 0.9, (10, 2)) * SIZE
+    seen = read_csm(folder / "adjusted" / "one_csm.json").ground_to_image(model.image_to_ground(inner, 240.0))
+    assert np.abs(seen - inner - (3.0, -2.0)).max() < 0.1
     # An adjusted state of the same image goes before it.
     write_csm(model, folder / "one.adjusted_state.json")
     assert Path(open_scene(image).model_source).name == "one.adjusted_state.json"

@@ -75,6 +75,17 @@ def test_parts_of_a_strip_join(real: Path) -> None:
 
 
 @pytest.mark.realdata
+@pytest.mark.parametrize("name", ["10200100A1865800.r100.xml", "10200100A1865800_asp_plot_dg_mosaic.r100.xml"])
+def test_the_xml_of_a_mosaic_is_the_camera_of_its_parts(real: Path, name: str) -> None:
+    """Two programs made one image of the strip; its rows go on in those of the first part."""
+    whole, part = read_isd_pushbroom(real / ASP / "tiled_xmls" / name), read_isd_pushbroom(real / PARTS[0])
+    image = np.random.default_rng(0).uniform(0, 1, (30, 2)) * part.camera.size
+    seen = whole.ground_to_image(part.image_to_ground(image, 3500.0))
+    # Their tables are as long as the strip; a spline through a longer table is another one, a little.
+    assert np.abs(seen - image).max() < 0.002
+
+
+@pytest.mark.realdata
 def test_what_the_rpc_of_a_rewritten_xml_is_made_of(real: Path) -> None:
     """The WorldView-3 file was rewritten, and its RPC fitted to the camera without aberration: no vendor's.
 
@@ -205,6 +216,24 @@ def test_tiles_are_one_scene(folder: Path, whole: tuple[Pushbroom, RPC]) -> None
     together = open_scene(folder / f"{STEM}.TIL")
     assert (together.width, together.height) == SIZE
     assert np.abs(together.models["pushbroom"].ground_to_image(ground) - image - (40, 0)).max() < 1e-6
+
+
+def test_a_wrong_size_of_the_whole_does_not_move_tiles(folder: Path, whole: tuple[Pushbroom, RPC]) -> None:
+    """Programs that pad images to full blocks write so into IMD; where tiles lie is said by themselves."""
+    text = isd_text(size=SIZE, tiles=TILES, rpc=whole[1])
+    (folder / f"{STEM}.XML").write_text(
+        text.replace("<NUMROWS>50", "<NUMROWS>64").replace("<NUMCOLUMNS>60", "<NUMCOLUMNS>64")
+    )
+    for name, _, _, width, height in TILES:
+        pixels(folder / name, (width, height))
+    second = open_scene(folder / TILES[1][0])
+    assert [(Path(piece.path).name, piece.offset, piece.size) for piece in second.pieces] == [
+        (TILES[0][0], (-40, 0), (40, 50))
+    ]
+    assert not second.warnings
+    ground = whole[0].image_to_ground([[50.0, 30.0]], 200.0)
+    for each in second.models.values():
+        assert np.abs(each.ground_to_image(ground) - (10.0, 30.0)).max() < 0.05
 
 
 def test_a_til_leads_nowhere_else(folder: Path) -> None:
