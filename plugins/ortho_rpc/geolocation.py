@@ -86,7 +86,10 @@ def open_scene(dataset: gdal.Dataset, *, lon: str | None = None, lat: str | None
 
 def _layout_of(dataset: gdal.Dataset) -> Layout:
     """Return what the domain ``GEOLOCATION`` says; its files have to lie beside the image."""
-    fields, name = dataset.GetMetadata("GEOLOCATION") or {}, dataset.GetDescription()
+    name = dataset.GetDescription()
+    # GDAL gives bytes where a text is none.
+    fields = {key: text if isinstance(text, str) else "?" for key, text in
+              (dataset.GetMetadata("GEOLOCATION") or {}).items()}  # fmt: skip
     if not has_arrays(dataset) or not fields.get("Y_DATASET"):
         raise InputError("this image names no geolocation arrays", file=name, field="GEOLOCATION", remedy=_REMEDY)
     folder = place(name).parent

@@ -114,7 +114,8 @@ def test_json_has_finite_numbers(text: str) -> None:
     ("name", "number"),
     [
         ("dem", 46246), ("csm-line-scanner", 11712), ("maxar-isd", 4167), ("maxar-isd", 8174),
-        ("image", 1026), ("image", 1046), ("orbview3-label", 1001), ("vrt", 2000781), ("opensfm", 2000063),
+        ("geolocation", 604757), ("image", 1026), ("image", 1046), ("orbview3-label", 1001), ("vrt", 2000781),
+        ("opensfm", 2000063),
         ("frame-table", 2000278), ("bilsat-survey", 2000041), ("cartosat-met", 2000539),
         ("model-frame", 577), ("model-pushbroom", 4978), ("model-pushbroom", 5370), ("model-pushbroom", 6137),
     ],
