@@ -8,6 +8,9 @@ before ("warm": files and kernels), and then at places that were not asked for.
 
 from __future__ import annotations
 
+import importlib.util
+import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -132,6 +135,7 @@ def main(side: int) -> None:
         session.close()
         for stated in (True, False):
             pair(folder, stated)
+        painted(folder)
 
 
 def pair(folder: Path, stated: bool) -> None:
@@ -158,6 +162,41 @@ def pair(folder: Path, stated: bool) -> None:
     for name, job in ((f"pair of 100 points, {what}", session._solve), ("all that is shown of them", session.state)):
         print(f"{name:<44} {waited(lambda _, job=job: job(), 20):8.0f} ms, CPU {worked(job, 20):.0f} ms")
     session.close()
+
+
+def painted(folder: Path) -> None:
+    """Measure in Chromium, if it is there, when the page and its first tile are seen after the address is opened."""
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None or importlib.util.find_spec("playwright") is None:
+        print("the page itself: no Chromium here")
+        return
+    from playwright.sync_api import sync_playwright
+
+    server = subprocess.Popen(
+        [sys.executable, "-m", "ortho_pipeline", "measure", str(folder / "scene.tif"), "--reference",
+         str(folder / "reference.tif"), "--dem", str(folder / "dem.tif"), "-o", str(folder / "page.geojson"),
+         "--no-browser"],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert server.stdout is not None
+    address = server.stdout.readline().split()[-1]
+    seen, tiles = [], []
+    with sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        for _ in range(5):
+            page = browser.new_page(viewport={"width": 1400, "height": 860})
+            page.goto(address)
+            loaded = "performance.getEntriesByType('resource')"
+            tile = f"{loaded}.find((one) => one.name.includes('/tiles/') && one.responseEnd)"
+            page.wait_for_function(f"() => performance.getEntriesByType('paint').length > 1 && {tile}")
+            seen.append(page.evaluate("() => performance.getEntriesByName('first-contentful-paint')[0].startTime"))
+            tiles.append(page.evaluate(f"() => {tile}.responseEnd"))
+            page.close()
+        browser.close()
+    server.terminate()
+    server.wait(30)
+    print(f"{'first paint of the page':<44} {max(seen):8.0f} ms (asked: 2000)")
+    print(f"{'its first tile':<44} {max(tiles):8.0f} ms")
 
 
 if __name__ == "__main__":
