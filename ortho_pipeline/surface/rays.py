@@ -28,6 +28,8 @@ LEVELS = 5
 #: More DEM samples under the points than this are not held in memory at once.
 _MOST_SAMPLES = 64_000_000
 _PROBES = 500
+#: Halvings that find up to where a model follows a ray: to a thousandth of the range of heights.
+_HALVINGS = 10
 
 
 def meet_surface(model: SensorModel, image: ArrayLike, surface: Surface, *, tolerance: float = 1e-3) -> Array:
@@ -242,17 +244,16 @@ def _bracket(ray: _Ray, low: float, high: float) -> tuple[Array, Array]:
     """Return heights above and below the first intersection; NaN where there is none."""
     count = len(ray.image)
     every = np.arange(count)
-    ends = [ray.places(every, np.full(count, height)) for height in (low, high)]
-    length = np.hypot(*(ends[1] - ends[0]).T)
-    # A ray whose ends are not known (beyond the model) is still worth a try, at the pace of the others.
+    top, length = _tops(ray, low, high)
+    # A ray of which no part is known (beyond the model) is still worth a try, at the pace of the others.
     typical = float(np.nanmax(length)) if np.isfinite(length).any() else 1.0
     steps = np.clip(np.ceil(np.where(np.isfinite(length), length, typical)), 1, 2000).astype(int)
     above, below = np.full(count, np.nan), np.full(count, np.nan)
-    last = np.full(count, high)
+    last = top.copy()
     last_clear = ray.clearance(every, last)
     active = every
     for step in range(1, int(steps.max(initial=0)) + 1):
-        height = high + (low - high) * np.minimum(step / steps[active], 1.0)
+        height = top[active] + (low - top[active]) * np.minimum(step / steps[active], 1.0)
         clear = ray.clearance(active, height)
         with np.errstate(invalid="ignore"):
             under = clear <= 0
@@ -263,6 +264,26 @@ def _bracket(ray: _Ray, low: float, high: float) -> tuple[Array, Array]:
         if not len(active):
             break
     return above, below
+
+
+def _tops(ray: _Ray, low: float, high: float) -> tuple[Array, Array]:
+    """Return the height at which each ray begins, and how many DEM samples it passes from there to the lower height.
+
+    The upper height, or for a ray that the model does not follow so far up the highest at which it does: a ray must not
+    depend on those that come with it. Its length is NaN where the model does not reach the lower height.
+    """
+    every = np.arange(len(ray.image))
+    foot, top = ray.places(every, np.full(len(every), low)), np.full(len(every), high)
+    length = np.hypot(*(ray.places(every, top) - foot).T)
+    short = np.flatnonzero(np.isnan(length) & np.isfinite(foot).all(axis=1))
+    known, unknown = np.full(len(short), low), np.full(len(short), high)
+    for _ in range(_HALVINGS if len(short) else 0):
+        middle = (known + unknown) / 2
+        found = np.hypot(*(ray.places(short, middle) - foot[short]).T)
+        good = np.isfinite(found)
+        length[short[good]], top[short[good]] = found[good], middle[good]
+        known, unknown = np.where(good, middle, known), np.where(good, unknown, middle)
+    return top, length
 
 
 def _narrow(ray: _Ray, above: Array, below: Array, tolerance: float) -> Array:

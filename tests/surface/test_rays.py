@@ -134,6 +134,28 @@ def test_rays_that_are_no_parabolas_are_followed_by_the_exact_model(model, surfa
     assert np.abs(surface.above(ground, model.crs)).max() <= 1e-3
 
 
+def test_a_ray_does_not_depend_on_those_that_come_with_it_where_the_model_does_not_reach_the_top(
+    model, surface, monkeypatch
+):
+    """They were followed apart from the others, one step long, and a DEM that covers a scene was said not to."""
+    image = np.random.default_rng(2).uniform(20, 580, (60, 2))
+    expected = meet_surface(model, image, surface)
+    original = RPC.image_to_ground
+
+    def ends(self, image, height):
+        ground = original(self, image, height)
+        ground[(np.asarray(image)[:, 0] > 200) & (np.broadcast_to(height, len(ground)) > 590)] = np.nan
+        return ground
+
+    monkeypatch.setattr(RPC, "image_to_ground", ends)
+    there = expected[:, 2] < 580
+    assert there.sum() > 40
+    np.testing.assert_allclose(meet_surface(model, image, surface)[there], expected[there], atol=2e-3)
+    # One ray that reaches the top shows where terrain may be met.
+    pairs = [meet_surface(model, np.stack([point, [30.0, 30.0]]), surface)[0] for point in image[there]]
+    np.testing.assert_allclose(pairs, expected[there], atol=2e-3)
+
+
 @pytest.mark.parametrize("count", [3, 5, 7])
 def test_polynomials_in_height_go_through_their_values(count):
     values = np.random.default_rng(count).normal(size=(2, 3, count, 2))
