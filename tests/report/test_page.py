@@ -226,3 +226,12 @@ def test_a_scene_that_nothing_tests_is_not_said_to_be_fine(tmp_path):
     assert [one.text for one in signals((), [{"code": "no-redundancy", "text": "none left"}], tested=False)] == [
         "None left"
     ]
+
+
+def test_the_legend_of_the_map_has_what_was_left_out(tmp_path):
+    points = measured()
+    image = points.image.copy()
+    image[np.flatnonzero(points.control)[3]] += (30.0, 0.0)
+    for name, given, told in (("wrong", dataclasses.replace(points, image=image), 1), ("good", points, 0)):
+        report.write_report_html(made(given), tmp_path / f"{name}.html", ortho=b"a picture")
+        assert (tmp_path / f"{name}.html").read_text(encoding="utf-8").count("× left out") == told
