@@ -221,9 +221,9 @@ def aster_text(size: tuple[int, int] = (60, 50), rpc: RPC | None = None) -> str:
     )
 
 
-def dimap_product(folder: Path, rpc: RPC | None = None) -> tuple[Path, Path]:
-    """Write DIM_A.XML, its RPC and two tiles of 200 and 100 columns; return the tiles."""
-    names = [f"IMG_A_R1C{k}.TIF" for k in (1, 2)]
+def dimap_product(folder: Path, rpc: RPC | None = None, ending: str = "TIF") -> tuple[Path, Path]:
+    """Write DIM_A.XML, its RPC and two tiles of 200 and 100 columns, TIF or JP2; return the tiles."""
+    names = [f"IMG_A_R1C{k}.{ending}" for k in (1, 2)]
     listed = "".join(
         f'<Data_File tile_R="1" tile_C="{k}"><DATA_FILE_PATH href="{name}"/></Data_File>'
         for k, name in enumerate(names, 1)
@@ -233,14 +233,16 @@ def dimap_product(folder: Path, rpc: RPC | None = None) -> tuple[Path, Path]:
         "<NTILES_COUNT ntiles_R='1' ntiles_C='2'/><OVERLAP_ROW>0</OVERLAP_ROW><OVERLAP_COL>0</OVERLAP_COL>"
         "</Regular_Tiling></Tile_Set></Raster_Dimensions>"
         "<Raster_Encoding><DATA_TYPE>INTEGER</DATA_TYPE><NBITS>8</NBITS><SIGN>UNSIGNED</SIGN></Raster_Encoding>"
-        "<Data_Access><DATA_FILE_ORGANISATION>BAND_COMPOSITE</DATA_FILE_ORGANISATION><DATA_FILE_FORMAT>image/tiff"
-        f"</DATA_FILE_FORMAT><DATA_FILE_TILES>true</DATA_FILE_TILES><Data_Files>{listed}</Data_Files></Data_Access>"
+        "<Data_Access><DATA_FILE_ORGANISATION>BAND_COMPOSITE</DATA_FILE_ORGANISATION><DATA_FILE_FORMAT>image/"
+        f"{'tiff' if ending == 'TIF' else 'jp2'}</DATA_FILE_FORMAT><DATA_FILE_TILES>true</DATA_FILE_TILES>"
+        f"<Data_Files>{listed}</Data_Files></Data_Access>"
     )
     # First: GDAL deletes the metadata of an image that it writes anew.
     for name, width in zip(names, (200, 100), strict=True):
-        dataset = gdal.GetDriverByName("GTiff").Create(str(folder / name), width, 400)
+        dataset = gdal.GetDriverByName("MEM").Create("", width, 400)
         dataset.GetRasterBand(1).Fill(width // 2)
-        dataset = None
+        driver, options = ("GTiff", []) if ending == "TIF" else ("JP2OpenJPEG", ["QUALITY=100", "REVERSIBLE=YES"])
+        gdal.GetDriverByName(driver).CreateCopy(str(folder / name), dataset, options=options)
     (folder / "DIM_A.XML").write_text(dimap_text().replace("</Raster_Dimensions>", tiling))
     if rpc is not None:
         (folder / "RPC_A.XML").write_text(rpc_xml(rpc))

@@ -36,6 +36,7 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.light import LightPath
 from ortho_pipeline.options import MatchOptions, PointOptions, SurfaceOptions
 from ortho_pipeline.plugins import open_scene
+from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.testing import check_sensor_model
 
 PLEIADES = "DIM_PHR1A_P_201303310839568_SEN_620285101-001.XML"
@@ -477,6 +478,19 @@ def test_metadata_or_folder_in_place_of_an_image(tiled: tuple[Path, Path, Pushbr
     assert list(scene.models) == ["rpc", "pushbroom"]
     ground = model.image_to_ground([[250.0, 100.0]], 205.0)
     assert np.abs(scene.model.ground_to_image(ground) - [250.0, 100.0]).max() < 1e-3
+
+
+@pytest.mark.skipif(gdal.GetDriverByName("JP2OpenJPEG") is None, reason="this GDAL reads no JPEG 2000")
+def test_tiles_in_jpeg_2000(tiled: tuple[Path, Path, Pushbroom], tmp_path: Path) -> None:
+    """As Pleiades Neo is delivered: the folder is one image, of which the tiles are pieces."""
+    (tmp_path / "jp2").mkdir()
+    first, second = dimap_product(tmp_path / "jp2", read_rpc_text(tiled[0].parent / "RPC_A.XML"), "JP2")
+    scene = open_scene(first.parent)
+    assert ((scene.width, scene.height), list(scene.models)) == ((300, 400), ["rpc", "pushbroom"])
+    values = RasterSource(scene.path).read(195, 10, 10, 1)[0, 0]
+    assert values.tolist() == [100] * 5 + [50] * 5
+    (piece,) = open_scene(second).pieces
+    assert (Path(piece.path), piece.offset) == (first, (-200, 0))
 
 
 def test_every_command_takes_the_folder(tiled: tuple[Path, Path, Pushbroom]) -> None:
