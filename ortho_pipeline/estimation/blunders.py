@@ -347,11 +347,11 @@ def _checks(solution: Solution, points: Points, used: np.ndarray, common: Array 
 def _outlying_checks(
     solution: Solution, points: Points, used: np.ndarray, sigma0: float, common: Array | None
 ) -> list[Outlying]:
-    from scipy.special import fdtrc
-
     checks = _checks(solution, points, used, common)
     if checks is None:
         return []
+    from scipy.special import fdtrc
+
     squares = checks.squares
     scale, freedom = max(sigma0, _SCALE_FLOOR) ** 2, max(solution.freedom, 1.0)
     own = float(np.median(squares)) / _MEDIAN_OF_TWO
@@ -380,8 +380,6 @@ def checks_apart(solution: Solution, points: Points, used: np.ndarray, said: Seq
     hide each other, and a model may follow its control points and nothing between them. Matches are left to what is
     said of their reference.
     """
-    from scipy.special import fdtrc
-
     measured = points.groups < 0
     if solution.sigma0 is None or not len(solution.model.params) or not measured[used].all():
         return []
@@ -394,6 +392,8 @@ def checks_apart(solution: Solution, points: Points, used: np.ndarray, said: Seq
     scale = max(float(solution.sigma0), _SCALE_FLOOR) ** 2
     if not count:
         return []
+    from scipy.special import fdtrc
+
     ratio = float(checks.squares[good].mean()) / 2 / scale
     if ratio < _APART**2 or fdtrc(2 * count, max(solution.freedom, 1.0), ratio) > OUTLYING_RISK:
         return []

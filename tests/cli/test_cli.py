@@ -87,6 +87,19 @@ def test_the_process_ends_with_its_code_and_what_was_asked_for_at_the_end(words,
     assert "Traceback" not in done.stderr
 
 
+def test_an_ortho_without_points_loads_nothing_of_scipy(tiny, tmp_path):
+    """scipy.special and scipy.linalg take a tenth of a second each, by what they load of NumPy (numpy.f2py)."""
+    words = ["rectify", str(tiny.image), "--height", "700", "-o", str(tmp_path / "out"), "-tr", "20"]
+    code = (
+        f"import sys; from ortho_pipeline.cli.program import main; sys.argv = ['ortho', *{words!r}]\n"
+        "try: main()\nfinally: print([name for name in ('scipy.special', 'scipy.linalg', 'numpy.f2py', "
+        "'scipy.stats', 'scipy.ndimage', 'matplotlib', 'pystac') if name in sys.modules])"
+    )
+    # Kernels are compiled in the first run, which loads more.
+    runs = [subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True) for _ in range(2)]
+    assert runs[1].stdout.splitlines()[-1] == "[]"
+
+
 def test_importing_the_package_is_light():
     code = f"import sys, ortho_pipeline; print([name for name in {HEAVY!r} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
