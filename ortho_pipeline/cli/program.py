@@ -194,7 +194,9 @@ def _begin() -> None:
     import logging
 
     from ortho_pipeline.files.locations import close_network
+    from ortho_pipeline.files.process_limits import share_freed_memory
 
+    share_freed_memory()
     # What a command loads is never garbage: looking through it over and over takes a twelfth of a small scene's time.
     gc.set_threshold(50_000, 20, 50)
     # Before GDAL is loaded, which reads the environment; worker processes inherit it.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import resource
 import subprocess
 import sys
@@ -80,3 +81,34 @@ def test_a_run_with_little_memory_ends_within_seconds(tmp_path, megabytes):
     ended = subprocess.run(words, check=False, capture_output=True, text=True, timeout=60)
     assert ended.stdout.startswith("1 False"), ended.stdout + ended.stderr
     assert "there is not enough memory: a limit on this process leaves" in ended.stdout
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="heaps of threads are glibc's")
+def test_threads_share_a_heap() -> None:
+    """A heap of a thread is a reservation of 64 MB that begins at a multiple of that."""
+    code = (
+        "import sys, threading, time, pathlib\n"
+        "from ortho_pipeline.files.process_limits import share_freed_memory\n"
+        "if len(sys.argv) > 1: assert share_freed_memory()\n"
+        "kept, ready = [], threading.Barrier(5)\n"
+        "def hold(): kept.append([bytearray(60_000) for _ in range(9)]); ready.wait(); ready.wait()\n"
+        "for _ in range(4): threading.Thread(target=hold, daemon=True).start()\n"
+        "ready.wait()\n"
+        "maps = [line.split() for line in pathlib.Path('/proc/self/maps').read_text().splitlines()]\n"
+        "print(sum(int(one[0].split('-')[0], 16) % (64 << 20) == 0 and len(one) == 5 for one in maps))\n"
+        "ready.wait()"
+    )
+    heaps = [
+        int(
+            subprocess.run(
+                [sys.executable, "-c", code, *more],
+                capture_output=True,
+                text=True,
+                check=True,
+                env={key: value for key, value in os.environ.items() if key != "MALLOC_ARENA_MAX"},
+            ).stdout
+        )
+        for more in ((), ("shared",))
+    ]
+    assert heaps[0] >= 2
+    assert heaps[1] == 0
