@@ -13,7 +13,11 @@ COPY --from=build /opt/ortho /opt/ortho
 ENV PATH=/opt/ortho/bin:$PATH ORTHO_CACHE=/cache/ortho NUMBA_CACHE_DIR=/opt/numba PYTHONUNBUFFERED=1
 USER 10001
 WORKDIR /work
-# Compiled code of the usual job is in the image: a new container does not compile.
-COPY --chown=ortho:ortho sample_data/scene.tif /tmp/sample/
-RUN ortho rectify /tmp/sample/scene.tif --height 1000 -o /tmp/warm && rm -r /tmp/warm
+# Compiled code of the usual job is in the image, for all processors of this kind: a new container does not compile, also
+# where it runs as another user or cannot write. On ARM: --build-arg CPU=generic.
+ARG CPU=x86-64-v3
+ENV NUMBA_CPU_NAME=$CPU NUMBA_CPU_FEATURES=""
+COPY --chown=ortho:ortho sample_data/scene.tif sample_data/scene_RPC.TXT sample_data/dem.tif /tmp/sample/
+RUN ortho rectify /tmp/sample/scene.tif --dem /tmp/sample/dem.tif --dem-vertical ellipsoid --override-dem-vertical \
+        -o /tmp/warm && rm -r /tmp/warm && chmod -R a+rX /opt/numba
 ENTRYPOINT ["ortho"]

@@ -12,6 +12,9 @@ from pathlib import Path
 
 import pytest
 import yaml
+from click.testing import CliRunner
+
+from ortho_pipeline.cli.program import cli
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -41,6 +44,23 @@ def test_the_dockerfile_has_no_faults_that_linters_know():
         pytest.skip("hadolint is not installed")
     done = subprocess.run([hadolint, ROOT / "Dockerfile"], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, "")
+
+
+def test_the_image_is_made_of_what_its_steps_read(tmp_path):
+    """The step that compiles is done with the files that are copied for it; the RPC beside the scene was not."""
+    text = (ROOT / "Dockerfile").read_text(encoding="utf-8").replace("\\\n", " ")
+    copied = [line.split()[1:] for line in text.splitlines() if line.startswith("COPY ") and "--from" not in line]
+    for *sources, target in copied:
+        for source in (one for one in sources if not one.startswith("--")):
+            assert (ROOT / source).exists(), source
+            if target == "/tmp/sample/":
+                shutil.copy(ROOT / source, tmp_path)
+    (step,) = re.findall(r"^RUN ortho (.*?) &&", text, flags=re.MULTILINE)
+    words = [
+        word.replace("/tmp/sample", str(tmp_path)).replace("/tmp/warm", str(tmp_path / "o")) for word in step.split()
+    ]
+    result = CliRunner().invoke(cli, words)
+    assert result.exit_code == 0, result.output
 
 
 def test_the_citation_is_of_this_version():

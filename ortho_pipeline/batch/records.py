@@ -106,7 +106,8 @@ class Record:
             "document": DOCUMENT, "schema_version": SCHEMA_VERSION, **vars(self),
             "inputs": [vars(one) for one in self.inputs], "outputs": [vars(one) for one in self.outputs],
         }  # fmt: skip
-        files.write_json(path, document)
+        # On one line: the encoder of many is written in Python, and takes as long as the rest of the record.
+        files.write_text(path, json.dumps(document, allow_nan=False) + "\n")
 
     @classmethod
     def read(cls, path: Path) -> Record | None:

@@ -54,7 +54,8 @@ class Outputs:
         return self.folder / f"{self.prefix}journal{_PART}"
 
     @property
-    def _lock_path(self) -> Path:
+    def lock_path(self) -> Path:
+        """File whose lock is held while they are written."""
         return self.folder / f"{self.prefix}lock{_PART}"
 
     # -- begin and end -----------------------------------------------------------------------------------------------
@@ -81,7 +82,7 @@ class Outputs:
             with contextlib.suppress(OSError):
                 if failed or self.side_cars:
                     self._clear()
-                self._lock_path.unlink(missing_ok=True)
+                self.lock_path.unlink(missing_ok=True)
             os.close(self._lock)
             self._lock = None
         for path in self._made:
@@ -93,7 +94,7 @@ class Outputs:
 
         The system releases a lock however the process ends; its file stays when the process is killed.
         """
-        path = self._lock_path
+        path = self.lock_path
         while True:
             killed = os.path.lexists(path)
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
@@ -405,7 +406,8 @@ def append_line(path: str | os.PathLike[str], line: str) -> None:
 def clear_up(path: str | os.PathLike[str]) -> None:
     """Remove what a killed command left of a file that it was writing alone."""
     final = _place(path)
-    if final.parent.is_dir():
+    # One that was killed leaves its lock.
+    if os.path.lexists(Outputs(final.parent, final.name).lock_path):
         with together(final.parent, final.name):
             pass
 

@@ -115,7 +115,7 @@ def test_a_journal_of_somebody_else_leads_nowhere(tmp_path):
     folder, victim = tmp_path / "out", tmp_path / "victim"
     victim.write_text("precious")
     with together(folder, "scene") as outputs:
-        journal, lock, prefix = outputs.journal, outputs._lock_path, outputs.prefix
+        journal, lock, prefix = outputs.journal, outputs.lock_path, outputs.prefix
         write_text(folder / "a.txt", "a")
     for listed in (
         {"renames": [[f"{prefix}x.part", "../victim"]], "obsolete": []},
