@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from collections.abc import Iterator
@@ -130,6 +131,27 @@ def test_pages_of_blocks_and_runs_fit_every_screen(request, browser, tmp_path, w
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         assert complaints == []
         page.context.close()
+
+
+@pytest.mark.slow
+def test_pages_of_matches_and_mosaics_fit_every_screen(browser, tmp_path):
+    sample, runner = ROOT / "sample_data", CliRunner()
+    given = f"--reference {sample}/reference.tif --dem {sample}/dem.tif"
+    lines = [f"match {sample}/scene.tif {given} -o m.geojson --report m.html"]
+    for name, box in (("west", "530000 4121500 532000 4123500"), ("east", "531000 4121500 533000 4123500")):
+        lines.append(f"rectify {sample}/scene.tif --height 800 -t_srs EPSG:32636 -tr 10 10 -te {box} -o {name}")
+    lines.append("mosaic west/scene_ortho.tif east/scene_ortho.tif -o mosaic.tif --seamlines")
+    with contextlib.chdir(tmp_path):
+        for line in lines:
+            done = runner.invoke(cli, line.split())
+            assert done.exit_code == 0, done.output
+    for name in ("m.html", "mosaic.html"):
+        for width in (1440, 1024, 390):
+            for scheme in ("light", "dark"):
+                page, complaints = opened(browser, tmp_path / name, width, color_scheme=scheme)
+                assert page.evaluate("document.documentElement.scrollWidth") <= width
+                assert complaints == []
+                page.context.close()
 
 
 def test_first_screens_of_blocks_runs_and_comparisons_answer_a_fresh_reader(made, block, run, browser):
