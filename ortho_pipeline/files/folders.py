@@ -30,12 +30,12 @@ class Listing:
     ----------
     names : tuple of str
         Sorted.
-    special : tuple of str
+    special : frozenset of str
         Those of them that are neither plain files nor folders: links, pipes, devices.
     """
 
     def __init__(self, names: Iterable[str], special: Iterable[str] = ()) -> None:
-        self.names, self.special = tuple(sorted(names)), tuple(special)
+        self.names, self.special = tuple(sorted(names)), frozenset(special)
         self._matching: dict[re.Pattern[str], list[str]] = {}
 
     @cached_property

@@ -10,6 +10,7 @@ import contextlib
 import logging
 import math
 import os
+import re
 import stat
 import threading
 from collections.abc import Mapping, Sequence
@@ -40,8 +41,7 @@ MAX_BLOCK = 1 << 30
 #: Bytes that reading and warping may take where nobody says how many.
 MEMORY = 512_000_000
 #: Endings of files beside an image that GDAL's readers of metadata look for.
-_SIDE_CARS = (".xml", ".txt", ".imd", ".rpb", ".pvl", ".met", ".att", ".eph", ".tfw", ".wld", ".prj", ".hdr", ".ovr",
-              ".msk", ".rpc", ".dim")  # fmt: skip
+_SIDE_CARS = re.compile(r"(?is).+\.(xml|txt|imd|rpb|pvl|met|att|eph|tfw|wld|prj|hdr|ovr|msk|rpc|dim)$")
 _WHOLE = "give a whole raster of a format that GDAL reads ('ortho doctor' lists the allowed ones); copy it again"
 
 
@@ -142,12 +142,13 @@ def _refuse_pipes(path: Path) -> None:
     """Refuse an image beside whose metadata or side-cars lies a pipe or a device: GDAL would wait for it for ever."""
     folder = path if path.is_dir() else path.parent
     with contextlib.suppress(OSError):
-        for name in listing(folder).special:
-            related = path.stem in name or os.path.splitext(name)[1].lower() in _SIDE_CARS
+        found = listing(folder)
+        related = {name for name in found.special if path.stem in name}
+        related |= found.special.intersection(found.matching(_SIDE_CARS))
+        for name in related - {path.name}:
             kind = 0
-            if related and name != path.name:
-                with contextlib.suppress(OSError):  # a link that leads nowhere: there is nothing to read
-                    kind = stat.S_IFMT(os.stat(folder / name).st_mode)
+            with contextlib.suppress(OSError):  # a link that leads nowhere: there is nothing to read
+                kind = stat.S_IFMT(os.stat(folder / name).st_mode)
             if kind in (stat.S_IFIFO, stat.S_IFCHR, stat.S_IFBLK):
                 raise InputError(
                     "a pipe or a device lies beside this image where its metadata would be", file=path,
