@@ -106,12 +106,12 @@ def intersect(models: Mapping[str, SensorModel], points: BlockPoints, *, scaled:
     found = np.asarray(np.isfinite(local).all(axis=1))
     residuals = points.measured - predict(frame, chosen, points, local)
     used = np.asarray(np.isfinite(residuals).all(axis=1))
-    rays, misfit, partials = _equations(frame, chosen, points, used, local)
+    rays, of, misfit, partials = _equations(frame, chosen, points, used, local, np.arange(len(points)))
     freedom = 2 * int(used.sum()) - 3 * int(found.sum())
     sigma0 = math.sqrt(float((misfit**2).sum()) / freedom) if freedom > 0 else None
     axes = frame.enu_at(places.geodetic)
     covariance = np.full((len(points), 3, 3), np.nan)
-    normal = _per_point(points, rays, partials.swapaxes(1, 2) @ partials)
+    normal = _per_point(len(points), of, partials.swapaxes(1, 2) @ partials)
     covariance[found] = np.linalg.inv(normal[found])
     covariance = axes @ covariance @ axes.swapaxes(1, 2)
     rows = np.zeros((points.rays, 2, 3))
@@ -170,36 +170,33 @@ def meet(frame: GroundFrame, models: Sequence[SensorModel], points: BlockPoints,
     local = _first(frame, models, points, used)
     used = used & np.asarray(np.isfinite(local).all(axis=1))[points.point]
     counts = np.bincount(points.point[used], minlength=len(points))
-    used &= counts[points.point] >= 2
-    open_points = np.flatnonzero(np.bincount(points.point[used], minlength=len(points)) >= 2)
-    moving = np.zeros(len(points), dtype=bool)
-    moving[open_points] = True
-    parallel = np.logical_not(moving)
-    factor = np.ones(len(points))
-    squares, shift = np.full(len(points), np.inf), np.zeros((len(points), 3))
-    before = local.copy()
+    found = np.full_like(local, np.nan)
+    moving = np.flatnonzero(counts >= 2)
+    # Of the points that move: where they were last better, how long a part of the last step they go, and that step.
+    before, factor, shift = local[moving], np.ones(len(moving)), np.zeros((len(moving), 3))
+    squares = np.full(len(moving), np.inf)
     for _ in range(_STEPS):
-        mask = used & moving[points.point]
-        if not mask.any():
+        if not len(moving):
             break
-        rays, misfit, rows = _equations(frame, models, points, mask, local)
-        now = _per_point(points, rays, (misfit**2).sum(axis=1))
+        _, of, misfit, rows = _equations(frame, models, points, used, local, moving)
+        now = _per_point(len(moving), of, (misfit**2).sum(axis=1))
         with np.errstate(invalid="ignore"):
-            worse = moving & ~(now <= squares * (1 + 1e-9) + 1e-14)
-        factor[worse] /= 2
-        better = moving & ~worse
-        squares[better], before[better], factor[better] = now[better], local[better], 1.0
-        normal = _per_point(points, rays, np.einsum("kic,kid->kcd", rows, rows))
-        right = _per_point(points, rays, np.einsum("kic,ki->kc", rows, misfit))
-        rows_better = np.flatnonzero(better)
-        step, open_ = _solved(normal[rows_better], right[rows_better])
-        parallel[rows_better] = open_
-        shift[rows_better] = np.where(open_[:, None], 0.0, step)
-        local[moving] = before[moving] + factor[moving, None] * shift[moving]
-        length = np.linalg.norm(shift, axis=1) * factor
-        moving &= ~parallel & (length > 1e-7) & (factor > 1e-4)
-    local[parallel | ~np.isfinite(squares)] = np.nan
-    return local
+            better = now <= squares * (1 + 1e-9) + 1e-14
+        factor[~better] /= 2
+        squares[better], before[better], factor[better] = now[better], local[moving[better]], 1.0
+        normal = _per_point(len(moving), of, np.einsum("kic,kid->kcd", rows, rows))[better]
+        right = _per_point(len(moving), of, np.einsum("kic,ki->kc", rows, misfit))[better]
+        step, parallel = _solved(normal, right)
+        shift[better] = step
+        lost = np.zeros(len(moving), dtype=bool)
+        lost[better] = parallel
+        local[moving] = before + factor[:, None] * shift
+        ended = lost | ~((np.linalg.norm(shift, axis=1) * factor > 1e-7) & (factor > 1e-4))
+        met = ended & ~lost & np.isfinite(squares)
+        found[moving[met]] = local[moving[met]]
+        moving, before, factor, shift, squares = (part[~ended] for part in (moving, before, factor, shift, squares))
+    found[moving] = np.where(np.isfinite(squares)[:, None], local[moving], np.nan)
+    return found
 
 
 def _solved(normal: Array, right: Array) -> tuple[Array, np.ndarray]:
@@ -233,29 +230,39 @@ def _first(frame: GroundFrame, models: Sequence[SensorModel], points: BlockPoint
 
 
 def _equations(
-    frame: GroundFrame, models: Sequence[SensorModel], points: BlockPoints, used: np.ndarray, local: Array
-) -> tuple[Index, Array, Array]:
-    """Return the rays ``(k,)`` in the mask `used`, misfits ``(k, 2)`` over sigma, partials by points ``(k, 2, 3)``."""
-    places = frame.places(local)
+    frame: GroundFrame,
+    models: Sequence[SensorModel],
+    points: BlockPoints,
+    used: np.ndarray,
+    local: Array,
+    numbers: Index,
+) -> tuple[Index, Index, Array, Array]:
+    """Return the equations of points `numbers` ``(n,)``, of the rays in the mask `used` alone.
+
+    These are the rays ``(k,)``, places of their points among the n, misfits ``(k, 2)`` over sigma, and partials by the
+    points ``(k, 2, 3)``.
+    """
+    place = np.full(len(points), -1)
+    place[numbers] = np.arange(len(numbers))
+    places, wanted = frame.places(local[numbers]), used & (place[points.point] >= 0)
     parts = [(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2, 3)))]
     for model, rays_of in zip(models, points.rays_of_images, strict=True):
-        rays = rays_of[used[rays_of]]
+        rays = rays_of[wanted[rays_of]]
         if not len(rays):
             continue
-        image, partials = places.projected(model, points.point[rays])
+        image, partials = places.projected(model, place[points.point[rays]])
         sigma = points.sigma_image[rays]
         misfit = points.whitened((points.measured[rays] - image) / sigma[:, None], rays)
         parts.append((rays, misfit, points.whitened(partials / sigma[:, None, None], rays)))
     rays, misfits, partials = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return rays, misfits, partials
+    return rays, place[points.point[rays]], misfits, partials
 
 
-def _per_point(points: BlockPoints, rays: Index, values: Array) -> Array:
-    """Return the sums over some rays of each point ``(N, ...)`` of values ``(k, ...)``."""
-    of = points.point[rays]
-    total = np.zeros((len(points), *values.shape[1:]))
+def _per_point(count: int, of: Index, values: Array) -> Array:
+    """Return the sums ``(count, ...)`` of values ``(k, ...)`` over the rays `of` each point."""
+    total = np.zeros((count, *values.shape[1:]))
     for place in np.ndindex(values.shape[1:]):
-        total[:, *place] = np.bincount(of, weights=values[:, *place], minlength=len(points))
+        total[:, *place] = np.bincount(of, weights=values[:, *place], minlength=count)
     return total
 
 

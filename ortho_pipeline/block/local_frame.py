@@ -107,10 +107,9 @@ class Places:
 
     def _chained(self, model: SensorModel, by_ground: Array, rows: np.ndarray) -> Array:
         """Return d(image)/d(frame) of d(image)/d(ground)."""
-        way = self.partials(model.crs)[rows]
-        # Written out: products of stacks of such small matrices take several times as long.
-        x, y, h = (by_ground[:, :, axis, None] * way[:, None, axis] for axis in range(3))
-        return x + y + h
+        from ortho_pipeline.block.equations import point_kernel
+
+        return np.asarray(point_kernel.chained(by_ground, self.partials(model.crs), rows))
 
     def _geodetic_partials(self) -> Array:
         if self._slopes is None:

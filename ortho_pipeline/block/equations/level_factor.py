@@ -24,7 +24,7 @@ from ortho_pipeline.block.equations.image_pairs import Levels
 from ortho_pipeline.models.base import Array
 
 #: Up to so many parameters all eigenvalues are computed, beyond that the extreme ones are iterated for.
-_FEW = 1500
+_FEW = 200
 
 
 class LevelMatrix:

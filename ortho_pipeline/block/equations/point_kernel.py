@@ -1,4 +1,4 @@
-"""Compiled elimination of the points of large blocks, one after the other; `elimination` is its tested reference.
+"""Compiled elimination of the points of blocks, one after the other, and the chain rule of their rays.
 
 Rays stand point by point: those of the t-th point are ``order[starts[t]:starts[t + 1]]``, by image. Nothing that is
 made of a point is kept: factoring its few rows again takes less than reading them back.
@@ -224,3 +224,16 @@ def ground(order, starts, numbers, grounded, image, slot, blocks, factor, by_par
                     for d in range(j, 3):
                         value += root[i, c] * inner[c, d] * root[j, d]
                 found[numbers[t], i, j] = value
+
+
+@compiled
+def chained(by_ground, way, rows):
+    """Return d(image)/d(frame) ``(n, 2, 3)`` of d(image)/d(ground) ``(n, 2, 3)`` and `way` ``(N, 3, 3)`` of `rows`."""
+    found = np.empty(by_ground.shape)
+    for k in range(by_ground.shape[0]):
+        at = way[rows[k]]
+        for side in range(2):
+            x, y, h = by_ground[k, side, 0], by_ground[k, side, 1], by_ground[k, side, 2]
+            for axis in range(3):
+                found[k, side, axis] = x * at[0, axis] + y * at[1, axis] + h * at[2, axis]
+    return found
