@@ -53,6 +53,8 @@ class Served:
 
     def click(self, pane: str, place: np.ndarray) -> None:
         """Click a pixel of the scene as the page shows it at first: the whole of it."""
+        # A longer headline moves the views: until they are drawn there, a click in them is one of their old place.
+        self.page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
         box = self.page.locator(f"#{pane}").bounding_box()
         assert box is not None
         middle = np.array([box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
