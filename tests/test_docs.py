@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 import sys
+import tomllib
 from pathlib import Path
 
 import click
@@ -110,3 +111,24 @@ def test_every_public_name_has_a_page_of_its_docstring(tmp_path):
                 r"^- `(\w+)`", page.partition("**Parameters**")[2].partition("**R")[0], re.MULTILINE
             )
             assert set(documented) <= set(inspect.signature(thing).parameters)
+
+
+def test_changes_stand_by_version():
+    """Newest first, with dates; the newest is that of the package; what is new stands under "Unreleased"."""
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    intro, *sections = re.split(r"^## ", text, flags=re.MULTILINE)
+    heads = [section.partition("\n")[0] for section in sections]
+    assert heads[0] == "Unreleased"
+    found = [re.fullmatch(r"(\d+)\.(\d+)\.(\d+) \((\d{4}-\d\d-\d\d)\)", head) for head in heads[1:]]
+    assert all(found), heads
+    versions = [tuple(map(int, one.groups()[:3])) for one in found if one]
+    dates = [one[4] for one in found if one]
+    assert versions == sorted(set(versions), reverse=True)
+    assert dates == sorted(dates, reverse=True)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert ".".join(map(str, versions[0])) == project["version"]
+    lines = [line for line in text.splitlines() if line.startswith("- ")]
+    twice = {line for line in lines if lines.count(line) > 1}
+    assert not twice
+    assert "\n- " not in text.rpartition("<!--")[2], "the last line of CHANGELOG.md belongs to Unreleased, at the top"
+    assert "- " not in intro.splitlines()

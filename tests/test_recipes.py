@@ -1,4 +1,4 @@
-"""Recipes and the citation say what pyproject.toml says."""
+"""Recipes, the citation and the changes say what pyproject.toml says."""
 
 from __future__ import annotations
 
