@@ -119,6 +119,27 @@ def _inverse(upper):
 
 
 @inlined
+def _product(a, b, found):
+    """Fill `found` with the product of two matrices."""
+    for i in range(a.shape[0]):
+        for j in range(b.shape[1]):
+            found[i, j] = 0.0
+        for c in range(a.shape[1]):
+            factor = a[i, c]
+            for j in range(b.shape[1]):
+                found[i, j] += factor * b[c, j]
+
+
+@inlined
+def _times(a, x, found):
+    """Fill `found` with the product of a matrix and a vector."""
+    for i in range(a.shape[0]):
+        found[i] = 0.0
+        for c in range(a.shape[1]):
+            found[i] += a[i, c] * x[c]
+
+
+@inlined
 def _solve(of, node, weights, inverse, met, taken, normal, right):
     """Solve at a node; return its log likelihood and the square of all misfits.
 
@@ -127,8 +148,8 @@ def _solve(of, node, weights, inverse, met, taken, normal, right):
     """
     spread, square = _points(of, node, weights, inverse, met, taken)
     scale, size = 1.0 / node[0], normal.shape[0]
-    np.dot(of.flat, taken, normal)
-    np.dot(of.flat, met, right)
+    _product(of.flat, taken, normal)
+    _times(of.flat, met, right)
     for a in range(size):
         right[a] = (of.image_right[a] - right[a]) * scale + of.pseudo_right[a]
         for b in range(size):
@@ -165,9 +186,9 @@ def means(of, nodes, chances, moved, weights, z, cofactors, shift, ground):
     for t in range(nodes.shape[0]):
         _, square = _solve(of, nodes[t], weights, inverse, met, taken, normal, right)
         back = _inverse(normal)
-        np.dot(back, back.T, own)
-        np.dot(back, right, z)
-        np.dot(taken, own, spread)
+        _product(back, back.T, own)
+        _times(back, right, z)
+        _product(taken, own, spread)
         for a in range(size):
             for b in range(size):
                 cofactors[a, b] += chances[t] * (own[a, b] + (z[a] * z[b] if moved else 0.0))
