@@ -120,7 +120,7 @@ def _destroy(dataset: gdal.Dataset) -> None:
 
 
 def png_bytes(pixels: NDArray[np.uint8]) -> bytes:
-    """Encode pixels ``(bands, rows, columns)`` as PNG: two bands are grey and alpha, four are RGBA."""
+    """Encode pixels ``(bands, rows, columns)`` as PNG: one band is grey, three are RGB; one more is alpha."""
     count, rows, columns = pixels.shape
     memory = gdal.GetDriverByName("MEM").Create("", columns, rows, count, gdal.GDT_Byte)
     memory.WriteArray(pixels)

@@ -526,17 +526,23 @@ def test_a_wrong_check_point_is_said_everywhere_and_counts(tmp_path):
     assert [key for key, value in doubts.items() if value] == [name]
 
 
-@pytest.mark.parametrize(("bands", "colour_type"), [(1, 4), (2, 4), (3, 6), (4, 6)])
-def test_preview_is_a_png_with_transparent_nodata(tmp_path, bands, colour_type):
-    png = report.preview_png(_raster(tmp_path / "o.tif", bands), side=100)
+@pytest.mark.parametrize("hole", [True, False])
+@pytest.mark.parametrize(("bands", "colours"), [(1, 1), (2, 1), (3, 3), (4, 3)])
+def test_preview_is_a_png_with_transparent_nodata(tmp_path, bands, colours, hole):
+    path = _raster(tmp_path / "o.tif", bands)
+    if hole:
+        dataset = gdal.Open(str(path), gdal.GA_Update)
+        dataset.WriteArray(np.zeros((bands, 9, 9), dtype=dataset.ReadAsArray(0, 0, 1, 1).dtype))
+        del dataset
+    png = report.preview_png(path, side=100)
     assert png.startswith(b"\x89PNG\r\n\x1a\n")
     assert struct.unpack(">II", png[16:24]) == (100, 67)
-    assert png[25] == colour_type
+    assert png[25] == (2 if colours == 3 else 0) + (4 if hole else 0)  # as the format says: colour, alpha
     gdal.FileFromMemBuffer("/vsimem/preview.png", png)
-    decoded = gdal.Open("/vsimem/preview.png").ReadAsArray()
-    assert decoded.shape[0] == (2 if colour_type == 4 else 4)
+    decoded = gdal.Open("/vsimem/preview.png").ReadAsArray().reshape(colours + hole, 67, 100)
     assert decoded[0, -1, -1] == 255
-    assert decoded[-1, 10, 10] == 255
+    if hole:
+        assert (decoded[-1, 0, 0], decoded[-1, 10, 10]) == (0, 255)
     gdal.Unlink("/vsimem/preview.png")
     assert not [name for name in gdal.ReadDir("/vsimem/") or () if name.startswith("ortho_png")]
 
