@@ -89,6 +89,7 @@ docs: setup
 	$(BIN)/python docs/make_reference.py
 	$(BIN)/python docs/make_man.py
 	rm -rf docs/__pycache__
+	$(BIN)/pip install --quiet --editable ".[docs]"
 	$(BIN)/zensical build --strict --clean
 	echo "Site:    $(CURDIR)/out/site/index.html"
 	echo "Manual:  man -l $(CURDIR)/out/man/ortho.1"
