@@ -34,6 +34,15 @@ def metres(value: float) -> str:
     return f"{value:.2f} m" if abs(value) < 10 else f"{value:.1f} m"
 
 
+def class_size(centimetres: int) -> str:
+    """Return an accuracy class: whole centimetres; from a metre on metres of three digits, rounded up."""
+    if centimetres < 100:
+        return f"{centimetres} cm"
+    step = 10 ** max(0, len(str(centimetres)) - 3)
+    up = -(-centimetres // step) * step
+    return f"{up / 100:.{max(0, 5 - len(str(up)))}f} m"
+
+
 def fixed(value: float | None) -> str:
     """Return a value with three digits."""
     if value is None:

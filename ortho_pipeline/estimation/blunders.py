@@ -34,6 +34,8 @@ BLUNDER_RISK = 0.001
 OUTLYING_RISK = 0.01
 #: Check points that are together so many times farther off than expected are told.
 _APART = 2.0
+#: Of these the ones are counted that are so many times as far off as expected, which hardly a good one is.
+_ONE_APART = 3.0
 #: From so many check points on their own scatter counts, where it is larger than that of the control points.
 _OWN_SCATTER = 5
 #: Measured check points that show where they lie together beside matches.
@@ -108,8 +110,8 @@ def _restarted(problem: Problem, keep: np.ndarray) -> Problem:
 
 def _reason(size: float) -> str:
     if not math.isfinite(size):
-        return "gross error: the other points put it outside of the model"
-    return f"gross error: {size:.1f} px from where the other points put it"
+        return "gross error, for the other points put it outside of the model"
+    return f"gross error, {size:.1f} px from where the other points put it"
 
 
 def _median_start(problem: Problem, solution: Solution) -> np.ndarray:
@@ -374,9 +376,9 @@ def _outlying_checks(
 
 
 def checks_apart(solution: Solution, points: Points, used: np.ndarray, said: Sequence[Outlying]) -> list[Notice]:
-    """Return a notice where check points, without those that are `said`, are farther off than the fit lets expect.
+    """Return a notice where check points, without those that are `said`, contradict the fit.
 
-    By the F test of their mean square against sigma0, where it is at least twice as far: several wrong check points
+    By the F test of their mean square against sigma0, at least twice as far off as expected: several wrong check points
     hide each other, and a model may follow its control points and nothing between them. Matches are left to what is
     said of their reference.
     """
@@ -399,11 +401,24 @@ def checks_apart(solution: Solution, points: Points, used: np.ndarray, said: Seq
         return []
     sizes = np.hypot(*checks.miss.T)
     found = float(np.sqrt((sizes[good] ** 2).mean()))
-    worst = [points.ids[checks.problem.rows[i]] for i in np.argsort(-np.where(good, sizes, 0.0))[: min(3, count)]]
-    expected = float(np.sqrt((checks.expected(scale)[good] ** 2).mean()))
+    usual = checks.expected(scale)
+    off = 1 if count == 1 else int((good & (sizes > _ONE_APART * usual)).sum())
+    worst = [
+        points.ids[checks.problem.rows[i]] for i in np.argsort(-np.where(good, sizes, 0.0))[: min(3, off or count)]
+    ]
+    expected = float(np.sqrt((usual[good] ** 2).mean()))
     text = (
-        f"{counted(count, 'check point')} {'is' if count == 1 else 'are'} {found:.3g} px off (RMSE), where the control "
-        f"points let expect {expected:.2g} px, farthest {', '.join(worst)}: check points are wrong, or the model is "
-        "poor between the control points"
+        f"{contradicting(off, count, worst)}: RMSE {found:.3g} px{'' if count == 1 else f' over all {count}'}, where "
+        f"{expected:.2g} px was to be expected from the control points; check points are wrong, or the model is poor "
+        "between the control points"
     )
-    return [Notice("checks-apart", text, count=count, rmse=found, expected=expected, points=worst)]
+    return [Notice("checks-apart", text, count=count, off=off, rmse=found, expected=expected, points=worst)]
+
+
+def contradicting(off: int, count: int, points: Sequence[str]) -> str:
+    """Say how many check points contradict the control points: `off` of `count`, or all together; and the farthest."""
+    named = f"({'farthest ' if (off or count) > len(points) else ''}{', '.join(points)})"
+    if not off:
+        return f"{counted(count, 'check point')} together contradict the control points {named}"
+    of = "" if off == count else f"{off} of "
+    return f"{of}{counted(count, 'check point')} contradict{'s' if off == 1 else ''} the control points {named}"

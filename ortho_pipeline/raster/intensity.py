@@ -98,7 +98,7 @@ class Intensity:
                 valid &= band.GetMaskBand().ReadAsArray(*window, **size) != 0
         except RuntimeError as error:
             raise InputError(
-                f"the pixels cannot be read ({first_line(error)})", file=self.source.path,
+                f"the pixels cannot be read ({first_line(error, self.source.path)})", file=self.source.path,
                 remedy="the file is cut off or damaged: copy it again",
             ) from error  # fmt: skip
         found /= len(self._bands)

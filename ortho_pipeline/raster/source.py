@@ -176,10 +176,10 @@ def _in_archive(name: str) -> str:
     return f"name the image in it: {', '.join(found)}" if found else "name the image in it: /vsizip/FILE.zip/IMAGE"
 
 
-def first_line(error: BaseException) -> str:
-    """Return the first line of what an error says."""
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+def first_line(error: BaseException, of: object = "") -> str:
+    """Return the first line of what an error says: without the file `of` it, and without a full stop."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[0].removeprefix(str(of)).lstrip(",: ").rstrip(". ") or lines[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,7 +327,7 @@ class _RasterFile:
             return read(*window, **options)
         except RuntimeError as error:
             raise InputError(
-                f"the pixels cannot be read ({first_line(error)})",
+                f"the pixels cannot be read ({first_line(error, self.path)})",
                 file=self.path,
                 remedy="the file is cut off or damaged: copy it again",
             ) from error

@@ -107,13 +107,15 @@ def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHea
     if known := adjustment.object_rms.check:
         if known.n < ENOUGH_CHECK_POINTS:
             notes.append(FEW)
-        what = f"RMSE in plan and height at {counted(known.n, 'check point')} whose ground took no part"
+        what = (
+            f"RMSE in plan and height at {counted(known.n, 'check point')}: their ground was not used, their rays were"
+        )
         return said(metres(known.plan), what, metres(known.h))
     # The ground of control is held by its sigma: how well it fits is to be seen in the images.
     seen = [image.rms.back_projected for image in adjustment.images.values()]
     if check := merged(*(one.check for one in seen)):
-        what = f"RMSE of {counted(check.n, 'measurement')} of check points, whose ground took no part, in the images"
-        return said(px(check.total), what + to)
+        what = f"RMSE of {counted(check.n, 'measurement')} of check points in the images{to}"
+        return said(px(check.total), f"{what}: their ground was not used, their rays were")
     control = merged(*(one.control for one in seen))
     if adjustment.object_rms.control and control:
         notes.append("No check points were kept apart.")
@@ -197,7 +199,7 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
         adjustment=adjustment,
         head=report.headline,
         notes=[note for note in report.headline.notes if note != FEW or not said],
-        verdict=None if report.map_scale is None else fitness(report.map_scale),
+        verdict=None if report.map_scale is None else fitness(report.map_scale, heights=True),
         ground_sigmas=variance_lines(adjustment.variances),
         roles={role: sum(point.role == role for point in adjustment.points) for role in ROLES},
         points=sorted(

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from ortho_pipeline.display.numbers import class_size
 from ortho_pipeline.errors import counted
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres
@@ -69,7 +70,7 @@ class MapScale:
         by = "" if self.limited_by is None else f" (limited by the {self.limited_by})"
         said = f"{base}: {_scale(self.paper_scale)}{by} by 0.25 mm in the map; "
         claim = "ASPRS 2023 class" if self.claim else "it would be ASPRS 2023 class"
-        said += f"{claim} {self.class_cm} cm; NMAS {_scale(self.nmas_scale)}."
+        said += f"{claim} {class_size(self.class_cm)}; NMAS {_scale(self.nmas_scale)}."
         if self.evidence == "loo":
             said += " No check points were kept apart: an indication, no claim."
         elif not self.claim:

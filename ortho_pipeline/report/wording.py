@@ -6,14 +6,17 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ortho_pipeline.display.notices import Notice, texts_but
-from ortho_pipeline.display.numbers import metres, plain_size, px, share, short, signed, size_text
+from ortho_pipeline.display.numbers import class_size, metres, plain_size, px, share, short, signed, size_text
 from ortho_pipeline.errors import counted
+from ortho_pipeline.estimation.blunders import contradicting
 from ortho_pipeline.report.adjustment_records import Adjustment, Bias, Parameter, Rmse, RmseOnGround, RmsesOnGround
 from ortho_pipeline.report.matching import MatchingRecord, Tested, is_relative
 from ortho_pipeline.report.records import NOT_TESTED, Dem, FlatGround, Headline, MapScaleRecord, SceneReport
 
 #: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
 ENOUGH_CHECK_POINTS = 30
+#: An RMSE so many times that of the check points which agree is no figure to judge fitness by.
+_FAR_ABOVE = 2.0
 #: From so many measured points on their figure leads before that of matches.
 _LEADING = 3
 FEW = f"Fewer than {ENOUGH_CHECK_POINTS} check points: an indication, not a claim of accuracy (ASPRS 2023)."
@@ -81,6 +84,8 @@ def headline(
 
 def verdict(report: SceneReport) -> str:
     """Say in one sentence what the accuracy suffices for, and under which conditions."""
+    if against := contradiction(report):
+        return f"{against}; no fitness for maps is claimed until that is settled."
     found = report.map_scale
     if found is None:
         if report.headline.figure == NOT_TESTED:
@@ -89,21 +94,45 @@ def verdict(report: SceneReport) -> str:
     return fitness(found)
 
 
-def fitness(found: MapScaleRecord) -> str:
-    """Say in one sentence which map scales an accuracy suffices for, and by what evidence."""
+def contradiction(report: SceneReport) -> str | None:
+    """Say that check points contradict the control points, by the notice or by what one of them does to the RMSE."""
+    adjustment = report.adjustment
+    for one in (*report.notices, *adjustment.notices):
+        if one["code"] == "checks-apart":
+            # Earlier versions did not count them.
+            return contradicting(one.get("off", 0), one["count"], one["points"])
+    names = [one.id for one in adjustment.outlying if one.role == "check"]
+    check, rest = adjustment.rmse.check, adjustment.rmse_of_agreeing_checks
+    if names and check and rest and check.total > _FAR_ABOVE * rest.total:
+        return contradicting(len(names), check.n, names[:3])
+    return None
+
+
+def fitness(found: MapScaleRecord, *, heights: bool = False) -> str:
+    """Say in one sentence which map scales an accuracy suffices for, and by what evidence.
+
+    With `heights` it is that of ground whose heights were determined too, of which no scale is claimed.
+    """
     paper = "no usual map scale" if found.paper_scale is None else f"maps of 1 : {found.paper_scale:,}"
     nmas = "no usual scale" if found.nmas_scale is None else f"1 : {found.nmas_scale:,}"
-    limit = "" if found.limited_by is None else f", limited by the {found.limited_by}"
-    said = f"Fit for {paper} (0.25 mm in the map{limit}); ASPRS 2023 horizontal class {found.class_cm} cm; NMAS {nmas}"
+    rule = "RMSE of at most 0.25 mm in the map"
+    if found.limited_by is not None:
+        rule += f", pixels of at most 0.1 mm; the {found.limited_by} decides"
+    asked = ", which does not count pixels," if found.limited_by == "pixel" else ""
+    said = f"Fit for {paper}{' in plan' if heights else ''} ({rule}); NMAS{asked} {nmas}"
+    said += f"; ASPRS 2023 horizontal class {class_size(found.class_cm)}"
     points = {
         "check": counted(found.n, "check point"),
         "delivered": f"{counted(found.n, 'point')} of the model as delivered",
         "loo": f"{counted(found.n, 'control point')} left out in turn",
     }[found.evidence]
+    end = "; no fitness is claimed for heights" if heights else ""
     if found.claim:
         stated = "" if found.survey else ", whose own accuracy is not stated and not in it"
-        return f"{said}: by {points}{stated}."
-    return f"{said}: an indication by {points}, no claim, for which ASPRS asks for {ENOUGH_CHECK_POINTS} check points."
+        return f"{said}: by {points}{stated}{end}."
+    gives = "gives" if found.n == 1 else "give"
+    needs = f"a claim by ASPRS 2023 needs {ENOUGH_CHECK_POINTS}{'' if found.evidence == 'check' else ' check points'}"
+    return f"{said}; {points} {gives} an indication, {needs}{end}."
 
 
 def _of_matches(matching: MatchingRecord, relative: Tested, notes: list[str]) -> Headline:
@@ -140,8 +169,8 @@ def _fit_notes(adjustment: Adjustment) -> list[str]:
     notes = []
     if lost := len(adjustment.rejected):
         notes.append(
-            f"{counted(lost, 'control point')} left out and not counted: good points that are left out are a sign of a "
-            "model that does not suit the scene."
+            f"{counted(lost, 'control point')} left out and not counted. If several points that you trust are left "
+            "out, the model does not suit the scene."
         )
     control, parameters = adjustment.rmse.control, len(adjustment.parameters)
     if control and parameters:
@@ -182,7 +211,7 @@ def summary_text(report: SceneReport) -> str:
     rows.append(("accuracy", f"{head.figure}{ground}: {head.what}"))
     rows += [("", note) for note in head.notes]
     if report.map_scale:
-        rows.append(("map scale", report.map_scale.statement))
+        rows.append(("map scale", verdict(report) if contradiction(report) else report.map_scale.statement))
     for role, found in (("control", report.covariance.control), ("check", report.covariance.check)):
         if found and found.verdict == "systematic":
             rows.append(("pattern", f"{role} points: {found.statement}"))

@@ -219,7 +219,7 @@ class DemFile:
                 mask = band.GetMaskBand().ReadAsArray(left, top, width, height)
         except RuntimeError as error:
             raise InputError(
-                f"the heights cannot be read ({first_line(error)})",
+                f"the heights cannot be read ({first_line(error, self.path)})",
                 file=self.path,
                 remedy="copy the DEM again: it is damaged",
             ) from error

@@ -53,6 +53,8 @@ def test_a_source_that_is_cut_off_is_named_and_leaves_no_ortho(tmp_path, share):
     with pytest.raises(InputError) as caught:
         commands.rectify(image, tmp_path / "out", surface=SurfaceOptions(dem=str(image.parent / "dem.tif")))
     helps(caught.value, tmp_path / "out", "scene.tif")
+    assert str(caught.value).count("scene.tif") == 1
+    assert ".)" not in str(caught.value)
 
 
 @pytest.mark.parametrize("kind", ["folder", "no XML", "loop"])

@@ -46,17 +46,32 @@ def test_what_failed_stands_first_and_then_the_least_accurate(tmp_path, ortho):
     rows = re.findall(r"<tr[ >].*?</tr>", page.split("<tbody>")[1], re.DOTALL)
     assert ["Failed" in rows[0], "untested" in rows[1], "bad" in rows[2], "good" in rows[3]] == [True] * 4
     assert "1 of 4 scenes failed" in page
-    assert "june: 3 scenes made; 2 with an RMSE of 0.20 to 3.00 px at check points; 1 that nothing tests." in page
+    assert (
+        "june: 3 scenes were made; 2 tested at check points, RMSE 0.20 to 3.00 px; 1 not tested at any point." in page
+    )
     # What to look at stands in the row, gravest first, and that nothing tests a scene is the first of all.
     assert "Nothing tests how accurate this is." in rows[1]
     assert "only check, or an orthoimage" in rows[1]
     assert "Look." in rows[2]
+    assert "<th>tested at</th>" in page
     write_run_page(tmp_path / "part.html", "june", [{**scene("late"), "status": "missing", "facts": {}}])
     assert "nobody has made this scene yet" in (tmp_path / "part.html").read_text(encoding="utf-8")
     assert "Give a DEM." in rows[0]
     assert page.count("<script") == 1
     assert 'href="scenes/a%20b_report.html"' in rows[3]
     assert rows[3].count("data:image/png;base64,") == 1
+
+
+def test_check_points_that_contradict_have_another_mark_than_a_formality(tmp_path):
+    few = {"code": "few-check-points", "text": "6 check points: few"}
+    formal, apart = scene("formal", 0.2), scene("apart", 7.2)
+    formal["facts"]["notices"] = [few]
+    apart["facts"]["notices"] = [few, {"code": "checks-apart", "text": "3 of 6 check points contradict"}]
+    write_run_page(tmp_path / "index.html", "june", [formal, apart])
+    rows = re.findall(r"<tr[ >].*?</tr>", (tmp_path / "index.html").read_text().split("<tbody>")[1], re.DOTALL)
+    assert '<li class="stop">' in rows[0]
+    assert "Wrong until shown otherwise.</b> 3 of 6" in rows[0]
+    assert '<li class="look">' in rows[1]
 
 
 def test_the_same_results_are_the_same_page_and_cost_no_pixel(tmp_path, ortho, monkeypatch):

@@ -136,6 +136,9 @@ def test_a_dem_that_is_cut_off_is_called_damaged(tiny, tmp_path):
     for fill in ("error", "mask", "nearest", "500"):
         error = refused(tiny, tmp_path / "out", "cannot be read", surface=dem_of(tiny, dem=dem, fill=fill))
         assert error.file == str(dem)
+        # What GDAL says is a part of the sentence: without the file, which stands before it, and without its full stop.
+        assert str(error).count(str(dem)) == 1
+        assert ".)" not in error.message
 
 
 @pytest.mark.parametrize("fill", ["nearest", "500"])

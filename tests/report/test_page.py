@@ -15,6 +15,7 @@ import pytest
 from osgeo import gdal
 
 from ortho_pipeline.display.drawing import Drawing
+from ortho_pipeline.display.numbers import class_size
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection
@@ -22,11 +23,12 @@ from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.gallery.points import SIDE, point_chips
+from ortho_pipeline.report.map_scale import judge
 from ortho_pipeline.report.page.advice import WORDS, advised, signals
 from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import degrees, plot_ortho
-from ortho_pipeline.report.records import NOT_TESTED, SceneReport
-from ortho_pipeline.report.wording import verdict
+from ortho_pipeline.report.records import NOT_TESTED, MapScaleRecord, SceneReport
+from ortho_pipeline.report.wording import fitness, verdict
 from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
 from ortho_pipeline.simulation.terrain import Terrain
 
@@ -48,7 +50,7 @@ def made(points: Points, crs: str = "EPSG:32636", correction: str = "shift") -> 
     cell = (max(x) - min(x) + 2 * margin) / 1200
     extent = (min(x) - margin, min(y) - margin, max(x) + margin, max(y) + margin)
     grid = Grid.of_extent(pyproj.CRS(crs), extent, (cell, cell))
-    return report.build_report(scene=scene, fit=result, grid=grid)
+    return report.build_report(scene=scene, fit=result, grid=grid, warnings=result.warnings)
 
 
 def onto(made_: SceneReport, drawing: Drawing, lon_lat: np.ndarray) -> np.ndarray:
@@ -194,9 +196,12 @@ def test_the_gravest_notice_comes_first():
 @pytest.mark.parametrize(
     ("points", "said"),
     [
-        (measured(control=10, check=30), r"Fit for maps of 1 : [\d,]+ \(0\.25 mm.*class \d+ cm; NMAS .*: by 30 check"),
-        (measured(), r"an indication by 6 check points, no claim, for which ASPRS asks for 30"),
-        (measured(check=0), r"an indication by 12 control points left out in turn, no claim"),
+        (
+            measured(control=10, check=30),
+            r"Fit for maps of 1 : [\d,]+ \(RMSE of at most 0\.25 mm.*; NMAS.* [\d,]+; .*class [\d.]+ c?m: by 30 check",
+        ),
+        (measured(), r"6 check points give an indication, a claim by ASPRS 2023 needs 30\.$"),
+        (measured(check=0), r"12 control points left out in turn give an indication, a claim .* needs 30 check points"),
         (measured().select(np.arange(18) < 1), r"What it is fit for nobody can say"),
     ],
 )
@@ -205,6 +210,44 @@ def test_verdict_is_one_sentence_with_its_conditions(points, said):
     assert re.search(said, text)
     assert text.count(". ") == 0
     assert text.endswith(".")
+
+
+@pytest.mark.parametrize("wrong", [1, 3])
+def test_verdict_leads_with_check_points_that_contradict_the_control(tmp_path, wrong):
+    points = measured()
+    image = points.image.copy()
+    names = []
+    for index, by in zip(np.flatnonzero(points.check)[:wrong], ((14.0, 0.0), (0.0, -11.0), (-8.0, 0.0)), strict=False):
+        image[index] += by
+        names.append(points.ids[index])
+    said = made(dataclasses.replace(points, image=image))
+    text = verdict(said)
+    verb = "contradicts" if wrong == 1 else "contradict"
+    assert text == (
+        f"{wrong} of 6 check points {verb} the control points ({', '.join(names)}); no fitness for maps is claimed "
+        "until that is settled."
+    )
+    assert f"map scale {text}" in report.summary_text(said)
+    report.write_report_html(said, tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Fit for maps" not in page
+    assert "Map scale, not claimed while check points contradict" in page
+
+
+def test_a_block_claims_no_fitness_for_heights():
+    found = judge(np.full((30, 2), 10.0), "check", None)
+    text = fitness(MapScaleRecord(**found.to_json()), heights=True)
+    assert " in plan (" in text
+    # 14.142 m is 1415 cm: what is rounded is no better than it was.
+    assert "class 14.2 m" in text
+    assert text.endswith("no fitness is claimed for heights.")
+
+
+def test_a_class_has_centimetres_up_to_a_metre_and_three_digits_above():
+    sizes = [class_size(one) for one in (1, 51, 99, 100, 101, 999, 1438, 1797, 9991, 12345, 123456)]
+    assert sizes == [
+        "1 cm", "51 cm", "99 cm", "1.00 m", "1.01 m", "9.99 m", "14.4 m", "18.0 m", "100 m", "124 m", "1240 m",
+    ]  # fmt: skip
 
 
 def test_places_of_points_are_in_the_json(tmp_path):

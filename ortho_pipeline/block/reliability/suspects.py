@@ -226,12 +226,12 @@ class _Suspects:
         if culprit is None:
             known = _GROUND in self.parts
             who = "its ground and its measurements contradict each other" if known else "its rays miss each other"
-            reason = f"gross error: {who} by {size:.1f} px, and it cannot be decided which is wrong"
+            reason = f"gross error, {who} by {size:.1f} px, and it cannot be decided which is wrong"
             return Rejected(name, "point", None, reason)
         if culprit == _GROUND:
-            return Rejected(name, "ground", None, f"gross error: {size:.1f} m from where its rays meet")
+            return Rejected(name, "ground", None, f"gross error, {size:.1f} m from where its rays meet")
         image = points.images[points.image[chunk.rays[k, culprit]]]
-        return Rejected(name, "ray", image, f"gross error: {size:.1f} px from where the other rays and points put it")
+        return Rejected(name, "ray", image, f"gross error, {size:.1f} px from where the other rays and points put it")
 
     def _apart(self, of: Index, without: int | None) -> Array:
         """Return the misfits ``(n, m)`` of all rows of some points at the places that all parts but one give."""

@@ -16,6 +16,9 @@ _STOP: dict[str, str] = {
     "swapped.",
     "reference-made-of-scene": "Take another reference: one that was not made of this scene.",
     "unstable": "Add points, or take a correction with fewer parameters.",
+    "checks-apart": "Measure those named again, in the image and at their source, before the model or the control is "
+    "changed. If all are off alike, check their CRS and heights; if those far from control are the worst, add control "
+    "there.",
     "undecided-contradiction": "Measure the points named again; one of them is wrong.",
     "only-a-start": "Add control points or a reference to match with before the ortho is used.",
     "rpc-elsewhere": "Check that the RPC belongs to this image, and is not that of a crop or of another scene.",
@@ -23,11 +26,11 @@ _STOP: dict[str, str] = {
     "metadata-contradict": "Find out which of the two is right before the ortho is used; ask who delivered the scene.",
 }
 _LOOK: dict[str, str] = {
-    "left-out": "Look at it in the image and at its coordinates: measure it again, or leave it out of the file.",
+    "left-out": "Look at it in the image and at its coordinates: measure it again, or delete it from the file of "
+    "points.",
     "more-left-out": "So many gross errors mean that the points or the model do not suit the scene: see both.",
-    "contradicting-point": "Look at it in the image and at its coordinates: measure it again, or take it out.",
-    "checks-apart": "Look at these in the image and at their coordinates. If all are off alike, check their CRS and "
-    "heights; if those far from control are the worst, add control there.",
+    "contradicting-point": "Look at it in the image and at its coordinates, and measure it again; take it out only "
+    "if its source is found wrong.",
     "no-projection": "Give the points a height, and check their CRS.",
     "takes-no-part": "Measure these points in one more image.",
     "outside-of-image": "Check whether these were measured in another image or in a crop of this one.",

@@ -79,14 +79,14 @@ def _summary(rows: Sequence[Row]) -> str:
     made = [row for row in rows if row.error is None]
     if not made:
         return "None was made."
-    parts = [f"{counted(len(made), 'scene')} made"]
+    parts = [f"{counted(len(made), 'scene was', 'scenes were')} made"]
     for kind, name in EVIDENCE.items():
         sizes = [row.rmse for row in made if row.evidence == kind and row.rmse is not None]
         if sizes:
             span = px(sizes[0]) if len(sizes) == 1 else f"{fixed(min(sizes))} to {px(max(sizes))}"
-            parts.append(f"{len(sizes)} with an RMSE of {span} at {name}")
+            parts.append(f"{len(sizes)} tested at {name}, RMSE {span}")
     if untested := sum(row.evidence is None for row in made):
-        parts.append(f"{untested} that nothing tests")
+        parts.append(f"{untested} not tested at any point")
     return f"{'; '.join(parts)}."
 
 

@@ -21,7 +21,7 @@ from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import plot_ortho
 from ortho_pipeline.report.plots import plots
 from ortho_pipeline.report.records import NOT_TESTED, Provenance, SceneReport
-from ortho_pipeline.report.wording import FEW, verdict
+from ortho_pipeline.report.wording import FEW, contradiction, verdict
 
 if TYPE_CHECKING:
     from ortho_pipeline.imaging.matching import Matches
@@ -62,6 +62,7 @@ def write_report_html(
         # What is a notice stands among them, with what to do.
         notes=[note for note in report.headline.notes if note != FEW or not said],
         verdict=verdict(report),
+        contradicted=contradiction(report) is not None,
         signals=said,
         levels=WORDS,
         rejected={one.id: one.reason for one in adjustment.rejected},
