@@ -104,7 +104,7 @@ CLOSED = """
 import sys
 from ortho_pipeline.cli import program as cli
 from ortho_pipeline.files.locations import located
-sys.argv = ["ortho", "--version"]
+sys.argv = ["ortho", "models"]
 try:
     cli.main()
 except SystemExit:

@@ -131,6 +131,19 @@ def _product(a, b, found):
 
 
 @inlined
+def _upper_product(a, b, found):
+    """Fill the upper triangle of `found` with a product that is symmetric."""
+    size = a.shape[0]
+    for i in range(size):
+        for j in range(i, size):
+            found[i, j] = 0.0
+        for c in range(a.shape[1]):
+            factor = a[i, c]
+            for j in range(i, size):
+                found[i, j] += factor * b[c, j]
+
+
+@inlined
 def _times(a, x, found):
     """Fill `found` with the product of a matrix and a vector."""
     for i in range(a.shape[0]):
@@ -148,11 +161,11 @@ def _solve(of, node, weights, inverse, met, taken, normal, right):
     """
     spread, square = _points(of, node, weights, inverse, met, taken)
     scale, size = 1.0 / node[0], normal.shape[0]
-    _product(of.flat, taken, normal)
+    _upper_product(of.flat, taken, normal)
     _times(of.flat, met, right)
     for a in range(size):
         right[a] = (of.image_right[a] - right[a]) * scale + of.pseudo_right[a]
-        for b in range(size):
+        for b in range(a, size):
             normal[a, b] = (of.image[a, b] - normal[a, b]) * scale + of.pseudo[a, b]
     spread += (of.counts[0] - of.counts[1]) * np.log(node[0]) + _factor(normal, right)
     square += of.counts[2] * scale
