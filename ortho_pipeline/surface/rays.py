@@ -177,7 +177,7 @@ class _Parabolas(_Ray):
     """The same, but for parabolas in height through three exact positions of each point."""
 
     def __init__(self, ray: _Ray, low: float, high: float) -> None:
-        vars(self).update(vars(ray))
+        super().__init__(ray.model, ray.image, ray.surface)
         self._middle, self._half = (low + high) / 2, (high - low) / 2
         heights = np.repeat([low, self._middle, high], len(ray.image))
         below, self._at, above = ray.samples(np.tile(ray.image, (3, 1)), heights).reshape(3, -1, 2)

@@ -214,6 +214,15 @@ def test_a_stereo_pair_is_tied_by_clicks_in_either_image(
     assert not served.faults
 
 
+def tab_to_scene(page: playwright.Page, most: int) -> None:
+    """Press the tabulator until the view of the scene has the focus."""
+    for _ in range(most):
+        page.keyboard.press("Tab")
+        if page.evaluate("() => document.activeElement.id") == "scene":
+            break
+    assert page.evaluate("() => document.activeElement.id") == "scene"
+
+
 @pytest.mark.slow
 def test_six_points_by_keyboard_alone(serve, whole_reference: Path, truth) -> None:
     served = serve(whole_reference)
@@ -221,11 +230,7 @@ def test_six_points_by_keyboard_alone(serve, whole_reference: Path, truth) -> No
     page.keyboard.press("?")
     playwright.expect(page.locator("#keys")).to_be_visible()
     page.keyboard.press("Escape")
-    for _ in range(12):
-        page.keyboard.press("Tab")
-        if page.evaluate("() => document.activeElement.id") == "scene":
-            break
-    assert page.evaluate("() => document.activeElement.id") == "scene"
+    tab_to_scene(page, 12)
     accepted = 0
     for _ in range(12):
         page.keyboard.press("n")
@@ -256,11 +261,7 @@ def test_six_points_of_a_pair_by_keyboard_alone(serve, whole_reference: Path, wh
     """Ties and control at the places that are offered, a role changed, models compared: no mouse."""
     served = serve(whole_reference, whole_stereo.path)
     page = served.page
-    for _ in range(14):
-        page.keyboard.press("Tab")
-        if page.evaluate("() => document.activeElement.id") == "scene":
-            break
-    assert page.evaluate("() => document.activeElement.id") == "scene"
+    tab_to_scene(page, 14)
     accepted = 0
     for _ in range(14):
         page.keyboard.press("n")

@@ -7,6 +7,9 @@ import hashlib
 import http.client
 import http.server
 import random
+import shutil
+import socket
+import subprocess
 import threading
 import time
 import urllib.parse
@@ -18,6 +21,26 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+
+@contextmanager
+def installed_server(program: str, options: Callable[[int], list[str]]) -> Iterator[int]:
+    """Run a server that is told by its options on which port to listen; skip the test where it is not installed."""
+    found = shutil.which(program)
+    if found is None:
+        pytest.skip(f"{program} is not installed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port: int = free.getsockname()[1]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen([found, *options(port)], **quiet) as server:
+        for _ in range(400):
+            with socket.socket() as asked:
+                if asked.connect_ex(("127.0.0.1", port)) == 0:
+                    break
+            time.sleep(0.05)
+        yield port
+        server.terminate()
 
 
 class PublicFolder:

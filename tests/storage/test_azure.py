@@ -5,10 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import hmac
-import shutil
-import socket
-import subprocess
-import time
 import urllib.request
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -18,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from osgeo import gdal
-from servers import on_a_faulty_way
+from servers import installed_server, on_a_faulty_way
 
 from ortho_pipeline.commands import rectify
 from ortho_pipeline.errors import StorageError
@@ -34,23 +30,13 @@ Address = tuple[str, int]
 
 @pytest.fixture(scope="module")
 def azurite(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Address]:
-    program = shutil.which("azurite-blob")
-    if program is None:
-        pytest.skip("azurite is not installed")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = [program, "--blobHost", "127.0.0.1", "--blobPort", str(port), "--skipApiVersionCheck", "--silent",
-               "--disableTelemetry", "--location", str(tmp_path_factory.mktemp("azurite"))]  # fmt: skip
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as running:
-        for _ in range(400):
-            with socket.socket() as asked:
-                if asked.connect_ex(("127.0.0.1", port)) == 0:
-                    break
-            time.sleep(0.05)
+    folder = tmp_path_factory.mktemp("azurite")
+    fixed = ["--skipApiVersionCheck", "--silent", "--disableTelemetry", "--location", str(folder)]
+    with installed_server(
+        "azurite-blob", lambda port: ["--blobHost", "127.0.0.1", "--blobPort", str(port), *fixed]
+    ) as port:
         make_container(port, "box")
         yield "127.0.0.1", port
-        running.terminate()
 
 
 def make_container(port: int, name: str) -> None:

@@ -9,8 +9,6 @@ import json
 import random
 import shutil
 import socket
-import subprocess
-import time
 from collections import Counter
 from collections.abc import Iterator
 from datetime import timedelta
@@ -21,7 +19,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from osgeo import gdal
-from servers import FaultyWay, moto_server, on_a_faulty_way, running, serving
+from servers import FaultyWay, installed_server, moto_server, on_a_faulty_way, running, serving
 
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import export, rectify
@@ -48,22 +46,9 @@ def moto() -> Iterator[Address]:
 @pytest.fixture(scope="module")
 def s3rver(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Address]:
     """The second server, by other people in another language: ``npm install s3rver``, its ``.bin`` in PATH."""
-    program = shutil.which("s3rver")
-    if program is None:
-        pytest.skip("s3rver is not installed")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    folder = tmp_path_factory.mktemp("s3rver")
-    command = [program, "-d", str(folder), "-a", "127.0.0.1", "-p", str(port), "--configure-bucket", "bucket", "-s"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as running:
-        for _ in range(200):
-            with socket.socket() as asked:
-                if asked.connect_ex(("127.0.0.1", port)) == 0:
-                    break
-            time.sleep(0.05)
+    fixed = ["-d", str(tmp_path_factory.mktemp("s3rver")), "-a", "127.0.0.1", "--configure-bucket", "bucket", "-s"]
+    with installed_server("s3rver", lambda port: [*fixed, "-p", str(port)]) as port:
         yield "127.0.0.1", port
-        running.terminate()
 
 
 @pytest.fixture(params=["moto", "s3rver"])
