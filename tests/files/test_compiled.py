@@ -2,6 +2,7 @@
 
 import ast
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -50,6 +51,26 @@ def test_every_kernel_is_made_without_a_cache_and_computes_the_same() -> None:
     )
     assert done.returncode == 0, done.stderr
     assert float(done.stdout) == 4.0  # 4 u + 8 v
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="looks for instructions of x86-64")
+def test_kernels_of_rpcs_are_vector_instructions() -> None:
+    """A branch in their loops, or arrays that may overlap, and they take one point at a time: half as fast."""
+    done = run(
+        "import numpy as np\n"
+        "from ortho_pipeline.models import rpc_kernel as kernel\n"
+        "points, tables = np.ones((9, 3)), (np.zeros(5), np.ones(5), np.ones((4, 20)))\n"
+        "heights, limits = np.ones(9), np.ones(3)\n"
+        "kernel.project(points, *tables, limits, np.ones((9, 2)))\n"
+        "start = np.ones((2, 6)), limits, 1e-9, 1e-5, 25\n"
+        "kernel.image_to_ground(np.ones((9, 2)), heights, *tables, *start, points)\n"
+        "for one in (kernel.project, kernel.image_to_ground):\n"
+        "    print(''.join(one.inspect_asm().values()).count('divpd'))\n"
+    )
+    projecting, inverse = map(int, done.stdout.split())
+    assert projecting >= 2
+    assert inverse >= 11
 
 
 def test_kept_code_is_made_again_when_a_function_of_another_module_changes(tmp_path: Path) -> None:

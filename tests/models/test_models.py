@@ -106,6 +106,42 @@ def test_compiled_kernels_agree_with_numpy():
     np.testing.assert_allclose(found[good], parts[good], rtol=0, atol=1e-12)
 
 
+def bent_rpc(seed: int = 5) -> RPC:
+    """An RPC whose terms of second and third order are 0.06 of the first: a Jacobian has to be made anew on the way."""
+    random, first = np.random.default_rng(seed), make_rpc()
+    names = "col_num", "col_den", "row_num", "row_den"
+    return make_rpc(**{n: getattr(first, n) + random.normal(0, 0.06, 20) * (np.arange(20) > 3) for n in names})
+
+
+@pytest.mark.parametrize("model", [make_rpc(), bent_rpc()], ids=["rpc", "bent"])
+def test_the_compiled_result_of_a_point_does_not_depend_on_the_others(model):
+    """Blocks are computed together: the order of points, and what stands beside them, must not show in a bit."""
+    count = COMPILED_FROM + 77
+    random = np.random.default_rng(3)
+    ground = box_of(model, count) + np.where(random.uniform(size=(count, 1)) < 0.1, [0.05, 0.03, 400.0], 0.0)
+    ground[::97] = np.nan
+    image = model.ground_to_image(ground)
+    image[::89], image[::83] = random.uniform(-1e5, 1e5, (len(image[::89]), 2)), np.nan
+    found = model.image_to_ground(image, ground[:, 2])
+    order = random.permutation(count)
+    np.testing.assert_array_equal(model.ground_to_image(ground[order]), model.ground_to_image(ground)[order])
+    np.testing.assert_array_equal(model.image_to_ground(image[order], ground[order, 2]), found[order])
+    shorter = slice(31, count - 11)
+    np.testing.assert_array_equal(model.image_to_ground(image[shorter], ground[shorter, 2]), found[shorter])
+    assert 0.03 < np.isnan(found[:, 0]).mean() < 0.3
+
+
+def test_the_compiled_inverse_renews_its_jacobian():
+    model = bent_rpc()
+    ground = box_of(model, COMPILED_FROM)
+    image = model.ground_to_image(ground)
+    found = model.image_to_ground(image, ground[:, 2])
+    parts = [model.image_to_ground(image[k::10], ground[k::10, 2]) for k in range(10)]
+    for k, part in enumerate(parts):
+        np.testing.assert_allclose(found[k::10], part, rtol=0, atol=1e-12)
+    assert np.abs(model.ground_to_image(found) - image).max() < 1e-8
+
+
 def test_inverse_gives_nan_instead_of_a_false_root():
     model = make_rpc()
     far = np.array([[1e6, 1e6], [np.nan, 0.0], [6000.0, 1e9]])
