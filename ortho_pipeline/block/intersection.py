@@ -7,6 +7,7 @@ errors of the models themselves are not in it (they are in that of an adjustment
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ import numpy as np
 
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints, Index
+from ortho_pipeline.block.projection.rays import linearised
 from ortho_pipeline.errors import InputError, TooFewPoints, counted
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
@@ -244,18 +246,14 @@ def _equations(
     """
     place = np.full(len(points), -1)
     place[numbers] = np.arange(len(numbers))
-    places, wanted = frame.places(local[numbers]), used & (place[points.point] >= 0)
-    parts = [(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2, 3)))]
-    for model, rays_of in zip(models, points.rays_of_images, strict=True):
-        rays = rays_of[wanted[rays_of]]
-        if not len(rays):
-            continue
-        image, partials = places.projected(model, place[points.point[rays]])
-        sigma = points.sigma_image[rays]
-        misfit = points.whitened((points.measured[rays] - image) / sigma[:, None], rays)
-        parts.append((rays, misfit, points.whitened(partials / sigma[:, None, None], rays)))
-    rays, misfits, partials = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return rays, place[points.point[rays]], misfits, partials
+    wanted = used & (place[points.point] >= 0)
+    parts = [rays_of[wanted[rays_of]] for rays_of in points.rays_of_images]
+    rays, ends = np.concatenate([np.zeros(0, dtype=np.int64), *parts]), np.cumsum([0, *map(len, parts)])
+    of_images = [np.arange(begin, end) for begin, end in itertools.pairwise(ends.tolist())]
+    of, scale = place[points.point[rays]], 1.0 / points.sigma_image[rays]
+    seen = linearised(frame.places(local[numbers]), models, of_images, of, scale, 0)
+    misfits = points.whitened((points.measured[rays] - seen.image) * scale[:, None], rays)
+    return rays, of, misfits, points.whitened(seen.by_point, rays)
 
 
 def _per_point(count: int, of: Index, values: Array) -> Array:

@@ -181,7 +181,7 @@ class RPC(SensorModel):
         from ortho_pipeline.models import rpc_kernel
 
         image = np.empty((len(ground), 2))
-        rpc_kernel.project(ground, *self._tables(), np.array([DOMAIN_LIMIT, *self._reach]), image)
+        rpc_kernel.project(ground, *self.tables, image)
         return image
 
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
@@ -192,19 +192,21 @@ class RPC(SensorModel):
 
         ground = np.empty((len(image), 3))
         heights = np.ascontiguousarray(np.broadcast_to(np.asarray(height, dtype=np.float64), len(image)))
+        offsets, scales, coefficients, limits = self.tables
         rpc_kernel.image_to_ground(
-            image, heights, *self._tables(), self._inverse_start(), np.array([DOMAIN_LIMIT, *self._reach]),
-            INVERSE_TOLERANCE, INVERSE_VERIFIED, 25, ground,
+            image, heights, offsets, scales, coefficients, self._inverse_start(), limits, INVERSE_TOLERANCE,
+            INVERSE_VERIFIED, 25, ground,
         )  # fmt: skip
         return ground
 
-    def _tables(self) -> tuple[Array, Array, Array]:
-        """Return offsets and scales of lon, lat, h, column, row, and the coefficients, for the compiled kernels."""
+    @cached_property
+    def tables(self) -> tuple[Array, Array, Array, Array]:
+        """Offsets and scales of lon, lat, h, column, row; coefficients ``(4, 20)`` and limits as in `rpc_kernel`."""
         offsets = np.array([self.lon_off, self.lat_off, self.h_off, self.col_off, self.row_off])
         scales = np.array([self.lon_scale, self.lat_scale, self.h_scale, self.col_scale, self.row_scale])
-        coefficients = self._polynomials
         # With positive denominators at the centre: where one is not, there is a pole in between.
-        return offsets, scales, coefficients * np.repeat(np.sign(coefficients[1::2, :1]), 2, axis=0)
+        coefficients = self._polynomials * np.repeat(np.sign(self._polynomials[1::2, :1]), 2, axis=0)
+        return offsets, scales, coefficients, np.array([DOMAIN_LIMIT, *self._reach])
 
     def _inverse_start(self) -> Array:
         """Return first approximations ``(2, 6)`` of the inverse: see `rpc_kernel.image_to_ground`."""

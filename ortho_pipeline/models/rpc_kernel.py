@@ -50,6 +50,41 @@ def _with_slopes(a, x, y, z):
     return _polynomial(a, x, y, z), by_x, by_y
 
 
+@inlined
+def with_all_slopes(a, x, y, z, count, found):
+    """Fill `found` ``(4, n)`` with the values of a polynomial at n points, and its derivatives by L, P and H.
+
+    As loops over points without a branch: they take four or eight of them at a time.
+    """
+    value, by_x, by_y, by_z = found[0], found[1], found[2], found[3]
+    a0, a1, a2, a3, a4, a5, a6, a7, a8, a9 = a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8], a[9]
+    a10, a11, a12, a13, a14, a15, a16, a17, a18, a19 = (
+        a[10],
+        a[11],
+        a[12],
+        a[13],
+        a[14],
+        a[15],
+        a[16],
+        a[17],
+        a[18],
+        a[19],
+    )
+    for k in range(count):
+        p, q, r = x[k], y[k], z[k]
+        pp, qq, rr = p * p, q * q, r * r
+        # What squares are multiplied by, and products of two different ones.
+        of_pp, of_qq, of_rr = a7 + q * a14 + r * a17, a8 + p * a12 + r * a18, a9 + p * a13 + q * a16
+        of_pq = a4 + r * a10
+        value[k] = (
+            a0 + p * (a1 + q * of_pq + r * a5) + q * (a2 + r * a6) + r * a3
+            + pp * (p * a11 + of_pp) + qq * (q * a15 + of_qq) + rr * (r * a19 + of_rr)
+        )  # fmt: skip
+        by_x[k] = a1 + q * of_pq + r * a5 + 3.0 * pp * a11 + 2.0 * p * of_pp + qq * a12 + rr * a13
+        by_y[k] = a2 + p * of_pq + r * a6 + 3.0 * qq * a15 + 2.0 * q * of_qq + pp * a14 + rr * a16
+        by_z[k] = a3 + p * (a5 + q * a10) + q * a6 + 3.0 * rr * a19 + 2.0 * r * of_rr + pp * a17 + qq * a18
+
+
 @compiled
 def project(ground, offsets, scales, coefficients, limits, image):
     """Fill `image` ``(N, 2)`` with the projections of `ground` ``(N, 3)`` (lon, lat, h).

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,9 +26,10 @@ from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import Misfits
 from ortho_pipeline.block.equations.reduced_system import NormalSystem, Solution
-from ortho_pipeline.block.equations.unknowns import Mask
-from ortho_pipeline.block.points import Index
 from ortho_pipeline.models.base import Array
+
+if TYPE_CHECKING:
+    from ortho_pipeline.block.equations import point_kernel
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,65 +39,70 @@ class Elimination:
     linear: Linear
 
     @cached_property
-    def _points(self) -> tuple[Index, Index, Index, Mask, Index]:
-        ordering = self.linear.ordering
-        return ordering.rays, ordering.starts, ordering.numbers, ordering.known, ordering.image
+    def _rows(self) -> point_kernel.Rows:
+        """These equations for compiled code."""
+        from ortho_pipeline.block.equations import point_kernel
 
-    @property
-    def _partials(self) -> tuple[Array, Array, Array]:
-        return self.linear.by_params, self.linear.by_point, self.linear.ground_by_point
+        linear, ordering = self.linear, self.linear.ordering
+        return point_kernel.Rows(
+            ordering.rays, ordering.starts, ordering.numbers, ordering.known, ordering.image,
+            linear.problem.levels.pairs.slot, linear.by_params, linear.by_point, linear.ground_by_point,
+            linear.misfits.rays, linear.misfits.ground,
+        )  # fmt: skip
 
     def system(self) -> NormalSystem:
         """Return the normal equations of the parameters alone."""
         from ortho_pipeline.block.equations import point_kernel
 
-        linear, misfits = self.linear, self.linear.misfits
-        levels = linear.problem.levels
-        system = NormalSystem(levels)
-        parts = system.blocks, system.right
-        point_kernel.reduce(*self._points, levels.pairs.slot, *self._partials, misfits.rays, misfits.ground, parts)
-        system.add(linear.pseudo.image, linear.pseudo.rows, misfits.pseudo)
+        linear = self.linear
+        system = NormalSystem(linear.problem.levels)
+        point_kernel.reduce(self._rows, 0, linear.ordering.points, system.blocks, system.right)
+        system.add(linear.pseudo.image, linear.pseudo.rows, linear.misfits.pseudo)
         return system
 
-    def shifts(self, values: Array) -> Array:
-        """Return the step of the points ``(N, 3)`` that goes with that of the parameters ``(P,)``."""
+    def shifts(self, values: Array) -> tuple[Array, Misfits]:
+        """Return the step of the points ``(N, 3)`` that goes with that of the parameters ``(P,)``.
+
+        And what both take off the misfits, to first order.
+        """
         from ortho_pipeline.block.equations import point_kernel
 
-        found = np.zeros((len(self.linear.problem.points), 3))
-        step, misfits = np.append(values, 0.0)[self.linear.problem.columns.padded], self.linear.misfits
-        point_kernel.shifts(*self._points, step, *self._partials, misfits.rays, misfits.ground, found)
-        return found
+        linear, points = self.linear, self.linear.problem.points
+        step = np.append(values, 0.0)[linear.problem.columns.padded]
+        found, of_rays, of_ground = np.zeros((len(points), 3)), np.zeros((points.rays, 2)), np.zeros((len(points), 3))
+        point_kernel.shifts(self._rows, 0, linear.ordering.points, step, found, of_rays, of_ground)
+        pseudo = (linear.pseudo.rows * step[linear.pseudo.image]).sum(axis=1)
+        return found, Misfits(of_rays, of_ground, pseudo)
 
     def hats(self, cofactors: Cofactors) -> tuple[Array, Array]:
         """Return the parts of the hat matrix of rays ``(M, 2, 2)`` and of known ground ``(N, 3, 3)``."""
         from ortho_pipeline.block.equations import point_kernel
 
-        levels, found = self.linear.problem.levels, _no_hats(self.linear)
-        blocks = cofactors.blocks
-        point_kernel.hats(*self._points, levels.pairs.slot, blocks, *self._partials, *found)
+        points = self.linear.problem.points
+        found = np.zeros((points.rays, 2, 2)), np.zeros((len(points), 3, 3))
+        point_kernel.hats(self._rows, 0, self.linear.ordering.points, cofactors.blocks, *found)
         return found
 
     def ground(self, covariance: Cofactors, factor: float) -> Array:
         """Return the covariances ``(N, 3, 3)`` of the points in the frame; NaN for those that take no part."""
         from ortho_pipeline.block.equations import point_kernel
 
-        levels, blocks = self.linear.problem.levels, covariance.blocks
         found = np.full((len(self.linear.problem.points), 3, 3), np.nan)
-        point_kernel.ground(*self._points, levels.pairs.slot, blocks, factor, *self._partials, found)
+        point_kernel.ground(self._rows, 0, self.linear.ordering.points, covariance.blocks, factor, found)
         return found
-
-
-def _no_hats(linear: Linear) -> tuple[Array, Array]:
-    return np.zeros((linear.problem.points.rays, 2, 2)), np.zeros((len(linear.problem.points), 3, 3))
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A step of the parameters with its cofactors, and that of the points ``(N, 3)``."""
+    """A step of the parameters with its cofactors, and that of the points ``(N, 3)``.
+
+    `change` are the misfits that it takes off, to first order.
+    """
 
     points: Elimination
     solution: Solution
     shift: Array
+    change: Misfits
 
     @property
     def linear(self) -> Linear:
@@ -117,17 +124,12 @@ class Step:
         """The steps of all unknowns, one after the other."""
         return np.concatenate([self.solution.values, self.shift.ravel()])
 
-    @property
-    def change(self) -> Misfits:
-        """Misfits that it takes off, to first order."""
-        return self.linear.changes(self.solution.values, self.shift)
-
 
 def step_of(linear: Linear, damping: float = 0.0) -> Step:
     """Return the step that minimises the squares to first order; with `damping` a shorter one."""
     points = Elimination(linear)
     solution = points.system().solve(damping)
-    return Step(points, solution, points.shifts(solution.values))
+    return Step(points, solution, *points.shifts(solution.values))
 
 
 def weakest(linear: Linear) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from ortho_pipeline.block.equations.problem import BlockProblem, Misfits, PseudoEquations, Selection, State
 from ortho_pipeline.block.equations.unknowns import Mask, Ordering
+from ortho_pipeline.block.projection.rays import linearised
 from ortho_pipeline.models.base import Array
 
 
@@ -35,17 +37,15 @@ class Linear:
         points = problem.points
         ordering = problem.ordering(weights) if ordering is None else ordering
         places = problem.frame.places(state.local)
-        predicted = points.measured.copy()
-        by_point = np.zeros((points.rays, 2, 3))
-        by_params = np.zeros((points.rays, 2, problem.columns.widest))
-        for model, used in zip(state.models, ordering.rays_of_image, strict=True):
-            predicted[used], by_point[used], partials = places.linearised(model, points.point[used])
-            by_params[used, :, : partials.shape[2]] = partials
-        root = (np.sqrt(weights.ray_weights) / points.sigma_image)[:, None, None]
-        by_point = points.whitened(np.multiply(by_point, root, out=by_point), slice(None))
-        by_params = points.whitened(np.multiply(by_params, root, out=by_params), slice(None))
+        root = np.sqrt(weights.ray_weights) / points.sigma_image
+        seen = linearised(places, state.models, ordering.rays_of_image, points.point, root, problem.columns.widest)
+        left_out = np.ones(points.rays, dtype=bool)
+        left_out[ordering.rays] = False
+        seen.image[left_out] = points.measured[left_out]
+        by_point = points.whitened(seen.by_point, slice(None))
+        by_params = points.whitened(seen.by_params, slice(None))
         pseudo = problem.pseudo_equations(state)
-        misfits = problem.misfits_of(predicted, state.local, pseudo, ordering, weights)
+        misfits = problem.misfits_of(seen.image, state.local, pseudo, ordering, weights)
         ground_by_point, rows = np.zeros((len(points), 3, 3)), ordering.grounded
         scale = np.sqrt(weights.ground_weights[rows])[:, None] / problem.ground_sigmas[rows]
         ground_by_point[rows] = problem.enu[rows] * scale[:, :, None]
@@ -56,18 +56,17 @@ class Linear:
         problem, points, numbers = self.problem, self.problem.points, np.flatnonzero(moved)
         place = np.zeros(len(points), dtype=np.int64)
         place[numbers] = np.arange(len(numbers))
-        places = problem.frame.places(local[numbers])
-        root = np.sqrt(self.weights.ray_weights) / points.sigma_image
+        # Their rays, image by image, as if there were no others.
+        parts = [of_image[moved[points.point[of_image]]] for of_image in self.ordering.rays_of_image]
+        used, ends = np.concatenate(parts), np.cumsum([0, *map(len, parts)])
+        of_images = [np.arange(begin, end) for begin, end in itertools.pairwise(ends.tolist())]
+        root = np.sqrt(self.weights.ray_weights[used]) / points.sigma_image[used]
+        places, widest = problem.frame.places(local[numbers]), problem.columns.widest
+        seen = linearised(places, self.state.models, of_images, place[points.point[used]], root, widest)
         rays, by_point, by_params = self.misfits.rays.copy(), self.by_point.copy(), self.by_params.copy()
-        for model, of_image in zip(self.state.models, self.ordering.rays_of_image, strict=True):
-            used = of_image[moved[points.point[of_image]]]
-            if not len(used):
-                continue
-            image, by_place, partials = places.linearised(model, place[points.point[used]])
-            scale = root[used]
-            rays[used] = points.whitened((points.measured[used] - image) * scale[:, None], used)
-            by_point[used] = points.whitened(by_place * scale[:, None, None], used)
-            by_params[used, :, : partials.shape[2]] = points.whitened(partials * scale[:, None, None], used)
+        rays[used] = points.whitened((points.measured[used] - seen.image) * root[:, None], used)
+        by_point[used] = points.whitened(seen.by_point, used)
+        by_params[used] = points.whitened(seen.by_params, used)
         ground = problem.ground_misfits(local, self.ordering, self.weights)
         return replace(
             self, state=replace(self.state, local=local), by_point=by_point, by_params=by_params,
@@ -98,12 +97,3 @@ class Linear:
         counts = np.diff(self.problem.columns.offsets)
         for image in np.unique(self.pseudo.image[of]).tolist():
             yield image, self.pseudo.rows[of & (self.pseudo.image == image), : counts[image]]
-
-    def changes(self, step: Array, shift: Array) -> Misfits:
-        """Return what a step of the parameters ``(P,)`` and of the points ``(N, 3)`` takes off, to first order."""
-        points = self.problem.points
-        of_image = np.append(step, 0.0)[self.problem.columns.padded]
-        rays = np.einsum("nij,nj->ni", self.by_params, of_image[points.image])
-        rays += np.einsum("nij,nj->ni", self.by_point, shift[points.point])
-        ground = np.einsum("nij,nj->ni", self.ground_by_point, shift)
-        return Misfits(rays, ground, (self.pseudo.rows * of_image[self.pseudo.image]).sum(axis=1))

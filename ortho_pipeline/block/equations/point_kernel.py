@@ -1,31 +1,74 @@
 """Compiled elimination of the points of blocks, one after the other, and the chain rule of their rays.
 
 Rays stand point by point: those of the t-th point are ``order[starts[t]:starts[t + 1]]``, by image. Nothing that is
-made of a point is kept: factoring its few rows again takes less than reading them back.
+made of a point is kept: factoring its few rows again takes less than reading them back. Points that the same images
+show follow each other, so that what is added up by pairs of images is so in a small matrix of these images first.
 """
 
 from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ortho_pipeline.files.compiled import compiled, inlined
 
+Array = Any
+
+
+class Rows(NamedTuple):
+    """Equations of a block, and the order in which its n points are eliminated.
+
+    `image` ``(M,)`` are the images of the rays, `slot` ``(images, images)`` numbers of their pairs, `numbers` ``(n,)``
+    the points, `grounded` ``(n,)`` whether their known ground weighs in. Misfits are those of the rays ``(M, 2)`` and
+    of the ground ``(N, 3)``, partials `by_params` ``(M, 2, p)``, `by_point` ``(M, 2, 3)``, `by_ground` ``(N, 3, 3)``.
+    """
+
+    order: Array
+    starts: Array
+    numbers: Array
+    grounded: Array
+    image: Array
+    slot: Array
+    by_params: Array
+    by_point: Array
+    by_ground: Array
+    misfits: Array
+    of_ground: Array
+
+
+class Point(NamedTuple):
+    """The rows of one point, factored: B = Q R, with `q` ``(3, rows)``, and `turned` ``(3, k p)``, which is Q' A."""
+
+    q: Array
+    r: Array
+    turned: Array
+
 
 @inlined
-def _factored(rays, count, grounded, by_point, by_ground, q, r):
-    """Factor the rows of a point, B = Q R, by Gram and Schmidt, each column made orthogonal twice; return their number.
+def _room(rows, begin, end):
+    """Return room for any point between two, and the most rays that one has."""
+    most = 0
+    for t in range(begin, end):
+        most = max(most, rows.starts[t + 1] - rows.starts[t])
+    return Point(np.empty((3, 2 * most + 3)), np.empty((3, 3)), np.empty((3, most * rows.by_params.shape[2]))), most
 
-    `rays` are the `count` rays, `by_ground` ``(3, 3)`` the partials of known ground, which weighs in if `grounded`.
-    """
-    size = 2 * count
-    for a in range(count):
+
+@inlined
+def _factored(rows, t, point):
+    """Factor the rows of the t-th point by Gram and Schmidt, each column made orthogonal twice; return their number."""
+    q, r = point.q, point.r
+    size = 0
+    for a in range(rows.starts[t], rows.starts[t + 1]):
+        ray = rows.order[a]
         for c in range(3):
-            q[2 * a, c] = by_point[rays[a], 0, c]
-            q[2 * a + 1, c] = by_point[rays[a], 1, c]
-    if grounded:
+            q[c, size] = rows.by_point[ray, 0, c]
+            q[c, size + 1] = rows.by_point[ray, 1, c]
+        size += 2
+    if rows.grounded[t]:
         for row in range(3):
             for c in range(3):
-                q[size + row, c] = by_ground[row, c]
+                q[c, size + row] = rows.by_ground[rows.numbers[t], row, c]
         size += 3
     for c in range(3):
         for d in range(3):
@@ -34,183 +77,264 @@ def _factored(rays, count, grounded, by_point, by_ground, q, r):
             for d in range(c):
                 along = 0.0
                 for row in range(size):
-                    along += q[row, d] * q[row, c]
+                    along += q[d, row] * q[c, row]
                 for row in range(size):
-                    q[row, c] -= along * q[row, d]
+                    q[c, row] -= along * q[d, row]
                 r[d, c] += along
         square = 0.0
         for row in range(size):
-            square += q[row, c] * q[row, c]
+            square += q[c, row] * q[c, row]
         r[c, c] = np.sqrt(square)
         scale = 1.0 / r[c, c] if square > 0.0 else 0.0
         for row in range(size):
-            q[row, c] *= scale
+            q[c, row] *= scale
     return size
 
 
 @inlined
-def _turned(rays, count, by_params, q, turned):
-    """Fill `turned` ``(3, k p)`` with Q' A."""
-    wide = by_params.shape[2]
-    for a in range(count):
+def _turned(rows, t, point):
+    """Fill Q' A of the t-th point."""
+    wide, begin = rows.by_params.shape[2], rows.starts[t]
+    for a in range(rows.starts[t + 1] - begin):
+        ray = rows.order[begin + a]
         for c in range(3):
-            first, second = q[2 * a, c], q[2 * a + 1, c]
+            first, second = point.q[c, 2 * a], point.q[c, 2 * a + 1]
             for u in range(wide):
-                turned[c, a * wide + u] = first * by_params[rays[a], 0, u] + second * by_params[rays[a], 1, u]
-
-
-@compiled
-def reduce(order, starts, numbers, grounded, image, slot, by_params, by_point, by_ground, misfits, of_ground, parts):
-    """Add the normal equations of the parameters, the points eliminated, to blocks and right side.
-
-    `numbers` ``(n,)`` are the points, `grounded` ``(n,)`` whether their known ground weighs in; `misfits` ``(M, 2)``
-    are those of the rays and `of_ground` ``(N, 3)`` of the ground; `parts` are the blocks ``(S, p, p)`` of the pairs of
-    images, by `slot` ``(images, images)``, and the right side ``(images, p)``.
-    """
-    blocks, right = parts
-    wide, most = by_params.shape[2], 0
-    for t in range(len(numbers)):
-        most = max(most, starts[t + 1] - starts[t])
-    q, r, turned, met = np.empty((2 * most + 3, 3)), np.empty((3, 3)), np.empty((3, most * wide)), np.empty(3)
-    for t in range(len(numbers)):
-        rays, count = order[starts[t] : starts[t + 1]], starts[t + 1] - starts[t]
-        _factored(rays, count, grounded[t], by_point, by_ground[numbers[t]], q, r)
-        _turned(rays, count, by_params, q, turned)
-        for c in range(3):
-            met[c] = 0.0
-            for a in range(count):
-                met[c] += q[2 * a, c] * misfits[rays[a], 0] + q[2 * a + 1, c] * misfits[rays[a], 1]
-            if grounded[t]:
-                for row in range(3):
-                    met[c] += q[2 * count + row, c] * of_ground[numbers[t], row]
-        for a in range(count):
-            ray, i = rays[a], image[rays[a]]
-            own = slot[i, i]
-            for u in range(wide):
-                first, second = by_params[ray, 0, u], by_params[ray, 1, u]
-                right[i, u] += first * misfits[ray, 0] + second * misfits[ray, 1]
-                for c in range(3):
-                    right[i, u] -= turned[c, a * wide + u] * met[c]
-                for v in range(wide):
-                    blocks[own, u, v] += first * by_params[ray, 0, v] + second * by_params[ray, 1, v]
-            for b in range(a, count):
-                pair = slot[i, image[rays[b]]]
-                for u in range(wide):
-                    x, y, z = turned[0, a * wide + u], turned[1, a * wide + u], turned[2, a * wide + u]
-                    for v in range(wide):
-                        k = b * wide + v
-                        blocks[pair, u, v] -= x * turned[0, k] + y * turned[1, k] + z * turned[2, k]
-
-
-@compiled
-def shifts(order, starts, numbers, grounded, image, step, by_params, by_point, by_ground, misfits, of_ground, shift):
-    """Fill `shift` ``(N, 3)`` with the steps of the points that go with a step ``(images, p)`` of the parameters."""
-    wide, most = by_params.shape[2], 0
-    for t in range(len(numbers)):
-        most = max(most, starts[t + 1] - starts[t])
-    q, r = np.empty((2 * most + 3, 3)), np.empty((3, 3))
-    for t in range(len(numbers)):
-        rays, count = order[starts[t] : starts[t + 1]], starts[t + 1] - starts[t]
-        _factored(rays, count, grounded[t], by_point, by_ground[numbers[t]], q, r)
-        x, y, z = 0.0, 0.0, 0.0
-        for a in range(count):
-            for side in range(2):
-                left = misfits[rays[a], side]
-                for u in range(wide):
-                    left -= by_params[rays[a], side, u] * step[image[rays[a]], u]
-                row = 2 * a + side
-                x, y, z = x + q[row, 0] * left, y + q[row, 1] * left, z + q[row, 2] * left
-        if grounded[t]:
-            for side in range(3):
-                left, row = of_ground[numbers[t], side], 2 * count + side
-                x, y, z = x + q[row, 0] * left, y + q[row, 1] * left, z + q[row, 2] * left
-        z = z / r[2, 2]
-        y = (y - r[1, 2] * z) / r[1, 1]
-        x = (x - r[0, 1] * y - r[0, 2] * z) / r[0, 0]
-        shift[numbers[t], 0], shift[numbers[t], 1], shift[numbers[t], 2] = x, y, z
+                point.turned[c, a * wide + u] = (
+                    first * rows.by_params[ray, 0, u] + second * rows.by_params[ray, 1, u]
+                )  # fmt: skip
 
 
 @inlined
-def _taken(rays, count, image, slot, blocks, turned, product, inner):
-    """Fill `product` ``(k p, 3)`` with C A' Q and `inner` ``(3, 3)`` with Q' A C A' Q."""
-    wide = blocks.shape[1]
+def _as_before(rows, t):
+    """Return whether the t-th point is shown by the same images as the one before it."""
+    here, count = rows.starts[t], rows.starts[t + 1] - rows.starts[t]
+    before = here - count
+    if before != rows.starts[t - 1]:
+        return False
+    same = True
     for a in range(count):
+        same = same and rows.image[rows.order[here + a]] == rows.image[rows.order[before + a]]
+    return same
+
+
+@inlined
+def _add_point(rows, t, size, point, sums, right):
+    """Add the equations of the parameters that the t-th point leaves to `sums` ``(k p, k p)`` and `right` ``(k p,)``.
+
+    Of the symmetric matrix blocks on and above the diagonal alone.
+    """
+    wide, begin = rows.by_params.shape[2], rows.starts[t]
+    count = rows.starts[t + 1] - begin
+    turned, q = point.turned, point.q
+    x, y, z = 0.0, 0.0, 0.0
+    for row in range(size):
+        if row < 2 * count:
+            misfit = rows.misfits[rows.order[begin + row // 2], row % 2]
+        else:
+            misfit = rows.of_ground[rows.numbers[t], row - 2 * count]
+        x, y, z = x + q[0, row] * misfit, y + q[1, row] * misfit, z + q[2, row] * misfit
+    for a in range(count):
+        ray = rows.order[begin + a]
+        of_col, of_row = rows.misfits[ray, 0], rows.misfits[ray, 1]
         for u in range(wide):
-            x, y, z = 0.0, 0.0, 0.0
-            for b in range(count):
-                pair = slot[image[rays[a]], image[rays[b]]]
-                for v in range(wide):
-                    value = blocks[pair, u, v] if a <= b else blocks[pair, v, u]
-                    k = b * wide + v
-                    x, y, z = x + value * turned[0, k], y + value * turned[1, k], z + value * turned[2, k]
-            k = a * wide + u
-            product[k, 0], product[k, 1], product[k, 2] = x, y, z
-    for c in range(3):
-        for d in range(3):
-            inner[c, d] = 0.0
-            for k in range(count * wide):
-                inner[c, d] += turned[c, k] * product[k, d]
+            i = a * wide + u
+            first, second = rows.by_params[ray, 0, u], rows.by_params[ray, 1, u]
+            along, across, up = turned[0, i], turned[1, i], turned[2, i]
+            right[i] += first * of_col + second * of_row - (along * x + across * y + up * z)
+            own = sums[i]
+            for v in range(wide):
+                own[a * wide + v] += first * rows.by_params[ray, 0, v] + second * rows.by_params[ray, 1, v]
+            for k in range(a * wide, count * wide):
+                own[k] -= along * turned[0, k] + across * turned[1, k] + up * turned[2, k]
 
 
 @compiled
-def hats(order, starts, numbers, grounded, image, slot, blocks, by_params, by_point, by_ground, of_rays, of_ground):
-    """Fill `of_rays` ``(M, 2, 2)`` and `of_ground` ``(N, 3, 3)`` with the parts of the hat matrix, C being `blocks`."""
-    wide, most = by_params.shape[2], 0
-    for t in range(len(numbers)):
-        most = max(most, starts[t + 1] - starts[t])
-    q, r, turned = np.empty((2 * most + 3, 3)), np.empty((3, 3)), np.empty((3, most * wide))
-    product, core, cross, own = np.empty((most * wide, 3)), np.empty((3, 3)), np.empty((2, 3)), np.empty((2, wide))
-    for t in range(len(numbers)):
-        rays, count = order[starts[t] : starts[t + 1]], starts[t + 1] - starts[t]
-        size = _factored(rays, count, grounded[t], by_point, by_ground[numbers[t]], q, r)
-        _turned(rays, count, by_params, q, turned)
-        _taken(rays, count, image, slot, blocks, turned, product, core)
+def reduce(rows, begin, end, blocks, right):
+    """Add the normal equations of the parameters, points `begin` to `end` eliminated.
+
+    They go to blocks ``(S, p, p)`` of pairs of images, and to the right side ``(images, p)``.
+    """
+    wide = rows.by_params.shape[2]
+    point, most = _room(rows, begin, end)
+    sums, side = np.empty((most * wide, most * wide)), np.empty(most * wide)
+    for t in range(begin, end):
+        first = rows.starts[t]
+        count = rows.starts[t + 1] - first
+        if t == begin or not _as_before(rows, t):
+            sums[: count * wide, : count * wide] = 0.0
+            side[: count * wide] = 0.0
+        size = _factored(rows, t, point)
+        _turned(rows, t, point)
+        _add_point(rows, t, size, point, sums, side)
+        if t + 1 < end and _as_before(rows, t + 1):
+            continue
+        for a in range(count):
+            i = rows.image[rows.order[first + a]]
+            for u in range(wide):
+                right[i, u] += side[a * wide + u]
+            for b in range(a, count):
+                pair = rows.slot[i, rows.image[rows.order[first + b]]]
+                for u in range(wide):
+                    for v in range(wide):
+                        blocks[pair, u, v] += sums[a * wide + u, b * wide + v]
+
+
+@compiled
+def shifts(rows, begin, end, step, shift, of_rays, of_ground):
+    """Fill what goes with a step ``(images, p)`` of the parameters, of points `begin` to `end`.
+
+    Those are `shift` ``(N, 3)``, the steps of the points, and what both take off the misfits of rays ``(M, 2)`` and
+    ground ``(N, 3)``, to first order.
+    """
+    wide = rows.by_params.shape[2]
+    point, _ = _room(rows, begin, end)
+    for t in range(begin, end):
+        size, number = _factored(rows, t, point), rows.numbers[t]
+        x, y, z = 0.0, 0.0, 0.0
+        place = 0
+        for a in range(rows.starts[t], rows.starts[t + 1]):
+            ray = rows.order[a]
+            own = step[rows.image[ray]]
+            for side in range(2):
+                taken = 0.0
+                for u in range(wide):
+                    taken += rows.by_params[ray, side, u] * own[u]
+                of_rays[ray, side] = taken
+                left = rows.misfits[ray, side] - taken
+                x, y, z = x + point.q[0, place] * left, y + point.q[1, place] * left, z + point.q[2, place] * left
+                place += 1
+        for row in range(place, size):
+            left = rows.of_ground[number, row - place]
+            x, y, z = x + point.q[0, row] * left, y + point.q[1, row] * left, z + point.q[2, row] * left
+        z = z / point.r[2, 2]
+        y = (y - point.r[1, 2] * z) / point.r[1, 1]
+        x = (x - point.r[0, 1] * y - point.r[0, 2] * z) / point.r[0, 0]
+        shift[number, 0], shift[number, 1], shift[number, 2] = x, y, z
+        for a in range(rows.starts[t], rows.starts[t + 1]):
+            for side in range(2):
+                by = rows.by_point[rows.order[a], side]
+                of_rays[rows.order[a], side] += by[0] * x + by[1] * y + by[2] * z
+        for row in range(size - place):
+            by = rows.by_ground[number, row]
+            of_ground[number, row] = by[0] * x + by[1] * y + by[2] * z
+
+
+@inlined
+def _gathered(rows, t, blocks, whole):
+    """Fill `whole` ``(k p, k p)`` with those of `blocks` ``(S, p, p)`` that the images of the t-th point have."""
+    wide, begin = rows.by_params.shape[2], rows.starts[t]
+    count = rows.starts[t + 1] - begin
+    for a in range(count):
+        for b in range(a, count):
+            pair = rows.slot[rows.image[rows.order[begin + a]], rows.image[rows.order[begin + b]]]
+            for u in range(wide):
+                for v in range(wide):
+                    whole[a * wide + u, b * wide + v] = blocks[pair, u, v]
+                    whole[b * wide + v, a * wide + u] = blocks[pair, u, v]
+
+
+@inlined
+def _spread(rows, t, fresh, blocks, point, whole, product, inner):
+    """Factor the t-th point; fill `product` ``(3, k p)`` with Q' A C and `inner` ``(3, 3)`` with Q' A C A' Q.
+
+    C are `blocks` ``(S, p, p)``, whose part for the images of the point is made anew in `whole` if they are `fresh`.
+    Returns the number of rows.
+    """
+    if fresh:
+        _gathered(rows, t, blocks, whole)
+    size = _factored(rows, t, point)
+    _turned(rows, t, point)
+    turned = point.turned
+    wide = (rows.starts[t + 1] - rows.starts[t]) * rows.by_params.shape[2]
+    east, north, up = product[0], product[1], product[2]
+    for k in range(wide):
+        east[k], north[k], up[k] = 0.0, 0.0, 0.0
+    for i in range(wide):
+        x, y, z, row = turned[0, i], turned[1, i], turned[2, i], whole[i]
+        for k in range(wide):
+            value = row[k]
+            east[k] += x * value
+            north[k] += y * value
+            up[k] += z * value
+    for c in range(3):
+        for d in range(3):
+            inner[c, d] = 0.0
+        for k in range(wide):
+            value = turned[c, k]
+            inner[c, 0], inner[c, 1], inner[c, 2] = (
+                inner[c, 0] + value * east[k], inner[c, 1] + value * north[k], inner[c, 2] + value * up[k],
+            )  # fmt: skip
+    return size
+
+
+@inlined
+def _hat(rows, ray, place, point, whole, product, core, own, found):
+    """Fill the hat matrix ``(2, 2)`` of a ray, the `place`-th of its point; `core` is Q' A C A' Q plus the unit matrix.
+
+    With P = Q' A C it is Q Q' + F C F' = A C A' - A P' Q' - Q P A' + Q core Q', of the rows of the ray.
+    """
+    by, wide = rows.by_params[ray], rows.by_params.shape[2]
+    begin = place * wide
+    for i in range(2):
+        row = 2 * place + i
+        x, y, z = point.q[0, row], point.q[1, row], point.q[2, row]
+        # Of Q core - A P', which the columns Q' of the other row take.
+        along = x * core[0, 0] + y * core[1, 0] + z * core[2, 0]
+        across = x * core[0, 1] + y * core[1, 1] + z * core[2, 1]
+        up = x * core[0, 2] + y * core[1, 2] + z * core[2, 2]
+        for u in range(wide):
+            along -= by[i, u] * product[0, begin + u]
+            across -= by[i, u] * product[1, begin + u]
+            up -= by[i, u] * product[2, begin + u]
+        # Of A C - Q P, which A' of the other row takes.
+        for v in range(wide):
+            own[v] = -(x * product[0, begin + v] + y * product[1, begin + v] + z * product[2, begin + v])
+        for u in range(wide):
+            value, row = by[i, u], whole[begin + u]
+            for v in range(wide):
+                own[v] += value * row[begin + v]
+        for j in range(2):
+            other = 2 * place + j
+            value = along * point.q[0, other] + across * point.q[1, other] + up * point.q[2, other]
+            for v in range(wide):
+                value += own[v] * by[j, v]
+            found[ray, i, j] = value
+
+
+@compiled
+def hats(rows, begin, end, blocks, of_rays, of_ground):
+    """Fill the parts of the hat matrix of rays ``(M, 2, 2)`` and known ground ``(N, 3, 3)``, C being `blocks`."""
+    wide = rows.by_params.shape[2]
+    point, most = _room(rows, begin, end)
+    whole, product, core = np.empty((most * wide, most * wide)), np.empty((3, most * wide)), np.empty((3, 3))
+    own = np.empty(wide)
+    for t in range(begin, end):
+        size = _spread(rows, t, t == begin or not _as_before(rows, t), blocks, point, whole, product, core)
         for c in range(3):
             core[c, c] += 1.0
-        for a in range(count):
-            ray = rays[a]
-            pair = slot[image[ray], image[ray]]
-            for side in range(2):
-                for c in range(3):
-                    cross[side, c] = 0.0
-                    for u in range(wide):
-                        cross[side, c] += by_params[ray, side, u] * product[a * wide + u, c]
-                for v in range(wide):
-                    own[side, v] = 0.0
-                    for u in range(wide):
-                        own[side, v] += by_params[ray, side, u] * blocks[pair, u, v]
-            for i in range(2):
-                for j in range(2):
-                    value = 0.0
-                    for v in range(wide):
-                        value += own[i, v] * by_params[ray, j, v]
-                    for c in range(3):
-                        value -= cross[i, c] * q[2 * a + j, c] + cross[j, c] * q[2 * a + i, c]
-                        for d in range(3):
-                            value += q[2 * a + i, c] * core[c, d] * q[2 * a + j, d]
-                    of_rays[ray, i, j] = value
-        for i in range(size - 2 * count):
+        place = 0
+        for a in range(rows.starts[t], rows.starts[t + 1]):
+            _hat(rows, rows.order[a], place, point, whole, product, core, own, of_rays)
+            place += 1
+        for i in range(size - 2 * place):
             for j in range(3):
                 value = 0.0
                 for c in range(3):
                     for d in range(3):
-                        value += q[2 * count + i, c] * core[c, d] * q[2 * count + j, d]
-                of_ground[numbers[t], i, j] = value
+                        value += point.q[c, 2 * place + i] * core[c, d] * point.q[d, 2 * place + j]
+                of_ground[rows.numbers[t], i, j] = value
 
 
 @compiled
-def ground(order, starts, numbers, grounded, image, slot, blocks, factor, by_params, by_point, by_ground, found):
+def ground(rows, begin, end, blocks, factor, found):
     """Fill `found` ``(N, 3, 3)`` with the covariances of the points, in the frame, C being `blocks`."""
-    wide, most = by_params.shape[2], 0
-    for t in range(len(numbers)):
-        most = max(most, starts[t + 1] - starts[t])
-    q, r, turned = np.empty((2 * most + 3, 3)), np.empty((3, 3)), np.empty((3, most * wide))
-    product, inner, root = np.empty((most * wide, 3)), np.empty((3, 3)), np.zeros((3, 3))
-    for t in range(len(numbers)):
-        rays, count = order[starts[t] : starts[t + 1]], starts[t + 1] - starts[t]
-        _factored(rays, count, grounded[t], by_point, by_ground[numbers[t]], q, r)
-        _turned(rays, count, by_params, q, turned)
-        _taken(rays, count, image, slot, blocks, turned, product, inner)
+    wide = rows.by_params.shape[2]
+    point, most = _room(rows, begin, end)
+    whole, product, inner = np.empty((most * wide, most * wide)), np.empty((3, most * wide)), np.empty((3, 3))
+    root, r = np.zeros((3, 3)), point.r
+    for t in range(begin, end):
+        _spread(rows, t, t == begin or not _as_before(rows, t), blocks, point, whole, product, inner)
         for c in range(3):
             inner[c, c] += factor
             root[c, c] = 1.0 / r[c, c]
@@ -223,7 +347,7 @@ def ground(order, starts, numbers, grounded, image, slot, blocks, factor, by_par
                 for c in range(i, 3):
                     for d in range(j, 3):
                         value += root[i, c] * inner[c, d] * root[j, d]
-                found[numbers[t], i, j] = value
+                found[rows.numbers[t], i, j] = value
 
 
 @compiled

@@ -73,6 +73,7 @@ class Ordering:
 
     `rays` ``(K,)`` that take part stand by point and image, those of the n `numbers` of points between `starts`
     ``(n + 1,)``; `known` ``(n,)`` says whose known ground weighs in. `rays_of_image` are the rays of each image.
+    Points that the same images show follow each other.
     """
 
     image: Index
@@ -84,7 +85,7 @@ class Ordering:
 
     @classmethod
     def of(cls, points: BlockPoints, taking_part: Mask, grounded: Mask) -> Ordering:
-        """Sort points by the number of their rays and by the images that show them.
+        """Sort points by the images that show them.
 
         Parameters
         ----------
@@ -97,7 +98,11 @@ class Ordering:
         rays = rays[np.lexsort((points.image[rays], points.point[rays]))]
         counts = np.bincount(points.point[rays], minlength=len(points))
         numbers = np.flatnonzero(counts)
-        starts = np.concatenate([[0], np.cumsum(counts[numbers])])
+        starts = np.cumsum(counts[numbers]) - counts[numbers]
+        order = _by_images(points.image[rays], starts, counts[numbers])
+        numbers, begin, counts = numbers[order], starts[order], counts[numbers[order]]
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        rays = rays[np.arange(len(rays)) + np.repeat(begin - starts[:-1], counts)]
         of_image = tuple(rays_of[taking_part[rays_of]] for rays_of in points.rays_of_images)
         return cls(points.image, rays, starts, numbers, grounded[numbers], of_image)
 
@@ -129,3 +134,15 @@ class Ordering:
     def points(self) -> int:
         """Number of points that take part."""
         return len(self.numbers)
+
+
+def _by_images(image: Index, starts: Index, counts: Index) -> Index:
+    """Return an order of points ``(n,)`` in which those of the same images follow each other, by their first image.
+
+    `image` ``(K,)`` are those of their rays, point by point from `starts` on.
+    """
+    if not len(starts):
+        return starts
+    # Two sets of images that come to the same number would only lie side by side.
+    numbers = np.random.default_rng(0).integers(0, 2**62, int(image.max()) + 1, dtype=np.uint64)
+    return np.lexsort((np.add.reduceat(numbers[image], starts), counts, image[starts]))
