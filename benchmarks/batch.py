@@ -1,7 +1,8 @@
 """How long many small scenes take: a plain loop, `ortho run` in one process, in two, and on two dask workers.
 
     python benchmarks/batch.py [--scenes 200] [--repeat 3] [--quiet SECONDS] [--json FILE]
-    python benchmarks/batch.py --dask [--scenes 600] [--repeat 3]      the CPU of dask beside that of the loop, in pairs
+    python benchmarks/batch.py --dask [--scenes 600] [--repeat 3] [--sample 600] [--workers 1]
+                                        the CPU of dask beside that of the loop over a sample of the scenes, in pairs
 
 The scenes are windows of sample_data/scene.tif with the RPC moved along, so that each is a scene of its own. Every way
 starts with an empty output folder; the time is that of the whole call, the start of the processes included. A run that
@@ -16,17 +17,22 @@ import dataclasses
 import functools
 import hashlib
 import json
+import multiprocessing
 import os
+import re
 import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import yaml
 from osgeo import gdal
 
 from ortho_pipeline import commands
@@ -37,7 +43,8 @@ from ortho_pipeline.options import OutputOptions, SurfaceOptions
 SAMPLE = Path(__file__).resolve().parent.parent / "sample_data"
 SIDE = 400
 PROCESSORS, TICKS = len(os.sched_getaffinity(0)), os.sysconf("SC_CLK_TCK")
-ALLOCATOR = {"OMP_NUM_THREADS": 1, "MALLOC_TRIM_THRESHOLD_": 1 << 28, "MALLOC_MMAP_THRESHOLD_": 32 << 20}
+#: Where dask's configuration for small scenes stands.
+SCALE = Path(__file__).resolve().parent.parent / "docs" / "scale.md"
 FILE = """
 defaults:
   surface: {dem: dem.tif}
@@ -64,9 +71,9 @@ def make_scenes(folder: Path, count: int) -> None:
         dataset = None
 
 
-def loop(folder: Path) -> None:
-    """Rectify all scenes one after the other, with nothing around it."""
-    for image in sorted((folder / "raw").glob("*.tif")):
+def loop(folder: Path, every: int = 1, first: int = 0) -> None:
+    """Rectify all scenes, or every so many, one after the other, with nothing around it."""
+    for image in sorted((folder / "raw").glob("*.tif"))[first::every]:
         commands.rectify(
             image, folder / "out" / image.stem, surface=SurfaceOptions(dem=folder / "dem.tif"), output=OutputOptions()
         )
@@ -92,8 +99,8 @@ def timed_on_dask(folder: Path, few: Path, workers: int = 2) -> dict[str, float]
     import dask
     from distributed import LocalCluster
 
-    # docs/scale.md: dask's own settings of the allocator and its profiler cost some 15 % each.
-    dask.config.set({"distributed.nanny.pre-spawn-environ": ALLOCATOR, "distributed.worker.profile.enabled": False})
+    (told,) = re.findall(r"```yaml\n(distributed:.*?)```", SCALE.read_text(encoding="utf-8"), flags=re.DOTALL)
+    dask.config.update(dask.config.config, yaml.safe_load(told))
     with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
         work = functools.partial(run, executor="dask", scheduler=cluster.scheduler_address)
         timed(few, work)
@@ -189,17 +196,34 @@ def measure(folder: Path, few: Path, scenes: int, repeat: int, quiet: float) -> 
     }
 
 
-def dask_overhead(folder: Path, few: Path, repeat: int) -> None:
-    """Print how much CPU a dask cluster of one worker takes beside the plain loop, in pairs.
+def loops(folder: Path, crew: Sequence[Executor], sample: int) -> None:
+    """Rectify a sample of the scenes by plain loops at once."""
+    every = len(list((folder / "raw").glob("*.tif"))) // sample
+    ends = [one.submit(loop, folder, every * len(crew), every * number) for number, one in enumerate(crew)]
+    for end in ends:
+        end.result()
 
-    Two workers at once would disturb each other's caches: that is no overhead of dask.
+
+def dask_overhead(folder: Path, few: Path, repeat: int, workers: int, sample: int, scenes: int) -> None:
+    """Print how much CPU a dask cluster takes beside plain loops in as many processes, in pairs.
+
+    The loops, before and after the cluster, are in processes that have made a few scenes, as dask's are.
     """
-    timed(few, loop)
     ratios = []
-    for _ in range(repeat):
-        plain, spread = timed(folder, loop), timed_on_dask(folder, few, 1)
-        ratios.append(spread["cpu"] / plain["cpu"])
-        print(f"loop {plain['cpu']:.1f} s CPU, dask {spread['cpu']:.1f} s, ratio {ratios[-1]:.3f}", flush=True)
+    with ExitStack() as stack:
+        spawn = multiprocessing.get_context("spawn")
+        crew = [stack.enter_context(ProcessPoolExecutor(1, spawn)) for _ in range(workers)]
+        for one in crew:
+            loops(few, [one], 4)
+        for _ in range(repeat):
+            before = timed(folder, lambda where: loops(where, crew, sample))
+            spread = timed_on_dask(folder, few, workers)
+            after = timed(folder, lambda where: loops(where, crew, sample))
+            plain, each = 500 * (before["cpu"] + after["cpu"]) / sample, 1000 * spread["cpu"] / scenes
+            ratios.append(each / plain)
+            loop_ms = [round(1000 * one["cpu"] / sample, 1) for one in (before, after)]
+            print(f"ms of CPU a scene: loop {loop_ms[0]} and {loop_ms[1]}, "
+                  f"dask {each:.1f}, ratio {ratios[-1]:.3f}", flush=True)  # fmt: skip
     print(f"median {statistics.median(ratios):.3f}")
 
 
@@ -211,13 +235,16 @@ def main() -> None:
     parser.add_argument("--quiet", type=float, default=0.0)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--dask", action="store_true")
+    parser.add_argument("--sample", type=int, default=600)
+    parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder, few = Path(name) / "all", Path(name) / "few"
         make_scenes(folder, given.scenes)
         make_scenes(few, 4)
         if given.dask:
-            return dask_overhead(folder, few, given.repeat)
+            sample = min(given.sample, given.scenes)
+            return dask_overhead(folder, few, given.repeat, given.workers, sample, given.scenes)
         found = measure(folder, few, given.scenes, given.repeat, given.quiet)
         found["killed_and_resumed"] = killed_and_resumed(folder, given.scenes)
     if given.json:

@@ -25,7 +25,7 @@ from ortho_pipeline.options import EXECUTORS
 
 #: Jobs that are handed over before their turn, so that no worker waits for the next one.
 _AHEAD = 256
-#: Seconds of work that travel together to a scheduler, and jobs of them at most.
+#: Seconds of work that travel together to a scheduler, and at most so many jobs.
 _TOGETHER, _MOST_TOGETHER = 1.0, 64
 #: Environment variables that bound the threads of numerical libraries.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -126,53 +126,72 @@ class InGroups:
     ----------
     executor : Executor
         Not shut down here.
+    slots : int
+        Tasks that it works on at once when it begins.
     """
 
-    def __init__(self, executor: Executor) -> None:
-        self._executor = executor
+    def __init__(self, executor: Executor, slots: int = 1) -> None:
+        self._executor, self._slots = executor, max(1, slots)
 
     def completed(self, work: Callable[[Job], Outcome], jobs: Iterable[Job]) -> Iterator[tuple[Job, Future[Outcome]]]:
         """Yield jobs and their finished futures, group by group in the order in which they end.
 
-        The jobs of a group that was lost are done again one by one: only a job that kills its worker ends with
+        Nobody knows how long a job takes before the second one of a worker has ended, for the first one loads what it
+        needs; so few are handed over before. What a group did not begin within its time is handed over anew. The
+        jobs of a group that was lost are done again one by one: only a job that kills its worker ends with
         `WorkerDied`.
         """
-        rest, alone, size = iter(jobs), deque[Job](), 1
+        rest, undone, alone, size, answers = iter(jobs), deque[Job](), deque[Job](), 1, 0
         waiting: dict[Future[Any], tuple[Job, ...]] = {}
         try:
             while True:
-                while len(waiting) < _AHEAD:
-                    group = (alone.popleft(),) if alone else tuple(itertools.islice(rest, size))
+                while len(waiting) < (_AHEAD if answers > self._slots else 2 * self._slots):
+                    again, most = (alone, 1) if alone else (undone, size)
+                    group = tuple(again.popleft() for _ in range(min(most, len(again))))
+                    group = group or tuple(itertools.islice(rest, size))
                     if not group:
                         break
                     waiting[_submitted(self._executor, _work_through, (work, group))] = group
                 if not waiting:
                     return
-                done, _ = wait(waiting, return_when=FIRST_COMPLETED)
-                for future in done:
-                    group = waiting.pop(future)
+                seconds = []
+                for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                    group, answers = waiting.pop(future), answers + 1
                     if future.exception() is None:
-                        seconds, futures = future.result()
-                        size = max(1, min(_MOST_TOGETHER, int(_TOGETHER * len(group) / max(seconds, 1e-6))))
-                        yield from zip(group, map(_finished, futures), strict=True)
+                        took, futures = future.result()
+                        seconds.append(took)
+                        undone.extend(group[len(futures) :])
+                        yield from zip(group, map(_finished, futures), strict=False)
                     elif len(group) > 1:
                         alone.extend(group)
                     else:
                         yield group[0], _died(future)
+                if seconds:
+                    size = max(1, min(_MOST_TOGETHER, int(_TOGETHER / max(min(seconds), 1e-6))))
         finally:
             for future in waiting:
                 future.cancel()
 
 
 def _work_through(given: tuple[Callable[[Job], Outcome], Sequence[Job]]) -> tuple[float, list[tuple[Any, Any]]]:
-    """Do some jobs one after the other; return the seconds of all, and of each its result or its exception."""
+    """Do some jobs one after the other, until twice their time is over.
+
+    Returns
+    -------
+    seconds : float
+        Of one job, in the mean.
+    list
+        Of each job that was done its result or its exception.
+    """
     work, jobs = given
-    begin, done = time.monotonic(), []
+    begin, done = time.monotonic(), list[tuple[Any, Any]]()
     for job in jobs:
         future = Sequential().submit(work, job)
         error = future.exception()
         done.append((future.result() if error is None else None, error))
-    return time.monotonic() - begin, done
+        if time.monotonic() - begin > 2 * _TOGETHER:
+            break
+    return (time.monotonic() - begin) / len(done), done
 
 
 def _finished(done: tuple[Any, BaseException | None]) -> Future[Any]:
@@ -324,7 +343,7 @@ def crew_of(
                              remedy="for example tcp://host:8786")  # fmt: skip
         client, pool = dask_executor(scheduler)
         with client:
-            yield InGroups(pool), threads or 1
+            yield InGroups(pool, sum(client.nthreads().values())), threads or 1
     elif executor == "sequential":
         yield Sequential(), threads
     elif executor in ("processes", None):

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
 import shutil
 import signal
 import time
@@ -15,9 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from click.testing import CliRunner
 from osgeo import gdal
 
+from ortho_pipeline.batch import executors
 from ortho_pipeline.batch import runner as batch
 from ortho_pipeline.batch.executors import InGroups, WorkerDied, completed
 from ortho_pipeline.cli.program import cli
@@ -25,6 +28,8 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
 
 distributed = pytest.importorskip("distributed")
+dask = pytest.importorskip("dask")
+SCALE = Path(__file__).resolve().parents[2] / "docs" / "scale.md"
 
 FILE = """
 defaults:
@@ -113,12 +118,30 @@ def test_no_scheduler(folder):
         batch.run(folder / "p.yaml", executor="dask", scheduler="tcp://127.0.0.1:1")
 
 
+def test_the_settings_for_small_scenes_are_some_that_dask_knows() -> None:
+    """What docs/scale.md advises is measured by benchmarks/batch.py; a key of another name would change nothing."""
+    (told,) = re.findall(r"```yaml\n(distributed:.*?)```", SCALE.read_text(encoding="utf-8"), flags=re.DOTALL)
+    advised = yaml.safe_load(told)["distributed"]
+    for name in ("worker.profile.enabled", "admin.tick.interval", "admin.system-monitor.interval"):
+        value = advised
+        for part in name.split("."):
+            value = value[part]
+        # A value of the kind of dask's own, and a shorter pause than that after which a loop counts as hanging.
+        assert isinstance(value, type(dask.config.get(f"distributed.{name}"))), name
+    assert advised["nanny"]["pre-spawn-environ"].keys() >= {"MALLOC_TRIM_THRESHOLD_", "OMP_NUM_THREADS"}
+    parse_timedelta = dask.utils.parse_timedelta
+    limit = dask.config.get("distributed.admin.tick.limit")
+    assert parse_timedelta(advised["admin"]["tick"]["interval"]) < parse_timedelta(limit)
+    assert sum(len(values) for values in advised.values()) == 4, "a setting that is not looked for above"
+
+
 class Counting(ThreadPoolExecutor):
     """A pool that notes what it is given, and loses a task as dask does whose worker dies."""
 
     def __init__(self, lost: int = -1) -> None:
         super().__init__(1)
         self.tasks: list[tuple[Any, ...]] = []
+        self.done: list[tuple[Any, ...]] = []
         self.lost = lost
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -127,7 +150,12 @@ class Counting(ThreadPoolExecutor):
             gone: Future[Any] = Future()
             gone.set_exception(BrokenExecutor())
             return gone
-        return super().submit(fn, *args, **kwargs)
+        return super().submit(self._noted, fn, *args)
+
+    def _noted(self, fn: Any, given: tuple[Any, Any]) -> Any:
+        seconds, done = fn(given)
+        self.done.append(given[1][: len(done)])
+        return seconds, done
 
 
 def one_over(number: int) -> float:
@@ -140,7 +168,26 @@ def test_short_jobs_travel_together_and_each_has_its_own_result() -> None:
         assert len(found) == 3000
         assert isinstance(found.pop(100).exception(), ZeroDivisionError)
         assert all(future.result() == one_over(job) for job, future in found.items())
-        assert len(pool.tasks) < 600  # the first 256 alone, the others up to 64 together
+        assert len(pool.tasks) < 60  # the first alone, the others up to 64 together
+
+
+def test_nothing_is_handed_over_by_the_time_that_a_cold_worker_takes() -> None:
+    """The first job of a worker loads what all need: the second one tells how many travel together."""
+    cold = iter([0.3])
+    with Counting() as pool:
+        found = dict(completed(InGroups(pool), lambda _: time.sleep(next(cold, 0.001)), range(600)))
+    assert len(found) == 600
+    assert len(pool.tasks) < 30
+
+
+def test_long_jobs_behind_short_ones_do_not_wait_in_one_group(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scenes that are there already are seen in milliseconds; behind them may stand those that take minutes."""
+    monkeypatch.setattr(executors, "_TOGETHER", 0.02)
+    with Counting() as pool:
+        found = dict(completed(InGroups(pool), lambda job: time.sleep(0.005 * (job >= 1000)), range(1064)))
+    assert len(found) == 1064
+    # A group ends with the job in which twice its time is over; 64 jobs travelled together before.
+    assert max(sum(job >= 1000 for job in jobs) for jobs in pool.done) <= 2 * 0.02 / 0.005 + 1
 
 
 def test_of_a_group_that_is_lost_only_the_job_that_loses_it_has_failed() -> None:
