@@ -26,7 +26,7 @@ from ortho_pipeline.block.intersection import frame_of, meet, models_of, predict
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.reliability.blunders import find_blunders
-from ortho_pipeline.block.reliability.known_points import outlying
+from ortho_pipeline.block.reliability.known_points import notices, outlying
 from ortho_pipeline.block.reliability.suspects import Rejected
 from ortho_pipeline.block.variances.components import Posterior
 from ortho_pipeline.block.variances.grid import estimate, posterior, reweighed
@@ -352,7 +352,7 @@ def _result(
         shared_errors=shared,
         rejected=rejected,
         outlying=doubts,
-        warnings=(*(one.notice() for one in doubts), *notes),
+        warnings=(*notices(doubts, points, object_residuals), *notes),
         condition=solved.condition,
         iterations=solved.iterations,
     )

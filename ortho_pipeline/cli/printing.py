@@ -45,6 +45,8 @@ def print_result(result: Result, as_json: bool) -> None:
 
 def print_fit(result: FitResult) -> None:
     """Print parameters, residuals (of many points the largest) and the RMSEs."""
+    from ortho_pipeline.report.wording import withheld
+
     document = result.to_json()
     click.echo(f"Sensor {document['sensor']}, model {document['model']} of {document['model_source']}")
     _print_parameters(document)
@@ -58,6 +60,9 @@ def print_fit(result: FitResult) -> None:
     if rest:
         click.echo(f"and {counted(rest, 'point')} with smaller residuals (--json has all)")
     click.echo("\nResiduals are measured minus predicted, in pixels; 'left out': had the point taken no part.")
+    against = withheld(document["notices"])
+    if against:
+        click.echo(against)
     if document["raw_bias"] and document["parameters"]:
         bias = document["raw_bias"]
         click.echo(f"Model as delivered: column {bias['col']:+.3f}, row {bias['row']:+.3f} on average")
@@ -76,7 +81,7 @@ def print_fit(result: FitResult) -> None:
         click.echo(f"Matching: {result.matching.text()}. {result.matching.floor()}")
         if absolute := result.matching.absolute_text():
             click.echo(absolute)
-    if document["map_scale"]:
+    if document["map_scale"] and not against:
         click.echo(f"Map scale: {document['map_scale']['statement']}")
     for role, found in document["covariance"].items():
         if found:

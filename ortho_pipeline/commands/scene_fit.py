@@ -118,17 +118,18 @@ class Adjusted:
         return tuple(dict.fromkeys(found))
 
     def _doubtful(self) -> list[Notice]:
-        """Return a notice for each point that was left out, and for each that contradicts the others and was not."""
+        """Return a notice for each point left out, and each that contradicts the others unless one of all says it."""
         left = [
             Notice("left-out", f"point {name} was left out: {reason}", point=name, reason=reason)
             for name, reason in self.fit.rejected
         ]
+        told = {name for one in self.fit.warnings if one.code == "checks-apart" for name in one.fields["points"]}
         return left + [
             Notice(
                 "contradicting-point", f"{one.role} point {one.id} contradicts the others: {one.reason}",
                 point=one.id, role=one.role,
             )
-            for one in self.fit.outlying
+            for one in self.fit.outlying if one.role == "control" or one.id not in told
         ]  # fmt: skip
 
     def _elsewhere(self) -> list[Notice]:

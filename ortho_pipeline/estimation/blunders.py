@@ -36,6 +36,10 @@ OUTLYING_RISK = 0.01
 _APART = 2.0
 #: Of these the ones are counted that are so many times as far off as expected, which hardly a good one is.
 _ONE_APART = 3.0
+#: An RMSE so many times that of the check points which agree is no figure to judge accuracy by.
+FAR_ABOVE = 2.0
+#: Contradicting check points that a notice names.
+_NAMED = 10
 #: From so many check points on their own scatter counts, where it is larger than that of the control points.
 _OWN_SCATTER = 5
 #: Measured check points that show where they lie together beside matches.
@@ -375,50 +379,68 @@ def _outlying_checks(
     ]
 
 
-def checks_apart(solution: Solution, points: Points, used: np.ndarray, said: Sequence[Outlying]) -> list[Notice]:
-    """Return a notice where check points, without those that are `said`, contradict the fit.
+def checks_apart(
+    solution: Solution, points: Points, used: np.ndarray, said: Sequence[Outlying], *, shared: bool = False
+) -> list[Notice]:
+    """Return a notice where check points contradict the control points, so that their RMSE tells no accuracy.
 
-    By the F test of their mean square against sigma0, at least twice as far off as expected: several wrong check points
-    hide each other, and a model may follow its control points and nothing between them. Matches are left to what is
-    said of their reference.
+    Those that contradict by themselves (`said`) do it where they more than double the RMSE of the others. The others
+    do it together, by the F test of their mean square against sigma0, where they are at least twice as far off as
+    expected: several wrong check points hide each other, and a model may follow its control points and nothing between
+    them. Of matches, and where points have an error in common (`shared`), that is left to what is said of their
+    reference.
     """
-    measured = points.groups < 0
-    if solution.sigma0 is None or not len(solution.model.params) or not measured[used].all():
+    if solution.sigma0 is None or not len(solution.model.params):
         return []
+    measured = points.groups < 0
     checks = _checks(solution, points.with_roles(np.where(points.check & ~measured, "tie", points.roles)), used, None)
     if checks is None:
         return []
-    names = {one.id for one in said}
-    good = np.array([points.ids[i] not in names for i in checks.problem.rows])
-    count = int(good.sum())
     scale = max(float(solution.sigma0), _SCALE_FLOOR) ** 2
-    if not count:
+    ids = np.array([points.ids[i] for i in checks.problem.rows])
+    off, usual = np.isin(ids, [one.id for one in said]), checks.expected(scale)
+    sizes = np.hypot(*(checks.problem.image - solution.model.ground_to_image(checks.problem.ground)).T)
+    apart = not shared and measured[used].all() and _together_apart(checks.squares[~off], scale, solution.freedom)
+    rest = None if off.all() else _rms(sizes[~off])
+    if not apart and not (off.any() and _rms(sizes) > FAR_ABOVE * (_rms(usual) if rest is None else rest)):
         return []
+    agree = "check points are wrong, or the model is poor between the control points"
+    over = "" if len(ids) == 1 else f" over all {len(ids)}"
+    if apart:
+        off |= sizes > (_ONE_APART * usual if len(ids) > 1 else 0.0)
+    elif rest is not None:
+        agree = "the other check points agree with the control points"
+        over += f", {rest:.2g} px without {'it' if off.sum() == 1 else 'them'}"
+    far = ids[np.lexsort((-sizes, ~off))][: min(_NAMED, int(off.sum()) or 3)].tolist()
+    fields = {"count": len(ids), "off": int(off.sum()), "rmse": _rms(sizes), "expected": _rms(usual), "points": far}
+    text = (
+        f"{contradicting(int(off.sum()), len(ids), far)}: RMSE {_rms(sizes):.3g} px{over}, where {_rms(usual):.2g} px "
+        f"was to be expected from the control points; {agree}"
+    )
+    return [Notice("checks-apart", text, **fields)]
+
+
+def _together_apart(squares: Array, scale: float, freedom: float) -> bool:
+    """Tell whether check points are farther off together than expected, by their squared distances in sigmas."""
     from scipy.special import fdtrc
 
-    ratio = float(checks.squares[good].mean()) / 2 / scale
-    if ratio < _APART**2 or fdtrc(2 * count, max(solution.freedom, 1.0), ratio) > OUTLYING_RISK:
-        return []
-    sizes = np.hypot(*checks.miss.T)
-    found = float(np.sqrt((sizes[good] ** 2).mean()))
-    usual = checks.expected(scale)
-    off = 1 if count == 1 else int((good & (sizes > _ONE_APART * usual)).sum())
-    worst = [
-        points.ids[checks.problem.rows[i]] for i in np.argsort(-np.where(good, sizes, 0.0))[: min(3, off or count)]
-    ]
-    expected = float(np.sqrt((usual[good] ** 2).mean()))
-    text = (
-        f"{contradicting(off, count, worst)}: RMSE {found:.3g} px{'' if count == 1 else f' over all {count}'}, where "
-        f"{expected:.2g} px was to be expected from the control points; check points are wrong, or the model is poor "
-        "between the control points"
-    )
-    return [Notice("checks-apart", text, count=count, off=off, rmse=found, expected=expected, points=worst)]
+    if not len(squares):
+        return False
+    ratio = float(squares.mean()) / 2 / scale
+    return ratio >= _APART**2 and bool(fdtrc(2 * len(squares), max(freedom, 1.0), ratio) <= OUTLYING_RISK)
 
 
-def contradicting(off: int, count: int, points: Sequence[str]) -> str:
-    """Say how many check points contradict the control points: `off` of `count`, or all together; and the farthest."""
-    named = f"({'farthest ' if (off or count) > len(points) else ''}{', '.join(points)})"
+def _rms(sizes: Array) -> float:
+    return float(np.sqrt((sizes**2).mean()))
+
+
+def contradicting(
+    off: int, count: int, points: Sequence[str], what: str = "the control points", role: str = "check"
+) -> str:
+    """Say how many points of a role contradict `what`: `off` of `count`, or all together; and the farthest by name."""
+    shown = points[:3]
+    named = f"({'farthest ' if (off or count) > len(shown) else ''}{', '.join(shown)})"
     if not off:
-        return f"{counted(count, 'check point')} together contradict the control points {named}"
+        return f"{counted(count, f'{role} point')} together contradict {what} {named}"
     of = "" if off == count else f"{off} of "
-    return f"{of}{counted(count, 'check point')} contradict{'s' if off == 1 else ''} the control points {named}"
+    return f"{of}{counted(count, f'{role} point')} contradict{'s' if off == 1 else ''} {what} {named}"

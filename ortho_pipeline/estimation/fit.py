@@ -309,8 +309,7 @@ def fit(
     used[problem.rows[keep]] = True
     seen = _without(common, model, points)
     said = outlying(solution, seen, used, None if common is None else common.covariance)
-    if common is None:
-        warnings += checks_apart(solution, seen, used, said)
+    warnings += checks_apart(solution, seen, used, said, shared=common is not None)
     found = _result(
         solution, seen, used, raw, {**known_bad, **rejected}, warnings, name, strength, problem.priors, common
     )

@@ -14,6 +14,7 @@ from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import flat, metres, px
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import counted
+from ortho_pipeline.estimation.blunders import contradicting
 from ortho_pipeline.files.documents import json_value, made_of
 from ortho_pipeline.points.rows import ROLES
 from ortho_pipeline.report.adjustment_records import Rmse, is_known
@@ -36,7 +37,7 @@ from ortho_pipeline.report.page.advice import WORDS, signals
 from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import plot_locator
 from ortho_pipeline.report.records import NOT_TESTED, MapScaleRecord, RpcRecord
-from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, FEW, fitness
+from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, FEW, NONE_APART, NOTICED, fitness, withheld
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.start import Start
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
 
 #: Rays that are drawn of each image, points that are listed on the page.
 _DRAWN_RAYS, _LISTED = 400, 400
+#: What makes points of known ground a test.
+KEPT_OUT = "whose known ground was kept out of the adjustment"
 #: A frame's side, the longest arrow in it, and the margin in which arrows of points at its edge end.
 _SIDE, _ARROW, _MARGIN = 420.0, 44.0, 48.0
 
@@ -107,18 +110,16 @@ def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHea
     if known := adjustment.object_rms.check:
         if known.n < ENOUGH_CHECK_POINTS:
             notes.append(FEW)
-        what = (
-            f"RMSE in plan and height at {counted(known.n, 'check point')}: their ground was not used, their rays were"
-        )
-        return said(metres(known.plan), what, metres(known.h))
+        what = f"RMSE in plan and height at {counted(known.n, 'check point')}, {KEPT_OUT}"
+        return said(metres(known.plan), f"{what} (their image measurements were not)", metres(known.h))
     # The ground of control is held by its sigma: how well it fits is to be seen in the images.
     seen = [image.rms.back_projected for image in adjustment.images.values()]
     if check := merged(*(one.check for one in seen)):
         what = f"RMSE of {counted(check.n, 'measurement')} of check points in the images{to}"
-        return said(px(check.total), f"{what}: their ground was not used, their rays were")
+        return said(px(check.total), f"{what}, {KEPT_OUT} (the measurements were not)")
     control = merged(*(one.control for one in seen))
     if adjustment.object_rms.control and control:
-        notes.append("No check points were kept apart.")
+        notes.append(NONE_APART)
         if not adjustment.redundancy:
             return said(NOT_TESTED, "nothing is left over to test the fit with")
         what = f"RMSE of {counted(control.n, 'measurement')} of control points in the images{to}: the fit, not a test"
@@ -128,6 +129,23 @@ def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHea
     return said(
         figure, f"median residual of {counted(len(sizes), 'ray')}: how well the images agree, not how right they are"
     )
+
+
+def verdict(report: BlockReport) -> str | None:
+    """Say which known points contradict the block, and what the accuracy suffices for; None where there is neither."""
+    if against := withheld(report.notices):
+        return against
+    said = []
+    for role in ("check", "control"):
+        names = list(dict.fromkeys(one.point for one in report.adjustment.outlying if one.role == role))
+        if names:
+            known = [one for one in report.adjustment.points if one.role == role and one.residual != (None, None, None)]
+            still = "it counts" if len(names) == 1 else "they count"
+            against = contradicting(len(names), len(known), names, "the block", role)
+            said.append(f"{against}; {still} all the same.")
+    if report.map_scale is not None:
+        said.append(fitness(report.map_scale, heights=True))
+    return " ".join(said) or None
 
 
 def summary_text(report: BlockReport) -> str:
@@ -150,7 +168,7 @@ def summary_text(report: BlockReport) -> str:
         f"Redundancy {adjustment.redundancy}, sigma0 {sigma0}, {counted(len(adjustment.rejected), 'gross error')}"
     )
     height = f", height {head.height}" if head.height else ""
-    lines += [f"{head.figure}{height}: {head.what}", *head.notes]
+    lines += [f"{head.figure}{height}: {head.what}", *filter(None, [withheld(report.notices)]), *head.notes]
     return "\n".join([*lines, *(f"Warning: {text}" for text in report.warnings)])
 
 
@@ -198,8 +216,9 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
         report=report,
         adjustment=adjustment,
         head=report.headline,
-        notes=[note for note in report.headline.notes if note != FEW or not said],
-        verdict=None if report.map_scale is None else fitness(report.map_scale, heights=True),
+        notes=[note for note in report.headline.notes if note not in NOTICED or not said],
+        verdict=verdict(report),
+        marks=_marks(adjustment),
         ground_sigmas=variance_lines(adjustment.variances),
         roles={role: sum(point.role == role for point in adjustment.points) for role in ROLES},
         points=sorted(
@@ -216,6 +235,14 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
         script=script(),
         policy=policy(script()),
     )
+
+
+def _marks(adjustment: BlockAdjustment) -> list[str]:
+    """Say what the marks on the map of the network are, of what there is."""
+    there = {point.role for point in adjustment.points}
+    kinds = {"control": "dots are control points", "check": "squares are check points", "tie": "small dots are ties"}
+    said = [what for role, what in kinds.items() if role in there]
+    return [*said, "crosses are what was left out"] if adjustment.rejected else said
 
 
 def plot_rays(report: BlockReport, label: str, rays: Sequence[Ray]) -> Drawing | None:

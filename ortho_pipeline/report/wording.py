@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from ortho_pipeline.display.notices import Notice, texts_but
 from ortho_pipeline.display.numbers import class_size, metres, plain_size, px, share, short, signed, size_text
@@ -15,22 +16,21 @@ from ortho_pipeline.report.records import NOT_TESTED, Dem, FlatGround, Headline,
 
 #: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
 ENOUGH_CHECK_POINTS = 30
-#: An RMSE so many times that of the check points which agree is no figure to judge fitness by.
-_FAR_ABOVE = 2.0
 #: From so many measured points on their figure leads before that of matches.
 _LEADING = 3
+#: Notes of headlines that a notice says too, with what to do.
 FEW = f"Fewer than {ENOUGH_CHECK_POINTS} check points: an indication, not a claim of accuracy (ASPRS 2023)."
+
+NONE_APART = "No check points were kept apart."
+NOTICED = (FEW, NONE_APART)
 
 
 def few_check_points(count: int) -> Notice:
     """Return the notice that there are too few check points for a claim of accuracy."""
-    return Notice(
-        "few-check-points",
-        f"{counted(count, 'check point')}: fewer than the {ENOUGH_CHECK_POINTS} that ASPRS 2023 asks for before "
-        "accuracy is claimed",
-        count=count,
-        enough=ENOUGH_CHECK_POINTS,
-    )
+    few = f"{counted(count, 'check point')}: fewer than the" if count else "no check points, and"
+    asks = "that ASPRS 2023 asks for" if count else "are what ASPRS 2023 asks for"
+    text = f"{few} {ENOUGH_CHECK_POINTS} {asks} before accuracy is claimed"
+    return Notice("few-check-points", text, count=count, enough=ENOUGH_CHECK_POINTS)
 
 
 def headline(
@@ -74,7 +74,7 @@ def headline(
             else f"RMSE at {points} of the model as delivered, none of which it was adjusted to"
         )
         return _headline(rmse.control, ground.control, what, notes)
-    notes.append("No check points were kept apart.")
+    notes.append(NONE_APART)
     if rmse.loo and adjustment.redundancy:
         what = f"RMSE when each of {counted(rmse.loo.n, 'control point')} is left out in turn{to}"
         return _headline(rmse.loo, ground.loo, what, notes)
@@ -84,8 +84,8 @@ def headline(
 
 def verdict(report: SceneReport) -> str:
     """Say in one sentence what the accuracy suffices for, and under which conditions."""
-    if against := contradiction(report):
-        return f"{against}; no fitness for maps is claimed until that is settled."
+    if against := withheld(report.adjustment.notices):
+        return against
     found = report.map_scale
     if found is None:
         if report.headline.figure == NOT_TESTED:
@@ -94,17 +94,14 @@ def verdict(report: SceneReport) -> str:
     return fitness(found)
 
 
-def contradiction(report: SceneReport) -> str | None:
-    """Say that check points contradict the control points, by the notice or by what one of them does to the RMSE."""
-    adjustment = report.adjustment
-    for one in (*report.notices, *adjustment.notices):
+def withheld(notices: Iterable[Mapping[str, Any]]) -> str | None:
+    """Say why no fitness is claimed, where notices say that check points contradict the control; None elsewhere."""
+    for one in notices:
         if one["code"] == "checks-apart":
+            what = "the block" if "rmse_m" in one else "the control points"  # a block has metres
             # Earlier versions did not count them.
-            return contradicting(one.get("off", 0), one["count"], one["points"])
-    names = [one.id for one in adjustment.outlying if one.role == "check"]
-    check, rest = adjustment.rmse.check, adjustment.rmse_of_agreeing_checks
-    if names and check and rest and check.total > _FAR_ABOVE * rest.total:
-        return contradicting(len(names), check.n, names[:3])
+            against = contradicting(one.get("off", 0), one["count"], one["points"], what)
+            return f"{against}; no fitness for maps is claimed until that is settled."
     return None
 
 
@@ -187,8 +184,8 @@ def _fit_notes(adjustment: Adjustment) -> list[str]:
 def _outlying_notes(adjustment: Adjustment) -> list[str]:
     """Say which check points contradict the others, and what the figure would be without them."""
     names = [one.id for one in adjustment.outlying if one.role == "check"]
-    if not names:
-        return []
+    if not names or withheld(adjustment.notices):
+        return []  # the verdict and a notice say it
     said = f"Probably wrong, but counted: check point{'s' if len(names) > 1 else ''} {', '.join(names)}"
     rest = adjustment.rmse_of_agreeing_checks
     return [f"{said}; without {px(rest.total)} at {counted(rest.n, 'check point')}." if rest else f"{said}."]
@@ -211,7 +208,7 @@ def summary_text(report: SceneReport) -> str:
     rows.append(("accuracy", f"{head.figure}{ground}: {head.what}"))
     rows += [("", note) for note in head.notes]
     if report.map_scale:
-        rows.append(("map scale", verdict(report) if contradiction(report) else report.map_scale.statement))
+        rows.append(("map scale", withheld(adjustment.notices) or report.map_scale.statement))
     for role, found in (("control", report.covariance.control), ("check", report.covariance.check)):
         if found and found.verdict == "systematic":
             rows.append(("pattern", f"{role} points: {found.statement}"))

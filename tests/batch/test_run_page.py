@@ -70,8 +70,9 @@ def test_check_points_that_contradict_have_another_mark_than_a_formality(tmp_pat
     write_run_page(tmp_path / "index.html", "june", [formal, apart])
     rows = re.findall(r"<tr[ >].*?</tr>", (tmp_path / "index.html").read_text().split("<tbody>")[1], re.DOTALL)
     assert '<li class="stop">' in rows[0]
-    assert "Wrong until shown otherwise.</b> 3 of 6" in rows[0]
+    assert "Settle this first.</b> 3 of 6" in rows[0]
     assert '<li class="look">' in rows[1]
+    assert "RMSE 0.20 to 7.20 px; 1 with something to settle first." in (tmp_path / "index.html").read_text()
 
 
 def test_the_same_results_are_the_same_page_and_cost_no_pixel(tmp_path, ortho, monkeypatch):

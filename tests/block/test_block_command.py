@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import json
+import re
 import zipfile
 from pathlib import Path
 
@@ -270,6 +272,37 @@ def test_the_report_is_one_page_in_both_lights(stereo: Stereo, tmp_path: Path) -
             < 2e-3
         )
         assert report["images"][f"{name}_BAND"]["covered"] == pytest.approx(0.5, abs=0.15)
+
+
+def verdict_of(out: Path) -> str:
+    (said,) = re.findall(r'<p class="verdict">(.*?)</p>', (out / "block_report.html").read_text())
+    return html.unescape(said)
+
+
+def test_the_verdict_leads_with_known_points_that_contradict_the_block(stereo: Stereo, tmp_path: Path) -> None:
+    """One check point of twelve is wrong in height by much, then by little."""
+    truth = stereo.ground[9].copy()
+    stereo.ground[9, 2] += 60.0
+    out = tmp_path / "wrong"
+    said = run("adjust", *stereo.images, "--points", stereo.write(), "-o", out)
+    against = "1 of 12 check points contradicts the block (p9); no fitness for maps is claimed until that is settled."
+    assert verdict_of(out) == against
+    assert against in said.split("Warning")[0]
+    report = json.loads((out / "block_report.json").read_text())
+    (notice,) = [one for one in report["notices"] if "p9" in one["text"]]
+    assert notice["code"] == "checks-apart"
+    assert (notice["off"], notice["count"], notice["points"]) == (1, 12, ["p9"])
+    rms = report["adjustment"]["object_rms"]["check"]
+    assert notice["rmse_m"] == pytest.approx({"plan": rms["plan"], "height": rms["h"]})
+    page = (out / "block_report.html").read_text()
+    assert page.index('<li class="stop">') < page.index("p9: its height is") < page.index('<li class="look">')
+    # Near enough that the RMSE still says how accurate the others are: named first, and the claim stands.
+    stereo.ground[9] = truth + np.array([0.0, 0.0, 20.0])
+    said = run("adjust", *stereo.images, "--points", stereo.write(), "-o", tmp_path / "near")
+    assert verdict_of(tmp_path / "near").startswith(
+        "1 of 12 check points contradicts the block (p9); it counts all the same. Fit for maps of 1 :"
+    )
+    assert "Warning: check point p9: its height is" in said
 
 
 def test_empty_parts_of_images_are_said(stereo: Stereo, tmp_path: Path) -> None:

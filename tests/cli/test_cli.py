@@ -171,6 +171,19 @@ def test_fit_prints_a_table_with_every_point(tiny):
     assert "measured minus predicted" in output
 
 
+def test_fit_leads_with_check_points_that_contradict_the_control(tiny):
+    rows = tiny.points(14)
+    rows[12] = (rows[12][0], rows[12][1] + 9.0, *rows[12][2:])
+    tiny.write(tiny.gcps, rows)
+    done = run("fit", *fit_arguments(tiny), "--check", "ids:p10,p11,p12,p13")
+    against = "1 of 4 check points contradicts the control points (p12); no fitness for maps is claimed"
+    assert done.stdout.index(against) < done.stdout.index("RMSE control")
+    assert "Map scale" not in done.stdout
+    assert done.stderr.count("p12") == 1
+    fine = run("fit", *fit_arguments(tiny), "--check", "ids:p10,p11,p13")
+    assert "Map scale" in fine.stdout
+
+
 def test_rectify_takes_the_names_of_gdalwarp(tiny, tmp_path):
     out = tmp_path / "out"
     done = run(

@@ -338,6 +338,16 @@ def test_a_wrong_check_point_is_named_and_counts(rpc, checks):
     rest = found.rmse("agreeing")
     assert rest is None if checks == 1 else (rest["n"] == checks - 1 and rest["total"] < 0.7)
     assert found.to_json()["outlying"][0]["id"] == "p12"
+    # Alone it decides what the RMSE is: no accuracy is to be told by it. One of twelve that is off by little is not so.
+    (notice,) = [one for one in found.warnings if one.code == "checks-apart"]
+    assert (notice.fields["off"], notice.fields["count"], notice.fields["points"]) == (1, checks, ["p12"])
+    assert notice.fields["rmse"] == pytest.approx(found.rmse("check")["total"])
+    if rest is not None:
+        assert f"{rest['total']:.2g} px without it" in notice
+        assert notice.endswith("the other check points agree with the control points")
+        near = fit(start(rpc), moved(good, "p12", (2.2, 0.0)))
+        assert near.rmse("check")["total"] < 2 * (near.rmse("agreeing") or near.rmse("check"))["total"] or checks < 12
+        assert checks < 12 or not [one for one in near.warnings if one.code == "checks-apart"]
 
 
 def test_a_model_that_is_poor_everywhere_makes_no_check_point_wrong(rpc):

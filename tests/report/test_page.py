@@ -28,7 +28,7 @@ from ortho_pipeline.report.page.advice import WORDS, advised, signals
 from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import degrees, plot_ortho
 from ortho_pipeline.report.records import NOT_TESTED, MapScaleRecord, SceneReport
-from ortho_pipeline.report.wording import fitness, verdict
+from ortho_pipeline.report.wording import few_check_points, fitness, verdict
 from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
 from ortho_pipeline.simulation.terrain import Terrain
 
@@ -227,6 +227,11 @@ def test_verdict_leads_with_check_points_that_contradict_the_control(tmp_path, w
         f"{wrong} of 6 check points {verb} the control points ({', '.join(names)}); no fitness for maps is claimed "
         "until that is settled."
     )
+    # The light is that of the verdict, and one notice says it, not one of all and one of each.
+    shown = signals(said.warnings, said.notices)
+    assert [one.level for one in shown][:1] == ["stop"]
+    assert sum("contradict" in one.text for one in shown) == 1
+    assert "Probably wrong" not in "".join(said.headline.notes)
     assert f"map scale {text}" in report.summary_text(said)
     report.write_report_html(said, tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
@@ -278,3 +283,12 @@ def test_the_legend_of_the_map_has_what_was_left_out(tmp_path):
     for name, given, told in (("wrong", dataclasses.replace(points, image=image), 1), ("good", points, 0)):
         report.write_report_html(made(given), tmp_path / f"{name}.html", ortho=b"a picture")
         assert (tmp_path / f"{name}.html").read_text(encoding="utf-8").count("× left out") == told
+
+
+def test_the_legend_of_the_map_and_the_notices_have_no_check_points_where_there_are_none(tmp_path):
+    for checks in (6, 0):
+        path = tmp_path / f"{checks}.html"
+        report.write_report_html(made(measured(check=checks)), path, ortho=b"a picture")
+        legend = re.findall(r'<span class="legend">(.*?)</span>\.', path.read_text(encoding="utf-8"))[0]
+        assert re.findall(r'class="dot (\w+)"', legend) == ["control", "check"][: 1 + bool(checks)]
+    assert few_check_points(0) == "no check points, and 30 are what ASPRS 2023 asks for before accuracy is claimed"

@@ -8,6 +8,7 @@ tested here against the covariance of the adjusted ground and the accuracy of th
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,13 +16,17 @@ import numpy as np
 from ortho_pipeline.block.equations.problem import BlockProblem
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.equations.unknowns import Mask
+from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.reliability.standardised_residuals import standardise_ground
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.estimation.blunders import FAR_ABOVE, contradicting
 from ortho_pipeline.models.base import Array
 
 #: Chance that of a good block any point is named.
 _RISK = 0.01
+#: Contradicting check points that one notice names.
+_NAMED = 10
 
 
 @dataclass(frozen=True)
@@ -47,13 +52,18 @@ class Outlying:
 
     def notice(self) -> Notice:
         """Say it to people."""
-        where = {"plan": "its place in plan is", "height": "its height is", "ground": "its ground is"}[self.what]
         taken = "it counts in the accuracy all the same" if self.role == "check" else "it was used all the same"
         text = (
-            f"{self.role} point {self.point}: {where} {self.metres:.2f} m ({self.sigmas:.1f} sigma) from where the "
-            f"block puts it; {taken}: check its coordinates and measurements"
+            f"{self.role} point {self.point}: {self.place} from where the block puts it; {taken}: check its "
+            "coordinates and measurements"
         )
         return Notice("contradicting-point", text, point=self.point, role=self.role)
+
+    @property
+    def place(self) -> str:
+        """How far which part of it is off."""
+        where = {"plan": "its place in plan is", "height": "its height is", "ground": "its ground is"}[self.what]
+        return f"{where} {self.metres:.2f} m ({self.sigmas:.1f} sigma)"
 
 
 def outlying(
@@ -99,6 +109,46 @@ def outlying(
         for k, what, metres, sigmas, chance in found
         if chance < _RISK / len(found)
     )
+
+
+def notices(doubts: Sequence[Outlying], points: BlockPoints, residuals: Array) -> list[Notice]:
+    """Return a notice for each contradicting point; one for all check points where their RMSE tells no accuracy.
+
+    That is where it is more than twice that of the others in plan or in height, or no more of them agree than
+    contradict.
+
+    Parameters
+    ----------
+    residuals : ndarray (N, 3)
+        Known minus adjusted ground, metres east, north, up.
+    """
+    names = list(dict.fromkeys(one.point for one in sorted(doubts, key=lambda one: -one.sigmas) if one.role == "check"))
+    tested = points.check & np.isfinite(residuals).any(axis=1)
+    off = tested & np.isin(points.ids, names)
+    sizes = {"plan": np.hypot(residuals[:, 0], residuals[:, 1]), "height": np.abs(residuals[:, 2])}
+    every = {what: _rms(size[tested]) for what, size in sizes.items()}
+    rest = {what: _rms(size[tested & ~off]) for what, size in sizes.items()}
+    spoilt = 2 * off.sum() >= tested.sum() or any(every[what] > FAR_ABOVE * rest[what] for what in sizes)
+    if not (names and spoilt):
+        return [one.notice() for one in doubts]
+    who = contradicting(int(off.sum()), int(tested.sum()), names, "the block")
+    without = "" if not (tested & ~off).any() else f", {_both(rest)} without {'it' if off.sum() == 1 else 'them'}"
+    places = "; ".join(
+        f"{one.point}: {one.place} from where the block puts it" for one in doubts if one.point in names[:3]
+    )
+    text = f"{who}: RMSE {_both(every)} over all {tested.sum()}{without}; {places}"
+    fields = {"count": int(tested.sum()), "off": int(off.sum()), "rmse_m": every, "points": names[:_NAMED]}
+    others = [one.notice() for one in doubts if one.role == "control" or one.point not in names[:_NAMED]]
+    return [Notice("checks-apart", text, **fields), *others]
+
+
+def _rms(sizes: Array) -> float:
+    known = sizes[np.isfinite(sizes)]
+    return float(np.sqrt((known**2).mean())) if len(known) else 0.0
+
+
+def _both(rmse: Mapping[str, float]) -> str:
+    return f"{rmse['plan']:.2f} m in plan and {rmse['height']:.2f} m in height"
 
 
 def _sigmas(problem: BlockProblem, variances: Variances) -> Array:

@@ -95,7 +95,10 @@ def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:
     """Return the correction to take, and why."""
     of_ground = {one.name: np.concatenate([one.errors("check"), one.errors("control")]) for one in tried}
     of_rays = {one.name: one.rays for one in tried}
-    for errors, what, unit in ((of_ground, "points whose ground took no part", "m"), (of_rays, "rays left out", "px")):
+    for errors, what, unit in (
+        (of_ground, "points whose known ground was kept out of the fit", "m"),
+        (of_rays, "rays left out", "px"),
+    ):
         tested = {name: values for name, values in errors.items() if np.isfinite(values).any()}
         if not tested:
             continue

@@ -18,6 +18,7 @@ from ortho_pipeline.files.documents import json_position, json_value
 from ortho_pipeline.measure.block.left_out import LeftOut
 from ortho_pipeline.measure.solution import SUSPICIOUS
 from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.report.block import KEPT_OUT
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS
 
 
@@ -115,10 +116,7 @@ def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:
     count = sum(int(one["n"]) for one in rays)
     total = float(np.sqrt(sum(one["n"] * one["total"] ** 2 for one in rays) / count)) if count else None
     few = f"; fewer than {ENOUGH_CHECK_POINTS} check points, no claim" if found["n"] < ENOUGH_CHECK_POINTS else ""
-    text = (
-        f"RMSE in plan, {found['h']:.3f} m in height, at {counted(found['n'], 'check point')} whose ground took no "
-        f"part{to}{few}"
-    )
+    text = f"RMSE in plan, {found['h']:.3f} m in height, at {counted(found['n'], 'check point')}, {KEPT_OUT}{to}{few}"
     told: dict[str, Any] = json_value({"px": total, "m": found["plan"], "n": found["n"], "what": text})
     return told
 

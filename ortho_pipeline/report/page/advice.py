@@ -87,7 +87,7 @@ _LEVELS: tuple[tuple[Level, dict[str, str]], ...] = (("stop", _STOP), ("look", _
 #: Of a code that this version does not know.
 _UNKNOWN = "Read it before the ortho is used."
 #: The levels in words, the gravest first.
-WORDS: dict[Level, str] = {"stop": "Wrong until shown otherwise", "look": "To look at", "know": "To know"}
+WORDS: dict[Level, str] = {"stop": "Settle this first", "look": "To look at", "know": "To know"}
 
 
 @dataclass(frozen=True)

@@ -87,6 +87,8 @@ def _summary(rows: Sequence[Row]) -> str:
             parts.append(f"{len(sizes)} tested at {name}, RMSE {span}")
     if untested := sum(row.evidence is None for row in made):
         parts.append(f"{untested} not tested at any point")
+    if stops := sum(row.signal is not None and row.signal.level == "stop" for row in made):
+        parts.append(f"{stops} with something to settle first")
     return f"{'; '.join(parts)}."
 
 

@@ -21,7 +21,7 @@ from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import plot_ortho
 from ortho_pipeline.report.plots import plots
 from ortho_pipeline.report.records import NOT_TESTED, Provenance, SceneReport
-from ortho_pipeline.report.wording import FEW, contradiction, verdict
+from ortho_pipeline.report.wording import NOTICED, verdict, withheld
 
 if TYPE_CHECKING:
     from ortho_pipeline.imaging.matching import Matches
@@ -60,11 +60,12 @@ def write_report_html(
         adjustment=adjustment,
         head=report.headline,
         # What is a notice stands among them, with what to do.
-        notes=[note for note in report.headline.notes if note != FEW or not said],
+        notes=[note for note in report.headline.notes if note not in NOTICED or not said],
         verdict=verdict(report),
-        contradicted=contradiction(report) is not None,
+        contradicted=withheld(adjustment.notices) is not None,
         signals=said,
         levels=WORDS,
+        roles={one.role for one in adjustment.points},
         rejected={one.id: one.reason for one in adjustment.rejected},
         outlying={one.id: one.reason for one in adjustment.outlying},
         has_loo=any(point.loo_residual for point in adjustment.points),
