@@ -19,7 +19,7 @@ from ortho_pipeline.block.determination import refuse_too_few, refuse_undetermin
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
-from ortho_pipeline.block.equations.solver import Solved, attempt
+from ortho_pipeline.block.equations.solver import EXACT, NEAR, Solved, attempt
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.intersection import frame_of, meet, models_of, predict
@@ -94,22 +94,24 @@ def adjust(
     common = CommonError.of(problem, state, selection)
     if common is not None:
         problem = common.applied(problem)
-    solved = attempt(problem, state, whole)
+    # The search for gross errors begins near the minimum as well as at it, but sigmas are found at it.
+    tolerance = NEAR if robust and not problem.unstated.any() else EXACT
+    solved = attempt(problem, state, whole, tolerance)
     held = _held(solved, state, selection, whole) if robust else None
     _refuse_many_outside(solved if held is None else held, whole)
     solved, inside = _checked(solved, whole) if held is None else (held, held.without_astray(whole))
     if problem.unstated.any():
-        solved = reweighed(solved, inside, estimate(solved))
-    rejected: tuple[Rejected, ...] = ()
+        solved = reweighed(solved, inside, estimate(solved), tolerance)
+    rejected, near = tuple[Rejected, ...](), solved.state
     if robust and problem.size and solved.unit_weight()[1] >= 4:
         blunders = find_blunders(solved, inside)
-        rejected = blunders.rejected
+        rejected, near = blunders.rejected, blunders.state
         if blunders.undecided:
             notes.append(_undecided(blunders.undecided))
         inside = blunders.kept
-    if rejected or held is not None:
+    if robust:
         problem = replace(solved.problem, pseudo=problem.pseudo)
-        solved, inside = _checked(attempt(problem, solved.state, inside), inside)
+        solved, inside = _checked(attempt(problem, near, inside), inside)
     gauge = gauge.replace(by_control(problem, selection), by_control(problem, inside))
     judged = _among(points, {one.point for one in rejected})
     notes += _without(points, ~_among(points, set(exclude)) & ~problem.active(inside) & ~judged)
@@ -131,7 +133,7 @@ def _held(solved: Solved, start: State, selection: Selection, whole: Selection) 
         return None
     if solved.astray.sum() <= _ASTRAY * problem.active(whole).sum():
         return None
-    held = attempt(with_datum(problem, start, selection, HOLD)[0], start, whole)
+    held = attempt(with_datum(problem, start, selection, HOLD)[0], start, whole, NEAR)
     lost = 0 if held.astray is None else int(held.astray.sum())
     return held if held.converged and lost < solved.astray.sum() else None
 

@@ -11,6 +11,7 @@ import numpy as np
 import pyproj
 import pytest
 
+from ortho_pipeline.block import adjustment
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.elimination import Elimination, step_of
@@ -18,10 +19,12 @@ from ortho_pipeline.block.equations.image_pairs import ImagePairs, Levels
 from ortho_pipeline.block.equations.level_factor import LevelFactor
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
-from ortho_pipeline.block.equations.solver import solve
+from ortho_pipeline.block.equations.reduced_system import NormalSystem
+from ortho_pipeline.block.equations.solver import EXACT, solve
 from ortho_pipeline.block.equations.unknowns import Columns
 from ortho_pipeline.block.intersection import frame_of, meet
 from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.block.reliability import blunders
 from ortho_pipeline.block.variances import control_equations
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import as_ground
@@ -309,3 +312,29 @@ def test_equations_with_a_few_points_elsewhere_are_those_of_the_state(linear: Li
     np.testing.assert_allclose(found.by_point, wanted.by_point, rtol=0, atol=1e-8)
     np.testing.assert_allclose(found.by_params, wanted.by_params, rtol=0, atol=1e-8)
     np.testing.assert_array_equal(found.state.local, local)
+
+
+def test_a_search_near_the_minimum_finds_the_same_in_fewer_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    models, points = strip(10, 400)
+    random = np.random.default_rng(2)
+    measured = points.measured.copy()
+    wrong = random.choice(points.rays, 30, replace=False)
+    measured[wrong] += random.uniform(10, 60, (30, 2)) * random.choice([-1.0, 1.0], (30, 2))
+    points, steps, system = replace(points, measured=measured), [0, 0], Elimination.system
+
+    def counted(self: Elimination) -> NormalSystem:
+        steps[0] += 1
+        return system(self)
+
+    monkeypatch.setattr(Elimination, "system", counted)
+    near = adjust(models, points)
+    steps.reverse()
+    for module in (adjustment, blunders):
+        monkeypatch.setattr(module, "NEAR", EXACT)
+    exact = adjust(models, points)
+    assert steps[1] < 0.85 * steps[0]
+    assert len(near.rejected) > 20
+    assert near.rejected == exact.rejected
+    # Both end where a step is below 1e-8 of all misfits, which is up to 1e-5 sigmas of one parameter.
+    np.testing.assert_allclose(near.values / exact.sigmas, exact.values / exact.sigmas, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(near.sigmas, exact.sigmas, rtol=1e-9)

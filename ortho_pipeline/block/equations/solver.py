@@ -19,7 +19,12 @@ from ortho_pipeline.errors import InputError, NotConverged
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 from ortho_pipeline.models.base import Array
 
+#: Length of a step at which a minimum counts as reached, over the lengths of misfits and of their sigmas: the minimum
+#: itself, or near enough to tell gross errors from others by it.
+EXACT, NEAR = 1e-8, 1e-4
 _STEPS = 50
+#: Near a minimum steps shrink to this part of the one before at least: they might creep there from far away.
+_SHRUNK = 0.1
 #: Part of the points that a step may lead out of the models, and still be one to believe of the others.
 _FEW = 0.5
 
@@ -103,7 +108,7 @@ class Solved:
         return axes @ found @ axes.swapaxes(1, 2)
 
 
-def solve(problem: BlockProblem, start: State, selection: Selection) -> Solved:
+def solve(problem: BlockProblem, start: State, selection: Selection, tolerance: float = EXACT) -> Solved:
     """Minimise the squared misfits.
 
     Raises
@@ -111,13 +116,15 @@ def solve(problem: BlockProblem, start: State, selection: Selection) -> Solved:
     NotConverged
         If no minimum is found.
     """
-    found = attempt(problem, start, selection)
+    found = attempt(problem, start, selection, tolerance)
     if not found.converged or found.astray is not None:
         raise NotConverged("the adjustment did not converge", remedy="give more control points or a simpler model")
     return found
 
 
-def solve_inside(problem: BlockProblem, start: State, selection: Selection) -> tuple[Solved, Selection]:
+def solve_inside(
+    problem: BlockProblem, start: State, selection: Selection, tolerance: float = EXACT
+) -> tuple[Solved, Selection]:
     """Minimise the squared misfits without points whose rays lead out of the models; return what takes part, too.
 
     Raises
@@ -125,28 +132,32 @@ def solve_inside(problem: BlockProblem, start: State, selection: Selection) -> t
     NotConverged
         If no minimum is found.
     """
-    found = attempt(problem, start, selection)
+    found = attempt(problem, start, selection, tolerance)
     while found.converged and found.astray is not None:
         selection = found.without_astray(selection)
-        found = attempt(problem, found.state, selection)
+        found = attempt(problem, found.state, selection, tolerance)
     if not found.converged:
         raise NotConverged("the adjustment did not converge", remedy="give more control points or a simpler model")
     return found, selection
 
 
-def attempt(problem: BlockProblem, start: State, selection: Selection) -> Solved:
+def attempt(problem: BlockProblem, start: State, selection: Selection, tolerance: float = EXACT) -> Solved:
     """Minimise the squared misfits of all points that have a place inside of their models; see `Solved`.
 
     What a step leads out of them, as with nearly parallel rays or while the images are far from right, is left out at
     once: nothing is known of it there, and it must not keep the others from where they belong. Where these have come to
     rest, each such point whose rays meet takes part again, once; so does what has no place at the start (NaN).
 
+    Parameters
+    ----------
+    tolerance : {EXACT, NEAR}
+
     Raises
     ------
     NotConverged
         If nothing can be computed at the start.
     """
-    found = _inside(problem, start, selection)
+    found = _inside(problem, start, selection, tolerance)
     gone = found.astray
     if gone is None or not found.converged or found.undetermined:
         return found
@@ -156,7 +167,7 @@ def attempt(problem: BlockProblem, start: State, selection: Selection) -> Solved
         return found
     state = replace(found.state, local=np.where(back[:, None], met, found.state.local))
     gone = gone & ~back
-    again = _inside(problem, state, selection.without(gone, problem.points.point))
+    again = _inside(problem, state, selection.without(gone, problem.points.point), tolerance)
     if not again.converged or again.undetermined:
         return found
     outside = gone if again.astray is None else gone | again.astray
@@ -181,18 +192,18 @@ def _met(found: Solved, gone: Mask, selection: Selection) -> Array:
     return met
 
 
-def _inside(problem: BlockProblem, start: State, selection: Selection) -> Solved:
+def _inside(problem: BlockProblem, start: State, selection: Selection, tolerance: float) -> Solved:
     """Return the minimum without points that have no place at the start, or were led out of their models since."""
     outside, iterations = problem.active(selection) & ~np.isfinite(start.local).all(axis=1), 0
     while True:
-        found = _descended(problem, start, selection.without(outside, problem.points.point))
+        found = _descended(problem, start, selection.without(outside, problem.points.point), tolerance)
         iterations += found.iterations
         if found.astray is None:
             return replace(found, iterations=iterations, astray=outside if outside.any() else None)
         outside, start = outside | found.astray, found.state
 
 
-def _descended(problem: BlockProblem, start: State, selection: Selection) -> Solved:
+def _descended(problem: BlockProblem, start: State, selection: Selection, tolerance: float) -> Solved:
     """Return the minimum by Gauss-Newton, damped where that does not descend, or where a step leads points `astray`."""
     ordering = problem.ordering(selection)
     damping, steps = 0.0, Steps()
@@ -208,7 +219,8 @@ def _descended(problem: BlockProblem, start: State, selection: Selection) -> Sol
         promised = float(np.linalg.norm(change))
         length = math.sqrt(square) + math.sqrt(ordering.observations)
         # Close to the minimum steps are rounding: they do not get shorter any more, or do not descend.
-        small = promised <= 1e-8 * length or (promised <= 1e-6 * length and promised > before / 4)
+        small = promised <= EXACT * length or (promised <= 1e-6 * length and promised > before / 4)
+        small |= promised <= tolerance * length and promised <= _SHRUNK * before
         if small and not damping:
             return Solved(linear, step, iteration)
         whole = step.whole

@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ortho_pipeline.block.equations.linear import Linear
-from ortho_pipeline.block.equations.problem import BlockProblem, Selection
-from ortho_pipeline.block.equations.solver import Solved, attempt, once, solve_inside
+from ortho_pipeline.block.equations.problem import BlockProblem, Selection, State
+from ortho_pipeline.block.equations.solver import NEAR, Solved, attempt, once, solve_inside
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.reliability.standardised_residuals import SCALE_FLOOR, StandardisedResiduals, standardise
 from ortho_pipeline.block.reliability.suspects import Rejected, Trusted, judge
@@ -39,9 +39,13 @@ _DOUBT = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A selection without its gross errors, these, and the suspects that nothing could be decided about."""
+    """A selection without its gross errors, these, and the suspects that nothing could be decided about.
+
+    `state` is near the solution of what is kept.
+    """
 
     kept: Selection
+    state: State
     rejected: tuple[Rejected, ...] = ()
     undecided: tuple[str, ...] = ()
 
@@ -52,7 +56,7 @@ def find_blunders(solved: Solved, selection: Selection) -> Found:
     Parameters
     ----------
     solved : Solved
-        The solution of everything in the selection.
+        The solution of everything in the selection, or near it: what is found is no more than a selection.
 
     Raises
     ------
@@ -63,7 +67,7 @@ def find_blunders(solved: Solved, selection: Selection) -> Found:
     variances = estimate(solved)
     significant = _significant(solved, tests, variances)
     if not significant.any() and not _suspects(problem, tests, variances, _DOUBT).any():
-        return Found(selection)
+        return Found(selection, solved.state)
     problem, robust = _robust(solved, selection, tests, variances)
     tests = standardise(robust)
     suspects = _suspects(problem, tests, variances, _SUSPECT)
@@ -79,10 +83,11 @@ def find_blunders(solved: Solved, selection: Selection) -> Found:
             doubted = np.flatnonzero(suspects).tolist()
             if suspects[problem.active(selection) & selection.ground].all():
                 _refuse_many(problem, selection, doubted)
-            return Found(kept, tuple(rejected.values()), tuple(problem.points.ids[i] for i in doubted))
+            names = tuple(problem.points.ids[i] for i in doubted)
+            return Found(kept, solved.state, tuple(rejected.values()), names)
         kept, rejected = judge(trusted, selection, suspects)
         _refuse_many(problem, selection, list(rejected))
-        solved, kept = solve_inside(trusted.solved.problem, trusted.solved.state, kept)
+        solved, kept = solve_inside(trusted.solved.problem, trusted.solved.state, kept, NEAR)
         more = _significant(solved, standardise(solved), trusted.variances)
         if variances.estimated:
             # Suspects were the worst, and without them a sigma is found too small: the others return into it.
@@ -95,7 +100,7 @@ def find_blunders(solved: Solved, selection: Selection) -> Found:
             break
         suspects = more
         trusted = _trusted(trusted.solved.problem, (trusted.solved,), selection, suspects)
-    return Found(kept, tuple(rejected[number] for number in sorted(rejected)))
+    return Found(kept, solved.state, tuple(rejected[number] for number in sorted(rejected)))
 
 
 def _trusted(problem: BlockProblem, starts: tuple[Solved, ...], selection: Selection, suspects: Mask) -> Trusted | None:
@@ -108,12 +113,12 @@ def _trusted(problem: BlockProblem, starts: tuple[Solved, ...], selection: Selec
     if selection.ground.any() and not (problem.active(others) & others.ground).any():
         return None
     start = min((one.state for one in starts), key=lambda state: problem.square(state, others))
-    solved = attempt(problem, start, others)
+    solved = attempt(problem, start, others, NEAR)
     if solved.condition > CONDITION_LIMIT or not solved.converged:
         return None
     found = estimate(solved)
     found = replace(found, image=max(found.image, SCALE_FLOOR))
-    return Trusted(reweighed(solved, solved.without_astray(others), found), found)
+    return Trusted(reweighed(solved, solved.without_astray(others), found, NEAR), found)
 
 
 def _robust(

@@ -24,7 +24,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ortho_pipeline.block.equations.problem import PERFECT_GROUND, Selection
-from ortho_pipeline.block.equations.solver import Solved, solve
+from ortho_pipeline.block.equations.solver import EXACT, Solved, solve
 from ortho_pipeline.block.variances.components import Posterior, Variances
 from ortho_pipeline.block.variances.control_equations import ControlEquations, Node
 from ortho_pipeline.errors import NotConverged
@@ -77,7 +77,7 @@ def _grid_of(solved: Solved) -> tuple[_Grid, Variances]:
     return _grids[solved]
 
 
-def reweighed(solved: Solved, selection: Selection, variances: Variances) -> Solved:
+def reweighed(solved: Solved, selection: Selection, variances: Variances, tolerance: float = EXACT) -> Solved:
     """Return the solution with these standard deviations; as it is if nothing much changes.
 
     Where that does not converge, as with cameras that few points hardly determine, it stays as it is, too; `posterior`
@@ -86,7 +86,7 @@ def reweighed(solved: Solved, selection: Selection, variances: Variances) -> Sol
     if not variances.estimated and abs(variances.image - 1.0) < _SAME:
         return solved
     try:
-        return solve(variances.applied(solved.problem), solved.state, selection)
+        return solve(variances.applied(solved.problem), solved.state, selection, tolerance)
     except NotConverged:
         return solved
 
