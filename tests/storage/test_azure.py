@@ -74,10 +74,10 @@ def test_objects_are_written_on_conditions_read_and_removed(azurite: Address, mo
     lease = store.put("lease", b"mine", new=True)
     with pytest.raises(Conflict):
         store.put("lease", b"yours", new=True)
-    renewed = store.put("lease", b"still", replacing=lease.e_tag)
+    renewed = store.put("lease", b"still", replacing=lease.version)
     with pytest.raises(Conflict):
-        store.put("lease", b"late", replacing=lease.e_tag)
-    assert store.read("lease", 100)[1].e_tag == renewed.e_tag
+        store.put("lease", b"late", replacing=lease.version)
+    assert store.read("lease", 100)[1].version == renewed.version
     assert set(store.names()) == {("large", len(data)), ("lease", 5)}
     store.delete("large")
     assert not store.exists("large")

@@ -97,7 +97,7 @@ def test_what_is_stored_in_parts_is_checked_too(
     path.write_bytes(data)
     store = Objects("s3://bucket/parts", allow_network=True)
     content = store.put("large", path)
-    assert content.e_tag.strip('"') in content.tags
+    assert content.version.strip('"') in content.tags
     back = tmp_path / "back"
     assert store.fetch("large", back, 1 << 30).sha256 == content.sha256
     assert back.read_bytes() == data
@@ -109,11 +109,11 @@ def test_of_two_that_write_one_object_one_is_told(moto: Address, monkeypatch: py
     first = store.put("lease", b"mine", new=True)
     with pytest.raises(Conflict):
         store.put("lease", b"yours", new=True)
-    second = store.put("lease", b"yours", replacing=first.e_tag)
+    second = store.put("lease", b"yours", replacing=first.version)
     with pytest.raises(Conflict):
-        store.put("lease", b"mine again", replacing=first.e_tag)
+        store.put("lease", b"mine again", replacing=first.version)
     assert store.read("lease", 100)[0] == b"yours"
-    assert second.e_tag != first.e_tag
+    assert second.version != first.version
 
 
 def test_nothing_is_asked_without_leave_and_no_secret_is_told(moto: Address, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,7 +178,7 @@ def test_encrypted_objects_are_checked_by_the_store_and_by_what_is_noted(
             assert store.put("a", secret).sha256 == hashlib.sha256(secret).hexdigest()
             assert store.read("a", 2000)[0] == secret
             lease = store.put("lease", b"mine", new=True)
-            assert store.put("lease", b"still", replacing=lease.e_tag).sha256 == hashlib.sha256(b"still").hexdigest()
+            assert store.put("lease", b"still", replacing=lease.version).sha256 == hashlib.sha256(b"still").hexdigest()
             with pytest.raises(Conflict):
                 store.put("lease", b"yours", new=True)
             way.KINDS, way.share = ("flipped request",), 1.0

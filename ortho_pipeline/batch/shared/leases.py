@@ -33,8 +33,8 @@ class Lost(OrthoError):
 class Lease:
     """A scene that this worker makes, until the block of `held` ends."""
 
-    def __init__(self, store: Objects, name: str, e_tag: str | None, holder: str, beat: int = 0) -> None:
-        self._store, self.name, self._e_tag, self._holder, self._beat = store, name, e_tag, holder, beat
+    def __init__(self, store: Objects, name: str, version: str | None, holder: str, beat: int = 0) -> None:
+        self._store, self.name, self._version, self._holder, self._beat = store, name, version, holder, beat
         self._lock, self._lost = threading.Lock(), False
 
     @contextlib.contextmanager
@@ -69,7 +69,7 @@ class Lease:
             self._beat += 1
             data = lease_document(self._holder, self._beat)
             try:
-                self._e_tag = self._store.put(self.name + _LEASE, data, replacing=self._e_tag).e_tag
+                self._version = self._store.put(self.name + _LEASE, data, replacing=self._version).version
             except Conflict as error:
                 self._lost = True
                 raise Lost(f"another worker has taken over {self.name!r}") from error
@@ -106,9 +106,9 @@ class Leases:
             made = self._store.put(name + _LEASE, data, new=seen is None, replacing=seen)
         except Conflict:
             with contextlib.suppress(FileNotFoundError):
-                return self._store.read(name + _LEASE, _MAX_BYTES)[1].e_tag or ""
+                return self._store.read(name + _LEASE, _MAX_BYTES)[1].version or ""
             return ""
-        return Lease(self._store, name, made.e_tag, self._holder)
+        return Lease(self._store, name, made.version, self._holder)
 
     def result(self, name: str) -> dict[str, Any] | None:
         """Return the result of a scene, None where there is none that can be understood."""

@@ -56,6 +56,7 @@ def is_address(text: str | os.PathLike[str]) -> bool:
 class Content:
     """What an object was when it was written or read: its size, checksums, and the store's name of this version.
 
+    That name is its ETag, and in Google's store the number of its generation.
     `tags` are the ETags that stores give such a content: the MD5 of what is stored at once, and for what is stored in
     parts the MD5 of theirs, with their number.
     """
@@ -63,7 +64,7 @@ class Content:
     size: int
     sha256: str
     tags: tuple[str, ...]
-    e_tag: str | None
+    version: str | None
 
 
 class Objects:
@@ -89,6 +90,7 @@ class Objects:
             )
         self.address = address.rstrip("/")
         self._store = _store_of(self.address)
+        self._version = "version" if self.address.startswith("gs://") else "e_tag"
         # The ETag of what is encrypted so is no checksum; the store verifies the SHA-256 that comes with an object.
         self._encrypted = bool(_key_management()) and self.address.startswith("s3://")
 
@@ -139,7 +141,7 @@ class Objects:
                     )  # fmt: skip
                 digests = _Digests()
                 taken = take(digests.through(result.stream(min_chunk_size=_CHUNK), limit))
-                content = digests.content(result.meta["e_tag"])
+                content = digests.content(result.meta[self._version])
                 count(content.size)
                 wrong = _difference(content, result.meta)
                 if self._encrypted:
@@ -175,7 +177,7 @@ class Objects:
         Parameters
         ----------
         replacing : str, optional
-            The ETag of the version that it takes the place of: not written if another one is there.
+            The version that it takes the place of: not written if another one is there.
         new : bool
             Do not write it if there is one of this name.
 
@@ -188,12 +190,12 @@ class Objects:
         """
         content = _content(data)
         if new or replacing is not None:
-            return self._put_if(name, data, content, "create" if new else {"e_tag": replacing})
+            return self._put_if(name, data, content, "create" if new else {self._version: replacing})
         for _ in range(_ATTEMPTS):
             with self._errors(name):
                 made = self._store.put(name, data, attributes=self._note(content), chunk_size=PART, max_concurrency=4)
                 if self._encrypted or (made["e_tag"] or "").strip('"') in content.tags:
-                    return replace(content, e_tag=made["e_tag"])
+                    return replace(content, version=made[self._version])
                 stored = self._store.head(name)
             wrong = _difference(content, stored, ours=True)
             if not wrong and _TAG.fullmatch(stored["e_tag"] or "") is None:
@@ -201,7 +203,7 @@ class Objects:
                 there = self._attempts(name, content.size, collections.deque(maxlen=0).extend)[1]
                 wrong = "" if there.sha256 == content.sha256 else "it is another content"
             if not wrong:
-                return replace(content, e_tag=stored["e_tag"])
+                return replace(content, version=stored[self._version])
         with contextlib.suppress(OrthoError):
             self.delete(name)
         gone = "could not be removed" if self.exists(name) else "was removed"
@@ -223,7 +225,7 @@ class Objects:
                     made = self._store.put(name, data, attributes=self._note(content), mode=mode, use_multipart=False)
                 stated = {"size": content.size, "e_tag": made["e_tag"]}
                 if self._encrypted or not (wrong := _difference(content, stated, ours=True)):
-                    return replace(content, e_tag=made["e_tag"])
+                    return replace(content, version=made[self._version])
             except StorageError as error:
                 failed = error
             with contextlib.suppress(FileNotFoundError):
@@ -306,12 +308,12 @@ class _Digests:
                 self._parts.append(self._part.digest())
                 self._part = hashlib.md5(usedforsecurity=False)
 
-    def content(self, e_tag: str | None) -> Content:
+    def content(self, version: str | None) -> Content:
         """Return what went through."""
         parts = self._parts + ([self._part.digest()] if self._size % PART else [])
         joined = hashlib.md5(b"".join(parts), usedforsecurity=False).hexdigest()
         tags = (self._md5.hexdigest(), f"{joined}-{len(parts)}")
-        return Content(self._size, self._sha256.hexdigest(), tags, e_tag)
+        return Content(self._size, self._sha256.hexdigest(), tags, version)
 
 
 def _content(data: bytes | Path) -> Content:
@@ -365,7 +367,9 @@ def _store_of(address: str) -> Any:
         given = _s3_settings()
     elif scheme == "az":
         given = _azure_settings()
-    if given.get("endpoint", "").startswith("http://"):
+    elif scheme == "gs":
+        given = _google_settings()
+    if given.get("endpoint", given.get("base_url", "")).startswith("http://"):
         options["allow_http"] = True
     make: Any = store.from_url  # one signature for each kind of store
     return make(address, client_options=options, retry_config=RETRIES, **given)
@@ -395,6 +399,17 @@ def _azure_settings() -> dict[str, Any]:
         "endpoint": parts.get("BlobEndpoint") or os.environ.get("AZURE_STORAGE_ENDPOINT"),
     }
     return {key: value for key, value in named.items() if value}
+
+
+def _google_settings() -> dict[str, Any]:
+    """Return what the names of GDAL say and `obstore` does not read itself."""
+    given: dict[str, Any] = {}
+    endpoint = os.environ.get("CPL_GS_ENDPOINT")
+    if endpoint:
+        given["base_url"] = endpoint.rstrip("/")
+    if os.environ.get("GS_NO_SIGN_REQUEST", "").upper() in ("YES", "TRUE", "1"):
+        given["skip_signature"] = True
+    return given
 
 
 def _key_management() -> str | None:
