@@ -209,21 +209,25 @@ def dask_overhead(folder: Path, few: Path, repeat: int, workers: int, sample: in
 
     The loops, before and after the cluster, are in processes that have made a few scenes, as dask's are.
     """
-    ratios = []
+    ratios, spread = list[float](), 0.0
     with ExitStack() as stack:
         spawn = multiprocessing.get_context("spawn")
         crew = [stack.enter_context(ProcessPoolExecutor(1, spawn)) for _ in range(workers)]
         for one in crew:
             loops(few, [one], 4)
         for _ in range(repeat):
-            before = timed(folder, lambda where: loops(where, crew, sample))
-            spread = timed_on_dask(folder, few, workers)
-            after = timed(folder, lambda where: loops(where, crew, sample))
-            plain, each = 500 * (before["cpu"] + after["cpu"]) / sample, 1000 * spread["cpu"] / scenes
-            ratios.append(each / plain)
-            loop_ms = [round(1000 * one["cpu"] / sample, 1) for one in (before, after)]
-            print(f"ms of CPU a scene: loop {loop_ms[0]} and {loop_ms[1]}, "
-                  f"dask {each:.1f}, ratio {ratios[-1]:.3f}", flush=True)  # fmt: skip
+            plain = []
+            for way in ("loop", "dask", "loop"):
+                if way == "dask":
+                    took = timed_on_dask(folder, few, workers)
+                else:
+                    took = timed(folder, lambda where: loops(where, crew, sample))
+                each = 1000 * took["cpu"] / (scenes if way == "dask" else sample)
+                print(f"{way}: {each:.1f} ms of CPU a scene, {took['wall']:.0f} s, "
+                      f"others {took['others']:.0%} of the machine", flush=True)  # fmt: skip
+                spread, plain = (each, plain) if way == "dask" else (spread, [*plain, each])
+            ratios.append(spread / statistics.mean(plain))
+            print(f"ratio {ratios[-1]:.3f}", flush=True)
     print(f"median {statistics.median(ratios):.3f}")
 
 
