@@ -12,6 +12,7 @@ from ortho_pipeline.points.table import (
     DEFAULT_SIGMA_IMAGE,
     Points,
     gcps_of_dataset,
+    points_of,
     read_points,
     write_points,
 )
@@ -26,6 +27,7 @@ __all__ = [
     "gcps_of_dataset",
     "marks_warning",
     "one_mark",
+    "points_of",
     "read_points",
     "write_points",
 ]

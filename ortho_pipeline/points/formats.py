@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from ortho_pipeline.errors import InputError, completed
+from ortho_pipeline.errors import InputError, completed, reads
 from ortho_pipeline.points.delimited import is_header, read_csv
 from ortho_pipeline.points.geojson import read_geojson
 from ortho_pipeline.points.link_lists import LINK_TABLE, odm_crs, read_asp, read_envi, read_links, read_odm, read_qgis
@@ -83,6 +83,7 @@ _FORMATS = (
 _NAMES = ", ".join(one.name for one in _FORMATS)
 
 
+@reads("see docs/formats.md for what stands in a file of points")
 def read_table(
     path: str | os.PathLike[str],
     image_name: str | None = None,

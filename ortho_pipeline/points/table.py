@@ -327,7 +327,15 @@ def read_points(
     InputError, CrsError, DatumError
         Names file, line and column, and what to do.
     """
-    table = read_table(path, image_name, pieces)
+    return points_of(path, read_table(path, image_name, pieces), crs, vertical, pixel_origin)
+
+
+@reads("see docs/formats.md for what stands in a file of points")
+def points_of(
+    path: str | os.PathLike[str], table: Table, crs: str | pyproj.CRS | None, vertical: str | Vertical | None,
+    pixel_origin: str,
+) -> Points:  # fmt: skip
+    """Return the points of a table that was read; parameters and errors are those of `read_points`."""
     return _points_of(path, table, crs, vertical, origin_shift(path, table, pixel_origin))
 
 

@@ -26,7 +26,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.beside import ask_beside
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, VsiPath, in_local_archive, network_is_closed, place, within
-from ortho_pipeline.raster.references import NAMES_OF, PLAIN_VRT, Named
+from ortho_pipeline.raster.references import NAMES_OF, PLAIN_VRT, Named, products_of_volume
 
 gdal.UseExceptions()
 
@@ -132,6 +132,8 @@ class _Gate:
             kind = _identified(name, drivers)
             if kind in _REFERRING:
                 self._see_named(there, kind, frozenset())
+            if kind == "DIMAP" and (product := self._product_of(there)) is not None:
+                there, name = product, os.fspath(product)
             if siblings:
                 self._see_side_cars(there)
             allowed = [kind] if kind in _REFERRING else [one for one in drivers if one in _PLAIN]
@@ -185,6 +187,9 @@ class _Gate:
     def _product_in(self, folder: Any) -> Any:
         """Return the DIMAP 2 metadata in a folder, which GDAL does not look for; None where it finds its own."""
         names = [name for name in listing(folder).names if re.match(r"(dim_|vol_|metadata\.dim)", name.lower())]
+        volumes = [name for name in names if re.fullmatch(r"vol_.*\.xml", name.lower())]
+        if len(volumes) == 1:
+            return self._product_of(folder / volumes[0])
         found = [name for name in names if re.fullmatch(r"dim_.*\.xml", name.lower())]
         if len(found) > 1:
             raise InputError(
@@ -192,6 +197,24 @@ class _Gate:
                 remedy="name the DIM_*.XML of one of them, or an image",
             )  # fmt: skip
         return folder / found[0] if found == names and found else None
+
+    def _product_of(self, volume: Any) -> Any:
+        """Return the metadata of the one product of a DIMAP volume; None where the file is no volume."""
+        places = [
+            next((target for target in self._targets(Named(name, "COMPONENT_PATH"), volume) if target.is_file()), name)
+            for name in dict.fromkeys(products_of_volume(volume))
+        ]
+        if len(places) > 1:
+            raise InputError(
+                f"this volume has several products: {', '.join(str(place) for place in places[:6])}", file=volume,
+                field="Dataset_Components", remedy="name one of them",
+            )  # fmt: skip
+        if places and isinstance(places[0], str):
+            raise InputError(
+                f"its product {places[0]!r} is not there", file=volume, field="COMPONENT_PATH",
+                remedy="copy the delivery with its folders, or name an image",
+            )  # fmt: skip
+        return places[0] if places else None
 
     def _see_side_cars(self, path: Any) -> None:
         """See to what GDAL takes up as overviews and masks because of its name."""

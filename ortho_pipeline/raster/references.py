@@ -135,6 +135,26 @@ def _names_of_dimap(path: Any) -> Iterator[Named]:
                     yield Named(text, name.upper())
 
 
+def products_of_volume(path: Any) -> list[str]:
+    """Return the names of the products that a DIMAP volume consists of; none where a file describes an image itself."""
+    document = next((child for name, child in _parts([_ELEMENT, "", _xml(path)]) if name == "dimap_document"), None)
+    if document is None or _inner(document, "raster_data"):
+        return []
+    components = [
+        part for content in _inner(document, "dataset_content") for parts in _inner(content, "dataset_components")
+        for part in _inner(parts, "component")
+    ]  # fmt: skip
+    return [
+        text.strip()
+        for part in components if any("DIMAP" in _value(kind) for kind in _inner(part, "component_type"))
+        for place in _inner(part, "component_path") for href in _inner(place, "href") for text in _value(href)
+    ]  # fmt: skip
+
+
+def _inner(node: Any, name: str) -> list[Any]:
+    return [child for found, child in _parts(node) if found == name]
+
+
 def _names_of_ers(path: Any) -> Iterator[Named]:
     """Yield the data file of an ERS header: raw pixels, or any raster where it is "Translated"."""
     text = _header(path)

@@ -14,6 +14,7 @@ from ortho_pipeline.commands.scene_fit import shared_model
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.hookspecs import Piece, Scene
 from ortho_pipeline.options import PointOptions
+from ortho_pipeline.points import formats
 from ortho_pipeline.surface.flat import FlatSurface
 
 OFF = np.array([3.0, -2.0])
@@ -54,6 +55,15 @@ def test_errors_are_taken_over_and_parallax_is_not(colours: Scene, tmp_path: Pat
     assert shared_model(colours) is colours.model
     cropped = replace(colours, pieces=(replace(colours.pieces[0], offset=(-5.0, -5.0)),))
     assert shared_model(cropped) is colours.model
+
+
+def test_the_file_of_points_is_read_once(colours: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options, _ = measured(colours, tmp_path)
+    read: list[object] = []
+    load = formats.load_text
+    monkeypatch.setattr(formats, "load_text", lambda path: (read.append(path), load(path))[1])
+    read_control(colours, options)
+    assert read == [options.gcps]
 
 
 def test_what_is_not_seen_is_refused(colours: Scene, tmp_path: Path) -> None:

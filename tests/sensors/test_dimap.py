@@ -506,6 +506,43 @@ def test_a_folder_of_two_products_names_them(tiled: tuple[Path, Path, Pushbroom]
         open_scene(folder)
 
 
+def volume(path: Path, *products: str) -> Path:
+    """Write what Airbus deliveries have at their top: a list of products, and of pictures of them."""
+    component = "<Component><COMPONENT_TYPE>{}</COMPONENT_TYPE><COMPONENT_PATH href='{}'/></Component>"
+    listed = [("DIMAP", one) for one in products] + [("DOCUMENT", "INDEX.HTM")]
+    path.write_text(
+        "<Dimap_Document><Metadata_Identification><METADATA_FORMAT version='2.15'>DIMAP</METADATA_FORMAT>"
+        "</Metadata_Identification><Dataset_Content><Dataset_Components>"
+        + "".join(component.format(*one) for one in listed)
+        + "</Dataset_Components></Dataset_Content></Dimap_Document>"
+    )
+    return path
+
+
+@pytest.mark.parametrize("given", ["VOL_PHR.XML", ""], ids=["volume", "folder"])
+def test_a_volume_is_its_one_product(tiled: tuple[Path, Path, Pushbroom], given: str) -> None:
+    folder = tiled[0].parent
+    top = volume(folder.parent / "VOL_PHR.XML", f"{folder.name}/DIM_A.XML").parent
+    scene = open_scene(top / given)
+    assert ((scene.width, scene.height), list(scene.models)) == ((300, 400), ["rpc", "pushbroom"])
+    assert Path(scene.path) == folder / "DIM_A.XML"
+
+
+def test_a_volume_of_several_products_names_them_and_one_whose_product_is_missing_it(
+    tiled: tuple[Path, Path, Pushbroom],
+) -> None:
+    folder = tiled[0].parent
+    shutil.copy(folder / "DIM_A.XML", folder / "DIM_B.XML")
+    given = volume(folder.parent / "VOL_PHR.XML", *(f"{folder.name}/DIM_{one}.XML" for one in "AB"))
+    for one in (given, given.parent):
+        with pytest.raises(InputError, match=r"several products: .*DIM_A.XML, .*DIM_B.XML") as caught:
+            open_scene(one)
+        assert caught.value.remedy == "name one of them"
+    volume(given, "IMG_01/DIM_C.XML")
+    with pytest.raises(InputError, match=r"its product 'IMG_01/DIM_C.XML' is not there"):
+        open_scene(given)
+
+
 @pytest.mark.realdata
 def test_rpc_of_pleiades_neo_and_its_vertices(real: Path) -> None:
     """Version 3 of the file; it counts from 0 where the vertices, with heights, count centres from 1.

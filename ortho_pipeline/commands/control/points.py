@@ -17,7 +17,7 @@ from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.hookspecs import Piece, Scene
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions
-from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, read_points
+from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, points_of
 from ortho_pipeline.points.formats import read_table
 from ortho_pipeline.points.rows import OWN_IMAGE
 from ortho_pipeline.points.selection import select_control
@@ -166,13 +166,13 @@ def _given_points(scene: Scene, options: PointOptions, opened: SceneOptions, sur
         Path(piece.path).name: OWN_IMAGE if piece.sees_apart else (*piece.offset, piece.scale) for piece in scene.pieces
     }
     name, path = Path(scene.path).name, located(path, allow_network=opened.allow_network)
-    points = read_points(path, crs=crs, vertical=vertical, pixel_origin=origin, image_name=name, pieces=pieces)
-    apart = [piece for piece in scene.pieces if piece.sees_apart]
+    table = read_table(path, name, pieces)
+    points = points_of(path, table, crs, vertical, origin)
     # The same rows in the same order: the table says in which image each of them was measured.
-    rows = read_table(path, name, pieces).rows if apart else []
-    named = np.array([Path(row.image_name).stem.lower() if row.image_name else "" for row in rows])
-    for piece in apart:
-        points = _taken_over(scene, piece, points, named == Path(piece.path).stem.lower(), surface)
+    named = np.array([Path(row.image_name).stem.lower() if row.image_name else "" for row in table.rows])
+    for piece in scene.pieces:
+        if piece.sees_apart:
+            points = _taken_over(scene, piece, points, named == Path(piece.path).stem.lower(), surface)
     return points
 
 
