@@ -11,6 +11,8 @@ _OTHER_BLOCKS = 64_000_000
 def limit_cache(memory: int, threads: int, *blocks: int) -> int:
     """Limit GDAL's block cache to a quarter of `memory` (at least 16 MB), or to what holds the blocks of each thread.
 
+    Beside its cache GDAL has room for the block that each thread decodes, which counts for that quarter.
+
     Returns
     -------
     int
@@ -18,7 +20,7 @@ def limit_cache(memory: int, threads: int, *blocks: int) -> int:
     """
     held = sum(blocks)
     threads = max(1, min(threads, memory // max(held, 1)))
-    gdal.SetCacheMax(max(memory // 4, 16_000_000))
+    gdal.SetCacheMax(max(memory // 4 - threads * held, 16_000_000))
     keep_blocks(threads * held)
     return threads
 

@@ -22,6 +22,8 @@ from ortho_pipeline.raster.source import Grid, RasterSource, holds, pixel_type
 
 #: Bytes up to which a raster that is going to be copied is kept in memory instead of in a file.
 _SMALL = 16_000_000
+#: Bytes of all bands beyond which blocks and tiles are smaller.
+_SQUARE = 1 << 23
 
 
 @dataclass(frozen=True)
@@ -177,6 +179,13 @@ def refuse_empty(valid_pixels: int, path: str | os.PathLike[str]) -> None:
         )  # fmt: skip
 
 
+def square_side(profile: Profile, side: int) -> int:
+    """Return the side (px) of a tile or block: the given one, halved until 8 MB hold all of its bands; at least 256."""
+    while side > 256 and side * side * profile.count * profile.dtype.itemsize > _SQUARE:
+        side //= 2
+    return side
+
+
 class RasterWriter:
     """A GeoTIFF or COG that is written in windows and appears at its path when it is complete.
 
@@ -196,7 +205,9 @@ class RasterWriter:
         if driver not in ("COG", "GTiff"):
             raise InputError(f"orthos are not written as {driver!r}", field="format", remedy="COG or GTiff")
         self.path, self.grid, self.profile, self.driver = Path(path), grid, profile, driver
-        self.options = checked_options(driver, dict(creation_options or {}), threads)
+        # The bands of a block lie together in the file, and GDAL holds several such blocks.
+        self._side = square_side(profile, 512)
+        self.options = checked_options(driver, dict(creation_options or {}), threads, self._side)
         self._lock = threading.Lock()
         self._written = 0
         self._open = contextlib.ExitStack()
@@ -208,7 +219,8 @@ class RasterWriter:
                 # The COG driver copies a finished raster: overviews come before the pixels in the file.
                 size = self.grid.width * self.grid.height * self.profile.count * self.profile.dtype.itemsize
                 self._work = None if size <= _SMALL and self.profile.validity == "nodata" else self.scratch("work")
-                options = {"TILED": "YES", "BIGTIFF": "IF_SAFER", "BLOCKXSIZE": "512", "BLOCKYSIZE": "512"}
+                side = str(self._side)
+                options = {"TILED": "YES", "BIGTIFF": "IF_SAFER", "BLOCKXSIZE": side, "BLOCKYSIZE": side}
             else:
                 self._work, options = self._temporary, self.options
             self._dataset = self._create(self._work, options)

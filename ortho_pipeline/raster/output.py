@@ -201,8 +201,8 @@ def _blocks(band: gdal.Band) -> list[tuple[int, int, int, int]]:
 # -- creation options --------------------------------------------------------------------------------------------------
 
 
-def checked_options(driver: str, given: dict[str, str], threads: int) -> dict[str, str]:
-    """Return lossless defaults under what the user gave; what the driver does not know is an error."""
+def checked_options(driver: str, given: dict[str, str], threads: int, side: int = 512) -> dict[str, str]:
+    """Return lossless defaults, a `side` of blocks, under what the user gave; what no driver knows is an error."""
     given = {key.upper(): value for key, value in given.items()}
     known = _known_options(driver)
     for key, value in given.items():
@@ -219,7 +219,7 @@ def checked_options(driver: str, given: dict[str, str], threads: int) -> dict[st
             )  # fmt: skip
     defaults = {"BIGTIFF": "IF_SAFER"}
     if driver == "GTiff":
-        defaults |= {"TILED": "YES", "BLOCKXSIZE": "512", "BLOCKYSIZE": "512"}
+        defaults |= {"TILED": "YES", "BLOCKXSIZE": str(side), "BLOCKYSIZE": str(side)}
         if given.get("TILED", "YES").upper() == "NO":
             defaults = {"BIGTIFF": "IF_SAFER"}
     else:

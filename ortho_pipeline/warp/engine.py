@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ from ortho_pipeline.raster.ortho import (
     as_written,
     keep_off_nodata,
     refuse_empty,
+    square_side,
     value_range,
 )
 from ortho_pipeline.raster.source import Grid, RasterSource
@@ -42,8 +43,10 @@ from ortho_pipeline.warp.block_kernel import DemWindow, Target, warp_block
 from ortho_pipeline.warp.gdal_engine import warp_with_gdal
 from ortho_pipeline.warp.lattice import BLOCK, Lattices, OutputBlock, Terrain, block_cells
 from ortho_pipeline.warp.layers.hiding import Hiding, Looked
+from ortho_pipeline.warp.reused import Reused
 
-#: Side of a tile, the piece of work of a thread.
+#: Side of a tile, the piece of work of a thread, of few bands (`square_side`). What a tile is may not depend on memory
+#: or threads, which the order of blocks in a file would tell.
 TILE = 4 * BLOCK
 #: Kernels by the name on the command line, with the source pixels that each reads around the one that holds the point
 #: ('average': plus half of its box).
@@ -149,11 +152,12 @@ def rectify(
             RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads)
         )
         mask = None if job.looked is None else stack.enter_context(job.looked.writer(driver, threads))
-        tiles = list(_tiles(grid, TILE))
-        for done, (left, top, pixels, valid, classes) in enumerate(_in_order(threads, job, tiles, ahead), start=1):
-            writer.write(left, top, pixels, valid)
+        tiles = list(_tiles(grid, square_side(profile, TILE)))
+        for done, made in enumerate(_in_order(threads, job, tiles, ahead), start=1):
+            writer.write(made.left, made.top, made.pixels, made.valid)
             if mask is not None:
-                mask.write(left, top, classes[None], None)
+                mask.write(made.left, made.top, made.classes[None], None)
+            job.give_back(made)
             if resources.progress:
                 resources.progress(done / len(tiles))
         refuse_empty(job.valid_pixels, path)
@@ -294,9 +298,7 @@ def _tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
             yield top, left, min(side, grid.height - top), min(side, grid.width - left)
 
 
-def _in_order(
-    threads: int, job: TileMaker, tiles: list[tuple[int, int, int, int]], ahead: int
-) -> Iterator[tuple[int, int, NDArray[Any], NDArray[np.bool_], Any]]:
+def _in_order(threads: int, job: TileMaker, tiles: list[tuple[int, int, int, int]], ahead: int) -> Iterator[Made]:
     """Yield tiles in their order, so that equal orthos are equal files; few are made, and `ahead` prepared, before.
 
     Threads begin work in the order in which it is handed to them: what a tile waits for has begun.
@@ -320,6 +322,17 @@ def _in_order(
         finally:
             for future in (*prepared, *pending):
                 future.cancel()
+
+
+class Made(NamedTuple):
+    """A tile: its place in the ortho, pixels ``(bands, h, w)``, which of them are valid ``(h, w)``, classes, memory."""
+
+    left: int
+    top: int
+    pixels: NDArray[Any]
+    valid: NDArray[np.bool_]
+    classes: Any
+    memory: NDArray[Any]
 
 
 class TileMaker:
@@ -348,6 +361,7 @@ class TileMaker:
         self.resampling = kernels.Resampling(kernel, 0, (1.0, 1.0), *value_range(source.dtype, profile), real=None)
         self.any_band = profile.validity == "nodata" or profile.dtype.kind == "f"
         self._lock = threading.Lock()
+        self._tiles, self._windows = Reused(), Reused()
         self.valid_pixels = 0
         self.looked: Looked | None = None
 
@@ -372,11 +386,14 @@ class TileMaker:
 
     def make(
         self, part: tuple[int, int, int, int], prepared: Future[tuple[Terrain, list[OutputBlock]]] | None = None
-    ) -> tuple[int, int, NDArray[Any], NDArray[np.bool_], Any]:
-        """Compute one tile (top, left, height, width): left, top, pixels, which are valid, their classes."""
+    ) -> Made:
+        """Compute one tile (top, left, height, width)."""
         top, left, height, width = part
-        pixels = np.full((self.source.count, height, width), self.resampling.fill, dtype=self.source.dtype)
-        tile = _Tile(top, left, pixels, np.zeros(pixels.shape, dtype=bool))
+        shape, dtype = (self.source.count, height, width), self.source.dtype
+        memory = self._tiles.empty((math.prod(shape) * (dtype.itemsize + 1),), np.uint8)
+        pixels, valid = np.split(memory, [math.prod(shape) * dtype.itemsize])
+        tile = _Tile(top, left, pixels.view(dtype).reshape(shape), valid.view(bool).reshape(shape))
+        tile.pixels[:], tile.valid[:] = self.resampling.fill, False
         terrain, seen = self.prepare(part) if prepared is None else prepared.result()
         for group, dem, area in terrain.groups(seen):
             self._warp(group, dem, area, tile)
@@ -394,7 +411,11 @@ class TileMaker:
         mask = bands[0] if len(bands) == 1 else np.asarray((np.any if self.any_band else np.all)(bands, axis=0))
         with self._lock:
             self.valid_pixels += int(np.count_nonzero(mask))
-        return left, top, out, mask, classes
+        return Made(left, top, out, mask, classes, memory)
+
+    def give_back(self, made: Made) -> None:
+        """Use the memory of a tile again, at which nobody looks any more."""
+        self._tiles.give_back(made.memory)
 
     # -- pixels ------------------------------------------------------------------------------------------------------
 
@@ -407,9 +428,10 @@ class TileMaker:
                 else:
                     self._warp_cells(block, dem, area, tile)
             return
-        window = _window(self.source, *together, reach=max(block.reach for block in blocks))
+        window = self._window(*together, max(block.reach for block in blocks))
         for block in blocks:
             self._warp_block(block, window, dem, tile.target(block, area))
+        self._windows.give_back(window.pixels)
 
     def _together(self, blocks: list[OutputBlock]) -> tuple[int, int, int, int] | None:
         """Return the window of the source under some blocks; None where it is too large for the memory."""
@@ -425,7 +447,7 @@ class TileMaker:
             window = self.lattices.source_window(block, *nodes)
             within = all(area[k] <= cell[k] and cell[k + 1] <= area[k + 1] for k in (0, 2))
             if window is not None and within:
-                self._warp_block(block, _window(self.source, *window, reach=block.reach), dem, tile.target(block, cell))
+                self._warp_block(block, self._window(*window, block.reach), dem, tile.target(block, cell))
 
     def _warp_block(self, block: OutputBlock, window: kernels.SourceWindow, dem: DemWindow, target: Target) -> None:
         # An array that threads shared would have them wait for each other's counts of its references.
@@ -433,7 +455,27 @@ class TileMaker:
         resampling = self.resampling._replace(reach=block.reach, box=block.box, real=real)
         empty = target.first_row >= target.last_row or target.first_column >= target.last_column
         while not empty and warp_block(window, block.lattice, dem, resampling, target):
-            window = _wider(self.source, window, block.reach)
+            window = self._wider(window, block.reach)
+
+    def _window(self, left: int, top: int, right: int, bottom: int, reach: int) -> kernels.SourceWindow:
+        source = self.source
+        pixels = source.read(left, top, right - left, bottom - top, self._windows.empty)
+        valid = source.read_valid(left, top, pixels)
+        masked = valid is not None
+        whole = np.ones(pixels.shape[1:] if masked else (1, 1), dtype=bool)
+        if valid is not None:
+            kernels.find_whole(valid, reach, whole)
+        return kernels.SourceWindow(
+            pixels, np.ones((1, 1, 1), dtype=bool) if valid is None else valid, whole, masked, left, top, source.width,
+            source.height,
+        )  # fmt: skip
+
+    def _wider(self, window: kernels.SourceWindow, reach: int) -> kernels.SourceWindow:
+        """Return a window larger by 64 pixels all around (terrain between the nodes reached beyond this one)."""
+        _, height, width = window.pixels.shape
+        left, top = max(0, window.left - 64), max(0, window.top - 64)
+        right, bottom = window.left + width + 64, window.top + height + 64
+        return self._window(left, top, min(self.source.width, right), min(self.source.height, bottom), reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -452,29 +494,3 @@ class _Tile:
         first_row, last_row, first, last = area[0], min(area[1], height - top), area[2], min(area[3], width - left)
         place = top + first_row, left + first
         return Target(first_row, last_row, first, last, *place, self.pixels, self.valid)
-
-
-def _window(source: RasterSource, left: int, top: int, right: int, bottom: int, *, reach: int) -> kernels.SourceWindow:
-    pixels = source.read(left, top, right - left, bottom - top)
-    valid = source.read_valid(left, top, pixels)
-    masked = valid is not None
-    whole = np.ones(pixels.shape[1:] if masked else (1, 1), dtype=bool)
-    if valid is not None:
-        kernels.find_whole(valid, reach, whole)
-    return kernels.SourceWindow(
-        pixels, np.ones((1, 1, 1), dtype=bool) if valid is None else valid, whole, masked, left, top, source.width,
-        source.height,
-    )  # fmt: skip
-
-
-def _wider(source: RasterSource, window: kernels.SourceWindow, reach: int) -> kernels.SourceWindow:
-    """Return a window larger by 64 pixels all around (terrain between the nodes reached beyond this one)."""
-    _, height, width = window.pixels.shape
-    return _window(
-        source,
-        max(0, window.left - 64),
-        max(0, window.top - 64),
-        min(source.width, window.left + width + 64),
-        min(source.height, window.top + height + 64),
-        reach=reach,
-    )

@@ -43,9 +43,9 @@ class Ramp(RasterSource):
             )
         super().__init__(path)
 
-    def read(self, left, top, width, height):
+    def read(self, left, top, width, height, empty=np.empty):
         rows, columns = np.mgrid[top : top + height, left : left + width] + 0.5
-        return np.stack([columns, rows])
+        return np.stack([columns, rows], out=empty((2, height, width), float))
 
 
 def compare(

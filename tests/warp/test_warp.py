@@ -882,6 +882,27 @@ def test_a_sparse_source_of_70000_pixels_a_side_in_little_memory(tmp_path):
     assert (pixels == 77).sum() == pytest.approx(512**2, rel=0.01)
 
 
+def test_many_bands_take_no_more_memory_than_tiles_of_8_mb(scene, tmp_path):
+    """32 bands of a tile of 1024² are 67 MB, of which there used to be four at a time, and windows of the same size."""
+    import tracemalloc
+
+    path, options = tmp_path / "many.tif", ["SPARSE_OK=TRUE", "TILED=YES"]
+    gdal.GetDriverByName("GTiff").Create(str(path), 600, 600, 32, gdal.GDT_UInt16, options).FlushCache()
+    source, surface = RasterSource(path), Surface.constant(700.0)
+    rectify(scene.model, source, surface, grid_of(size=50.0), tmp_path / "loads.tif", driver="GTiff")
+    tracemalloc.start()
+    try:
+        rectify(scene.model, source, surface, grid_of(size=600 * GSD), tmp_path / "1.tif", driver="GTiff",
+                resources=Resources(threads=1))  # fmt: skip
+        # Three tiles of 256², what is valid in them, a window: 27 MB.
+        assert tracemalloc.get_traced_memory()[1] < 40e6
+    finally:
+        tracemalloc.stop()
+    rectify(scene.model, source, surface, grid_of(size=600 * GSD), tmp_path / "2.tif", driver="GTiff")
+    assert gdal.Open(str(tmp_path / "1.tif")).GetRasterBand(1).GetBlockSize() == [256, 256]
+    assert sha256(tmp_path / "1.tif") == sha256(tmp_path / "2.tif")
+
+
 def test_an_output_that_may_exceed_4_gb_is_a_bigtiff(scene, tmp_path):
     """BIGTIFF=IF_SAFER by default: GDAL decides by the size of the raster, without compression known."""
     import struct

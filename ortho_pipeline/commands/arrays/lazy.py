@@ -120,8 +120,8 @@ class Tiles:
 
     def __call__(self, top: int, left: int, height: int, width: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Return pixels ``(bands, height, width)`` of a tile, and which of them ``(height, width)`` are valid."""
-        _, _, pixels, valid, _ = self._ready().make((top, left, height, width))
-        return pixels, valid
+        made = self._ready().make((top, left, height, width))
+        return made.pixels, made.valid
 
     def _ready(self) -> TileMaker:
         from ortho_pipeline.warp.engine import tile_maker
