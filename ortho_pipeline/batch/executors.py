@@ -6,7 +6,6 @@ Nothing heavy is imported at the top: a worker process sets its budget of thread
 from __future__ import annotations
 
 import contextlib
-import itertools
 import multiprocessing
 import os
 import signal
@@ -26,7 +25,7 @@ from ortho_pipeline.options import EXECUTORS
 #: Jobs that are handed over before their turn, so that no worker waits for the next one.
 _AHEAD = 256
 #: Seconds of work that travel together to a scheduler, and at most so many jobs.
-_TOGETHER, _MOST_TOGETHER = 1.0, 64
+_TOGETHER, _MOST_TOGETHER = 3.0, 64
 #: Environment variables that bound the threads of numerical libraries.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -118,7 +117,7 @@ class Processes:
 
 
 class InGroups:
-    """An executor to which short jobs travel together, as many as take about a second.
+    """An executor to which short jobs travel together, as many as take a few seconds; fewer towards the end.
 
     A task of a scheduler costs some milliseconds, whatever it does: messages, bookkeeping, a future.
 
@@ -141,16 +140,17 @@ class InGroups:
         jobs of a group that was lost are done again one by one: only a job that kills its worker ends with
         `WorkerDied`.
         """
-        rest, undone, alone, size, answers = iter(jobs), deque[Job](), deque[Job](), 1, 0
+        rest, alone, size, answers = deque(jobs), deque[Job](), 1, 0
         waiting: dict[Future[Any], tuple[Job, ...]] = {}
         try:
             while True:
                 while len(waiting) < (_AHEAD if answers > self._slots else 2 * self._slots):
-                    again, most = (alone, 1) if alone else (undone, size)
-                    group = tuple(again.popleft() for _ in range(min(most, len(again))))
-                    group = group or tuple(itertools.islice(rest, size))
-                    if not group:
+                    if not (alone or rest):
                         break
+                    # The last jobs are shared out among all, not held by one.
+                    fair = -(-len(rest) // (2 * self._slots))
+                    source, count = (alone, 1) if alone else (rest, min(size, fair))
+                    group = tuple(source.popleft() for _ in range(count))
                     waiting[_submitted(self._executor, _work_through, (work, group))] = group
                 if not waiting:
                     return
@@ -160,7 +160,7 @@ class InGroups:
                     if future.exception() is None:
                         took, futures = future.result()
                         seconds.append(took)
-                        undone.extend(group[len(futures) :])
+                        rest.extend(group[len(futures) :])
                         yield from zip(group, map(_finished, futures), strict=False)
                     elif len(group) > 1:
                         alone.extend(group)

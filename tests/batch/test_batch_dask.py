@@ -190,6 +190,13 @@ def test_long_jobs_behind_short_ones_do_not_wait_in_one_group(monkeypatch: pytes
     assert max(sum(job >= 1000 for job in jobs) for jobs in pool.done) <= 2 * 0.02 / 0.005 + 1
 
 
+def test_the_last_jobs_are_shared_out_among_all_workers() -> None:
+    with Counting() as pool:
+        found = dict(completed(InGroups(pool, slots=8), float, range(200)))
+    assert len(found) == 200
+    assert max(len(jobs) for jobs in pool.done) <= 200 / 16 + 1
+
+
 def test_of_a_group_that_is_lost_only_the_job_that_loses_it_has_failed() -> None:
     with Counting(lost=2000) as pool:
         found = dict(completed(InGroups(pool), float, range(3000)))
