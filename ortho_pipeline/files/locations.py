@@ -17,6 +17,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from urllib.parse import unquote
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.traffic import COUNTING
@@ -25,6 +26,15 @@ from ortho_pipeline.files.traffic import COUNTING
 SCHEMES = {"http": "/vsicurl/http://", "https": "/vsicurl/https://", "s3": "/vsis3/", "gs": "/vsigs/", "az": "/vsiaz/"}
 _ARCHIVES = ("/vsizip", "/vsitar", "/vsigzip", "/vsi7z", "/vsirar")
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
+#: What opens a door and stands in an address itself: a name with a password, or what a query calls so.
+_NAMED = re.compile(r"(?<=://)[^/?#@]*@")
+_SIGNED = re.compile(
+    r"[?&;](?:x-(?:amz|goog|ms)-[\w-]*|awsaccesskeyid|googleaccessid|sig|signature|password|secret|(?:api|access|auth|"
+    r"subscription)?[_-]?key|(?:access|auth|sas|session|security|id)?[_-]?token|header\.[\w-]*|\w*userpwd)=",
+    re.IGNORECASE,
+)
+#: The token of a page of answers opens none.
+_PAGE = re.compile(r"(?<=[?&])token=[^&]*", re.IGNORECASE)
 _SHOWN = 5
 #: No more is read at once of a file in an archive or behind a URL: a zip of 1 kB may hold billions of zeros.
 MAX_READ = 5_000_000
@@ -294,14 +304,28 @@ def located(path: AnyPath, *, allow_network: bool = False) -> AnyPath:
     return VsiPath(name)
 
 
-def require_network(address: str, allowed: bool) -> None:
+def require_network(address: str, allowed: bool, *, paged: bool = False) -> None:
     """Let this process reach the network, if that is allowed.
+
+    What is read is named in reports, records, models and logs: so an address holds no credentials.
+
+    Parameters
+    ----------
+    paged : bool
+        It is that of one page of many, as a server gave it: its token is no credential.
 
     Raises
     ------
     InputError
-        If it is not; `address` is what would be read or written there.
+        If it is not allowed, or the address, which is what would be read or written there, holds credentials.
     """
+    plain = unquote(address)
+    if _NAMED.search(plain) or _SIGNED.search(_PAGE.sub("", plain) if paged else plain):
+        raise InputError(
+            "an address with credentials in it (a password, a signature) is not read, for what is read is named in all "
+            "outputs", file=_NAMED.sub("", plain).partition("?")[0],
+            remedy="give it without them, as s3://, gs:// or az:// with the credentials in the environment",
+        )  # fmt: skip
     if not allowed:
         raise InputError(
             "files of the network are not opened unasked", file=address,

@@ -180,11 +180,17 @@ def test_cells_on_both_sides_of_the_antimeridian_and_around_a_pole(tmp_path: Pat
     heights = dem.heights(places)
     assert not np.isnan(heights).any()
     assert np.ptp(heights) < 1e-2
+    # Such a mosaic goes once round the world, from 180 degrees west on.
+    for cell in (Cell(179, 10), Cell(-180, 10)):
+        own = dem.file.read((cell.lon + 180) * ROWS, 0, ROWS, ROWS, 1.0)
+        np.testing.assert_array_equal(own, heights_of(cell))
     around = [Cell(lon, 89) for lon in range(-180, 180)]
     for cell in around:
         write_cell(tmp_path / "pole", cell)
     pole = found(str(tmp_path / "pole"), Extent(-180.0, 89.9, 180.0, 90.0), geoid, fill="mask")
     assert pole.shape == (ROWS, 360 * around[0].columns)
+    row = np.concatenate([heights_of(cell) for cell in around], axis=1)
+    np.testing.assert_array_equal(pole.file.read(0, 0, *pole.shape[::-1], 1.0), row)
     ring = np.column_stack([np.linspace(-180, 180, 1000), np.full(1000, 89.95)])
     assert not np.isnan(pole.around(0.0).heights(ring)).any()
 
@@ -273,9 +279,8 @@ def test_bytes_that_are_not_those_of_the_store_are_fetched_again_and_never_kept(
     with pytest.raises(StorageError, match="checksum") as caught:
         found(bucket.address, extent, geoid)
     assert caught.value.file == f"{bucket.address}/{name}"
-    assert not list((tmp_path / "kept").glob(f"*/*{HERE[0].name}.tif*")) or not list(
-        (tmp_path / "kept").glob("*/*.part")
-    )
+    left = [path.name for path in (tmp_path / "kept").rglob("*") if path.is_file() and path.suffix != ".lock"]
+    assert not [name for name in left if HERE[0].name in name or "part" in name], left
     bucket.faults[name] = lambda data, number: flipped(data, number) if number < bucket.asked[name] else None
     dem = found(bucket.address, extent, geoid)
     assert not np.isnan(dem.heights([[19.55, -30.45]])).any()
@@ -395,6 +400,21 @@ def test_without_the_geoid_there_is_no_ortho(
     assert not list((tmp_path / "no").glob("*"))
 
 
+def test_a_geoid_that_cannot_be_fetched_as_it_is_stored_makes_no_ortho(
+    bucket: PublicFolder, tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def damaged(name: str) -> Path:
+        raise StorageError(f"what was fetched is not the grid {name}", file="https://grids/here")
+
+    monkeypatch.setattr("ortho_pipeline.commands.heights.automatic.missing_grid", lambda _: "us_nga_egm08_25.tif")
+    monkeypatch.setattr("ortho_pipeline.commands.heights.automatic.fetch_grid", damaged)
+    surface = SurfaceOptions(dem="auto", source=bucket.address)
+    with pytest.raises(DatumError, match="cannot be fetched") as caught:
+        rectify(tiny.image, tmp_path / "no", surface=surface, scene=SceneOptions(allow_network=True))
+    assert caught.value.file == "https://grids/here"
+    assert not list((tmp_path / "no").glob("*"))
+
+
 def test_an_extent_holds_the_scene_at_all_heights_of_its_model(tiny: Any) -> None:
     scene = open_scene(tiny.image)
     extent = extent_under(scene)
@@ -454,6 +474,56 @@ def test_geoid_grids_are_fetched_once_and_never_in_part(tmp_path: Path) -> None:
     assert found == str(mine / name)
     assert undulation == 12.0
 
+
+@pytest.mark.slow
+@pytest.mark.skipif(EGM2008.is_file(), reason="the EGM2008 grid is installed here")
+def test_the_geoid_is_fetched_when_heights_are_first_found(bucket: PublicFolder, tiny: Any, tmp_path: Path) -> None:
+    """By `ortho rectify --dem auto --allow-network`; of wrong bytes there is no grid and no ortho."""
+    store, mine, out = tmp_path / "proj", tmp_path / "mine", tmp_path / "out"
+    store.mkdir()
+    mine.mkdir()
+    name = "us_nga_egm08_25.tif"
+    write_proj_grid(store / name)
+    digest = hashlib.sha256((store / name).read_bytes()).hexdigest()
+    listed = {"features": [{"properties": {"name": name, "sha256sum": digest}}]}
+    (store / "files.geojson").write_text(json.dumps(listed))
+    command = ["rectify", str(tiny.image), "--dem", "auto", "--dem-source", bucket.address, "--allow-network"]
+    with serving(store) as proj:
+        proj.faults[name] = lambda data, number: flipped(data, number) if number <= 3 else None
+        environment = {**os.environ, "PROJ_USER_WRITABLE_DIRECTORY": str(mine), "PROJ_NETWORK_ENDPOINT": proj.address}
+        environment["PYTHONPATH"] = os.pathsep.join(sys.path)
+        done = subprocess.run(
+            [sys.executable, "-c", _FIRST_USE, str(mine), *command, "-o", str(out)], capture_output=True, text=True,
+            env=environment, timeout=120, check=False,
+        )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    first, left, made, second = json.loads(done.stdout)
+    assert first[0] in (1, 2)
+    assert "checksum" in first[1]
+    assert (left, made) == ([], [])
+    assert second[0] == 0, second[1]
+    assert (mine / name).is_file()
+    # The grid of the test is 12 m everywhere, and so the heights are those above it with 12 m added.
+    same = rectify(tiny.image, tmp_path / "same", surface=SurfaceOptions(
+        dem="auto", source=str(bucket.folder), vertical=str(mine / name)))  # fmt: skip
+    pixels = [gdal.Open(str(one)).ReadAsArray() for one in (out / "tiny_ortho.tif", same.files["ortho"])]
+    np.testing.assert_array_equal(*pixels)
+
+
+_FIRST_USE = """
+import json, os, sys
+from pathlib import Path
+from dem_cells import COLUMNS, ROWS
+from click.testing import CliRunner
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.surface.cells import copernicus
+copernicus.ROWS, copernicus._COLUMNS, copernicus._MARGIN = ROWS, COLUMNS, 1
+mine, out = sys.argv[1], Path(sys.argv[-1])
+first = CliRunner().invoke(cli, sys.argv[2:])
+left, made = os.listdir(mine), [path.name for path in out.glob("tiny_*")]
+second = CliRunner().invoke(cli, sys.argv[2:])
+print(json.dumps([[first.exit_code, first.stderr], left, made, [second.exit_code, second.stderr]]))
+"""
 
 _FETCHING_GRIDS = """
 import json, os, sys

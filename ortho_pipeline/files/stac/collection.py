@@ -71,7 +71,7 @@ class Collection:
         for _ in range(_PAGES):
             if page is None:
                 return
-            found = read_document(page, allow_network=self._allow_network)
+            found = read_document(page, allow_network=self._allow_network, paged=True)
             for feature in found.get("features") or ():
                 yield item_of(_object(feature, page), page)
             following = [link for link in found.get("links") or () if _is_link(link) and link["rel"] == "next"]

@@ -21,8 +21,8 @@ _ATTEMPTS, _PAUSE, _TIMEOUT = 5, 0.2, 30.0
 _PASSING = (408, 429, 500, 502, 503, 504)
 
 
-def read_document(address: AnyPath, *, allow_network: bool) -> dict[str, Any]:
-    """Return the JSON object in a file, an object of a store, or the answer of a server.
+def read_document(address: AnyPath, *, allow_network: bool, paged: bool = False) -> dict[str, Any]:
+    """Return the JSON object in a file, an object of a store, or the answer of a server (`paged`: one of many).
 
     Raises
     ------
@@ -33,7 +33,7 @@ def read_document(address: AnyPath, *, allow_network: bool) -> dict[str, Any]:
     """
     text = url_of(address)
     if text.startswith(("http://", "https://")):
-        require_network(text, allow_network)
+        require_network(text, allow_network, paged=paged)
         found = parse_json(_answer(text), text, REMEDY)
     elif is_address(text):
         folder, _, name = text.rpartition("/")
