@@ -121,7 +121,7 @@ def test_keys_of_a_store_are_in_no_output_record_message_or_log(
         # Bytes are counted and reported; but for lists of folders, and 16 kB of each file that GDAL reads first.
         counted = report["provenance"]["network_bytes"]
         assert way.sent - before - 2 * 16_384 - 2_000 < counted <= way.sent - before
-        assert report["provenance"]["image"]["path"] == "s3://bucket/in/tiny.tif"
+        assert report["provenance"]["image"]["path"] == "/vsis3/bucket/in/tiny.tif"
         said += done.output + done.stderr
         far = CliRunner().invoke(cli, [*rectify, "-o", "s3://bucket/out"])
         assert far.exit_code == 0, far.stderr
