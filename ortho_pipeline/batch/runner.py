@@ -187,15 +187,15 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a summary says of a scene."""
     scene, adjustment = report["scene"], report["adjustment"]
     return {
-        "sensor": scene["sensor"],
-        "model": adjustment["model"],
+        "sensor": scene["sensor"], "model": adjustment["model"],
         "lean_m_per_m": scene["lean_m_per_m"],
         "rmse_px": {which: rmse and rmse["total"] for which, rmse in adjustment["rmse"].items()},
         "rmse_m": {which: rmse and rmse["total"] for which, rmse in report["rmse_m"].items()},
+        "rmse_points": {which: rmse and rmse["n"] for which, rmse in adjustment["rmse"].items()},
         "ortho": {name: report["ortho"][name] for name in ("crs", "resolution", "size", "valid_share")},
         "warnings": list(report["warnings"]),
         "notices": list(report["notices"]),
-    }
+    }  # fmt: skip
 
 
 def error_document(error: BaseException) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from typing import Any
 from ortho_pipeline.errors import InputError
 
 #: Variables of the page and what they are outside of it.
-_COLOURS = {"control": "#2563a8", "check": "#b4500b", "paper": "#ffffff", "ink": "#1b1f24"}
+_COLOURS = {"control": "#2563a8", "check": "#b4500b", "paper": "#ffffff", "ink": "#1b1f24", "stop": "#b3261e"}
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,7 @@ LOOKS = {
     "control-head": Look(None, "control"),
     "loo": Look("control", "paper", 1.7),
     "out": Look("ink", None, 1.6, 0.6),
+    "doubted": Look("stop", None, 2.4),
     "bar": Look("ink", "ink", 1.7),
     "rule": Look("ink", None, 1.7),
     "casing": Look("paper", None, 4.4, 0.6),
@@ -59,12 +60,12 @@ LOOKS = {
     "link": Look("ink", None, 1.2, 0.4),
     "link-wide": Look("ink", None, 3.2, 0.4),
     "tie-mark": Look(None, "ink", fill_opacity=0.7),
-    "outline-0": Look("control", "control", 1.8, 0.9, 0.06),
-    "outline-1": Look("check", "check", 1.8, 0.9, 0.06),
-    "outline-2": Look("ink", "ink", 1.4, 0.6, 0.03),
-    "outline-3": Look("control", "control", 1.8, 0.9, 0.06, dash="7 3"),
-    "outline-4": Look("check", "check", 1.8, 0.9, 0.06, dash="7 3"),
-    "outline-5": Look("ink", "ink", 1.4, 0.6, 0.03, dash="7 3"),
+    "outline-0": Look("ink", "ink", 1.8, 0.8, 0.04),
+    "outline-1": Look("ink", "ink", 1.8, 0.8, 0.04, dash="7 3"),
+    "outline-2": Look("ink", "ink", 1.8, 0.8, 0.04, dash="2 3"),
+    "outline-3": Look("ink", "ink", 1.1, 0.5, 0.04),
+    "outline-4": Look("ink", "ink", 1.1, 0.5, 0.04, dash="7 3"),
+    "outline-5": Look("ink", "ink", 1.1, 0.5, 0.04, dash="2 3"),
     "series-0": Look("control", None, 1.9),
     "series-1": Look("check", None, 1.9),
     "series-2": Look("ink", None, 1.6, 0.75),

@@ -78,6 +78,12 @@ def to_document(notices: Iterable[Notice]) -> dict[str, Any]:
     return {"warnings": [str(one) for one in found], "notices": [one.to_json() for one in found]}
 
 
+def doubted(notices: Sequence[Mapping[str, Any]]) -> frozenset[str]:
+    """Return the points of which notices of a document say that they contradict the others, and that count."""
+    one = {notice["point"] for notice in notices if notice["code"] == "contradicting-point"}
+    return frozenset(one.union(*(notice["points"] for notice in notices if notice["code"] == "checks-apart")))
+
+
 def texts_but(warnings: Sequence[str], notices: Sequence[Mapping[str, Any]], *codes: str) -> list[str]:
     """Return the warnings of a document, without those of the codes; documents of earlier versions have no notices."""
     if not notices:

@@ -27,6 +27,7 @@ from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points
+from ortho_pipeline.points.control_hull import outside_of_hull
 
 #: Chance that a good set of points loses any of its points to the search for gross errors.
 BLUNDER_RISK = 0.001
@@ -399,25 +400,36 @@ def checks_apart(
     scale = max(float(solution.sigma0), _SCALE_FLOOR) ** 2
     ids = np.array([points.ids[i] for i in checks.problem.rows])
     off, usual = np.isin(ids, [one.id for one in said]), checks.expected(scale)
-    sizes = np.hypot(*(checks.problem.image - solution.model.ground_to_image(checks.problem.ground)).T)
     apart = not shared and measured[used].all() and _together_apart(checks.squares[~off], scale, solution.freedom)
+    miss = checks.problem.image - solution.model.ground_to_image(checks.problem.ground)
+    sizes = np.hypot(*miss.T)
     rest = None if off.all() else _rms(sizes[~off])
     if not apart and not (off.any() and _rms(sizes) > FAR_ABOVE * (_rms(usual) if rest is None else rest)):
         return []
-    agree = "check points are wrong, or the model is poor between the control points"
-    over = "" if len(ids) == 1 else f" over all {len(ids)}"
     if apart:
         off |= sizes > (_ONE_APART * usual if len(ids) > 1 else 0.0)
-    elif rest is not None:
-        agree = "the other check points agree with the control points"
-        over += f", {rest:.2g} px without {'it' if off.sum() == 1 else 'them'}"
-    far = ids[np.lexsort((-sizes, ~off))][: min(_NAMED, int(off.sum()) or 3)].tolist()
-    fields = {"count": len(ids), "off": int(off.sum()), "rmse": _rms(sizes), "expected": _rms(usual), "points": far}
+        rest = None if off.all() or not off.any() else _rms(sizes[~off])
+    far = np.lexsort((-sizes, ~off))[: min(_NAMED, int(off.sum()) or 3)]
+    beyond = outside_of_hull(points.image[used], checks.problem.image[off])
+    without = "" if rest is None else f", {rest:.2g} px without {'it' if off.sum() == 1 else 'them'}"
+    agree = "check points are wrong, or the model is poor between the control points"
     text = (
-        f"{contradicting(int(off.sum()), len(ids), far)}: RMSE {_rms(sizes):.3g} px{over}, where {_rms(usual):.2g} px "
-        f"was to be expected from the control points; {agree}"
+        f"{contradicting(int(off.sum()), len(ids), ids[far].tolist())}: RMSE {_rms(sizes):.3g} px"
+        f"{'' if len(ids) == 1 else f' over all {len(ids)}'}{without}, where {_rms(usual):.2g} px was to be expected "
+        f"from the control points; {agree if apart or rest is None else 'the others agree with them'}"
     )
-    return [Notice("checks-apart", text, **fields)]
+    return [
+        Notice(
+            "checks-apart", text, count=len(ids), off=int(off.sum()), rmse=_rms(sizes), expected=_rms(usual),
+            points=ids[far].tolist(), rest=rest, alike=are_alike(miss[off]), beyond_control=int(beyond.sum()),
+        )
+    ]  # fmt: skip
+
+
+def are_alike(misses: Array) -> bool:
+    """Tell whether several misses ``(n, k)`` are one shift: their scatter about their mean is below half of it."""
+    mean = misses.mean(axis=0) if len(misses) else np.zeros(1)
+    return len(misses) > 1 and bool(_rms(np.linalg.norm(misses - mean, axis=1)) < 0.5 * np.linalg.norm(mean))
 
 
 def _together_apart(squares: Array, scale: float, freedom: float) -> bool:

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.points.table import Array
@@ -35,6 +36,17 @@ def control_hull(image: Array, size: tuple[int, int]) -> dict[str, Any] | None:
     inside = hull.intersection(shapely.box(0, 0, *size))
     outline = [[float(x), float(y)] for x, y in hull.exterior.coords[:-1]] if hull.geom_type == "Polygon" else []
     return {"share": float(inside.area) / (size[0] * size[1]), "n": len(image), "outline": outline}
+
+
+def outside_of_hull(control: Array, image: Array) -> NDArray[np.bool_]:
+    """Tell which points ``(m, 2)`` px lie farther outside the hull of control ``(n, 2)`` than half its spacing."""
+    if not len(control) or not len(image):
+        return np.zeros(len(image), dtype=bool)
+    import shapely
+
+    hull = shapely.MultiPoint(control).convex_hull
+    hull = hull.buffer(0.5 * math.sqrt(hull.area / len(control)))
+    return np.array([not hull.covers(shapely.Point(place)) for place in image], dtype=bool)
 
 
 def empty_parts(image: Array, size: tuple[int, int]) -> tuple[float, tuple[str, ...]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
-from ortho_pipeline.display.notices import Notice, to_document
+from ortho_pipeline.display.notices import Notice, doubted, to_document
 from ortho_pipeline.display.numbers import flat, metres, px
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import counted
@@ -37,7 +37,7 @@ from ortho_pipeline.report.page.advice import WORDS, signals
 from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import plot_locator
 from ortho_pipeline.report.records import NOT_TESTED, MapScaleRecord, RpcRecord
-from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, FEW, NONE_APART, NOTICED, fitness, withheld
+from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, FEW, NONE_APART, NOTICED, fitness, scale_rules, withheld
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.start import Start
@@ -46,7 +46,8 @@ if TYPE_CHECKING:
 #: Rays that are drawn of each image, points that are listed on the page.
 _DRAWN_RAYS, _LISTED = 400, 400
 #: What makes points of known ground a test.
-KEPT_OUT = "whose known ground was kept out of the adjustment"
+KEPT_OUT = "whose ground coordinates took no part"
+TIED = "their image measurements helped to tie the images"
 #: A frame's side, the longest arrow in it, and the margin in which arrows of points at its edge end.
 _SIDE, _ARROW, _MARGIN = 420.0, 44.0, 48.0
 
@@ -110,13 +111,13 @@ def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHea
     if known := adjustment.object_rms.check:
         if known.n < ENOUGH_CHECK_POINTS:
             notes.append(FEW)
-        what = f"RMSE in plan and height at {counted(known.n, 'check point')}, {KEPT_OUT}"
-        return said(metres(known.plan), f"{what} (their image measurements were not)", metres(known.h))
+        what = f"RMSE in plan and height at {counted(known.n, 'check point')}, {KEPT_OUT}; {TIED}"
+        return said(metres(known.plan), what, metres(known.h))
     # The ground of control is held by its sigma: how well it fits is to be seen in the images.
     seen = [image.rms.back_projected for image in adjustment.images.values()]
     if check := merged(*(one.check for one in seen)):
         what = f"RMSE of {counted(check.n, 'measurement')} of check points in the images{to}"
-        return said(px(check.total), f"{what}, {KEPT_OUT} (the measurements were not)")
+        return said(px(check.total), f"{what}, {KEPT_OUT}; {TIED}")
     control = merged(*(one.control for one in seen))
     if adjustment.object_rms.control and control:
         notes.append(NONE_APART)
@@ -140,12 +141,24 @@ def verdict(report: BlockReport) -> str | None:
         names = list(dict.fromkeys(one.point for one in report.adjustment.outlying if one.role == role))
         if names:
             known = [one for one in report.adjustment.points if one.role == role and one.residual != (None, None, None)]
-            still = "it counts" if len(names) == 1 else "they count"
             against = contradicting(len(names), len(known), names, "the block", role)
-            said.append(f"{against}; {still} all the same.")
+            said.append(f"{against}{_without(known, names) if role == 'check' else ''}.")
     if report.map_scale is not None:
-        said.append(fitness(report.map_scale, heights=True))
+        part = any(one["code"] == "points-cover-part" for one in report.notices)
+        where = " in plan" + (", where there are points" if part else "")
+        said.append(f"{fitness(report.map_scale, where)} No fitness is claimed for heights.")
     return " ".join(said) or None
+
+
+def _without(known: Sequence[BlockPoint], names: Sequence[str]) -> str:
+    """Say what the RMSE of check points is without some, and that these therefore do not decide it."""
+    rest = np.array([one.residual for one in known if one.id not in names], dtype=float)
+    if not len(rest):
+        return ""
+    squares = rest**2
+    plan, height = (math.sqrt(np.nanmean(part)) for part in (squares[:, 0] + squares[:, 1], squares[:, 2]))
+    it = "it" if len(names) == 1 else "them"
+    return f": without {it} {metres(plan)} in plan and {metres(height)} in height"
 
 
 def summary_text(report: BlockReport) -> str:
@@ -218,7 +231,9 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
         head=report.headline,
         notes=[note for note in report.headline.notes if note not in NOTICED or not said],
         verdict=verdict(report),
-        marks=_marks(adjustment),
+        marks=_marks(report),
+        scale_rules=None if report.map_scale is None else scale_rules(report.map_scale),
+        contradicted=withheld(report.notices) is not None,
         ground_sigmas=variance_lines(adjustment.variances),
         roles={role: sum(point.role == role for point in adjustment.points) for role in ROLES},
         points=sorted(
@@ -237,12 +252,13 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
     )
 
 
-def _marks(adjustment: BlockAdjustment) -> list[str]:
+def _marks(report: BlockReport) -> list[str]:
     """Say what the marks on the map of the network are, of what there is."""
-    there = {point.role for point in adjustment.points}
+    there = {point.role for point in report.adjustment.points}
     kinds = {"control": "dots are control points", "check": "squares are check points", "tie": "small dots are ties"}
     said = [what for role, what in kinds.items() if role in there]
-    return [*said, "crosses are what was left out"] if adjustment.rejected else said
+    said += ["crosses are what was left out"] if report.adjustment.rejected else []
+    return [*said, "in red rings what contradicts"] if doubted(report.notices) else said
 
 
 def plot_rays(report: BlockReport, label: str, rays: Sequence[Ray]) -> Drawing | None:

@@ -54,7 +54,7 @@ def _of_block(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
     sigma0 = f", sigma0 {float(adjusted['sigma0']):.3g}" if adjusted["sigma0"] else ""
     notes = (f"The block: {adjusted['gauge']}{sigma0}.", _source(scene))
     kinds = (
-        (image.rms.back_projected.check, "of check points, whose known ground was kept out of the adjustment,"),
+        (image.rms.back_projected.check, "of check points, whose ground coordinates took no part,"),
         (image.rms.back_projected.control, "of control points (the fit, not a test)"),
         (image.rms.residuals.tie, "of tie points (how well the images agree, not how right they are)"),
     )

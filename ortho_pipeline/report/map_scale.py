@@ -32,7 +32,7 @@ SCALES = tuple(int(step * 10**power) for power in range(2, 7) for step in (1, 2,
 #: ASPRS 2023: fewer check points support no claim.
 ENOUGH_CHECK_POINTS = 30
 #: In the map, metres: what the paper asks of positions and of pixels.
-_POSITION, _PIXEL = 0.25e-3, 0.1e-3
+POSITION, PIXEL = 0.25e-3, 0.1e-3
 #: NMAS: 1/30 inch at scales larger than 1 : 20,000, 1/50 inch from there on.
 _INCH, _STEP = 0.0254, 20_000
 
@@ -120,15 +120,19 @@ def judge(errors: Array, evidence: str, pixel: float | None, survey: float = 0.0
     squares = (errors**2).sum(axis=1)
     count, rmse = len(squares), float(np.sqrt(squares.mean()))
     ce90 = float(np.sqrt(np.sort(squares)[count - 1 - count // 10]))
-    smallest = max(rmse / _POSITION, (pixel or 0.0) / _PIXEL)
-    limited = None if pixel is None else ("pixel" if pixel / _PIXEL > rmse / _POSITION else "accuracy")
-    # A hair, so that an RMSE of 2.5 m serves 1 : 10,000.
-    paper = next((scale for scale in SCALES if scale >= smallest * (1 - 1e-9)), None)
+    limited = None if pixel is None else ("pixel" if pixel / PIXEL > rmse / POSITION else "accuracy")
+    paper = usual_scale(max(rmse / POSITION, (pixel or 0.0) / PIXEL))
     nmas = next((scale for scale in SCALES if ce90 <= nmas_limit(scale) * (1 + 1e-9)), None)
     return MapScale(
         evidence, count, rmse, ce90, pixel, paper, limited, math.ceil(100 * math.hypot(rmse, survey) - 1e-9), survey,
         evidence != "loo" and count >= ENOUGH_CHECK_POINTS, nmas,
     )  # fmt: skip
+
+
+def usual_scale(smallest: float) -> int | None:
+    """Return the first usual denominator from the smallest possible on, None beyond the last."""
+    # A hair, so that an RMSE of 2.5 m serves 1 : 10,000.
+    return next((scale for scale in SCALES if scale >= smallest * (1 - 1e-9)), None)
 
 
 def nmas_limit(scale: float) -> float:

@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, number, round_down
+from ortho_pipeline.display.notices import doubted
 from ortho_pipeline.errors import counted
 from ortho_pipeline.report.adjustment_records import Pair, Point, is_known
 from ortho_pipeline.report.gallery.plots import plot_match_histograms, plot_matches
@@ -100,8 +101,12 @@ def plot_residuals(report: SceneReport) -> Drawing | None:
     drawing.rect("frame", x0, y0, width * scale, height * scale)
     drawing.text(x0, y0 - 8, "0, 0", quiet=True)
     drawing.text(x0 + width * scale, y0 + height * scale + 15, f"{width}, {height}", quiet=True, anchor="end")
+    wrong = doubted(report.adjustment.notices)
     for point in points:
-        _draw_point(drawing, point, np.array(point.image) * scale + shift, arrow, len(points) <= _MAX_LABELS)
+        at = np.array(point.image) * scale + shift
+        if point.point.id in wrong:
+            drawing.circle("doubted", float(at[0]), float(at[1]), 9.0)
+        _draw_point(drawing, point, at, arrow, len(points) <= _MAX_LABELS)
     _legend(drawing, points, float(tall) + 20)
     if longest > 0:
         size = round_down(longest)

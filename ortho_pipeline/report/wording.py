@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from ortho_pipeline.display.numbers import class_size, metres, plain_size, px, s
 from ortho_pipeline.errors import counted
 from ortho_pipeline.estimation.blunders import contradicting
 from ortho_pipeline.report.adjustment_records import Adjustment, Bias, Parameter, Rmse, RmseOnGround, RmsesOnGround
+from ortho_pipeline.report.map_scale import PIXEL, POSITION, SCALES, usual_scale
 from ortho_pipeline.report.matching import MatchingRecord, Tested, is_relative
 from ortho_pipeline.report.records import NOT_TESTED, Dem, FlatGround, Headline, MapScaleRecord, SceneReport
 
@@ -76,6 +78,7 @@ def headline(
         return _headline(rmse.control, ground.control, what, notes)
     notes.append(NONE_APART)
     if rmse.loo and adjustment.redundancy:
+        notes.append("An error that all control points share would not show.")
         what = f"RMSE when each of {counted(rmse.loo.n, 'control point')} is left out in turn{to}"
         return _headline(rmse.loo, ground.loo, what, notes)
     what = "nothing is left over to test the fit with"
@@ -105,31 +108,85 @@ def withheld(notices: Iterable[Mapping[str, Any]]) -> str | None:
     return None
 
 
-def fitness(found: MapScaleRecord, *, heights: bool = False) -> str:
-    """Say in one sentence which map scales an accuracy suffices for, and by what evidence.
+def unsettled(report: SceneReport) -> str | None:
+    """Say beside the figure that it tells no accuracy yet, and what it is without the points that contradict."""
+    for one in report.adjustment.notices:
+        if one["code"] == "checks-apart":
+            rest = one.get("rest")
+            without = f": {px(rest)} without {', '.join(one['points'][:3])}" if rest is not None else ""
+            more = "" if len(one["points"]) <= 3 or rest is None else " and others"
+            return f"Not settled{without}{more}"
+    return None
 
-    With `heights` it is that of ground whose heights were determined too, of which no scale is claimed.
-    """
-    paper = "no usual map scale" if found.paper_scale is None else f"maps of 1 : {found.paper_scale:,}"
-    nmas = "no usual scale" if found.nmas_scale is None else f"1 : {found.nmas_scale:,}"
-    rule = "RMSE of at most 0.25 mm in the map"
-    if found.limited_by is not None:
-        rule += f", pixels of at most 0.1 mm; the {found.limited_by} decides"
-    asked = ", which does not count pixels," if found.limited_by == "pixel" else ""
-    said = f"Fit for {paper}{' in plan' if heights else ''} ({rule}); NMAS{asked} {nmas}"
-    said += f"; ASPRS 2023 horizontal class {class_size(found.class_cm)}"
-    points = {
-        "check": counted(found.n, "check point"),
-        "delivered": f"{counted(found.n, 'point')} of the model as delivered",
-        "loo": f"{counted(found.n, 'control point')} left out in turn",
-    }[found.evidence]
-    end = "; no fitness is claimed for heights" if heights else ""
-    if found.claim:
-        stated = "" if found.survey else ", whose own accuracy is not stated and not in it"
-        return f"{said}: by {points}{stated}{end}."
-    gives = "gives" if found.n == 1 else "give"
-    needs = f"a claim by ASPRS 2023 needs {ENOUGH_CHECK_POINTS}{'' if found.evidence == 'check' else ' check points'}"
-    return f"{said}; {points} {gives} an indication, {needs}{end}."
+
+def runner_up(report: SceneReport) -> str | None:
+    """Say how a recommended model compares to the others, and how far points that chose it are a test of it."""
+    comparison = report.comparison
+    if comparison is None or comparison.recommendation.model is None:
+        return None
+    chosen, checked = comparison.recommendation.model, comparison.recommendation.criterion == "check"
+    found = {
+        row.model: (_rms_of([row.rmse.check, row.rmse.loo if row.parameters else row.rmse.control]), row.parameters)
+        for row in comparison.rows
+        if not row.error and row.model != chosen
+    }
+    sizes = {name: size for name, (size, _) in found.items() if size is not None}
+    if not sizes:
+        return None
+    nearest = min(sizes, key=lambda name: sizes[name])
+    plain = next((name for name in sizes if not found[name][1]), None)
+    told = (
+        []
+        if nearest in comparison.recommendation.reason.replace(chosen, "")
+        else [f"{nearest} comes next with {px(sizes[nearest])}"]
+    )
+    told += [] if plain is None or plain == nearest else [f"{plain} as supplied has {px(sizes[plain])}"]
+    said = [f"{' and '.join(told)}."] if told else []
+    if checked:
+        said.append("The check points had a part in this choice, and are no independent test of it.")
+    return " ".join(said) or None
+
+
+def _rms_of(parts: Iterable[Rmse | None]) -> float | None:
+    """Return the root mean square over all points of some roles together."""
+    known = [one for one in parts if one is not None]
+    return math.sqrt(sum(one.n * one.total**2 for one in known) / sum(one.n for one in known)) if known else None
+
+
+def fitness(found: MapScaleRecord, where: str = "") -> str:
+    """Say in one sentence which map scale an accuracy suffices for, `where`, and what limits it."""
+    by_pixel = found.limited_by == "pixel" and found.pixel is not None
+    size, limit = (found.pixel or 0.0, PIXEL) if by_pixel else (found.rmse, POSITION)
+    what = f"pixels of {size:.4g} m are" if by_pixel else f"an RMSE of {size:.4g} m is"
+    larger = max((scale for scale in SCALES if scale < (found.paper_scale or math.inf)), default=None)
+    why = (
+        "" if larger is None else f": {what} more than the {limit * larger:g} m ({1000 * limit:g} mm) of 1 : {larger:,}"
+    )
+    said = f"{scale_text(found.paper_scale, 'maps of 1 : {:,}', 'no usual map scale')}{where}{why}"
+    if by_pixel:
+        said += f"; the RMSE would do for {scale_text(usual_scale(found.rmse / POSITION))}"
+    return f"Fit for {said}." if found.claim else f"By this indication fit for {said}."
+
+
+def scale_text(denominator: int | None, text: str = "1 : {:,}", none: str = "no usual scale") -> str:
+    """Return a map scale in words."""
+    return none if denominator is None else text.format(denominator)
+
+
+def scale_rules(found: MapScaleRecord) -> list[tuple[str, str, str, str]]:
+    """Return the rules that `fitness` and the standards go by: name, what it asks, what is found, and the result."""
+    rows = [("RMSE in plan", "at most 0.25 mm in the map", f"{found.rmse:.4g} m",
+             scale_text(usual_scale(found.rmse / POSITION)))]  # fmt: skip
+    if found.pixel is not None:
+        rows.append(("Pixels of the image", "at most 0.1 mm in the map", f"{found.pixel:.4g} m",
+                     scale_text(usual_scale(found.pixel / PIXEL))))  # fmt: skip
+    survey = f", {found.survey:.4g} m of the check points themselves" if found.survey else ""
+    needs = "" if found.claim else f" (a claim needs {ENOUGH_CHECK_POINTS} check points)"
+    rows.append(("ASPRS 2023, horizontal class", "RMSE, with that of the check points themselves, up to the next cm",
+                 f"{found.rmse:.4g} m{survey}", f"{class_size(found.class_cm)}{needs}"))  # fmt: skip
+    rows.append(("NMAS 1947", "nine of ten points within 1/30 inch in the map, 1/50 from 1 : 20,000 on; pixels do "
+                 "not count", f"{found.ce90:.4g} m", scale_text(found.nmas_scale)))  # fmt: skip
+    return rows
 
 
 def _of_matches(matching: MatchingRecord, relative: Tested, notes: list[str]) -> Headline:

@@ -45,10 +45,8 @@ def test_what_failed_stands_first_and_then_the_least_accurate(tmp_path, ortho):
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     rows = re.findall(r"<tr[ >].*?</tr>", page.split("<tbody>")[1], re.DOTALL)
     assert ["Failed" in rows[0], "untested" in rows[1], "bad" in rows[2], "good" in rows[3]] == [True] * 4
-    assert "1 of 4 scenes failed" in page
-    assert (
-        "june: 3 scenes were made; 2 tested at check points, RMSE 0.20 to 3.00 px; 1 not tested at any point." in page
-    )
+    assert "<h1>2 of 4 scenes ready; 1 failed, 1 not tested</h1>" in page
+    assert "june: of those ready 2 tested at check points, RMSE 0.20 to 3.00 px." in page
     # What to look at stands in the row, gravest first, and that nothing tests a scene is the first of all.
     assert "Nothing tests how accurate this is." in rows[1]
     assert "only check, or an orthoimage" in rows[1]
@@ -65,14 +63,19 @@ def test_what_failed_stands_first_and_then_the_least_accurate(tmp_path, ortho):
 def test_check_points_that_contradict_have_another_mark_than_a_formality(tmp_path):
     few = {"code": "few-check-points", "text": "6 check points: few"}
     formal, apart = scene("formal", 0.2), scene("apart", 7.2)
-    formal["facts"]["notices"] = [few]
+    formal["facts"]["notices"], formal["facts"]["rmse_points"] = [few], {"check": 6}
     apart["facts"]["notices"] = [few, {"code": "checks-apart", "text": "3 of 6 check points contradict"}]
-    write_run_page(tmp_path / "index.html", "june", [formal, apart])
+    untested = scene("untested")
+    untested["facts"]["rmse_px"]["loo"] = None
+    write_run_page(tmp_path / "index.html", "june", [formal, untested, apart])
     rows = re.findall(r"<tr[ >].*?</tr>", (tmp_path / "index.html").read_text().split("<tbody>")[1], re.DOTALL)
     assert '<li class="stop">' in rows[0]
     assert "Settle this first.</b> 3 of 6" in rows[0]
-    assert '<li class="look">' in rows[1]
-    assert "RMSE 0.20 to 7.20 px; 1 with something to settle first." in (tmp_path / "index.html").read_text()
+    # Before what nothing tests, and out of the span of RMSEs.
+    assert ["untested" in rows[1], '<li class="look">' in rows[2], "6 check points<" in rows[2]] == [True] * 3
+    page = (tmp_path / "index.html").read_text()
+    assert "<h1>1 of 3 scenes ready; 1 to settle first, 1 not tested</h1>" in page
+    assert "of those ready 1 tested at check points, RMSE 0.20 px." in page
 
 
 def test_the_same_results_are_the_same_page_and_cost_no_pixel(tmp_path, ortho, monkeypatch):

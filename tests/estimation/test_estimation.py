@@ -344,7 +344,7 @@ def test_a_wrong_check_point_is_named_and_counts(rpc, checks):
     assert notice.fields["rmse"] == pytest.approx(found.rmse("check")["total"])
     if rest is not None:
         assert f"{rest['total']:.2g} px without it" in notice
-        assert notice.endswith("the other check points agree with the control points")
+        assert notice.endswith("was to be expected from the control points; the others agree with them")
         near = fit(start(rpc), moved(good, "p12", (2.2, 0.0)))
         assert near.rmse("check")["total"] < 2 * (near.rmse("agreeing") or near.rmse("check"))["total"] or checks < 12
         assert checks < 12 or not [one for one in near.warnings if one.code == "checks-apart"]
@@ -382,6 +382,22 @@ def test_several_wrong_check_points_that_hide_each_other_are_told(rpc):
         f"3 of {notice.fields['count']} check points contradict the control points (p12, p13, p14)"
     )
     assert "was to be expected from the control points" in notice
+    # They are off to different sides, and not beyond control; all by the same, and far outside, is told as such.
+    assert (notice.fields["alike"], notice.fields["beyond_control"]) == (False, 0)
+    alike = points
+    for name in ("p12", "p13", "p14"):
+        alike = moved(alike, name, (9.0, -5.0))
+    (notice,) = [one for one in fit(start(rpc), alike).warnings if one.code == "checks-apart"]
+    assert notice.fields["alike"]
+    # Three check points a long way outside of control that lies in one corner.
+    near = np.argsort(np.hypot(*points.image.T))
+    roles = np.full(18, "check", dtype="<U7")
+    roles[near[:12]] = "control"
+    far = wrong = points.with_roles(roles)
+    for index in near[-3:]:
+        wrong = moved(wrong, far.ids[index], (9.0, -5.0))
+    (notice,) = [one for one in fit(start(rpc), wrong).warnings if one.code == "checks-apart"]
+    assert notice.fields["beyond_control"] > 0
 
 
 @pytest.mark.parametrize("checks", [1, 3, 12])

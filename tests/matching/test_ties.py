@@ -255,7 +255,9 @@ def test_an_adjustment_finds_ties_and_control_by_itself(tmp_path):
         "relative-to-reference"
     }
     assert "takes-no-part" not in {one["code"] for one in report["notices"]}
-    assert "in the images, relative to the reference, whose known ground was kept out" in report["headline"]["what"]
+    assert (
+        "in the images, relative to the reference, whose ground coordinates took no part" in report["headline"]["what"]
+    )
     assert {one["role"] for one in report["provenance"]["inputs"]} >= {"reference", "DEM"}
     # Pixels are 1 m: however many matches, the images lie as well as the reference does.
     adjustment = report["adjustment"]

@@ -191,7 +191,7 @@ def test_a_stereo_pair_is_tied_by_clicks_in_either_image(
         page.keyboard.press("Enter")
         served.says("#said", f"P{number + 1} accepted")
         page.keyboard.press("Escape")
-    served.says("#what", "1 check point, whose known ground was kept out of the adjustment, relative to the reference")
+    served.says("#what", "1 check point, whose ground coordinates took no part, relative to the reference")
     scrolled, shown = page.evaluate(
         "() => { const box = document.querySelector('aside > .scroll'); return [box.scrollWidth, box.clientWidth]; }"
     )
@@ -277,7 +277,7 @@ def test_six_points_of_a_pair_by_keyboard_alone(serve, whole_reference: Path, wh
         served.says("#said", f"P{accepted} accepted")
         if accepted == 6:
             break
-    served.says("#what", "check points?, whose known ground was kept out of the adjustment, relative to the reference")
+    served.says("#what", "check points?, whose ground coordinates took no part, relative to the reference")
     assert "control point would make the worst place" in page.inner_text("#gain")
     roles = [row.split("\t")[1] for row in page.inner_text("#table tbody").strip().split("\n")]
     assert sorted(roles) == ["check", "check", "control", "control", "tie", "tie"]

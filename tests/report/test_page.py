@@ -28,7 +28,7 @@ from ortho_pipeline.report.page.advice import WORDS, advised, signals
 from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import degrees, plot_ortho
 from ortho_pipeline.report.records import NOT_TESTED, MapScaleRecord, SceneReport
-from ortho_pipeline.report.wording import few_check_points, fitness, verdict
+from ortho_pipeline.report.wording import few_check_points, fitness, scale_rules, verdict
 from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
 from ortho_pipeline.simulation.terrain import Terrain
 
@@ -198,10 +198,10 @@ def test_the_gravest_notice_comes_first():
     [
         (
             measured(control=10, check=30),
-            r"Fit for maps of 1 : [\d,]+ \(RMSE of at most 0\.25 mm.*; NMAS.* [\d,]+; .*class [\d.]+ c?m: by 30 check",
+            r"^Fit for maps of 1 : ([\d,]+): (an RMSE|pixels) of [\d.]+ m \w+ more than the [\d.]+ m \(0\.\d+ mm",
         ),
-        (measured(), r"6 check points give an indication, a claim by ASPRS 2023 needs 30\.$"),
-        (measured(check=0), r"12 control points left out in turn give an indication, a claim .* needs 30 check points"),
+        (measured(), r"^By this indication fit for maps of 1 : [\d,]+: "),
+        (measured(check=0), r"^By this indication fit for maps of 1 : "),
         (measured().select(np.arange(18) < 1), r"What it is fit for nobody can say"),
     ],
 )
@@ -236,16 +236,40 @@ def test_verdict_leads_with_check_points_that_contradict_the_control(tmp_path, w
     report.write_report_html(said, tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert "Fit for maps" not in page
-    assert "Map scale, not claimed while check points contradict" in page
+    assert "Map scales, not claimed until the contradiction is settled" in page
+    # Beside the figure, with what it is without them; in the picture in rings; what to do is of these points.
+    assert said.adjustment.notices[0]["rest"] == pytest.approx(0.5, abs=0.5)
+    assert re.search(rf'class="unsettled">Not settled: 0\.\d+ px without {", ".join(names)}<', page)
+    assert page.count('class="doubted"') == wrong
+    assert ("off in different ways" if wrong == 3 else f"Measure {names[0]} again") in page
 
 
-def test_a_block_claims_no_fitness_for_heights():
+def test_a_scale_says_which_larger_one_it_is_too_coarse_for():
     found = judge(np.full((30, 2), 10.0), "check", None)
-    text = fitness(MapScaleRecord(**found.to_json()), heights=True)
-    assert " in plan (" in text
+    record = MapScaleRecord(**found.to_json())
+    assert fitness(record, " in plan") == (
+        "Fit for maps of 1 : 100,000 in plan: an RMSE of 14.14 m is more than the 12.5 m (0.25 mm) of 1 : 50,000."
+    )
+    rows = {rule: (here, result) for rule, _, here, result in scale_rules(record)}
+    assert rows["RMSE in plan"] == ("14.14 m", "1 : 100,000")
     # 14.142 m is 1415 cm: what is rounded is no better than it was.
-    assert "class 14.2 m" in text
-    assert text.endswith("no fitness is claimed for heights.")
+    assert rows["ASPRS 2023, horizontal class"] == ("14.14 m", "14.2 m")
+    assert "pixels" not in " ".join(rows).lower()
+
+
+def test_a_scale_that_pixels_limit_names_the_pixel_and_what_the_rmse_would_do():
+    found = judge(np.full((6, 2), 0.339), "check", 2.53, survey=0.14)
+    record = MapScaleRecord(**found.to_json())
+    assert fitness(record) == (
+        "By this indication fit for maps of 1 : 50,000: pixels of 2.53 m are more than the 2.5 m (0.1 mm) of "
+        "1 : 25,000; the RMSE would do for 1 : 2,000."
+    )
+    rows = {rule: (here, result) for rule, _, here, result in scale_rules(record)}
+    assert rows["RMSE in plan"] == ("0.4794 m", "1 : 2,000")
+    assert rows["Pixels of the image"] == ("2.53 m", "1 : 50,000")
+    assert rows["ASPRS 2023, horizontal class"] == (
+        "0.4794 m, 0.14 m of the check points themselves", "50 cm (a claim needs 30 check points)",
+    )  # fmt: skip
 
 
 def test_a_class_has_centimetres_up_to_a_metre_and_three_digits_above():

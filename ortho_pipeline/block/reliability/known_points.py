@@ -20,7 +20,7 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.reliability.standardised_residuals import standardise_ground
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.estimation.blunders import FAR_ABOVE, contradicting
+from ortho_pipeline.estimation.blunders import FAR_ABOVE, are_alike, contradicting
 from ortho_pipeline.models.base import Array
 
 #: Chance that of a good block any point is named.
@@ -137,7 +137,10 @@ def notices(doubts: Sequence[Outlying], points: BlockPoints, residuals: Array) -
         f"{one.point}: {one.place} from where the block puts it" for one in doubts if one.point in names[:3]
     )
     text = f"{who}: RMSE {_both(every)} over all {tested.sum()}{without}; {places}"
-    fields = {"count": int(tested.sum()), "off": int(off.sum()), "rmse_m": every, "points": names[:_NAMED]}
+    fields = {
+        "count": int(tested.sum()), "off": int(off.sum()), "rmse_m": every, "points": names[:_NAMED],
+        "rest_m": rest if without else None, "alike": are_alike(np.nan_to_num(residuals[off])),
+    }  # fmt: skip
     others = [one.notice() for one in doubts if one.role == "control" or one.point not in names[:_NAMED]]
     return [Notice("checks-apart", text, **fields), *others]
 

@@ -91,9 +91,10 @@ def open_dem(
         )  # fmt: skip
     with of_option("surface.vertical"):
         vertical = None if options.vertical is None else Vertical.parse(options.vertical)
-    return Surface.open(
-        path, vertical, override=options.override_vertical, fill=options.fill, memory=memory, **scene.access
-    )
+    with completed(field="surface.dem"):
+        return Surface.open(
+            path, vertical, override=options.override_vertical, fill=options.fill, memory=memory, **scene.access
+        )
 
 
 def dem_files(options: SurfaceOptions) -> list[str]:

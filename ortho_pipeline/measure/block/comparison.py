@@ -96,7 +96,7 @@ def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:
     of_ground = {one.name: np.concatenate([one.errors("check"), one.errors("control")]) for one in tried}
     of_rays = {one.name: one.rays for one in tried}
     for errors, what, unit in (
-        (of_ground, "points whose known ground was kept out of the fit", "m"),
+        (of_ground, "points whose ground coordinates took no part", "m"),
         (of_rays, "rays left out", "px"),
     ):
         tested = {name: values for name, values in errors.items() if np.isfinite(values).any()}

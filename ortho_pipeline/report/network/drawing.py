@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from ortho_pipeline.display.drawing import Drawing, round_down
+from ortho_pipeline.display.notices import doubted
 from ortho_pipeline.errors import counted
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array
@@ -103,6 +104,7 @@ def _draw_points(drawing: Drawing, report: BlockReport, paper: _Paper, first: fl
               if None not in one.ground]  # fmt: skip
     ties = [one for one in placed if one[0].role == "tie"]
     known = [one for one in placed if one[0].role != "tie"]
+    wrong = doubted(report.notices)
     for point, angle in (*ties[:: max(1, len(ties) // _POINTS)], *known[:_POINTS]):
         lon, lat = point.ground[0] or 0.0, point.ground[1] or 0.0
         at = paper.at(np.array([[first + (lon - first + 180.0) % 360.0 - 180.0, lat]]))[0]
@@ -113,3 +115,6 @@ def _draw_points(drawing: Drawing, report: BlockReport, paper: _Paper, first: fl
             else:
                 out = point.role == "control" and not point.used_ground
                 drawing.mark("out" if out else point.role, float(at[0]), float(at[1]))
+            if point.id in wrong:
+                drawing.circle("doubted", float(at[0]), float(at[1]), 8.0)
+                drawing.text(float(at[0]) + 11, float(at[1]) + 4, point.id)

@@ -56,7 +56,7 @@ def thinly_covered(places: Mapping[str, Mapping[str, Any]]) -> tuple[Notice, ...
         return ()
     said = ", ".join(f"{100 * share:.0f} % of {label}" for label, share in list(part.items())[:6])
     said += "" if len(part) <= 6 else f" and less of {counted(len(part) - 6, 'more image')}"
-    text = f"points cover {said} (their hull and half the distance between them): nothing holds or tests the rest"
+    text = f"points cover {said}: nothing holds or tests the rest"
     return (Notice("points-cover-part", text, share=part),)
 
 

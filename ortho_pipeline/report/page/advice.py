@@ -17,8 +17,7 @@ _STOP: dict[str, str] = {
     "reference-made-of-scene": "Take another reference: one that was not made of this scene.",
     "unstable": "Add points, or take a correction with fewer parameters.",
     "checks-apart": "Measure those named again, in the image and at their source, before the model or the control is "
-    "changed. If all are off alike, check their CRS and heights; if those far from control are the worst, add control "
-    "there.",
+    "changed.",
     "undecided-contradiction": "Measure the points named again; one of them is wrong.",
     "only-a-start": "Add control points or a reference to match with before the ortho is used.",
     "rpc-elsewhere": "Check that the RPC belongs to this image, and is not that of a crop or of another scene.",
@@ -131,7 +130,26 @@ def signals(
     return sorted(found, key=lambda one: order.index(one.level))
 
 
+def _about_checks(notice: Mapping[str, Any], to_do: str) -> str:
+    """Return what to do about check points that contradict the control, by what their errors look like."""
+    off, beyond = notice.get("off", 0), notice.get("beyond_control", 0)
+    if off == 1:
+        to_do = to_do.replace("those named", str(notice["points"][0])).replace("their source", "its source")
+    if notice.get("alike"):
+        to_do += " They are all off by about the same: check their CRS, their height datum and from where pixels count."
+    elif off > 1:
+        to_do += " They are off in different ways, as single mistakes are."
+    if beyond:
+        who = "It lies" if off == 1 else ("They lie" if beyond == off else f"{beyond} of them lie")
+        to_do += f" {who} outside of the area of the control points, where the model may be poor: add control there."
+    return to_do
+
+
 def _of(notice: Mapping[str, Any]) -> tuple[Level, str, str]:
     level, to_do = advised(notice["code"])
+    if notice["code"] == "few-check-points" and not notice.get("count", 1):
+        to_do = to_do.replace("Keep more points", "Keep some points")
+    if notice["code"] == "checks-apart":
+        to_do = _about_checks(notice, to_do)
     text = str(notice["text"])
     return level, text[:1].upper() + text[1:], to_do

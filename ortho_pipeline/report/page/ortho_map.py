@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.display.drawing import Drawing, round_down
+from ortho_pipeline.display.notices import doubted
 from ortho_pipeline.errors import counted
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
@@ -24,8 +25,9 @@ Array = NDArray[np.float64]
 
 #: Longer side of the drawing, CSS px.
 _SIDE = 720.0
-#: The longest vector as a share of the longer side.
+#: The longest vector as a share of the longer side, and in px.
 _LONGEST = 0.1
+LONGEST_ARROW = _LONGEST * _SIDE
 #: With more points than this their ids would hide the picture; beyond the second number only the largest are drawn.
 _MAX_LABELS, _MAX_POINTS = 40, 600
 #: Distances between the lines of the graticule, degrees: such as have round minutes or seconds.
@@ -83,8 +85,11 @@ def plot_ortho(report: SceneReport) -> Drawing | None:
     _graticule(drawing, paper)
     longest = max((math.hypot(*one.shift) for one in found if one.point.kind != "out"), default=0.0)
     stretch = _LONGEST * _SIDE / longest if longest > 0 else 0.0
+    wrong = doubted(report.adjustment.notices)
     for one in found:
-        _draw(drawing, one, stretch, label=len(found) <= _MAX_LABELS)
+        if one.point.id in wrong:
+            drawing.circle("doubted", *one.at, 10.0)
+        _draw(drawing, one, stretch, label=len(found) <= _MAX_LABELS or one.point.id in wrong)
     _scale_and_north(drawing, paper, stretch, longest)
     return drawing
 

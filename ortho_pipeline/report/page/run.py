@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,16 +27,22 @@ _SIDE, _MOST = 88, 300
 _NOT_MADE = {"message": "nobody has made this scene yet", "file": None, "field": None, "remedy": "run it"}
 #: The evidence that scenes are ordered by, the best first.
 EVIDENCE = {
-    "check": "check points", "matched": "held-out matches", "loo": "control points left out in turn",
-    "control": "control points: the fit",
+    "check": ("check point", "check points"), "matched": ("held-out match", "held-out matches"),
+    "loo": ("control point left out in turn", "control points left out in turn"),
+    "control": ("control point: the fit", "control points: the fit"),
 }  # fmt: skip
+
+
+#: What a scene may be other than ready, the worst first.
+STATES = {"failed": "failed", "stop": "to settle first", "untested": "not tested"}
 
 
 @dataclass(frozen=True)
 class Row:
     """A scene of the page; `page` is the address of its report from here, `rmse` px of the best `evidence` there is.
 
-    `signal` is the gravest of its notices, if it is to be looked at.
+    `signal` is the gravest of its notices, if it is to be looked at; `state` is ``failed``, ``stop`` (something is to
+    be settled first), ``untested`` or ``ready``; `tested_at` the evidence in words.
     """
 
     name: str
@@ -47,6 +54,24 @@ class Row:
     metres: float | None
     signal: Signal | None = None
     thumbnail: str | None = None
+
+    @property
+    def state(self) -> str:
+        """Which of the four states of `STATES` it is in."""
+        if self.error is not None:
+            return "failed"
+        if self.signal is not None and self.signal.level == "stop":
+            return "stop"
+        return "untested" if self.evidence is None else "ready"
+
+    @property
+    def tested_at(self) -> str:
+        """The evidence in words, with the number of points."""
+        if self.evidence is None:
+            return "not tested"
+        one, many = EVIDENCE[self.evidence]
+        number = (self.facts.get("rmse_points") or {}).get(self.evidence)
+        return many if number is None else counted(number, one, many)
 
 
 def write_run_page(path: str | os.PathLike[str], title: str, scenes: Sequence[Mapping[str, Any]]) -> None:
@@ -67,29 +92,31 @@ def write_run_page(path: str | os.PathLike[str], title: str, scenes: Sequence[Ma
     orthos = {one["name"]: one["files"].get("ortho") for one in scenes}
     shown = [_with_thumbnail(row, orthos[row.name]) if k < _MOST else row for k, row in enumerate(rows)]
     code = script()
+    states = Counter(row.state for row in rows)
     page = render(
         "report/run.html.j2", title=title, rows=shown, key=key, script=code, policy=policy(code), thumbnails=_MOST,
-        failed=sum(row.error is not None for row in rows), levels=WORDS, evidence=EVIDENCE, said=_summary(rows),
+        head=_headline(states, len(rows)), levels=WORDS, said=_summary(rows),
     )  # fmt: skip
     write_text(path, page)
 
 
+def _headline(states: Mapping[str, int], count: int) -> str:
+    """Say of how many scenes what holds; every scene counts once."""
+    others = [f"{states[state]} {what}" for state, what in STATES.items() if states.get(state)]
+    ready = f"{states.get('ready', 0)} of {counted(count, 'scene')} ready"
+    return f"{ready}; {', '.join(others)}" if others else f"{counted(count, 'scene')}, all ready"
+
+
 def _summary(rows: Sequence[Row]) -> str:
-    """Say how accurate the scenes are that were made, and how many nothing tests."""
-    made = [row for row in rows if row.error is None]
-    if not made:
-        return "None was made."
-    parts = [f"{counted(len(made), 'scene was', 'scenes were')} made"]
-    for kind, name in EVIDENCE.items():
-        sizes = [row.rmse for row in made if row.evidence == kind and row.rmse is not None]
+    """Say how accurate the scenes are that are ready, by what evidence."""
+    ready = [row for row in rows if row.state == "ready"]
+    parts = []
+    for kind, (_, name) in EVIDENCE.items():
+        sizes = [row.rmse for row in ready if row.evidence == kind and row.rmse is not None]
         if sizes:
             span = px(sizes[0]) if len(sizes) == 1 else f"{fixed(min(sizes))} to {px(max(sizes))}"
             parts.append(f"{len(sizes)} tested at {name}, RMSE {span}")
-    if untested := sum(row.evidence is None for row in made):
-        parts.append(f"{untested} not tested at any point")
-    if stops := sum(row.signal is not None and row.signal.level == "stop" for row in made):
-        parts.append(f"{stops} with something to settle first")
-    return f"{'; '.join(parts)}."
+    return f"of those ready {'; '.join(parts)}." if parts else "none is ready."
 
 
 def _is_of(path: Path, key: str) -> bool:
@@ -126,10 +153,8 @@ def _gravest(facts: Mapping[str, Any], *, tested: bool) -> Signal | None:
 
 
 def _order(row: Row) -> tuple[Any, ...]:
-    """Failed scenes first, then those of unknown accuracy, then the largest RMSE."""
-    if row.error is not None:
-        return 0, 0.0, row.name
-    return (1, 0.0, row.name) if row.rmse is None else (2, -row.rmse, row.name)
+    """Failed scenes first, then what is to be settled, then those of unknown accuracy, then the largest RMSE."""
+    return [*STATES, "ready"].index(row.state), -(row.rmse or 0.0), row.name
 
 
 def _with_thumbnail(row: Row, ortho: str | None) -> Row:

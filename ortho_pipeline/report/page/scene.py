@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import base64
+import math
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 from ortho_pipeline.display.drawing import style_sheet
+from ortho_pipeline.display.notices import doubted
 from ortho_pipeline.display.numbers import flat
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.files import write_text
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.raster.quicklook import preview_png
+from ortho_pipeline.report.adjustment_records import is_known
 from ortho_pipeline.report.gallery.chips import gallery
 from ortho_pipeline.report.gallery.plots import residuals_by_axis
 from ortho_pipeline.report.gallery.points import point_chips
 from ortho_pipeline.report.page.advice import WORDS, signals
 from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import place_of, plot_locator
-from ortho_pipeline.report.page.ortho_map import plot_ortho
+from ortho_pipeline.report.page.ortho_map import LONGEST_ARROW, plot_ortho
 from ortho_pipeline.report.plots import plots
 from ortho_pipeline.report.records import NOT_TESTED, Provenance, SceneReport
-from ortho_pipeline.report.wording import NOTICED, verdict, withheld
+from ortho_pipeline.report.wording import NOTICED, runner_up, scale_rules, unsettled, verdict, withheld
 
 if TYPE_CHECKING:
     from ortho_pipeline.imaging.matching import Matches
@@ -62,7 +65,13 @@ def write_report_html(
         # What is a notice stands among them, with what to do.
         notes=[note for note in report.headline.notes if note not in NOTICED or not said],
         verdict=verdict(report),
+        scale_rules=None if report.map_scale is None else scale_rules(report.map_scale),
         contradicted=withheld(adjustment.notices) is not None,
+        unsettled=unsettled(report),
+        runner_up=runner_up(report),
+        doubted=doubted(adjustment.notices) & {one.id for one in adjustment.points},
+        of_fit=not adjustment.rmse.check and bool(adjustment.rmse.loo) and bool(adjustment.parameters),
+        too_short=_too_short(report),
         signals=said,
         levels=WORDS,
         roles={one.role for one in adjustment.points},
@@ -85,6 +94,13 @@ def write_report_html(
         running=_running(report.scene.name),
     )
     write_text(path, page)
+
+
+def _too_short(report: SceneReport) -> bool:
+    """Tell whether some arrows over the ortho are too short to be drawn beside the longest."""
+    sizes = [math.hypot(*one.residual_m) for one in report.adjustment.points
+             if one.kind != "out" and is_known(one.residual_m)]  # fmt: skip
+    return bool(sizes) and min(sizes) < max(sizes) / LONGEST_ARROW
 
 
 def _running(name: str) -> str:
