@@ -38,7 +38,11 @@ class Rows(NamedTuple):
 
 
 class Point(NamedTuple):
-    """The rows of one point, factored: B = Q R, with `q` ``(3, rows)``, and `turned` ``(3, k p)``, which is Q' A."""
+    """The rows of one point, factored: B = Q R, with `q` ``(3, rows)``, and `turned` ``(3, k p)``, which is Q' A.
+
+    What has a column for each parameter of the images of a point has some more, which are zero, so that loops over them
+    take whole registers. They begin at the first column for the same reason: others are not unrolled.
+    """
 
     q: Array
     r: Array
@@ -46,12 +50,19 @@ class Point(NamedTuple):
 
 
 @inlined
+def _padded(columns):
+    """Return the next multiple of eight."""
+    return (columns + 7) // 8 * 8
+
+
+@inlined
 def _room(rows, begin, end):
-    """Return room for any point between two, and the most rays that one has."""
+    """Return room for any point between two, the most rays that one has, and the most columns."""
     most = 0
     for t in range(begin, end):
         most = max(most, rows.starts[t + 1] - rows.starts[t])
-    return Point(np.empty((3, 2 * most + 3)), np.empty((3, 3)), np.empty((3, most * rows.by_params.shape[2]))), most
+    wide = _padded(most * rows.by_params.shape[2])
+    return Point(np.empty((3, 2 * most + 3)), np.empty((3, 3)), np.empty((3, wide))), most, wide
 
 
 @inlined
@@ -93,16 +104,21 @@ def _factored(rows, t, point):
 
 @inlined
 def _turned(rows, t, point):
-    """Fill Q' A of the t-th point."""
+    """Fill Q' A of the t-th point; return its number of columns, padded."""
     wide, begin = rows.by_params.shape[2], rows.starts[t]
+    k = 0
     for a in range(rows.starts[t + 1] - begin):
-        ray = rows.order[begin + a]
-        for c in range(3):
-            first, second = point.q[c, 2 * a], point.q[c, 2 * a + 1]
-            for u in range(wide):
-                point.turned[c, a * wide + u] = (
-                    first * rows.by_params[ray, 0, u] + second * rows.by_params[ray, 1, u]
-                )  # fmt: skip
+        of_col, of_row = rows.by_params[rows.order[begin + a], 0], rows.by_params[rows.order[begin + a], 1]
+        q, row = point.q, 2 * a
+        for u in range(wide):
+            first, second = of_col[u], of_row[u]
+            point.turned[0, k] = q[0, row] * first + q[0, row + 1] * second
+            point.turned[1, k] = q[1, row] * first + q[1, row + 1] * second
+            point.turned[2, k] = q[2, row] * first + q[2, row + 1] * second
+            k += 1
+    for more in range(k, _padded(k)):
+        point.turned[0, more], point.turned[1, more], point.turned[2, more] = 0.0, 0.0, 0.0
+    return _padded(k)
 
 
 @inlined
@@ -119,14 +135,15 @@ def _as_before(rows, t):
 
 
 @inlined
-def _add_point(rows, t, size, point, sums, right):
-    """Add the equations of the parameters that the t-th point leaves to `sums` ``(k p, k p)`` and `right` ``(k p,)``.
+def _add_point(rows, t, size, point, sums, squares, right):
+    """Add the equations of the parameters that the t-th point leaves to those of its k images.
 
-    Of the symmetric matrix blocks on and above the diagonal alone.
+    These are `squares` ``(k, p, p)``, A' A of each image, `sums` ``(k p, k p)``, which is to be taken off, and `right`
+    ``(k p,)``.
     """
     wide, begin = rows.by_params.shape[2], rows.starts[t]
     count = rows.starts[t + 1] - begin
-    turned, q = point.turned, point.q
+    q, east, north, up = point.q, point.turned[0], point.turned[1], point.turned[2]
     x, y, z = 0.0, 0.0, 0.0
     for row in range(size):
         if row < 2 * count:
@@ -136,17 +153,18 @@ def _add_point(rows, t, size, point, sums, right):
         x, y, z = x + q[0, row] * misfit, y + q[1, row] * misfit, z + q[2, row] * misfit
     for a in range(count):
         ray = rows.order[begin + a]
-        of_col, of_row = rows.misfits[ray, 0], rows.misfits[ray, 1]
+        by_col, by_row = rows.by_params[ray, 0], rows.by_params[ray, 1]
         for u in range(wide):
-            i = a * wide + u
-            first, second = rows.by_params[ray, 0, u], rows.by_params[ray, 1, u]
-            along, across, up = turned[0, i], turned[1, i], turned[2, i]
-            right[i] += first * of_col + second * of_row - (along * x + across * y + up * z)
-            own = sums[i]
+            own, first, second, i = squares[a, u], by_col[u], by_row[u], a * wide + u
+            right[i] += first * rows.misfits[ray, 0] + second * rows.misfits[ray, 1]
+            right[i] -= east[i] * x + north[i] * y + up[i] * z
             for v in range(wide):
-                own[a * wide + v] += first * rows.by_params[ray, 0, v] + second * rows.by_params[ray, 1, v]
-            for k in range(a * wide, count * wide):
-                own[k] -= along * turned[0, k] + across * turned[1, k] + up * turned[2, k]
+                own[v] += first * by_col[v] + second * by_row[v]
+    columns = _padded(count * wide)
+    for i in range(count * wide):
+        row, first, second, third = sums[i], east[i], north[i], up[i]
+        for k in range(columns):
+            row[k] += first * east[k] + second * north[k] + third * up[k]
 
 
 @compiled
@@ -156,28 +174,30 @@ def reduce(rows, begin, end, blocks, right):
     They go to blocks ``(S, p, p)`` of pairs of images, and to the right side ``(images, p)``.
     """
     wide = rows.by_params.shape[2]
-    point, most = _room(rows, begin, end)
-    sums, side = np.empty((most * wide, most * wide)), np.empty(most * wide)
+    point, most, columns = _room(rows, begin, end)
+    sums, squares, side = np.empty((columns, columns)), np.empty((most, wide, wide)), np.empty(columns)
     for t in range(begin, end):
         first = rows.starts[t]
         count = rows.starts[t + 1] - first
         if t == begin or not _as_before(rows, t):
-            sums[: count * wide, : count * wide] = 0.0
-            side[: count * wide] = 0.0
+            sums[: count * wide, : _padded(count * wide)] = 0.0
+            squares[:count], side[: count * wide] = 0.0, 0.0
         size = _factored(rows, t, point)
         _turned(rows, t, point)
-        _add_point(rows, t, size, point, sums, side)
+        _add_point(rows, t, size, point, sums, squares, side)
         if t + 1 < end and _as_before(rows, t + 1):
             continue
         for a in range(count):
             i = rows.image[rows.order[first + a]]
             for u in range(wide):
                 right[i, u] += side[a * wide + u]
+                for v in range(wide):
+                    blocks[rows.slot[i, i], u, v] += squares[a, u, v]
             for b in range(a, count):
                 pair = rows.slot[i, rows.image[rows.order[first + b]]]
                 for u in range(wide):
                     for v in range(wide):
-                        blocks[pair, u, v] += sums[a * wide + u, b * wide + v]
+                        blocks[pair, u, v] -= sums[a * wide + u, b * wide + v]
 
 
 @compiled
@@ -188,7 +208,7 @@ def shifts(rows, begin, end, step, shift, of_rays, of_ground):
     ground ``(N, 3)``, to first order.
     """
     wide = rows.by_params.shape[2]
-    point, _ = _room(rows, begin, end)
+    point, _, _ = _room(rows, begin, end)
     for t in range(begin, end):
         size, number = _factored(rows, t, point), rows.numbers[t]
         x, y, z = 0.0, 0.0, 0.0
@@ -232,6 +252,9 @@ def _gathered(rows, t, blocks, whole):
                 for v in range(wide):
                     whole[a * wide + u, b * wide + v] = blocks[pair, u, v]
                     whole[b * wide + v, a * wide + u] = blocks[pair, u, v]
+    for i in range(count * wide):
+        for k in range(count * wide, _padded(count * wide)):
+            whole[i, k] = 0.0
 
 
 @inlined
@@ -244,23 +267,20 @@ def _spread(rows, t, fresh, blocks, point, whole, product, inner):
     if fresh:
         _gathered(rows, t, blocks, whole)
     size = _factored(rows, t, point)
-    _turned(rows, t, point)
-    turned = point.turned
-    wide = (rows.starts[t + 1] - rows.starts[t]) * rows.by_params.shape[2]
+    columns, turned = _turned(rows, t, point), point.turned
     east, north, up = product[0], product[1], product[2]
-    for k in range(wide):
+    for k in range(columns):
         east[k], north[k], up[k] = 0.0, 0.0, 0.0
-    for i in range(wide):
-        x, y, z, row = turned[0, i], turned[1, i], turned[2, i], whole[i]
-        for k in range(wide):
-            value = row[k]
-            east[k] += x * value
-            north[k] += y * value
-            up[k] += z * value
+    for i in range((rows.starts[t + 1] - rows.starts[t]) * rows.by_params.shape[2]):
+        first, second, third, row = turned[0, i], turned[1, i], turned[2, i], whole[i]
+        for k in range(columns):
+            east[k] += first * row[k]
+            north[k] += second * row[k]
+            up[k] += third * row[k]
     for c in range(3):
         for d in range(3):
             inner[c, d] = 0.0
-        for k in range(wide):
+        for k in range(columns):
             value = turned[c, k]
             inner[c, 0], inner[c, 1], inner[c, 2] = (
                 inner[c, 0] + value * east[k], inner[c, 1] + value * north[k], inner[c, 2] + value * up[k],
@@ -291,9 +311,9 @@ def _hat(rows, ray, place, point, whole, product, core, own, found):
         for v in range(wide):
             own[v] = -(x * product[0, begin + v] + y * product[1, begin + v] + z * product[2, begin + v])
         for u in range(wide):
-            value, row = by[i, u], whole[begin + u]
+            value, row = by[i, u], whole[begin + u, begin : begin + wide]
             for v in range(wide):
-                own[v] += value * row[begin + v]
+                own[v] += value * row[v]
         for j in range(2):
             other = 2 * place + j
             value = along * point.q[0, other] + across * point.q[1, other] + up * point.q[2, other]
@@ -305,10 +325,9 @@ def _hat(rows, ray, place, point, whole, product, core, own, found):
 @compiled
 def hats(rows, begin, end, blocks, of_rays, of_ground):
     """Fill the parts of the hat matrix of rays ``(M, 2, 2)`` and known ground ``(N, 3, 3)``, C being `blocks`."""
-    wide = rows.by_params.shape[2]
-    point, most = _room(rows, begin, end)
-    whole, product, core = np.empty((most * wide, most * wide)), np.empty((3, most * wide)), np.empty((3, 3))
-    own = np.empty(wide)
+    point, _, columns = _room(rows, begin, end)
+    whole, product, core = np.empty((columns, columns)), np.empty((3, columns)), np.empty((3, 3))
+    own = np.empty(rows.by_params.shape[2])
     for t in range(begin, end):
         size = _spread(rows, t, t == begin or not _as_before(rows, t), blocks, point, whole, product, core)
         for c in range(3):
@@ -329,9 +348,8 @@ def hats(rows, begin, end, blocks, of_rays, of_ground):
 @compiled
 def ground(rows, begin, end, blocks, factor, found):
     """Fill `found` ``(N, 3, 3)`` with the covariances of the points, in the frame, C being `blocks`."""
-    wide = rows.by_params.shape[2]
-    point, most = _room(rows, begin, end)
-    whole, product, inner = np.empty((most * wide, most * wide)), np.empty((3, most * wide)), np.empty((3, 3))
+    point, _, columns = _room(rows, begin, end)
+    whole, product, inner = np.empty((columns, columns)), np.empty((3, columns)), np.empty((3, 3))
     root, r = np.zeros((3, 3)), point.r
     for t in range(begin, end):
         _spread(rows, t, t == begin or not _as_before(rows, t), blocks, point, whole, product, inner)
