@@ -20,11 +20,11 @@ from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
 from ortho_pipeline.block.equations.solver import EXACT, NEAR, Solved, attempt
-from ortho_pipeline.block.equations.unknowns import Mask
+from ortho_pipeline.block.equations.unknowns import Mask, Ordering
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.intersection import frame_of, meet, models_of, predict
-from ortho_pipeline.block.local_frame import GEODETIC
-from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
+from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.block.reliability.blunders import find_blunders
 from ortho_pipeline.block.reliability.known_points import notices, outlying
 from ortho_pipeline.block.reliability.suspects import Rejected
@@ -35,6 +35,7 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, counted
 from ortho_pipeline.estimation.problem import Prior
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
+from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import marks_warning
@@ -47,6 +48,7 @@ _ASTRAY = 0.05
 _MOST = 0.5
 
 
+@one_blas_thread()
 def adjust(
     models: Mapping[str, SensorModel],
     points: BlockPoints,
@@ -57,6 +59,8 @@ def adjust(
     exclude: Collection[str] = (),
 ) -> BlockFit:
     """Adjust the models of all images and the ground of all points together.
+
+    The result does not depend on the number of processors, to the last bit.
 
     Parameters
     ----------
@@ -83,10 +87,13 @@ def adjust(
     unknown = sorted(set(exclude) - set(points.ids))
     if unknown:
         raise InputError(f"there is no point {unknown[0]!r} to leave out", field="exclude")
-    problem, state, whole = _prepared(chosen, points, priors or {}, exclude)
+    # Rays of a point beside each other, and points beside those of the same images: memory is read as it lies.
+    order = Ordering.of(points, np.ones(points.rays, dtype=bool), points.control).rays
+    stated = points.of_rays(order)
+    problem, state, whole = _prepared(chosen, stated, priors or {}, exclude)
     # What starts nowhere says nothing yet; where the images come right, it takes part.
     nowhere = np.asarray(~np.isfinite(state.local).all(axis=1))
-    selection, notes = whole.without(nowhere, points.point), list[Notice]()
+    selection, notes = whole.without(nowhere, stated.point), list[Notice]()
     problem, gauge = with_datum(problem, state, selection, hold)
     refuse_too_few(problem, selection)
     if problem.unstated.any():
@@ -118,8 +125,8 @@ def adjust(
     solved, found, common = _weighed(solved, inside, common)
     notes += found.variances.notes()
     notes += marks_warning(points.select(problem.active(inside) & inside.ground))
-    notes += uncertain_images(solved, points)
-    return _result(solved, found, common, inside, points, chosen, gauge, rejected, notes)
+    notes += uncertain_images(solved, stated)
+    return _result(solved, found, common, inside, points, order, chosen, gauge, rejected, notes)
 
 
 def _held(solved: Solved, start: State, selection: Selection, whole: Selection) -> Solved | None:
@@ -304,16 +311,19 @@ def _result(
     common: CommonError | None,
     selection: Selection,
     points: BlockPoints,
+    order: Index,
     start: tuple[SensorModel, ...],
     gauge: str,
     rejected: tuple[Rejected, ...],
     notes: list[Notice],
 ) -> BlockFit:
+    """Return what is told of `points`, whose rays the solution has in an `order`."""
     problem, state = solved.problem, solved.state
     sigma0, freedom = solved.unit_weight()
     active = problem.active(selection)
-    used = selection.rays & active[points.point]
-    variances = replace(found.variances, image=found.variances.image * problem.factor_of(points))
+    used = np.zeros(points.rays, dtype=bool)
+    used[order] = selection.rays & active[points.point[order]]
+    variances = replace(found.variances, image=found.variances.image * problem.factor_of(points.of_rays(order)))
     covariance, ground_covariance, shared = _covariances(solved, found, common)
     # Points that take no part still have a place where their rays meet, if they do.
     local = np.where(active[:, None], state.local, np.nan)
@@ -334,8 +344,8 @@ def _result(
         ground=ground,
         ground_covariance=ground_covariance + of_points,
         residuals=points.measured - predict(problem.frame, state.models, points, local),
-        back_projected=_reprojected(problem, state.models, known),
-        raw_residuals=_reprojected(problem, start, stated),
+        back_projected=_reprojected(problem.frame, points, state.models, known),
+        raw_residuals=_reprojected(problem.frame, points, start, stated),
         object_residuals=object_residuals,
         used_rays=used,
         used_ground=used_ground,
@@ -381,7 +391,6 @@ def _with_common(covariance: Cofactors, common: CommonError | None) -> tuple[Cof
     return covariance.mixed(1.0, common.by_params, common.left), common.of_points
 
 
-def _reprojected(problem: BlockProblem, models: Sequence[SensorModel], ground: Array) -> Array:
+def _reprojected(frame: GroundFrame, points: BlockPoints, models: Sequence[SensorModel], ground: Array) -> Array:
     """Return the reprojection residuals ``(M, 2)`` of known ground ``(N, 3)`` lon, lat, h."""
-    local = problem.frame.of_geodetic(ground)
-    return problem.points.measured - predict(problem.frame, models, problem.points, local)
+    return points.measured - predict(frame, models, points, frame.of_geodetic(ground))

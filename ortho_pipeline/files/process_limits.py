@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import _thread
 import ctypes
+import functools
 import os
 import resource
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ortho_pipeline.errors import OrthoError
 
@@ -129,3 +132,39 @@ def share_freed_memory() -> bool:
         return bool(ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1))
     except (AttributeError, OSError):
         return False
+
+
+class _Blas:
+    """How many are computing with one thread, and what they took from the others."""
+
+    lock, users = threading.Lock(), 0
+    limit: Any = None
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Let BLAS and LAPACK compute with one thread, in the whole process, until the last who asked for it has ended.
+
+    With several they share out sums by the number of processors, and so round otherwise on every machine; on matrices
+    of a few hundred rows their threads wait for each other more than they save.
+    """
+    with _Blas.lock:
+        if not _Blas.users:
+            _Blas.limit = _blas_libraries().limit(limits=1, user_api="blas")
+        _Blas.users += 1
+    try:
+        yield
+    finally:
+        with _Blas.lock:
+            _Blas.users -= 1
+            if not _Blas.users:
+                _Blas.limit.restore_original_limits()
+
+
+@functools.cache
+def _blas_libraries() -> Any:
+    """Return the libraries of NumPy and SciPy, which have one each."""
+    import scipy.linalg.lapack  # noqa: F401  (loads its library)
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pyproj
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from ortho_pipeline.block import adjustment
 from ortho_pipeline.block.adjustment import adjust
@@ -56,10 +57,10 @@ class Parallel(SensorModel):
         return np.stack([column, SIZE / 2 - (lat - LAT) * METRES + self.aslant * h], axis=1)
 
 
-def strip(images: int, points: int, seed: int = 0) -> tuple[dict[str, SensorModel], BlockPoints]:
-    """Return start models and points of a strip in which each image overlaps two on either side."""
+def strip(images: int, points: int, seed: int = 0, apart: float = 0.4) -> tuple[dict[str, SensorModel], BlockPoints]:
+    """Return start models and points of a strip in which each image overlaps two on either side, `apart` of a side."""
     random = np.random.default_rng(seed)
-    east = 0.4 * SIZE * np.arange(images)
+    east = apart * SIZE * np.arange(images)
     cameras = [Parallel(e, s, a) for e, s, a in zip(east, *random.uniform(-0.7, 0.7, (2, images)), strict=True)]
     plan = random.uniform((0.0, -SIZE / 2), (east[-1] + SIZE, SIZE / 2), (points, 2)) / METRES
     ground = np.column_stack([LON + plan[:, 0], LAT + plan[:, 1], random.uniform(100, 900, points)])
@@ -338,3 +339,32 @@ def test_a_search_near_the_minimum_finds_the_same_in_fewer_steps(monkeypatch: py
     # Both end where a step is below 1e-8 of all misfits, which is up to 1e-5 sigmas of one parameter.
     np.testing.assert_allclose(near.values / exact.sigmas, exact.values / exact.sigmas, rtol=0, atol=1e-5)
     np.testing.assert_allclose(near.sigmas, exact.sigmas, rtol=1e-9)
+
+
+def test_blocks_are_the_same_on_any_number_of_processors() -> None:
+    # All of the images share points: their equations are one matrix, large enough for BLAS to share it out.
+    models, points = strip(40, 90, apart=0.01)
+    models = {name: ImageCorrection.identity(one.model, "affine", one.origin) for name, one in models.items()}
+    found = []
+    for threads in (1, 2, 4):
+        with threadpool_limits(threads, user_api="blas"):
+            fit = adjust(models, points, robust=False)
+            found.append(b"".join(np.asarray(part).tobytes() for part in (
+                fit.values, fit.covariance, fit.ground, fit.ground_covariance, fit.residuals, fit.sigma0,
+            )))  # fmt: skip
+            assert {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"} == {threads}
+    assert found[1:] == found[:-1]
+
+
+def test_the_order_in_which_rays_are_stated_changes_no_bit() -> None:
+    models, points = strip(8, 200)
+    measured = points.measured.copy()
+    measured[::40] += 30.0
+    points = replace(points, measured=measured, sigma_image=np.linspace(0.2, 0.4, points.rays))
+    shuffled = np.random.default_rng(3).permutation(points.rays)
+    straight, other = adjust(models, points), adjust(models, points.of_rays(shuffled))
+    assert straight.rejected == other.rejected != ()
+    for name in ("values", "covariance", "ground", "ground_covariance"):
+        np.testing.assert_array_equal(getattr(straight, name), getattr(other, name))
+    for name in ("residuals", "back_projected", "raw_residuals", "used_rays"):
+        np.testing.assert_array_equal(getattr(straight, name)[shuffled], getattr(other, name))

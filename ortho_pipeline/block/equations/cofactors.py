@@ -10,6 +10,7 @@ import numpy as np
 from ortho_pipeline.block.equations.image_pairs import Levels
 from ortho_pipeline.block.equations.level_factor import LevelFactor
 from ortho_pipeline.block.points import Index
+from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models.base import Array
 
 
@@ -39,7 +40,8 @@ class Cofactors:
     @cached_property
     def matrix(self) -> Array:
         """All of it ``(P, P)``."""
-        found = self.times(np.eye(self.levels.columns.size))
+        with one_blas_thread():
+            found = self.times(np.eye(self.levels.columns.size))
         return (found + found.T) / 2
 
     @property
