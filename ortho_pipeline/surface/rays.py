@@ -2,8 +2,8 @@
 
 The ray of each of a few points is a parabola in height through three exact positions; where what it finds is not on the
 terrain by the exact model, that is followed step by step. Many points share a lattice over the image that gives DEM
-coordinates as polynomials in height, verified against the exact model; compiled code marches along it. The exact model
-has the last word: it gives the ground point at the height found.
+coordinates as polynomials in height, verified against the exact model; compiled code finds where these curves first
+meet the terrain (`ray_kernel`). The exact model has the last word: it gives the ground point at the height found.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ Array = NDArray[np.float64]
 MANY = 20_000
 #: Spacings (px) of the lattice, tried one after the other.
 _SPACINGS = (128, 64, 32, 16)
-#: Coefficients of a polynomial along a ray, as `ray_kernel.clearance` has them.
+#: Coefficients of a polynomial along a ray, as `ray_kernel` has them.
 LEVELS = 5
 #: More DEM samples under the points than this are not held in memory at once.
 _MOST_SAMPLES = 64_000_000
 _PROBES = 500
+#: Rays whose curves are in memory at once: they stay in the second cache.
+_TOGETHER = 4096
 #: Halvings that find up to where a model follows a ray: to a thousandth of the range of heights.
 _HALVINGS = 10
 
@@ -35,8 +37,9 @@ _HALVINGS = 10
 def meet_surface(model: SensorModel, image: ArrayLike, surface: Surface, *, tolerance: float = 1e-3) -> Array:
     """Intersect the rays of image points with a surface.
 
-    The ray comes down from above the highest terrain in steps of at most one DEM sample in plan, so that the first,
-    visible, intersection is found also where a ridge hides the slope behind it; then the bracket is narrowed.
+    It is the first, visible, intersection, also where a ridge hides the slope behind it. Many rays are followed from
+    cell to cell of the DEM, so that not even the top of a needle is passed by (see `ray_kernel`); few rays come down
+    from above the highest terrain in steps of at most one DEM sample in plan, and the bracket is then narrowed.
 
     Parameters
     ----------
@@ -197,7 +200,6 @@ def _march_many(
     if window[2] * window[3] > _MOST_SAMPLES:
         return None
     heights = ray.surface.window(*window)
-    steepest = max(float(np.nanmax(np.abs(np.diff(heights, axis=axis)), initial=0.0)) for axis in (0, 1))
     image = np.ascontiguousarray(ray.image)
     origin = np.floor(ray.low)
     extent = ray.high - origin
@@ -207,13 +209,23 @@ def _march_many(
         if size.prod() * LEVELS > len(image):
             return None  # the lattice would cost more than it saves
         nodes = _ray_lattice(ray, origin, size, spacing, middle, half)
-        if _lattice_error(ray, nodes, origin, extent, spacing, middle, half) * 2 * steepest <= tolerance:
+        flat = curve_nodes(nodes)
+        terrain = ray_kernel.terrain_of(heights, window[0], window[1], middle, half, flat)
+        if _lattice_error(ray, nodes, origin, extent, spacing, middle, half) * 2 * terrain.steepest <= tolerance:
             found = np.empty(len(image))
-            ray_kernel.march(
-                image, nodes, origin, float(spacing), heights, window[0], window[1], middle, half, tolerance, found
-            )
-            return found
+            curves = np.empty((flat.shape[2], _TOGETHER))
+            for first in range(0, len(image), _TOGETHER):
+                places = (image[first : first + _TOGETHER] - origin) / spacing
+                some = curves[:, : len(places)]
+                ray_kernel.curves_at(flat, places, some)
+                found[first : first + _TOGETHER] = ray_kernel.meet(some, terrain, tolerance)
+            return middle + half * found
     return None
+
+
+def curve_nodes(nodes: Array) -> Array:
+    """Return polynomials ``(..., levels, k)`` as `ray_kernel.curves_at` takes them: ``(..., k levels)``."""
+    return np.ascontiguousarray(nodes.swapaxes(-1, -2)).reshape(*nodes.shape[:-2], -1)
 
 
 def _ray_lattice(ray: _Ray, origin: Array, size: NDArray[np.int_], spacing: int, middle: float, half: float) -> Array:

@@ -61,10 +61,14 @@ def test_many_rays_are_the_rays_one_by_one(model, surface, monkeypatch):
     assert used[0] is not None
     few = np.concatenate([meet_surface(model, part, surface) for part in np.array_split(image, 4)])
     np.testing.assert_array_equal(np.isnan(many), np.isnan(few))
-    # Both stop within 1 mm of the terrain; a ray that grazes a slope is 1 mm away from it over some centimetres.
     good = np.isfinite(many[:, 0])
     assert good.mean() > 0.99
-    assert np.abs(many - few)[good, 2].max() < 0.1
+    # Both stop within 1 mm of the terrain: where a ray comes down to it by so many metres per metre, that is a height
+    # difference of so much more.
+    lower = model.image_to_ground(image[good], many[good, 2] - 0.05)
+    approach = np.abs(surface.above(lower, model.crs) - surface.above(many[good], model.crs)) / 0.05
+    assert (np.abs(many - few)[good, 2] * approach).max() < 2e-3
+    assert np.median(approach) > 0.5
     # The answer lies on the ray and on the terrain.
     assert np.abs(model.ground_to_image(many[good]) - image[good]).max() < 1e-6
     assert np.abs(surface.heights(many[good, :2], model.crs) - many[good, 2]).max() < 0.01

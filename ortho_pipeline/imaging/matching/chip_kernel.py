@@ -5,39 +5,23 @@ from __future__ import annotations
 import numpy as np
 
 from ortho_pipeline.files.compiled import compiled
-from ortho_pipeline.surface.ray_kernel import first_meeting
 
 
 @compiled
-def positions(nodes, heights, left, top, middle, half, tolerance, out):
+def positions(curves, met, out):
     """Fill `out` ``(rows, columns, 2)`` with the target's coordinates of a chip's pixels; NaN where nothing is seen.
 
-    `nodes` ``(m, m, 5, 4)`` are, at a lattice over the chip, polynomials in normalised height of the DEM's sample
-    coordinates (u, v) and of the target's (column, row). The ray of each pixel is followed from above to its first
-    intersection with the `heights`, whose first sample is (`left`, `top`).
+    `curves` ``(20, rows columns)`` are polynomials in normalised height of the DEM's sample coordinates (u, v) and of
+    the target's (column, row), `met` ``(rows columns,)`` the heights at which the rays of the pixels meet the terrain.
     """
-    rows, columns = out.shape[:2]
-    last = nodes.shape[0] - 1
-    levels = nodes.shape[2]
-    u, v, s, t = np.empty(levels), np.empty(levels), np.empty(levels), np.empty(levels)
-    for row in range(rows):
-        y = (row + 0.5) / rows * last
-        j = min(int(y), last - 1)
-        fy = y - j
-        for column in range(columns):
-            x = (column + 0.5) / columns * last
-            i = min(int(x), last - 1)
-            fx = x - i
-            w00, w10, w01, w11 = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
-            for k in range(levels):
-                a, b, c, d = nodes[j, i, k], nodes[j, i + 1, k], nodes[j + 1, i, k], nodes[j + 1, i + 1, k]
-                u[k] = w00 * a[0] + w10 * b[0] + w01 * c[0] + w11 * d[0]
-                v[k] = w00 * a[1] + w10 * b[1] + w01 * c[1] + w11 * d[1]
-                s[k] = w00 * a[2] + w10 * b[2] + w01 * c[2] + w11 * d[2]
-                t[k] = w00 * a[3] + w10 * b[3] + w01 * c[3] + w11 * d[3]
-            z = first_meeting(u, v, heights, left, top, middle, half, tolerance)
-            out[row, column, 0] = s[0] + z * (s[1] + z * (s[2] + z * (s[3] + z * s[4])))
-            out[row, column, 1] = t[0] + z * (t[1] + z * (t[2] + z * (t[3] + z * t[4])))
+    columns = out.shape[1]
+    for k in range(len(met)):
+        z = met[k]
+        for axis in range(2):
+            a = 10 + 5 * axis
+            out[k // columns, k % columns, axis] = curves[a, k] + z * (
+                curves[a + 1, k] + z * (curves[a + 2, k] + z * (curves[a + 3, k] + z * curves[a + 4, k]))
+            )
 
 
 @compiled

@@ -19,8 +19,9 @@ from ortho_pipeline.imaging.matching import chip_kernel
 from ortho_pipeline.imaging.matching.targets import Target, View
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.intensity import EXACT
+from ortho_pipeline.surface import ray_kernel
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.surface.rays import LEVELS, levels, polynomials
+from ortho_pipeline.surface.rays import LEVELS, curve_nodes, levels, polynomials
 
 Pixels = NDArray[np.float32]
 #: Nodes per side of a chip's lattice, tried until it is this exact (pixels of the target).
@@ -133,9 +134,15 @@ class _Nodes:
         if not self.shown[k] or (right - left) * (bottom - top) > _LARGEST:
             return False
         heights = surface.window(left, top, right - left, bottom - top)
-        chip_kernel.positions(
-            self.coefficients[k], heights, left, top, self.middle[k], self.half[k], _TOLERANCE, places
-        )  # fmt: skip
+        nodes = curve_nodes(self.coefficients[k])
+        rows, columns = places.shape[:2]
+        # Pixel centres, in units of nodes.
+        across, down = ((np.arange(count) + 0.5) / count * (len(nodes) - 1) for count in (columns, rows))
+        pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+        curves = np.empty((nodes.shape[2], len(pixels)))
+        ray_kernel.curves_at(nodes, pixels, curves)
+        terrain = ray_kernel.terrain_of(heights, left, top, self.middle[k], self.half[k], nodes)
+        chip_kernel.positions(curves, ray_kernel.meet(curves, terrain, _TOLERANCE), places)
         return True
 
     def _heights(self) -> list[int]:

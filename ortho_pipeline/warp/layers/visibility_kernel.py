@@ -15,11 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ortho_pipeline.files.compiled import compiled, inlined
+from ortho_pipeline.surface.ray_kernel import SQUARE_BITS, climbs
 
 #: Classes of `look`.
 CLEAR, HIDDEN, VOID = 0, 1, 2
-#: Cells per side of a square that is passed at once, as a power of two.
-SQUARE_BITS = 3
 #: Where cells are as many pixels wide as one in this, the pixels of one are filled at once.
 _WIDE = 0.125
 #: Terrain that rises above a line by less (m) is rounding.
@@ -118,7 +117,7 @@ def find_steep(heights: Any, void: bool, low: Any, high: Any, tops: Any, squares
     for j in range(tops.shape[0]):
         for i in range(tops.shape[1]):
             tops[j, i] = -np.inf
-            if _climbs(heights, j, i, low, high) or (void and _is_beside_void(heights, j, i)):
+            if climbs(heights, j, i, low, high) or (void and _is_beside_void(heights, j, i)):
                 top = max(heights[j, i], heights[j, i + 1], heights[j + 1, i], heights[j + 1, i + 1])
                 highest, tops[j, i] = max(highest, top), top
                 square = squares[j >> SQUARE_BITS]
@@ -143,17 +142,8 @@ def is_steep(heights: Any, low: Any, high: Any) -> bool:
     found = False
     for j in range(heights.shape[0] - 1):
         for i in range(heights.shape[1] - 1):
-            found |= _climbs(heights, j, i, low, high)
+            found |= climbs(heights, j, i, low, high)
     return found
-
-
-@inlined
-def _climbs(heights, j, i, low, high):
-    """Tell whether a cell climbs faster than some line; false beside a void, whichever corner it is."""
-    h00, h10, h01, h11 = heights[j, i], heights[j, i + 1], heights[j + 1, i], heights[j + 1, i + 1]
-    across = max(low[0] * (h10 - h00), high[0] * (h10 - h00), low[0] * (h11 - h01), high[0] * (h11 - h01))
-    down = max(low[1] * (h01 - h00), high[1] * (h01 - h00), low[1] * (h11 - h10), high[1] * (h11 - h10))
-    return across + down > 1.0 and h00 + h10 + h01 + h11 < np.inf
 
 
 @compiled
@@ -202,10 +192,12 @@ def _take_in_neighbours(high, low, scratch):
     last = len(high) - 1
     for k in range(last + 1):
         scratch[k] = max(high[max(k - 1, 0)], high[k], high[min(k + 1, last)])
-    high[:] = scratch
+    for k in range(last + 1):
+        high[k] = scratch[k]
     for k in range(last + 1):
         scratch[k] = min(low[max(k - 1, 0)], low[k], low[min(k + 1, last)])
-    low[:] = scratch
+    for k in range(last + 1):
+        low[k] = scratch[k]
 
 
 @inlined
