@@ -170,7 +170,7 @@ def _row_heights(dem, u0, du, v0, dv, spacing, tx, out):
                 out[m] = (h00 + h10 * fu) + (h01 + h11 * fu) * fv
         else:
             for m in range(k, end):
-                out[m] = dem_height_at(heights, u0 + du * tx[m], v0 + dv * tx[m], dem_left, dem_top, False)
+                out[m] = dem_height_at(heights, u0 + du * tx[m], v0 + dv * tx[m], dem_left, dem_top, cubic_dem)
         k = end
 
 
@@ -228,7 +228,7 @@ def warp_block(source: SourceWindow, lattice: Lattice, dem: DemWindow, resamplin
     int
         Number of pixels whose neighbours lie in the source but not in the window; the caller reads a larger one.
     """
-    first, last, reach = target.first_column, target.last_column, resampling.reach
+    first, last, reach, kernel = target.first_column, target.last_column, resampling.reach, resampling.kernel
     columns, rows = np.empty(last - first), np.empty(last - first)
     ticks = np.empty(last)
     for k in range(first, last):
@@ -243,7 +243,8 @@ def warp_block(source: SourceWindow, lattice: Lattice, dem: DemWindow, resamplin
     short = 0
     for row in range(target.first_row, target.last_row):
         block_coordinates(row, first, last, lattice, dem, ticks, columns, rows)
-        line, start, count, done = row - target.first_row + target.row, target.column, last - first, 0
+        line, start, count = row - target.first_row + target.row, target.column, last - first
+        done = np.int64(0)  # what takes a plain constant is compiled for it apart
         while done < count:
             # Parts of the row in which no neighbour is missing are made fast, the others with care.
             if source.masked:
@@ -252,12 +253,12 @@ def warp_block(source: SourceWindow, lattice: Lattice, dem: DemWindow, resamplin
                 begin, end = _span(columns, rows, low_col, high_col, low_row, high_row, done)
             if begin > done:
                 short += row_with_edges(
-                    resampling, source, columns[done:begin], rows[done:begin],
+                    kernel, resampling, source, columns[done:begin], rows[done:begin],
                     out[:, line, start + done : start + begin], out_valid[:, line, start + done : start + begin],
                 )  # fmt: skip
             for band in range(bands if end > begin else 0):
                 row_inside(
-                    resampling, pixels[band], columns[begin:end], rows[begin:end], left, top, scratch,
+                    kernel, resampling, pixels[band], columns[begin:end], rows[begin:end], left, top, scratch,
                     out[band, line, start + begin : start + end],
                 )  # fmt: skip
                 out_valid[band, line, start + begin : start + end] = True

@@ -12,7 +12,9 @@ import numpy as np
 
 from ortho_pipeline.files.compiled import compiled, inlined
 
-NEAREST, BILINEAR, CUBIC, LANCZOS, AVERAGE = range(5)
+#: Bilinear is None: numba leaves out of a function what `kernel is None` excludes, so that a plain job, as most first
+#: runs are, compiles no more than it needs. The others share what is compiled for a number.
+BILINEAR, NEAREST, CUBIC, LANCZOS, AVERAGE = None, 0, 1, 2, 3
 # Unsigned indices spare the compiled code a test for Python's negative ones in every access; they are made by way of
 # int32, which processors convert from and to floating point in one instruction.
 _ONE, _TWO = np.uint32(1), np.uint32(2)
@@ -47,7 +49,7 @@ class Resampling(NamedTuple):
 
     Parameters
     ----------
-    kernel : int
+    kernel : int or None
         One of the kernels above.
     reach : int
         How many pixels around a point the kernel reads.
@@ -59,7 +61,7 @@ class Resampling(NamedTuple):
         Of the type in which bilinear and cubic values are mixed (`mixing`).
     """
 
-    kernel: int
+    kernel: int | None
     reach: int
     box: tuple[float, float]
     low: float
@@ -213,13 +215,13 @@ def find_whole(valid: Any, reach: int, out: Any) -> None:
 
 
 @inlined
-def row_inside(resampling, source, columns, rows, left, top, scratch, out):
+def row_inside(kernel, resampling, source, columns, rows, left, top, scratch, out):
     """Make a row of one band whose points have all neighbours within the window `source`."""
-    kernel, low, high, integer = resampling.kernel, resampling.low, resampling.high, resampling.integer
-    if kernel == NEAREST:
-        _row_nearest(source, columns, rows, left, top, out)
-    elif kernel == BILINEAR:
+    low, high, integer = resampling.low, resampling.high, resampling.integer
+    if kernel is None:
         _row_bilinear(source, columns, rows, left, top, integer, scratch, out)
+    elif kernel == NEAREST:
+        _row_nearest(source, columns, rows, left, top, out)
     elif kernel == CUBIC:
         _row_cubic(source, columns, rows, left, top, low, high, integer, scratch, out)
     elif kernel == LANCZOS:
@@ -389,18 +391,18 @@ def _average_valid(source, valid, masked, col, row, box):
 
 
 @inlined
-def _edge_value(resampling, source, valid, masked, col, row, left, top, full_width, full_height):
-    """Value at image point (col, row) where neighbours may be missing; its own pixel is valid.
+def _edge_value(kernel, resampling, source, valid, masked, col, row, left, top, full_width, full_height):
+    """Value of another kernel than bilinear at image point (col, row) where neighbours may lack; its pixel is valid.
 
     As GDAL does: Lanczos takes the valid neighbours alone, with weights that sum to one; cubic falls back to bilinear.
     What is made as within the image is already rounded if the output is an integer.
     """
-    kernel, integer, real = resampling.kernel, resampling.integer, resampling.real.dtype.type
+    integer, real = resampling.integer, resampling.real.dtype.type
     x, y = col - 0.5, row - 0.5
     i, j = int(np.floor(x)), int(np.floor(y))
     span = 1 if kernel == CUBIC else 2
     inner = i >= span and j >= span and i + span + 1 < full_width and j + span + 1 < full_height
-    if inner and masked and kernel != BILINEAR:
+    if inner and masked:
         inner = _all_valid(valid, i - span - left, j - span - top, 2 * span + 2)
     if kernel == AVERAGE:
         return _average_valid(source, valid, masked, col - left, row - top, resampling.box)
@@ -412,6 +414,14 @@ def _edge_value(resampling, source, valid, masked, col, row, left, top, full_wid
         value = _lanczos_valid(source, valid, masked, x, y, left, top, full_width, full_height)
         if abs(value) < np.inf:
             return value
+    return _edge_bilinear(resampling, source, valid, masked, col, row, left, top, full_width, full_height)
+
+
+@inlined
+def _edge_bilinear(resampling, source, valid, masked, col, row, left, top, full_width, full_height):
+    """Bilinear value at image point (col, row) where neighbours may be missing; its own pixel is valid."""
+    integer, real = resampling.integer, resampling.real.dtype.type
+    x, y = col - 0.5, row - 0.5
     if masked:
         return _bilinear_valid(source, valid, x, y, left, top, full_width, full_height, real, integer)
     return _bilinear(source, x, y, left, top, full_width, full_height, real, integer)
@@ -419,7 +429,7 @@ def _edge_value(resampling, source, valid, masked, col, row, left, top, full_wid
 
 @compiled
 def row_with_edges(
-    resampling: Resampling, source: SourceWindow, columns: Any, rows: Any, out: Any, out_valid: Any
+    kernel: int | None, resampling: Resampling, source: SourceWindow, columns: Any, rows: Any, out: Any, out_valid: Any
 ) -> int:
     """Make one row ``(bands, columns)`` that touches the edge of the source, or invalid pixels.
 
@@ -429,7 +439,7 @@ def row_with_edges(
         Number of pixels whose neighbours lie in the source but not in the window.
     """
     pixels, valid, _, masked, left, top, full_width, full_height = source
-    kernel, reach, _, low, high, integer, fill, _ = resampling
+    _, reach, _, low, high, integer, fill, _ = resampling
     bands, window_height, window_width = pixels.shape
     short = 0
     for k in range(columns.size):
@@ -452,12 +462,17 @@ def row_with_edges(
                 out[band, k], out_valid[band, k] = fill, False
                 continue
             out_valid[band, k] = True
-            if kernel == NEAREST:
+            here = valid[band if masked else 0]
+            if kernel is None:
+                value = _edge_bilinear(
+                    resampling, pixels[band], here, masked, col, line, left, top, full_width, full_height
+                )
+            elif kernel == NEAREST:
                 out[band, k] = pixels[band, here_row - top, here_col - left]
                 continue
-            value = _edge_value(
-                resampling, pixels[band], valid[band if masked else 0], masked, col, line, left, top, full_width,
-                full_height
-            )  # fmt: skip
+            else:
+                value = _edge_value(
+                    kernel, resampling, pixels[band], here, masked, col, line, left, top, full_width, full_height
+                )
             out[band, k] = min(max(np.floor(value + 0.5), low), high) if integer else value
     return short

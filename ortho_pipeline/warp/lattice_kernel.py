@@ -73,9 +73,10 @@ def bounds(
         if not _mark(cells[b], along, across):
             continue
         parallax, step[b] = _reach(image[b], cells[b])
-        plan, shift = 0.0, _bent(dem[b], along, across)
+        # As of one level: for a view of another layout, or a constant, it would be compiled apart.
+        plan, shift = 0.0, _bent(dem[b].reshape(nodes, nodes, 1, 2), np.int64(0), along, across)
         for level in range(image.shape[3]):
-            plan = _worse(plan, _bent(image[b, :, :, level], along, across))
+            plan = _worse(plan, _bent(image[b], level, along, across))
         rest = 0.0
         for k in range(points.shape[1]):
             rest = _worse(
@@ -133,8 +134,8 @@ def _distance(one, other):
 
 
 @inlined
-def _bent(nodes, along, across):
-    """Return how far bilinear interpolation between nodes ``(n, n, 2)`` is off, as their second differences tell.
+def _bent(nodes, level, along, across):
+    """Return how far bilinear interpolation between nodes ``(n, n, levels, 2)`` is off, as second differences tell.
 
     An eighth of the largest, which bounds it where they change little from node to node, and the largest change, which
     is more than a single bend between two nodes moves the curve. Infinite where a node is missing.
@@ -147,22 +148,21 @@ def _bent(nodes, along, across):
             for i in range(count):
                 if not used[j, i]:
                     continue
-                u, v = _second(nodes, j, i, down, right)
+                u, v = _second(nodes, level, j, i, down, right)
                 largest = _worse(largest, u * u + v * v)
                 for side in range(2):
                     y, x = (j + 1, i) if side else (j, i + 1)
                     if y < count and x < count and used[y, x]:
-                        nu, nv = _second(nodes, y, x, down, right)
+                        nu, nv = _second(nodes, level, y, x, down, right)
                         change = _worse(change, (nu - u) ** 2 + (nv - v) ** 2)
         worst += np.sqrt(largest) / 8.0 + np.sqrt(change)
     return worst
 
 
 @inlined
-def _second(nodes, j, i, down, right):
-    first = nodes[j - down, i - right, 0] - 2.0 * nodes[j, i, 0] + nodes[j + down, i + right, 0]
-    second = nodes[j - down, i - right, 1] - 2.0 * nodes[j, i, 1] + nodes[j + down, i + right, 1]
-    return first, second
+def _second(nodes, level, j, i, down, right):
+    before, here, after = nodes[j - down, i - right, level], nodes[j, i, level], nodes[j + down, i + right, level]
+    return before[0] - 2.0 * here[0] + after[0], before[1] - 2.0 * here[1] + after[1]
 
 
 @inlined

@@ -73,6 +73,28 @@ def test_kernels_of_rpcs_are_vector_instructions() -> None:
     assert inverse >= 11
 
 
+@pytest.mark.slow
+def test_a_plain_job_compiles_one_kernel_and_no_function_of_the_warp_twice(tmp_path: Path) -> None:
+    """A first run compiled all five kernels, and helpers again for each constant that they were called with."""
+    done = run(
+        "import collections\n"
+        "from numba.core import event\n"
+        "class Heard(event.Listener):\n"
+        "    def on_start(self, event): found[event.data['dispatcher'].py_func.__qualname__] += 1\n"
+        "    def on_end(self, event): pass\n"
+        "found = collections.Counter()\n"
+        "event.register('numba:compile', Heard())\n"
+        "from ortho_pipeline.commands.rectification import rectify\n"
+        "from ortho_pipeline.options import SurfaceOptions\n"
+        f"rectify({str(SCENE)!r}, {str(tmp_path)!r}, surface=SurfaceOptions(height=700))\n"
+        "print(*(f'{name}={count}' for name, count in found.items()))"
+    )
+    times = dict(pair.split("=") for line in done.stdout.splitlines()[-1:] for pair in line.split())
+    assert times.get("warp_block") == times.get("_row_bilinear") == "1", done.stderr
+    assert not {"_row_cubic", "_row_lanczos", "_row_average"} & set(times)
+    assert {name for name in ("_bent", "_span", "_next_whole", "dem_height_at") if times[name] != "1"} == set()
+
+
 def test_kept_code_is_made_again_when_a_function_of_another_module_changes(tmp_path: Path) -> None:
     """numba's own cache gave the old value: it looks at the module of the caller alone."""
     made = "from ortho_pipeline.files.compiled import compiled, inlined\n"
