@@ -17,7 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator, UserProvidedCacheLocator
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    InTreeCacheLocator,
+    NullCache,
+    UserProvidedCacheLocator,
+)
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime import rtsys
 
@@ -34,13 +40,9 @@ def compiled(function: Callable[..., Any]) -> Any:
     """
     made: Any = _njit()(function)
     own, shared = _cache_of(_Cache, function), _cache_of(_Shared, function)
-    if own is None and shared is None:
-        # Neither the package's folder nor the user's cache can be written, as in many containers.
-        _say_once()
-        return made
     if own is not None and shared is not None and own.cache_path != shared.cache_path:
         own.shared = shared
-    made._cache = own or shared  # as enable_caching() does with numba's own
+    made._cache = own or shared or _Nowhere()  # as enable_caching() does with numba's own
     return made
 
 
@@ -112,7 +114,16 @@ class _Shared(_Cache):
     _impl_class: Any = _SharedPlace
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep nothing."""
+        """Keep nothing, and say so."""
+        _say_once()
+
+
+class _Nowhere(NullCache):
+    """Where nothing can be written and nobody has compiled, as in many containers."""
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep nothing, and say so."""
+        _say_once()
 
 
 @functools.cache
@@ -132,6 +143,6 @@ def _others(module: str) -> str:
 @functools.cache
 def _say_once() -> None:
     log.warning(
-        "compiled code cannot be kept, because neither this package's folder nor the home can be written: every run "
-        "compiles again, for some seconds. Remedy: set NUMBA_CACHE_DIR to a folder that can be written"
+        "what was compiled cannot be kept, because neither this package's folder nor the home can be written: every "
+        "run compiles it again, for some seconds. Remedy: set NUMBA_CACHE_DIR to a folder that can be written"
     )

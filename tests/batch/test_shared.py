@@ -6,6 +6,8 @@ import functools
 import json
 import os
 import random
+import subprocess
+import sys
 import threading
 import time
 from collections import Counter
@@ -234,6 +236,38 @@ def test_the_command_delivers_to_a_store_and_collects(store: str, tiny: Any, mon
     names = {name for name, _ in Objects(store, allow_network=True).names()}
     assert {"run.json", f"{STATE}/s0.result.json", "s1/s1_report.json"} <= names
     assert not (tiny.folder / "out").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "environments",
+    [
+        [{"AWS_BATCH_JOB_ARRAY_INDEX": str(k), "AWS_BATCH_JOB_ARRAY_SIZE": "2"} for k in range(2)],
+        [{"JOB_COMPLETION_INDEX": str(k), "ORTHO_SHARDS": "2"} for k in range(2)],
+        [{"SLURM_ARRAY_TASK_ID": str(k), "SLURM_ARRAY_TASK_MIN": "1", "SLURM_ARRAY_TASK_COUNT": "2"} for k in (1, 2)],
+    ],
+    ids=["AWS Batch", "Kubernetes", "Slurm"],
+)
+def test_both_workers_of_an_array_are_processes_that_make_all_scenes_once(
+    environments: list[dict[str, str]], store: str, tiny: Any
+) -> None:
+    """`ortho run --shard auto` as each kind of array starts it, both at once."""
+    raw = tiny.folder / "raw"
+    raw.mkdir()
+    for number in range(4):
+        gdal.Translate(str(raw / f"s{number}.tif"), str(tiny.image))
+    (tiny.folder / "p.yaml").write_text(FILE)
+    command = [sys.executable, "-m", "ortho_pipeline", "run", str(tiny.folder / "p.yaml"), "-o", store]
+    options = ["--allow-network", "--executor", "sequential", "--json", "--shard", "auto"]
+    workers = [
+        subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True, env={**os.environ, **environment})
+        for environment in environments
+    ]
+    said = [json.loads(worker.communicate(timeout=120)[0])["scenes"] for worker in workers]
+    assert [worker.returncode for worker in workers] == [0, 0]
+    made = Counter(scene["name"] for scenes in said for scene in scenes if scene["status"] == "done")
+    assert made == {f"s{k}": 1 for k in range(4)}
+    assert all({scene["status"] for scene in scenes} <= {"done", "unchanged"} for scenes in said)
 
 
 def test_a_pipeline_file_in_a_store_names_images_there(store: str, tiny: Any, monkeypatch: pytest.MonkeyPatch) -> None:
