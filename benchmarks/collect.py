@@ -28,7 +28,7 @@ COPY, EXACT = "gdal_translate (copy)", "gdalwarp exact, bilinear"
 BENCHMARKS: dict[str, tuple[list[str], bool]] = {
     "warp": (["warp.py", "--rounds", "5"], True),
     "scaling": (["warp.py", "--scaling"], True),
-    "points": (["points.py"], False),
+    "points": (["points.py"], True),
     "fit": (["fit.py"], False),
     "blocks": (["adjust.py"], True),
     "scenes": (["batch.py"], True),
