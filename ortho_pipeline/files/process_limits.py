@@ -10,10 +10,12 @@ from __future__ import annotations
 import _thread
 import ctypes
 import functools
+import itertools
 import os
 import resource
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +31,8 @@ _PER_THREAD = 72 << 20
 MOST_THREADS = 512
 #: What glibc calls the number of heaps that threads share (malloc.h).
 _M_ARENA_MAX = -8
+#: Parts that a work is shared out in, on any machine, so that sums over them are rounded alike.
+_PARTS = 8
 #: Seconds in which a thread has begun, if it ever does.
 _PATIENCE = 10.0
 
@@ -132,6 +136,27 @@ def share_freed_memory() -> bool:
         return bool(ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1))
     except (AttributeError, OSError):
         return False
+
+
+def parts_of(count: int, least: int) -> list[tuple[int, int]]:
+    """Return where the parts of a work of so many pieces begin and end, the same on any machine, `least` in each."""
+    parts = max(min(_PARTS, count // least), 1)
+    return list(itertools.pairwise(count * number // parts for number in range(parts + 1)))
+
+
+def side_by_side(work: Callable[[int, int, int], None], parts: list[tuple[int, int]]) -> None:
+    """Do a work on parts, each given by its number, begin and end, with as many threads as there are processors.
+
+    It has to let the interpreter go, as compiled code does, and each part to write to a place of its own.
+    """
+    jobs = [(number, *part) for number, part in enumerate(parts)]
+    threads = startable_threads(min(os.cpu_count() or 1, len(jobs))) if len(jobs) > 1 else 1
+    if threads == 1:
+        for job in jobs:
+            work(*job)
+        return
+    with ThreadPoolExecutor(threads, thread_name_prefix="parts") as pool:
+        list(pool.map(lambda job: work(*job), jobs))
 
 
 class _Blas:

@@ -5,6 +5,7 @@ They are compared with one dense least-squares problem of all unknowns, solved b
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from ortho_pipeline.block import adjustment
 from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.equations import elimination
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.elimination import Elimination, step_of
 from ortho_pipeline.block.equations.image_pairs import ImagePairs, Levels
@@ -341,12 +343,14 @@ def test_a_search_near_the_minimum_finds_the_same_in_fewer_steps(monkeypatch: py
     np.testing.assert_allclose(near.sigmas, exact.sigmas, rtol=1e-9)
 
 
-def test_blocks_are_the_same_on_any_number_of_processors() -> None:
+def test_blocks_are_the_same_on_any_number_of_processors(monkeypatch: pytest.MonkeyPatch) -> None:
     # All of the images share points: their equations are one matrix, large enough for BLAS to share it out.
     models, points = strip(40, 90, apart=0.01)
     models = {name: ImageCorrection.identity(one.model, "affine", one.origin) for name, one in models.items()}
+    monkeypatch.setattr(elimination, "_SHARE", 10)
     found = []
     for threads in (1, 2, 4):
+        monkeypatch.setattr(os, "cpu_count", lambda: threads)  # noqa: B023  (used within the round)
         with threadpool_limits(threads, user_api="blas"):
             fit = adjust(models, points, robust=False)
             found.append(b"".join(np.asarray(part).tobytes() for part in (
@@ -354,6 +358,21 @@ def test_blocks_are_the_same_on_any_number_of_processors() -> None:
             )))  # fmt: skip
             assert {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"} == {threads}
     assert found[1:] == found[:-1]
+
+
+def test_equations_in_parts_are_those_of_the_whole(linear: Linear, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = step_of(linear)
+    hats, spread = whole.points.hats(whole.solution.cofactors), whole.points.ground(whole.solution.cofactors, 1.0)
+    monkeypatch.setattr(elimination, "_SHARE", 10)
+    parts = step_of(linear)
+    assert len(parts.points._parts) == 8
+    np.testing.assert_allclose(parts.whole, whole.whole, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(parts.change.vector, whole.change.vector, rtol=0, atol=1e-9)
+    # What is not summed over points is the same to the last bit.
+    again = Elimination(linear)
+    np.testing.assert_array_equal(again.ground(whole.solution.cofactors, 1.0), spread)
+    for one, other in zip(again.hats(whole.solution.cofactors), hats, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_the_order_in_which_rays_are_stated_changes_no_bit() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ortho_pipeline.block.local_frame import GroundFrame
+from ortho_pipeline.block.projection import rays
 from ortho_pipeline.block.projection.rays import linearised
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.models import RPC, ImageCorrection, SensorModel
@@ -26,7 +27,7 @@ def rpc() -> RPC:
     return replace(export_rpc(camera).rpc, lon_off=179.999)
 
 
-def test_all_images_at_once_are_the_models_one_by_one(rpc: RPC) -> None:
+def test_all_images_at_once_are_the_models_one_by_one(rpc: RPC, monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(0)
     models: list[SensorModel] = [rpc]
     for kind in FREE:
@@ -46,18 +47,22 @@ def test_all_images_at_once_are_the_models_one_by_one(rpc: RPC) -> None:
     image = np.arange(count) % (len(models) + 1)
     of_images = [np.flatnonzero(image == n) for n in range(len(models))]
     found = linearised(places, models, of_images, point, scale, 6)
-    for model, rays in zip(models, of_images, strict=True):
-        wanted, by_point, by_params = places.linearised(model, point[rays])
-        np.testing.assert_allclose(found.image[rays], wanted, rtol=0, atol=1e-8)
-        seen = rays[np.isfinite(wanted[:, 0])]
-        assert 20 < len(seen) < len(rays) - 10
-        by_point, by_params = by_point * scale[rays, None, None], by_params * scale[rays, None, None]
-        np.testing.assert_allclose(found.by_point[rays], by_point, rtol=0, atol=1e-10)
+    for model, used in zip(models, of_images, strict=True):
+        wanted, by_point, by_params = places.linearised(model, point[used])
+        np.testing.assert_allclose(found.image[used], wanted, rtol=0, atol=1e-8)
+        seen = used[np.isfinite(wanted[:, 0])]
+        assert 20 < len(seen) < len(used) - 10
+        by_point, by_params = by_point * scale[used, None, None], by_params * scale[used, None, None]
+        np.testing.assert_allclose(found.by_point[used], by_point, rtol=0, atol=1e-10)
         own = by_params.shape[2]
         np.testing.assert_allclose(found.by_params[seen, :, :own], by_params[np.isfinite(wanted[:, 0])], rtol=1e-10)
         assert not found.by_params[seen, :, own:].any()
     of_none = np.flatnonzero(image == len(models))
     assert not any(part[of_none].any() for part in (found.image, found.by_point, found.by_params))
+    monkeypatch.setattr(rays, "_SHARE", 100)
+    in_parts = linearised(places, models, of_images, point, scale, 6)
+    for name in ("image", "by_point", "by_params"):
+        np.testing.assert_array_equal(getattr(in_parts, name), getattr(found, name))
     alone = linearised(places, models, of_images, point, scale, 0)
     np.testing.assert_array_equal(alone.by_point, found.by_point)
     assert alone.by_params.shape == (count, 2, 0)

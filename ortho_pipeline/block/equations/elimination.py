@@ -9,7 +9,8 @@ of :math:`Q_j` holds the parameters alone (the Schur complement, taken orthogona
 The reduced system is solved by its normal equations :math:`A^T A - (Q^T A)^T (Q^T A)`, with a diagonal of ones; blocks
 are refused at a condition at which these still have some digits. Cofactors of a point are
 :math:`R_j^{-1} (I + Q_j^T A_j\, C\, A_j^T Q_j) R_j^{-T}`, and the hat matrix of its rows is
-:math:`Q_j Q_j^T + F_j C F_j^T`. Compiled code takes the points one after the other.
+:math:`Q_j Q_j^T + F_j C F_j^T`. Compiled code takes the points one after the other, parts of them side by side: as many
+parts on any machine, whose sums are added in their order, so that results do not depend on the number of threads.
 
 Source: Brown 1976 (elimination of points); Demmel et al. 2021 (orthogonally); Grodecki and Dial 2003 (blocks of RPCs).
 """
@@ -26,10 +27,14 @@ from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import Misfits
 from ortho_pipeline.block.equations.reduced_system import NormalSystem, Solution
+from ortho_pipeline.files.process_limits import parts_of, side_by_side
 from ortho_pipeline.models.base import Array
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.equations import point_kernel
+
+#: Points that are worth a thread.
+_SHARE = 2_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,13 +55,23 @@ class Elimination:
             linear.misfits.rays, linear.misfits.ground,
         )  # fmt: skip
 
+    @property
+    def _parts(self) -> list[tuple[int, int]]:
+        return parts_of(self.linear.ordering.points, _SHARE)
+
     def system(self) -> NormalSystem:
         """Return the normal equations of the parameters alone."""
         from ortho_pipeline.block.equations import point_kernel
 
-        linear = self.linear
-        system = NormalSystem(linear.problem.levels)
-        point_kernel.reduce(self._rows, 0, linear.ordering.points, system.blocks, system.right)
+        linear, rows, parts = self.linear, self._rows, self._parts
+        systems = [NormalSystem(linear.problem.levels) for _ in parts]
+        side_by_side(
+            lambda k, begin, end: point_kernel.reduce(rows, begin, end, systems[k].blocks, systems[k].right), parts
+        )
+        system = systems[0]
+        for other in systems[1:]:
+            system.blocks += other.blocks
+            system.right += other.right
         system.add(linear.pseudo.image, linear.pseudo.rows, linear.misfits.pseudo)
         return system
 
@@ -67,10 +82,11 @@ class Elimination:
         """
         from ortho_pipeline.block.equations import point_kernel
 
-        linear, points = self.linear, self.linear.problem.points
+        linear, points, rows = self.linear, self.linear.problem.points, self._rows
         step = np.append(values, 0.0)[linear.problem.columns.padded]
         found, of_rays, of_ground = np.zeros((len(points), 3)), np.zeros((points.rays, 2)), np.zeros((len(points), 3))
-        point_kernel.shifts(self._rows, 0, linear.ordering.points, step, found, of_rays, of_ground)
+        made = found, of_rays, of_ground
+        side_by_side(lambda _, begin, end: point_kernel.shifts(rows, begin, end, step, *made), self._parts)
         pseudo = (linear.pseudo.rows * step[linear.pseudo.image]).sum(axis=1)
         return found, Misfits(of_rays, of_ground, pseudo)
 
@@ -78,17 +94,17 @@ class Elimination:
         """Return the parts of the hat matrix of rays ``(M, 2, 2)`` and of known ground ``(N, 3, 3)``."""
         from ortho_pipeline.block.equations import point_kernel
 
-        points = self.linear.problem.points
+        points, rows, blocks = self.linear.problem.points, self._rows, cofactors.blocks
         found = np.zeros((points.rays, 2, 2)), np.zeros((len(points), 3, 3))
-        point_kernel.hats(self._rows, 0, self.linear.ordering.points, cofactors.blocks, *found)
+        side_by_side(lambda _, begin, end: point_kernel.hats(rows, begin, end, blocks, *found), self._parts)
         return found
 
     def ground(self, covariance: Cofactors, factor: float) -> Array:
         """Return the covariances ``(N, 3, 3)`` of the points in the frame; NaN for those that take no part."""
         from ortho_pipeline.block.equations import point_kernel
 
-        found = np.full((len(self.linear.problem.points), 3, 3), np.nan)
-        point_kernel.ground(self._rows, 0, self.linear.ordering.points, covariance.blocks, factor, found)
+        rows, blocks, found = self._rows, covariance.blocks, np.full((len(self.linear.problem.points), 3, 3), np.nan)
+        side_by_side(lambda _, begin, end: point_kernel.ground(rows, begin, end, blocks, factor, found), self._parts)
         return found
 
 

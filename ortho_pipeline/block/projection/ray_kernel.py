@@ -73,15 +73,17 @@ def _by_point(images, n, u, v, sums, k, way, scale, found):
 
 
 @compiled
-def linearise(images, starts, rays, point, ground, way, scale, image, by_point, by_params):
+def linearise(images, begin_image, end_image, starts, rays, places, scale, image, by_point, by_params):
     """Fill image points ``(M, 2)``, their partials by points ``(M, 2, 3)`` and by parameters ``(M, 2, p)``.
 
-    The n-th image has the `rays` between ``starts[n]`` and ``starts[n + 1]``, whose points are `point` ``(M,)`` of
-    `ground` ``(N, 3)`` (lon, lat, h); `way` ``(N, 3, 3)`` is d(ground)/d(frame). Partials are multiplied with `scale`
+    Of images `begin_image` to `end_image` alone; the n-th has the `rays` between ``starts[n]`` and ``starts[n + 1]``.
+    `places` are the points of the rays ``(M,)`` among N, their lon, lat, h ``(N, 3)``, and d(lon, lat, h)/d(frame)
+    ``(N, 3, 3)``. Partials are multiplied with `scale`
     ``(M,)``, those by parameters set only where there are any. A ray is NaN where it leads out of its RPC.
     """
     place, sums = np.empty((3, _BATCH)), np.empty((4, 4, _BATCH))
-    for n in range(len(starts) - 1):
+    point, ground, way = places
+    for n in range(begin_image, end_image):
         c, columns = images.coefficients[n], images.columns[n]
         middle_col, middle_row = images.origins[n, 0], images.origins[n, 1]
         for begin in range(starts[n], starts[n + 1], _BATCH):

@@ -10,9 +10,13 @@ import numpy as np
 from ortho_pipeline.block.local_frame import GEODETIC, Places
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.block.projection import ray_kernel
+from ortho_pipeline.files.process_limits import parts_of, side_by_side
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.correction import COEFFICIENTS
+
+#: Rays that are worth a thread.
+_SHARE = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,19 +53,23 @@ def linearised(
     if rational:
         parts = [of_images[n] for n in rational]
         starts = np.cumsum([0, *map(len, parts)])
-        ray_kernel.linearise(
-            _tables([models[n] for n in rational], widest), starts, np.concatenate(parts), point,
-            places.in_crs(GEODETIC), places.partials(GEODETIC), scale, found.image, found.by_point, found.by_params,
-        )  # fmt: skip
-    for model, rays in zip(models, of_images, strict=True):
-        if not len(rays) or _rpc_of(model) is not None:
+        rays, images = np.concatenate(parts), _tables([models[n] for n in rational], widest)
+        at, made = (point, places.in_crs(GEODETIC), places.partials(GEODETIC)), (found.image, found.by_point)
+        side_by_side(
+            lambda _, begin, end: ray_kernel.linearise(
+                images, begin, end, starts, rays, at, scale, *made, found.by_params
+            ),
+            parts_of(len(rational), max(_SHARE * len(rational) // max(len(rays), 1), 1)),
+        )
+    for model, used in zip(models, of_images, strict=True):
+        if not len(used) or _rpc_of(model) is not None:
             continue
         if widest:
-            found.image[rays], by_point, by_params = places.linearised(model, point[rays])
-            found.by_params[rays, :, : by_params.shape[2]] = by_params * scale[rays, None, None]
+            found.image[used], by_point, by_params = places.linearised(model, point[used])
+            found.by_params[used, :, : by_params.shape[2]] = by_params * scale[used, None, None]
         else:
-            found.image[rays], by_point = places.projected(model, point[rays])
-        found.by_point[rays] = by_point * scale[rays, None, None]
+            found.image[used], by_point = places.projected(model, point[used])
+        found.by_point[used] = by_point * scale[used, None, None]
     return found
 
 
