@@ -1,4 +1,4 @@
-"""Speed and memory of bundle adjustments, and of the pushbroom's projection, on one core.
+"""Speed and memory of bundle adjustments, and of the pushbroom's projection.
 
 python benchmarks/adjust.py                       blocks of 100, 200 and 400 images with 200 tie points for each of them
 python benchmarks/adjust.py --images 1000         one of so many
