@@ -9,6 +9,7 @@ import numpy as np
 import pyproj
 import pytest
 from ortho_cartosat.truth import StereoPair
+from scipy.stats import chi2
 
 from ortho_pipeline.block.adjustment import _prepared, adjust
 from ortho_pipeline.block.equations import solver as block_solver
@@ -21,6 +22,7 @@ from ortho_pipeline.block.intersection import frame_of, intersect
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.reliability.standardised_residuals import standardise
+from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.estimation.problem import Prior
@@ -981,3 +983,17 @@ def test_results_are_short_in_a_console_and_tables_in_a_notebook(rpcs: dict[str,
     assert "left out: point p10" in html
     ties = adjust(starts(truth), measured(truth, places(20), "tie", noise=0.3))
     assert "left, tie points" in ties._repr_html_()
+
+
+@pytest.mark.parametrize("axes", [(0, 1), (2,), (0, 1, 2)])
+def test_the_chance_of_ground_is_that_of_its_distance_at_each_possible_sigma(axes: tuple[int, ...]) -> None:
+    """By the covariance of each node by itself and scipy's distribution, however it is computed."""
+    random = np.random.default_rng(4)
+    nodes, chances = random.uniform(0.1, 3.0, (40, 3)), random.dirichlet(np.ones(40))
+    root, apart = random.normal(size=(len(axes), len(axes))), random.normal(0, 2, len(axes))
+    found = Variances(1.0, 1.0, 1.0, (1.0, 1.0, 1.0), (1, 1), nodes=nodes, chances=chances)
+    expected = 0.0
+    for (image, plan, height), chance in zip(nodes, chances, strict=True):
+        spread = image * root @ root.T + np.diag([(plan, plan, height)[axis] for axis in axes])
+        expected += chance * chi2.sf(apart @ np.linalg.solve(spread, apart), len(axes))
+    assert found.chance_of(apart, root @ root.T, axes) == pytest.approx(expected, rel=1e-9)

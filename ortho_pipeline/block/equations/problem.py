@@ -165,7 +165,7 @@ class BlockProblem:
 
     # -- sigmas ------------------------------------------------------------------------------------------------------
 
-    @property
+    @cached_property
     def ground_sigmas(self) -> Array:
         """Sigmas ``(N, 3)`` of known ground in metres; infinite for a height that is not known."""
         stated, (plan, height) = self.points.sigma_ground, self.assumed
