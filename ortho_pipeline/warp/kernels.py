@@ -201,9 +201,12 @@ def find_whole(valid: Any, reach: int, out: Any) -> None:
     row = np.empty(width, dtype=np.uint8)
     out[:] = 1
     for j in range(height):
-        row[:] = valid[0, j]
+        # Loops: an assignment of arrays has numba compile the texts of its errors, which takes seconds.
+        for i in range(width):
+            row[i] = valid[0, j, i]
         for band in range(1, bands):
-            row &= valid[band, j]
+            for i in range(width):
+                row[i] &= valid[band, j, i]
         last = -reach - 1
         for i in range(width):
             if not row[i]:
