@@ -21,6 +21,13 @@ from ortho_pipeline.commands.survey.pipeline_file import text
 SAMPLE = Path(__file__).resolve().parent.parent.parent / "sample_data"
 
 
+def test_an_unknown_command_names_the_nearest():
+    done = CliRunner().invoke(cli, ["rectfy", "scene.tif"])
+    assert done.exit_code == 2
+    assert "No such command 'rectfy'; did you mean 'rectify'?" in done.output
+    assert "did you mean" not in CliRunner().invoke(cli, ["xyzzy"]).output
+
+
 def run(*words: Any) -> Result:
     return CliRunner().invoke(cli, [str(word) for word in words])
 
