@@ -1,4 +1,4 @@
-"""Servers of tests, on this machine: a folder behind HTTP as a public bucket is, with faults where a test wants."""
+"""Servers of tests, on this machine: a public bucket, with faults where a test wants; an ortho made within a store."""
 
 from __future__ import annotations
 
@@ -20,7 +20,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from osgeo import gdal
+
+from ortho_pipeline.commands import rectify
+from ortho_pipeline.files.storage.objects import Objects
+from ortho_pipeline.options import SceneOptions, SurfaceOptions
 
 
 @contextmanager
@@ -283,3 +289,18 @@ def moto_server(bucket: str) -> Iterator[tuple[str, int]]:
 def bucket_at(address: str, name: str) -> None:
     """Make a bucket in a server."""
     urllib.request.urlopen(urllib.request.Request(f"{address}/{name}", method="PUT")).close()
+
+
+def rectify_within(box: str, tiny: Any, folder: Path) -> None:
+    """Rectify a scene and a DEM of a store into it, and see that the ortho is that of the same files here."""
+    there = Objects(f"{box}/in", allow_network=True)
+    for path in (tiny.image, tiny.dem):
+        there.put(path.name, path)
+    surface = SurfaceOptions(dem=f"{box}/in/dem.tif", vertical="ellipsoid")
+    made = rectify(f"{box}/in/tiny.tif", f"{box}/out", surface=surface, scene=SceneOptions(allow_network=True))
+    assert made.files["ortho"] == f"{box}/out/tiny_ortho.tif"
+    Objects(f"{box}/out", allow_network=True).fetch("tiny_ortho.tif", folder / "there.tif", 1 << 30)
+    local = rectify(tiny.image, folder / "out", surface=SurfaceOptions(dem=str(tiny.dem), vertical="ellipsoid"))
+    np.testing.assert_array_equal(
+        gdal.Open(str(folder / "there.tif")).ReadAsArray(), gdal.Open(str(local.files["ortho"])).ReadAsArray()
+    )

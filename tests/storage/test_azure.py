@@ -13,14 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from osgeo import gdal
-from servers import installed_server, on_a_faulty_way
+from servers import installed_server, on_a_faulty_way, rectify_within
 
-from ortho_pipeline.commands import rectify
 from ortho_pipeline.errors import StorageError
 from ortho_pipeline.files.storage import objects
 from ortho_pipeline.files.storage.objects import PART, Conflict, Objects
-from ortho_pipeline.options import SceneOptions, SurfaceOptions
 
 #: Account and key of every Azurite, as its documentation has them.
 ACCOUNT = "devstoreaccount1"
@@ -100,14 +97,4 @@ def test_an_ortho_from_a_container_to_a_container(
     azurite: Address, tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at(azurite, monkeypatch)
-    there = Objects("az://box/in", allow_network=True)
-    for path in (tiny.image, tiny.dem):
-        there.put(path.name, path)
-    surface = SurfaceOptions(dem="az://box/in/dem.tif", vertical="ellipsoid")
-    made = rectify("az://box/in/tiny.tif", "az://box/out", surface=surface, scene=SceneOptions(allow_network=True))
-    assert made.files["ortho"] == "az://box/out/tiny_ortho.tif"
-    Objects("az://box/out", allow_network=True).fetch("tiny_ortho.tif", tmp_path / "there.tif", 1 << 30)
-    local = rectify(tiny.image, tmp_path / "out", surface=SurfaceOptions(dem=str(tiny.dem), vertical="ellipsoid"))
-    np.testing.assert_array_equal(
-        gdal.Open(str(tmp_path / "there.tif")).ReadAsArray(), gdal.Open(str(local.files["ortho"])).ReadAsArray()
-    )
+    rectify_within("az://box", tiny, tmp_path)

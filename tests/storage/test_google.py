@@ -19,14 +19,14 @@ from typing import Any
 import numpy as np
 import pytest
 from osgeo import gdal
-from servers import running
+from servers import rectify_within, running
 
 from ortho_pipeline.batch.shared.leases import Lease, Leases, Lost
 from ortho_pipeline.commands import rectify
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.storage import objects
 from ortho_pipeline.files.storage.objects import PART, Conflict, Objects
-from ortho_pipeline.options import SceneOptions, SurfaceOptions
+from ortho_pipeline.options import SurfaceOptions
 
 XML = 'xmlns="http://doc.s3.amazonaws.com/2006-03-01"'
 
@@ -168,16 +168,6 @@ def test_leases_are_renewed_and_taken_over(google: GoogleStore) -> None:
 
 
 def test_an_ortho_from_a_bucket_to_a_bucket(google: GoogleStore, tiny: Any, tmp_path: Path) -> None:
-    there = Objects("gs://box/in", allow_network=True)
-    for path in (tiny.image, tiny.dem):
-        there.put(path.name, path)
-    surface = SurfaceOptions(dem="gs://box/in/dem.tif", vertical="ellipsoid")
-    made = rectify("gs://box/in/tiny.tif", "gs://box/out", surface=surface, scene=SceneOptions(allow_network=True))
-    assert made.files["ortho"] == "gs://box/out/tiny_ortho.tif"
-    Objects("gs://box/out", allow_network=True).fetch("tiny_ortho.tif", tmp_path / "there.tif", 1 << 30)
-    local = rectify(tiny.image, tmp_path / "out", surface=SurfaceOptions(dem=str(tiny.dem), vertical="ellipsoid"))
-    np.testing.assert_array_equal(
-        gdal.Open(str(tmp_path / "there.tif")).ReadAsArray(), gdal.Open(str(local.files["ortho"])).ReadAsArray()
-    )
+    rectify_within("gs://box", tiny, tmp_path)
     with pytest.raises(InputError, match="network"):
         rectify("gs://box/in/tiny.tif", tmp_path / "no", surface=SurfaceOptions(height=0.0))

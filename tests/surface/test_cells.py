@@ -446,17 +446,23 @@ def write_proj_grid(path: Path) -> None:
     dataset = band = None
 
 
+def write_proj_store(folder: Path) -> str:
+    """Write the EGM2008 grid and its listing as PROJ's store has them; return the grid's name."""
+    name = "us_nga_egm08_25.tif"
+    write_proj_grid(folder / name)
+    digest = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+    listed = {"features": [{"properties": {"name": name, "sha256sum": digest}}]}
+    (folder / "files.geojson").write_text(json.dumps(listed))
+    return name
+
+
 @pytest.mark.skipif(EGM2008.is_file(), reason="the EGM2008 grid is installed here")
 def test_geoid_grids_are_fetched_once_and_never_in_part(tmp_path: Path) -> None:
     """In a process of its own, for PROJ's folders: `doctor` fails, then fetches; the grid is found in that process."""
     store, mine = tmp_path / "proj", tmp_path / "mine"
     store.mkdir()
     mine.mkdir()
-    name = "us_nga_egm08_25.tif"
-    write_proj_grid(store / name)
-    digest = hashlib.sha256((store / name).read_bytes()).hexdigest()
-    listed = {"features": [{"properties": {"name": name, "sha256sum": digest}}]}
-    (store / "files.geojson").write_text(json.dumps(listed))
+    name = write_proj_store(store)
     with serving(store) as proj:
         # The checksum is wrong each time that one attempt fetches the grid.
         proj.faults[name] = lambda data, number: flipped(data, number) if number <= 3 else None
@@ -482,11 +488,7 @@ def test_the_geoid_is_fetched_when_heights_are_first_found(bucket: PublicFolder,
     store, mine, out = tmp_path / "proj", tmp_path / "mine", tmp_path / "out"
     store.mkdir()
     mine.mkdir()
-    name = "us_nga_egm08_25.tif"
-    write_proj_grid(store / name)
-    digest = hashlib.sha256((store / name).read_bytes()).hexdigest()
-    listed = {"features": [{"properties": {"name": name, "sha256sum": digest}}]}
-    (store / "files.geojson").write_text(json.dumps(listed))
+    name = write_proj_store(store)
     command = ["rectify", str(tiny.image), "--dem", "auto", "--dem-source", bucket.address, "--allow-network"]
     with serving(store) as proj:
         proj.faults[name] = lambda data, number: flipped(data, number) if number <= 3 else None
