@@ -91,7 +91,7 @@ def block_coordinates(
     levels = nodes.shape[2]
     cell_row = row // spacing
     ty = (row - cell_row * spacing) / spacing
-    start, slope = np.empty(2 * levels), np.empty(2 * levels)
+    start, slope, scaled = np.empty(2 * levels), np.empty(2 * levels), np.empty(spacing)
     for cell in range(left // spacing, (right - 1) // spacing + 1):
         for k in range(levels):
             for axis in range(2):
@@ -111,13 +111,7 @@ def block_coordinates(
         if levels == 3:
             _quadratic(start, slope, middle, 1.0 / half, tx, cols, lines)
             continue
-        for k in range(tx.size):
-            t = (cols[k] - middle) / half
-            col = line = 0.0
-            for power in range(levels - 1, -1, -1):
-                col = col * t + (start[2 * power] + slope[2 * power] * tx[k])
-                line = line * t + (start[2 * power + 1] + slope[2 * power + 1] * tx[k])
-            cols[k], lines[k] = col, line
+        _polynomial(start, slope, middle, 1.0 / half, tx, cols, lines, scaled)
 
 
 @inlined
@@ -129,6 +123,20 @@ def _quadratic(start, slope, middle, scale, tx, cols, lines):
         t = (cols[k] - middle) * scale
         cols[k] = ((c2 + dc2 * tx[k]) * t + (c1 + dc1 * tx[k])) * t + (c0 + dc0 * tx[k])
         lines[k] = ((r2 + dr2 * tx[k]) * t + (r1 + dr1 * tx[k])) * t + (r0 + dr0 * tx[k])
+
+
+@inlined
+def _polynomial(start, slope, middle, scale, tx, cols, lines, scaled):
+    """As `_quadratic`, of any degree, one power after the other so that each is a simple loop; `scaled` is scratch."""
+    top = start.size - 2
+    for k in range(tx.size):
+        scaled[k] = (cols[k] - middle) * scale
+        cols[k], lines[k] = start[top] + slope[top] * tx[k], start[top + 1] + slope[top + 1] * tx[k]
+    for power in range(top - 2, -1, -2):
+        c, dc, r, dr = start[power], slope[power], start[power + 1], slope[power + 1]
+        for k in range(tx.size):
+            cols[k] = cols[k] * scaled[k] + (c + dc * tx[k])
+            lines[k] = lines[k] * scaled[k] + (r + dr * tx[k])
 
 
 @inlined

@@ -22,8 +22,9 @@ The error is not assumed but bounded, in every block, over the cells of its latt
 What is both rarer and smaller than the distance of nodes could hide from all of these, so a model with such detail says
 so (`SensorModel.detail`: a pushbroom knows the knots of its attitude), and gets a node in every piece of it.
 
-A block is refined until its bound is below half of the tolerance. Where no lattice is fine enough, and where the model
-ends within a block, every pixel is projected by the exact model at its own height.
+A block is refined until its bound is below half of the tolerance: by more heights, unless the first two parts alone are
+too large, or by nodes closer together. Where no lattice is fine enough, and where the model ends within a block, every
+pixel is projected by the exact model at its own height.
 
 Blocks lie at fixed places of the output grid and are the unit of all decisions, so the output does not depend on tile
 size, memory or number of threads.
@@ -50,9 +51,12 @@ from ortho_pipeline.warp.block_kernel import DemWindow, Lattice, heights_at
 
 #: Side of a block in output pixels.
 BLOCK = 256
-#: (lattice spacing in output pixels, number of heights), tried one after the other.
-#: after the last one every pixel is projected, which takes as many evaluations as a spacing of 2 with these heights.
-REFINEMENTS = ((64, 3), (32, 3), (16, 3), (16, 5), (8, 5), (8, 7), (4, 7))
+#: (lattice spacing in output pixels, number of heights), tried one after the other; one of the same spacing only where
+#: the spacing is not what lacks. Cubic terms in height are what most models lack next: four heights come first.
+#: After the last one every pixel is projected, which takes as many evaluations as a spacing of 2 with these heights.
+REFINEMENTS = ((64, 3), (64, 4), (32, 4), (16, 4), (16, 5), (8, 5), (8, 7), (4, 7))
+#: Nodes and heights that are evaluated at once where lattices are refined, which keeps their memory small.
+_TOGETHER = 1 << 15
 #: Check points per block.
 VERIFIED = 24
 #: Least side (output pixels) of the cells into which a block is cut where memory is short.
@@ -79,6 +83,12 @@ class OutputBlock:
     reach: int = 0
     box: tuple[float, float] = (1.0, 1.0)  # source columns and rows under one output pixel
     window: tuple[int, int, int, int] | None = None  # source pixels left, top, right, bottom
+
+    @property
+    def refinement(self) -> tuple[int, int]:
+        """Spacing of its nodes and number of its heights, as in `REFINEMENTS`."""
+        assert self.nodes is not None
+        return self.spacing, self.nodes.shape[2]
 
     @property
     def lattice(self) -> Lattice:
@@ -218,24 +228,28 @@ class Lattices:
         if not blocks:
             return []
         # One call for all blocks of a tile, whatever the memory: the last bits of a result may depend on a call's size.
-        for block, error in zip(blocks, self._evaluate(blocks, *REFINEMENTS[0], uv), strict=True):
-            final, steps = float(error), iter(REFINEMENTS[1:])
-            while final > self._tolerance / 2:
-                finer = next(steps, None)
-                if finer is None:
-                    self._project(block, terrain)
-                    final = 0.0
-                else:
-                    final = float(self._evaluate([block], *finer, self._nodes_dem([block], finer[0]))[0])
-            with self._lock:
-                self.worst, self.finest = max(self.worst, final), min(self.finest, block.spacing)
-                self.refined += block.spacing != REFINEMENTS[0][0]
+        error, plan = self._evaluate(blocks, *REFINEMENTS[0], uv)
+        limit = self._tolerance / 2
+        for spacing, count in REFINEMENTS[1:]:
+            lacking = [k for k in np.flatnonzero(error > limit) if spacing < blocks[k].spacing or plan[k] <= limit]
+            step = max(1, _TOGETHER // ((BLOCK // spacing + 1) ** 2 * count))
+            for part in (lacking[first : first + step] for first in range(0, len(lacking), step)):
+                some = [blocks[k] for k in part]
+                error[part], plan[part] = self._evaluate(some, spacing, count, self._nodes_dem(some, spacing))
+        for k in np.flatnonzero(error > limit):
+            self._project(blocks[k], terrain)
+            error[k] = 0.0
+        with self._lock:
+            self.worst = max(self.worst, float(error.max()))
+            self.finest = min(self.finest, *(block.spacing for block in blocks))
+            self.refined += sum(block.refinement != REFINEMENTS[0] for block in blocks)
         return [block for block in blocks if block.window is not None]
 
-    def _evaluate(self, blocks: list[OutputBlock], spacing: int, count: int, uv: Array) -> Array:
+    def _evaluate(self, blocks: list[OutputBlock], spacing: int, count: int, uv: Array) -> tuple[Array, Array]:
         """Set the lattices of `blocks` from exact model evaluations; return a bound on the error of each ``(blocks,)``.
 
-        Infinite for a block into which the scene may come between nodes that the model does not project.
+        Infinite for a block into which the scene may come between nodes that the model does not project. Then the part
+        of it that only nodes closer together make smaller.
         """
         columns, rows = self._offsets(blocks, *_positions(spacing))
         middle = np.array([block.middle for block in blocks])[:, None, None, None]
@@ -262,8 +276,11 @@ class Lattices:
             block.reach += math.ceil(max(block.box) / 2)
         block.window = self.source_window(block)
 
-    def _bounds(self, blocks: list[OutputBlock], image: Array, coefficients: Array, uv: Array) -> Array:
-        """Return a bound on the error (source px) of each block's lattice where it may show some of the image."""
+    def _bounds(self, blocks: list[OutputBlock], image: Array, coefficients: Array, uv: Array) -> tuple[Array, Array]:
+        """Return a bound on the error (source px) of each block's lattice where it may show some of the image.
+
+        And the part of it that comes of the distance of the nodes, as far as second differences tell.
+        """
         count, spacing = image.shape[1] - 1, blocks[0].spacing
         unknown = np.array([block.window is not None or self._in_domain(block) for block in blocks])
         cells, area = np.empty((len(blocks), count, count), dtype=bool), np.empty((len(blocks), 4))
@@ -273,13 +290,13 @@ class Lattices:
         output = columns * BLOCK + 0.5 + points[..., 0], rows * BLOCK + 0.5 + points[..., 1]
         middle, half = (np.array([getattr(block, name) for block in blocks])[:, None] for name in ("middle", "half"))
         exact = self._exact.image(*output, (middle + half * points[..., 2])[:, :, None])[:, :, 0]
-        error, step = np.empty(len(blocks)), np.empty(len(blocks))
+        error, plan, step = np.empty((3, len(blocks)))
         lattice_kernel.bounds(
-            image, coefficients, uv, cells, spacing, points, exact, self._exact.dem(*output), error, step
+            image, coefficients, uv, cells, spacing, points, exact, self._exact.dem(*output), error, plan, step
         )
         # Between nodes farther apart than the model's detail anything may hide.
-        error[step > self._detail] = np.inf
-        return error
+        error[step > self._detail] = plan[step > self._detail] = np.inf
+        return error, plan
 
     def source_window(
         self, block: OutputBlock, rows: slice = slice(None), columns: slice = slice(None)

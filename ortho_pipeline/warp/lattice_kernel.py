@@ -58,9 +58,11 @@ def _may_show(image, j, i, width, height, unknown):
 @compiled
 def bounds(
     image: Any, coefficients: Any, dem: Any, cells: Any, spacing: int, points: Any, exact: Any, exact_dem: Any,
-    error: Any, step: Any,
+    error: Any, apart: Any, step: Any,
 ) -> None:  # fmt: skip
     """Fill `error` ``(blocks,)`` with a bound (source px) on the error in the visible cells of each block.
+
+    And `apart` ``(blocks,)`` with the part of it that second differences tell, which the distance of nodes makes.
 
     `points` ``(blocks, p, 3)`` are offsets of columns and rows from the block's first pixel and normalised heights of
     check points, `exact` and `exact_dem` ``(blocks, p, 2)`` what the exact model and projection say there. `step`
@@ -69,7 +71,7 @@ def bounds(
     nodes = image.shape[1]
     along, across = np.empty((nodes, nodes), dtype=np.bool_), np.empty((nodes, nodes), dtype=np.bool_)
     for b in range(image.shape[0]):
-        error[b], step[b] = 0.0, 0.0
+        error[b], apart[b], step[b] = 0.0, 0.0, 0.0
         if not _mark(cells[b], along, across):
             continue
         parallax, step[b] = _reach(image[b], cells[b])
@@ -84,7 +86,8 @@ def bounds(
                 _unexplained(coefficients[b], dem[b], cells[b], spacing, points[b, k], exact[b, k], exact_dem[b, k],
                              parallax),
             )  # fmt: skip
-        error[b] = plan + parallax * shift + _TRUST * rest
+        apart[b] = plan + parallax * shift
+        error[b] = apart[b] + _TRUST * rest
         if not error[b] < np.inf:
             error[b] = np.inf
 

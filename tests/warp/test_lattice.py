@@ -167,10 +167,9 @@ def test_a_vibration_of_any_frequency(tmp_path, length):
         assert worst - ROUNDING <= result.max_error_px <= TOLERANCE / 2
 
 
-@pytest.mark.parametrize(("length", "amplitude"), [(33_000.0, 300.0), (1000.0, 1.0), (128.0, 0.02), (66.0, 300.0)])
-def test_a_vibration_over_mountains(tmp_path, length, amplitude):
-    """The heights of a block shift the rows over several waves, which no polynomial of the height follows."""
-    path = tmp_path / "dem.tif"
+def mountains(folder: Path) -> Surface:
+    """Heights of 150 to 450 m and noise, every 10 m about the middle."""
+    path = folder / "dem.tif"
     dataset = gdal.GetDriverByName("GTiff").Create(str(path), 80, 80, 1, gdal.GDT_Float64)
     dataset.SetProjection(UTM.to_wkt())
     dataset.SetGeoTransform((EAST - 400, 10.0, 0, NORTH + 400, 0, -10.0))
@@ -178,11 +177,60 @@ def test_a_vibration_over_mountains(tmp_path, length, amplitude):
     noise = np.random.default_rng(0).normal(0, 5, (80, 80))
     dataset.WriteArray(300 + 150 * np.sin(columns / 5) * np.cos(rows / 7) + noise)
     dataset = None
+    return Surface.open(path, "ellipsoid")
+
+
+@pytest.mark.parametrize(("length", "amplitude"), [(33_000.0, 300.0), (1000.0, 1.0), (128.0, 0.02), (66.0, 300.0)])
+def test_a_vibration_over_mountains(tmp_path, length, amplitude):
+    """The heights of a block shift the rows over several waves, which no polynomial of the height follows."""
     grid = Grid(UTM, EAST - 60.3, NORTH + 130.2, 0.5, 0.5, 240, 500)
-    surface = Surface.open(path, "ellipsoid")
+    surface = mountains(tmp_path)
     worst, count, result = compare(Trembling(length, amplitude), (6000, 6000), grid, tmp_path, surface=surface)
     assert count == grid.width * grid.height
     assert worst - ROUNDING <= result.max_error_px <= TOLERANCE / 2
+
+
+class Rising(Trembling):
+    """Columns that bend with the height: a power of it, or waves of some length (m) where `power` is 0."""
+
+    kind = "test_rising"
+
+    def __init__(self, amplitude: float, power: int, length: float = 150.0) -> None:
+        super().__init__(length, amplitude)
+        object.__setattr__(self, "power", power)
+        object.__setattr__(self, "calls", [])
+
+    def ground_to_image(self, ground):
+        ground = np.asarray(ground, float)
+        self.calls.append(len(ground))
+        x, y, h = ground.T
+        up = (h - 300) / self.length
+        bend = up**self.power if self.power else np.sin(2 * np.pi * up)
+        column = 3000 + (x - EAST + 0.3 * (h - 300)) / 0.5 + self.amplitude * bend
+        return np.stack([column, 3000 - (y - NORTH + 0.4 * (h - 300)) / 0.5], axis=1)
+
+
+@pytest.mark.parametrize("amplitude", [0.01, 1.0, 100.0])
+@pytest.mark.parametrize(
+    ("power", "length"),
+    [(3, 150.0), (4, 150.0), (5, 150.0), (8, 150.0), (0, 3000.0), (0, 300.0), (0, 75.0), (0, 20.0), (0, 1.0)],
+)
+def test_a_model_that_bends_with_the_height(tmp_path, power, length, amplitude):
+    grid = Grid(UTM, EAST - 60.3, NORTH + 130.2, 0.5, 0.5, 240, 500)
+    model = Rising(amplitude, power, length)
+    worst, count, result = compare(model, (6000, 6000), grid, tmp_path, surface=mountains(tmp_path))
+    assert count == grid.width * grid.height
+    assert worst - ROUNDING <= result.max_error_px <= TOLERANCE / 2
+
+
+def test_a_cubic_in_height_takes_a_height_more_and_all_blocks_of_a_tile_at_once(tmp_path):
+    """Nodes closer together would not help, and a call of the model for each block takes longer than it computes."""
+    model, surface = Rising(1.0, 3), mountains(tmp_path)
+    grid = Grid(UTM, EAST - 120.3, NORTH + 130.2, 0.5, 0.5, 512, 512)
+    result = rectify(model, Ramp(tmp_path, 6000, 6000), surface, grid, tmp_path / "o.tif", driver="GTiff")
+    assert (result.refined_blocks, result.blocks, result.finest_spacing) == (4, 4, 64)
+    # Nodes and check points, at three heights and at four.
+    assert model.calls == [4 * 25 * 3, 4 * 24, 4 * 25 * 4, 4 * 24]
 
 
 def shaken(rate: float, roll_px: float, glitch: bool = False) -> Pushbroom:
