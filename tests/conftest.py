@@ -43,6 +43,10 @@ hypothesis.settings.load_profile("tests")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        for mark in item.iter_markers("driver"):
+            if gdal.GetDriverByName(mark.args[0]) is None:
+                item.add_marker(pytest.mark.skip(reason=f"this GDAL was built without {mark.args[0]}"))
     if REAL.is_dir():
         return
     skip = pytest.mark.skip(reason="the real scenes (../shared/data beside the checkout) are not on this machine")

@@ -207,6 +207,7 @@ def doctor(*, fetch_grids: bool = False) -> dict[str, Any]:
             "version": raster.gdal.VersionInfo("RELEASE_NAME"),
             "bindings": raster.gdal.__version__,
             "drivers": allowed,
+            "missing_drivers": [name for name in raster.DRIVERS if name not in allowed],
         },
         "proj": proj_info(),
         "grids": grids(),

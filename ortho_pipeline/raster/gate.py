@@ -45,6 +45,13 @@ _FETCHING = (
 )  # fmt: skip
 #: Side-cars that GDAL opens as rasters, by their ending after the whole name of an image or after its stem.
 _RASTER_SIDE_CAR = re.compile(r"\.(ovr|msk|aux|rrd|r[0-9])$")
+#: Formats that a GDAL may have been built without, by the beginning of a file: wheels have fewer drivers.
+_BEGINNINGS = {
+    b"NITF": "NITF", b"EHFA_HEADER_TAG": "HFA", b"\x00\x00\x00\x0cjP": "JP2OpenJPEG", b"UHL1": "DTED",
+    b"ncols": "AAIGrid",
+}  # fmt: skip
+_ENDINGS = {".til": "TIL", ".hgt": "SRTMHGT", ".ers": "ERS", ".pix": "PCIDSK"}
+_BEGINNING = 4096
 _MANY = 10_000
 _OVERVIEWS = "OVERVIEWS"
 _OUTSIDE = (
@@ -125,11 +132,14 @@ class _Gate:
         if there.is_dir():
             self._see_folder(there)
             allowed = ["DIMAP"]
+            _require_driver("DIMAP", there)
             if (product := self._product_in(there)) is not None:
                 name = os.fspath(product)
                 self._see_named(product, "DIMAP", frozenset())
         else:
             kind = _identified(name, drivers)
+            if kind is None and not isinstance(there, VsiPath) and (format := _format_of(there)) is not None:
+                _require_driver(format, there)
             if kind in _REFERRING:
                 self._see_named(there, kind, frozenset())
             if kind == "DIMAP" and (product := self._product_of(there)) is not None:
@@ -366,6 +376,29 @@ def _is_below(path: VsiPath, folder: AnyPath) -> bool:
     """Tell whether a path lies in a folder by its text, in which dots lead nowhere."""
     rest = str(path).removeprefix(f"{os.fspath(folder)}/")
     return rest != str(path) and not {"", ".", ".."} & set(rest.split("/"))
+
+
+def _format_of(path: Path) -> str | None:
+    """Return the driver that a file needs by its name or beginning, None where these tell nothing."""
+    try:
+        with path.open("rb") as file:
+            beginning = file.read(_BEGINNING)
+    except OSError:
+        return None
+    if b"<Dimap_Document" in beginning:
+        return "DIMAP"
+    known = (driver for start, driver in _BEGINNINGS.items() if beginning.startswith(start))
+    return next(known, _ENDINGS.get(path.suffix.lower()))
+
+
+def _require_driver(name: str, file: Any) -> None:
+    """Raise an `InputError` if this GDAL was built without a driver."""
+    if gdal.GetDriverByName(name) is None:
+        raise InputError(
+            f"this is for GDAL's driver {name}, and this GDAL ({gdal.__version__}) was built without it", file=file,
+            remedy="take a GDAL that has it (that of Debian and Ubuntu has), or name a GeoTIFF: one image of a "
+            "product, or what gdal_translate makes elsewhere",
+        )  # fmt: skip
 
 
 def _identified(name: str, drivers: Sequence[str] | None) -> str | None:

@@ -179,7 +179,7 @@ def _in_archive(name: str) -> str:
 def first_line(error: BaseException, of: object = "") -> str:
     """Return the first line of what an error says: without the file `of` it, and without a full stop."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
-    return lines[0].removeprefix(str(of)).lstrip(",: ").rstrip(". ") or lines[0]
+    return lines[0].removeprefix(str(of)).removeprefix(Path(str(of)).name).lstrip(",: ").rstrip(". ") or lines[0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -226,7 +226,7 @@ def test_files_that_hfa_and_isis3_split_open(tmp_path):
         only(hostile.raster(tmp_path / f"{kind}.lbl", driver="ISIS3", options=[f"DATA_LOCATION={kind}"]))
 
 
-@pytest.mark.skipif(gdal.GetDriverByName("DIMAP") is None, reason="this GDAL does not read DIMAP")
+@pytest.mark.driver("DIMAP")
 def test_products_open_with_their_own_image_also_in_archives(tmp_path):
     product = tmp_path / "product"
     product.mkdir()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -165,3 +167,33 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, words):
     assert "/proc/self/mem" in ended.output
     assert "Remedy" in ended.output
     assert not (tmp_path / "out").exists()
+
+
+def test_a_format_that_this_gdal_was_built_without_is_named(tmp_path):
+    """As with wheels of GDAL: what cannot be read is refused by the name of the driver, not as if it were no raster."""
+    files = {
+        "scene.TIL": ("TIL", b"numTiles = 1;"), "DIM_A.XML": ("DIMAP", b"<?xml version='1.0'?><Dimap_Document/>"),
+        "a.ntf": ("NITF", b"NITF02.10" + bytes(400)), "N45E007.hgt": ("SRTMHGT", bytes(800)),
+        "folder": ("DIMAP", None),
+    }  # fmt: skip
+    for name, (_, content) in files.items():
+        if content is None:
+            (tmp_path / name).mkdir()
+        else:
+            (tmp_path / name).write_bytes(content)
+    program = (
+        "import sys\nfrom ortho_pipeline.errors import InputError\n"
+        "from ortho_pipeline.raster.source import open_dataset\n"
+        "for path in sys.argv[1:]:\n    try:\n        open_dataset(path)\n    except InputError as error:\n"
+        "        print(str(error).replace(chr(10), ' '))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *(tmp_path / name for name in files)], capture_output=True, text=True,
+        env=os.environ | {"GDAL_SKIP": ",".join({driver for driver, _ in files.values()})}, check=True,
+    )  # fmt: skip
+    said = done.stdout.splitlines()
+    assert len(said) == len(files), done.stderr
+    for line, (name, (driver, _)) in zip(said, files.items(), strict=True):
+        assert name in line
+        assert f"GDAL's driver {driver}, and this GDAL" in line
+        assert "Remedy: take a GDAL that has it" in line

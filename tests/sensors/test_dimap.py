@@ -469,6 +469,7 @@ def test_tiles_count_as_one_image(tiled: tuple[Path, Path, Pushbroom]) -> None:
         assert np.abs(each.ground_to_image(ground) - image).max() < 1e-3
 
 
+@pytest.mark.driver("DIMAP")
 @pytest.mark.parametrize("given", ["DIM_A.XML", ""], ids=["metadata", "folder"])
 def test_metadata_or_folder_in_place_of_an_image(tiled: tuple[Path, Path, Pushbroom], given: str) -> None:
     """All tiles are one image then, by GDAL's driver of DIMAP."""
@@ -480,7 +481,8 @@ def test_metadata_or_folder_in_place_of_an_image(tiled: tuple[Path, Path, Pushbr
     assert np.abs(scene.model.ground_to_image(ground) - [250.0, 100.0]).max() < 1e-3
 
 
-@pytest.mark.skipif(gdal.GetDriverByName("JP2OpenJPEG") is None, reason="this GDAL reads no JPEG 2000")
+@pytest.mark.driver("JP2OpenJPEG")
+@pytest.mark.driver("DIMAP")
 def test_tiles_in_jpeg_2000(tiled: tuple[Path, Path, Pushbroom], tmp_path: Path) -> None:
     """As Pleiades Neo is delivered: the folder is one image, of which the tiles are pieces."""
     (tmp_path / "jp2").mkdir()
@@ -493,6 +495,7 @@ def test_tiles_in_jpeg_2000(tiled: tuple[Path, Path, Pushbroom], tmp_path: Path)
     assert (Path(piece.path), piece.offset) == (first, (-200, 0))
 
 
+@pytest.mark.driver("DIMAP")
 def test_every_command_takes_the_folder(tiled: tuple[Path, Path, Pushbroom]) -> None:
     first, _, model = tiled
     info = used(first.parent, model, (300, 400), sensor="rpc", height=200.0, correction="model")
@@ -519,6 +522,7 @@ def volume(path: Path, *products: str) -> Path:
     return path
 
 
+@pytest.mark.driver("DIMAP")
 @pytest.mark.parametrize("given", ["VOL_PHR.XML", ""], ids=["volume", "folder"])
 def test_a_volume_is_its_one_product(tiled: tuple[Path, Path, Pushbroom], given: str) -> None:
     folder = tiled[0].parent
@@ -528,6 +532,7 @@ def test_a_volume_is_its_one_product(tiled: tuple[Path, Path, Pushbroom], given:
     assert Path(scene.path) == folder / "DIM_A.XML"
 
 
+@pytest.mark.driver("DIMAP")
 def test_a_volume_of_several_products_names_them_and_one_whose_product_is_missing_it(
     tiled: tuple[Path, Path, Pushbroom],
 ) -> None:

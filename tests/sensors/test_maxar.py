@@ -200,6 +200,7 @@ TILES = tuple(
 )
 
 
+@pytest.mark.driver("TIL")
 def test_tiles_are_one_scene(folder: Path, whole: tuple[Pushbroom, RPC]) -> None:
     model, rpc = whole
     (folder / f"{STEM}.XML").write_text(isd_text(size=SIZE, tiles=TILES, rpc=rpc))
@@ -236,6 +237,7 @@ def test_a_wrong_size_of_the_whole_does_not_move_tiles(folder: Path, whole: tupl
         assert np.abs(each.ground_to_image(ground) - (10.0, 30.0)).max() < 0.05
 
 
+@pytest.mark.driver("TIL")
 def test_a_til_leads_nowhere_else(folder: Path) -> None:
     (folder / f"{STEM}.XML").write_text(isd_text(size=SIZE))
     pixels(folder.parent / "other.TIF", (40, 50))

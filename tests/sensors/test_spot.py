@@ -153,7 +153,14 @@ def test_angular_speeds_move_the_scene_about_its_middle(scene: Path) -> None:
     assert moved[25] < 0.1 * moved[0]
 
 
-@pytest.mark.parametrize("given", ["IMAGERY.TIF", "METADATA.DIM", ""], ids=["image", "metadata", "folder"])
+@pytest.mark.parametrize(
+    "given",
+    [
+        pytest.param("IMAGERY.TIF", id="image"),
+        pytest.param("METADATA.DIM", id="metadata", marks=pytest.mark.driver("DIMAP")),
+        pytest.param("", id="folder", marks=pytest.mark.driver("DIMAP")),
+    ],
+)
 def test_image_metadata_or_folder(scene: Path, given: str) -> None:
     found = open_scene(scene / given)
     assert (found.sensor, Path(found.model_source).name) == ("spot", "METADATA.DIM")
@@ -161,6 +168,7 @@ def test_image_metadata_or_folder(scene: Path, given: str) -> None:
     assert set(found.priors) == set(found.model.param_names)
 
 
+@pytest.mark.driver("DIMAP")
 def test_every_command_takes_the_folder(scene: Path) -> None:
     info = used(scene, read_spot(scene / "METADATA.DIM").model, SIZE, sensor="spot", height=300.0,
                 correction="model")  # fmt: skip

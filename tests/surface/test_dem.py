@@ -565,7 +565,7 @@ def test_the_real_dem_refuses_without_option_and_takes_egm96(real: Path) -> None
 
 @pytest.mark.realdata
 @pytest.mark.parametrize("opener", [lambda p: p / "N44E005.hgt"])
-@pytest.mark.skipif(gdal.GetDriverByName("SRTMHGT") is None, reason="this GDAL reads no .hgt")
+@pytest.mark.driver("SRTMHGT")
 def test_a_real_srtm_tile(real: Path, opener: Callable[[Path], Path]) -> None:
     surface = Surface.open(opener(real / "shareloc/dtm/srtm_ventoux/srtm90_non_void_filled"), "egm96")
     # Mont Ventoux: 1909 m above the sea.

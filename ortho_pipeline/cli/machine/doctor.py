@@ -22,6 +22,8 @@ def doctor(fetch_grids: bool, as_json: bool) -> None:
     gdal, proj = document["gdal"], document["proj"]
     click.echo("Packages   " + ", ".join(f"{name} {version}" for name, version in document["packages"].items()))
     click.echo(f"GDAL       {gdal['version']} (bindings {gdal['bindings']}), reads {', '.join(gdal['drivers'])}")
+    if gdal["missing_drivers"]:
+        click.echo(f"{'':<10} built without {', '.join(gdal['missing_drivers'])}")
     click.echo(f"PROJ       {proj['proj']}, looks in {', '.join(proj['search_path'])}")
     for grid in document["grids"]:
         click.echo(f"{grid['datum']:<10} " + (f"{grid['path']}" if grid["found"] else f"missing: {grid.get('remedy')}"))
