@@ -20,7 +20,7 @@ from ortho_pipeline.batch.config import Config, Entry, Settings, merged, read_co
 from ortho_pipeline.batch.places import Place, Places
 from ortho_pipeline.commands.heights.automatic import AUTO
 from ortho_pipeline.commands.inputs import OWN_POINTS
-from ortho_pipeline.commands.stac.given import resolved
+from ortho_pipeline.commands.stac.given import heights_given, resolved
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files.locations import VsiPath, located, place
 from ortho_pipeline.files.stac.item import is_item
@@ -228,7 +228,7 @@ class _Planner:
             shown = self.places.of(str(asset), f"{where}.image")
         return Job(
             name=self._checked_name(name, image, where), image=shown, output=self.output, scene=scene,
-            points=self._points(settings, image, where), surface=self._surface(settings, image, where),
+            points=self._points(settings, image, where), surface=self._surface(settings, image, where, scene),
             match=self._match(settings, image, where), ortho=self._ortho(settings, image, where), versions=versions(),
         )  # fmt: skip
 
@@ -253,10 +253,13 @@ class _Planner:
             values["vertical"] = self._perhaps_file(values["vertical"], image, f"{where}.points.vertical")
         return PointOptions(**values)
 
-    def _surface(self, settings: Settings, image: Place, where: str) -> SurfaceOptions:
+    def _surface(self, settings: Settings, image: Place, where: str, scene: SceneOptions) -> SurfaceOptions:
         values: dict[str, Any] = dict(settings.surface)
         if values["dem"] != AUTO:
             values["dem"] = self._file(values["dem"], image, f"{where}.surface.dem")
+            raster = heights_given(values["dem"], scene)
+            if raster != values["dem"]:  # of a STAC item
+                values["dem"] = self.places.name(str(raster), f"{where}.surface.dem")
         for cell in () if values["dem"] is None else matching_files(values["dem"]) or ():
             self.places.inside(cell, f"{where}.surface.dem")
         if values["source"] is not None and not is_address(values["source"]):

@@ -41,6 +41,7 @@ from ortho_pipeline.report import block as block_report
 from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.network.cards import PICTURES, SIDE
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
+from ortho_pipeline.surface.base import Surface
 
 #: Pixels of an image of which a picture is made: without overviews nearly all of it has to be read.
 _PICTURED = 400_000_000
@@ -110,7 +111,7 @@ def adjust(
         except InputError as error:
             notes.append(Notice("no-rpc", f"no RPC is written ({error.message})").in_image(label))
             del files[f"{label} rpc"]
-    record = _record(images, points, scenes, starts, command, match, surface)
+    record = _record(images, points, scenes, starts, command, match, surface, gathered.heights)
     made = block_report.build_report(
         fit=fit, starts=starts, exported=exported, provenance=record, warnings=[*_warnings(fit, starts), *notes]
     )
@@ -238,12 +239,15 @@ def _record(
     command: str | None,
     match: MatchOptions,
     surface: SurfaceOptions,
+    heights: Surface | None,
 ) -> dict[str, Any]:
     """Return what is needed to make the same result again."""
     read: dict[Path, str] = {}
     for image, scene, start in zip(images, scenes, starts.values(), strict=True):
         for given in (options.points, options.gcps):
-            of_image = inputs.files_read(image, scene, PointOptions(gcps=given), surface, match, opened=start.scene)
+            of_image = inputs.files_read(
+                image, scene, PointOptions(gcps=given), surface, match, start.scene, heights=heights
+            )
             for path, role in of_image.items():
                 read.setdefault(path, role)
     first = next(iter(starts.values())).scene

@@ -14,14 +14,14 @@ from typing import Any
 import pyproj
 
 from ortho_pipeline import plugins
-from ortho_pipeline.commands.heights.surfaces import dem_files, sigma_file
+from ortho_pipeline.commands.heights.surfaces import dem_files, is_collected, sigma_file
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange import crop
 from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.exchange.rpc import files_of
 from ortho_pipeline.files import sha256, states
 from ortho_pipeline.files.documents import software_version
-from ortho_pipeline.files.locations import archive_of, located
+from ortho_pipeline.files.locations import archive_of, is_far, located
 from ortho_pipeline.files.process_limits import startable_threads
 from ortho_pipeline.files.traffic import bytes_read
 from ortho_pipeline.hookspecs import Scene
@@ -266,8 +266,13 @@ def files_read(
         add("image", _files_of(opened.path, scene) if opened.path != Path(image) else ())
         add("metadata", [*opened.sources, opened.model_source])
     add("points", [point_file(points)])
-    for dem in dem_files(surface) or (() if heights is None else heights.files):
-        add("DEM", [dem, *_files_of(dem, scene)])
+    for dem in dem_files(surface):
+        add("DEM", [dem, *(() if is_collected(dem) else _files_of(dem, scene))])
+    if heights is not None:
+        # Of heights that were found: what led to them, and the files.
+        add("DEM", heights.provenance.get("documents", ()))
+        for dem in (name for name in heights.files if Path(name) not in read and not is_far(name)):
+            add("DEM", [dem, *_files_of(dem, scene)])
     if surface.vertical is not None:
         add("geoid", [surface.vertical])
     add("DEM accuracy", [sigma_file(surface)])

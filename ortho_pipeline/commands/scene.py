@@ -13,7 +13,7 @@ from ortho_pipeline import plugins
 from ortho_pipeline.commands.heights.surfaces import open_dem
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION, Result, outputs_together
-from ortho_pipeline.commands.stac.given import with_items
+from ortho_pipeline.commands.stac.given import heights_given, with_items
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError, completed, counted
 from ortho_pipeline.estimation.ground_residuals import viewing
@@ -30,6 +30,7 @@ from ortho_pipeline.raster import source as raster
 from ortho_pipeline.report import document as report
 from ortho_pipeline.surface import accuracy as dem_accuracy
 from ortho_pipeline.surface import footprint
+from ortho_pipeline.surface.cells.copernicus import extent_of
 
 
 def sensors() -> dict[str, Any]:
@@ -176,8 +177,9 @@ def dem_check(
     InputError
         If a file cannot be used, or no check point lies on the DEM.
     """
-    heights = open_dem(dem_file, surface, scene)
     ground, plane, ids = dem_accuracy.read_check_heights(points, crs, vertical)
+    extent = extent_of(ground_transform(plane, "EPSG:4979")(ground)[:, :2])
+    heights = open_dem(heights_given(dem_file, scene), surface, scene, extents=[] if extent is None else [extent])
     found = dem_accuracy.check_dem(heights, ground, plane, ids)
     if not found.overall.count:
         raise InputError(

@@ -239,8 +239,8 @@ class SurfaceOptions:
     dem: Annotated[
         PathLike | None,
         Option(
-            "--dem", "Digital elevation model: a file, a pattern of the files that make one, or 'auto' for the cells "
-            "of the Copernicus DEM under the scene.", "FILE|auto",
+            "--dem", "Digital elevation model: a file, a pattern of the files that make one, a STAC item or "
+            "collection, or 'auto' for the cells of the Copernicus DEM under the scene.", "FILE|URL|auto",
         ),
     ] = None  # fmt: skip
     vertical: Annotated[

@@ -307,6 +307,10 @@ class Dem:
     #: Of heights that were found: the cells that have land, and those that have none.
     cells: tuple[str, ...] = ()
     sea_cells: tuple[str, ...] = ()
+    #: Of a STAC collection: the items' ids, the documents that lead to them, and what declares the height datum.
+    items: tuple[str, ...] = ()
+    documents: tuple[str, ...] = ()
+    declared_in: Literal["files", "items"] | None = None
 
     @property
     def is_flat(self) -> bool:

@@ -301,4 +301,5 @@ def _surface_text(surface: FlatGround | Dem) -> str:
     if isinstance(surface, FlatGround):
         return f"flat ground at {metres(surface.constant_height)} above the ellipsoid"
     covered = "" if surface.coverage is None else f", covers {share(surface.coverage)} of the scene"
-    return f"{Path(surface.path).name}, heights above {surface.vertical_label}{covered}"
+    items = f"{counted(len(surface.items), 'item')} of " if surface.items else ""
+    return f"{items}{Path(surface.path).name}, heights above {surface.vertical_label}{covered}"

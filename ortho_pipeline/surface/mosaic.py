@@ -22,6 +22,7 @@ import pyproj
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import CrsError, DatumError, InputError, counted
+from ortho_pipeline.files.stac.item import split
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
 from ortho_pipeline.surface.base import Array
 from ortho_pipeline.surface.dem_file import DemFile, SampleGrid
@@ -75,6 +76,8 @@ def matching_files(pattern: str | os.PathLike[str]) -> list[str] | None:
         If there are none, or too many.
     """
     text = os.fspath(pattern)
+    if split(text)[1]:
+        return None  # a pattern of assets in a STAC document
     if not glob.has_magic(text) or os.path.exists(text) or "://" in text or text.startswith("/vsi"):
         return None
     found = sorted(path for path in glob.iglob(text) if os.path.isfile(path))

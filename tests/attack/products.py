@@ -337,6 +337,17 @@ STAC_ITEM = """{"type": "Feature", "stac_version": "1.0.0", "id": "S", "geometry
   "points": {"href": "./points.csv", "type": "text/csv"},
   "small": {"href": "https://host/small.png", "type": "image/png", "roles": ["thumbnail"]}}}
 """
+#: A list of DEM items: one says where it lies by its geometry and its datum by a code, one by its box and a text.
+STAC_HEIGHTS = """{"type": "FeatureCollection", "features": [
+ {"type": "Feature", "stac_version": "1.0.0", "id": "a", "bbox": [0.0, 0.0, 1.0, 1.0],
+  "geometry": {"type": "Polygon", "coordinates": [[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]]]},
+  "properties": {"datetime": "2024-01-01T00:00:00Z", "proj:code": "EPSG:9707"},
+  "assets": {"dem": {"href": "./a.tif", "type": "image/tiff; application=geotiff", "roles": ["data"]}}},
+ {"type": "Feature", "stac_version": "1.0.0", "id": "b", "bbox": [1.0, 0.0, -9.0, 2.0, 1.0, 900.0], "geometry": null,
+  "properties": {"datetime": null, "end_datetime": "2023-01-01T00:00:00Z"},
+  "assets": {"elevation": {"href": "./b.tif", "proj:epsg": 9518, "proj:wkt2": "GEOGCRS[]"}}}],
+ "links": []}
+"""
 #: A static collection with an item in it, and the way to one beside it that is not there.
 STAC_COLLECTION = f"""{{"type": "Collection", "stac_version": "1.0.0", "id": "C", "features": [{STAC_ITEM}],
  "links": [{{"rel": "item", "href": "./items/T.json"}}, {{"rel": "root", "href": "../catalog.json"}}]}}

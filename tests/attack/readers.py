@@ -33,6 +33,7 @@ from ortho_pipeline.batch import plan as batch_plan
 from ortho_pipeline.batch.records import FileState, Record
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.commands.inputs import open_scene
+from ortho_pipeline.errors import CrsError
 from ortho_pipeline.exchange.csm import csm_text, read_csm
 from ortho_pipeline.exchange.model_file import read_model_file, save_model
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
@@ -364,6 +365,19 @@ def _stac_collection(path: Path) -> Any:
     return [[asset.name for item in collection.items((0.0, 0.0, 1.0, 1.0), "S") for asset in item.assets]]
 
 
+def _stac_heights(path: Path) -> Any:
+    items, _ = Collection(path).under([(0.5, 0.5, 1.5, 0.6)])
+    systems = [_system(text) for item in items for text in item.heights().systems]
+    return [[(item.id, item.date, item.boxes, item.heights().name) for item in items], systems]
+
+
+def _system(text: str) -> str:
+    try:
+        return parse_crs(text).name
+    except CrsError:
+        return ""
+
+
 def _csm_seed(folder: Path) -> bytes:
     (folder / "METADATA.DIM").write_text(products.spot_text())
     return csm_text(read_spot(folder / "METADATA.DIM", heights=(0.0, 300.0)).model)[0].encode()
@@ -448,6 +462,7 @@ READERS = (
     Reader("enmap-metadata", "xml", "one-METADATA.XML", _enmap_seed, _enmap),
     Reader("stac-item", "json", "one.json", _text(products.STAC_ITEM), _stac_item),
     Reader("stac-collection", "json", "one.json", _text(products.STAC_COLLECTION), _stac_collection),
+    Reader("stac-heights", "json", "one.json", _text(products.STAC_HEIGHTS), _stac_heights),
     Reader("planet-item", "json", "one_metadata.json", _text(products.PLANET), read_item),
     Reader("sar-extended", "json", "one_extended.json", _text(products.capella_text()), read_extended),
     Reader("maxar-isd", "xml", "one.XML", _maxar_seed, _maxar),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from numpy.typing import NDArray
+from osgeo import gdal
 from scenes import Case, Setting, write_raster
 
 from ortho_pipeline.block.point_files import read_block_points
@@ -235,11 +236,21 @@ def test_images_of_one_name_are_told_apart():
 
 
 def test_an_adjustment_finds_ties_and_control_by_itself(tmp_path):
-    """Two scenes that are some ten pixels off, a reference and a DEM: the whole, in one command."""
+    """Two scenes that are some ten pixels off, a reference and a DEM in a STAC collection: all in one command."""
     scenes, _ = looks(tmp_path, [-12.0, 12.0], side=300, dem_sigma=1.0, margin=100.0)
     scenes[0].write_reference()
     images = [scene.scene_file for scene in scenes]
-    heights = "--dem", scenes[0].dem_file, "--dem-vertical", "ellipsoid", "--dem-sigma", 2
+    dem = scenes[0].dem_file
+    place = gdal.Info(str(dem), format="json")["wgs84Extent"]
+    cell = {
+        "type": "Feature",
+        "stac_version": "1.0.0",
+        "id": "cell",
+        "geometry": place,
+        "assets": {"dem": {"href": dem.name}},
+    }
+    (dem.parent / "dem.json").write_text(json.dumps({"type": "FeatureCollection", "features": [cell]}))
+    heights = "--dem", dem.parent / "dem.json", "--dem-vertical", "ellipsoid", "--dem-sigma", 2
     run("adjust", *images, "--ties", "auto", "--reference", scenes[0].reference_file, *heights, "--search", 25,
         "--reference-sigma", 2, "--match-points", 60, "--correction", "affine", "-o", tmp_path / "out")  # fmt: skip
     before, after = [], []
@@ -258,7 +269,8 @@ def test_an_adjustment_finds_ties_and_control_by_itself(tmp_path):
     assert (
         "in the images, relative to the reference, whose ground coordinates took no part" in report["headline"]["what"]
     )
-    assert {one["role"] for one in report["provenance"]["inputs"]} >= {"reference", "DEM"}
+    read = {(one["role"], Path(one["path"]).name) for one in report["provenance"]["inputs"]}
+    assert {("DEM", dem.name), ("DEM", "dem.json"), ("reference", scenes[0].reference_file.name)} <= read
     # Pixels are 1 m: however many matches, the images lie as well as the reference does.
     adjustment = report["adjustment"]
     for image in adjustment["images"].values():

@@ -25,6 +25,7 @@ from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import Vertical, parse_crs
 from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, SurfaceOptions, numbers_of
 from ortho_pipeline.points import Points, assign_roles
+from ortho_pipeline.surface.base import Surface
 
 #: Ground of matches is exact (m): what is not known of it stands in the covariances in the image.
 _EXACT = 1e-3
@@ -32,12 +33,13 @@ _EXACT = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """The points of a block, what people ought to know of them, and the documents and texts of what was matched."""
+    """The points of a block, what people ought to know of them, and of what was matched documents, texts, heights."""
 
     table: BlockPoints
     notices: list[Notice]
     document: dict[str, Any]
     text: list[str]
+    heights: Surface | None = None
 
 
 def gather(
@@ -65,6 +67,7 @@ def gather(
     _refuse_contradictions(options, match, surface)
     matched = options.ties is not None or bool(match.reference)
     tables, notices, document, text = [], list[Notice](), dict[str, Any](), list[str]()
+    heights: Surface | None = None
     if options.points is not None:
         table, notes = read_points(images, labels, options, scenes[0].allow_network, whole=not matched)
         tables.append(table)
@@ -86,7 +89,7 @@ def gather(
             notices += found.notices
             document |= found.document
             text += found.text
-    return Gathered(joined(labels, tables), notices, document, text)
+    return Gathered(joined(labels, tables), notices, document, text, heights)
 
 
 def _refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: SurfaceOptions) -> None:

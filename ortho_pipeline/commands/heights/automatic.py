@@ -35,15 +35,27 @@ def open_automatic(options: SurfaceOptions, access: SceneOptions, memory: int, s
     InputError
         If the network is needed and not allowed, a scene has no model of its own, or land has no cell.
     """
-    extents = [extent_under(scene) for scene in scenes]
-    if not extents:
-        raise InputError("heights are only found under a scene", field="surface.dem", remedy="give `surface.dem=FILE`")
+    extents = extents_under(scenes)
     source = source_of(options.source, allow_network=access.allow_network)
     with of_option("surface.vertical"):
         vertical = None if options.vertical is None else Vertical.parse(options.vertical)
     if vertical is None:
         _require_geoid(access.allow_network)
     return open_cells(source, extents, vertical, options.override_vertical, options.fill, memory)
+
+
+def extents_under(scenes: Iterable[Scene]) -> list[Extent]:
+    """Return where scenes lie: see `extent_under`.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    extents = [extent_under(scene) for scene in scenes]
+    if not extents:
+        raise InputError("heights are only found under a scene", field="surface.dem", remedy="give `surface.dem=FILE`")
+    return extents
 
 
 def extent_under(scene: Scene) -> Extent:

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
-from ortho_pipeline.commands.heights.automatic import is_automatic, open_automatic
+from ortho_pipeline.commands.heights.automatic import extents_under, is_automatic, open_automatic
+from ortho_pipeline.commands.stac.given import heights_given
 from ortho_pipeline.errors import InputError, completed, of_option
+from ortho_pipeline.files.stac.collection import is_collection
+from ortho_pipeline.files.stac.item import split
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions, number_of
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.cells.collected import open_collected
+from ortho_pipeline.surface.cells.copernicus import Extent
 from ortho_pipeline.surface.dem import DemSurface
 from ortho_pipeline.surface.mosaic import matching_files
 
@@ -50,7 +55,9 @@ def open_surface(
     assert options.dem is not None
     if is_automatic(options):
         return open_automatic(options, scene, memory, under).with_sigma(sigma)
-    return open_dem(options.dem, options, scene, memory).with_sigma(sigma)
+    path = heights_given(options.dem, scene)
+    extents = extents_under(under) if is_collected(path) else []
+    return open_dem(path, options, scene, memory, extents).with_sigma(sigma)
 
 
 def open_sigma(
@@ -81,9 +88,19 @@ def open_sigma(
 
 
 def open_dem(
-    path: str | os.PathLike[str], options: SurfaceOptions, scene: SceneOptions, memory: int = OutputOptions.memory
+    path: str | os.PathLike[str],
+    options: SurfaceOptions,
+    scene: SceneOptions,
+    memory: int = OutputOptions.memory,
+    extents: Sequence[Extent] = (),
 ) -> DemSurface:
-    """Open a DEM; of the options it is those that say how its heights are to be understood."""
+    """Open a DEM; of the options it is those that say how its heights are to be understood.
+
+    Parameters
+    ----------
+    extents : sequence of Extent
+        Where heights are wanted, of a STAC collection.
+    """
     if options.source is not None:
         raise InputError(
             "this says where heights are found, and the DEM is given", field="surface.source",
@@ -92,16 +109,27 @@ def open_dem(
     with of_option("surface.vertical"):
         vertical = None if options.vertical is None else Vertical.parse(options.vertical)
     with completed(field="surface.dem"):
+        if is_collected(path):
+            return open_collected(
+                path, extents, vertical, options.override_vertical, options.fill, memory, scene.access
+            )  # fmt: skip
         return Surface.open(
             path, vertical, override=options.override_vertical, fill=options.fill, memory=memory, **scene.access
         )
 
 
 def dem_files(options: SurfaceOptions) -> list[str]:
-    """Return the files of the DEM that the user gave: one, those of a pattern, or none."""
+    """Return the files of the DEM that the user gave: one, those of a pattern, a collection's document, or none."""
     if options.dem is None or is_automatic(options):
         return []
+    if is_collected(options.dem):
+        return [split(options.dem)[0]]
     return [*(matching_files(options.dem) or [os.fspath(options.dem)])]
+
+
+def is_collected(dem: str | os.PathLike[str]) -> bool:
+    """Tell by its name whether a DEM is a STAC collection; an item has given way to its raster before."""
+    return is_collection(split(dem)[0])
 
 
 def require_heights(options: SurfaceOptions) -> None:

@@ -13,7 +13,8 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.beside import ask_beside
 from ortho_pipeline.files.locations import is_far
-from ortho_pipeline.files.stac.item import Asset, Item, is_item, read_item, split
+from ortho_pipeline.files.stac.collection import is_collection
+from ortho_pipeline.files.stac.item import Asset, Item, is_item, item_at, read_item, split
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 
 _P = ParamSpec("_P")
@@ -43,8 +44,8 @@ def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
                 given[name], scene = resolved(value, scene)
             elif name == _IMAGES:
                 given[name] = [_one_of_several(image, scene) for image in value]
-            elif name == _DEM and is_item(value):
-                given[name] = _chosen(value, scene)[1].href
+            elif name == _DEM and not isinstance(value, SurfaceOptions):
+                given[name] = heights_given(value, scene)
             else:
                 given[name] = _in_options(value, scene)
         if place is not None:
@@ -73,6 +74,21 @@ def resolved(image: Any, scene: SceneOptions) -> tuple[Any, SceneOptions]:
     return chosen.href, scene if rpc is None else replace(scene, rpc=rpc.href)
 
 
+def heights_given(dem: Any, scene: SceneOptions) -> Any:
+    """Return the raster of heights that a STAC item stands for; a collection, and anything else, as it is.
+
+    Raises
+    ------
+    InputError
+        If its asset is not known.
+    """
+    if not is_item(dem):
+        return dem
+    address, key = split(dem)
+    item = item_at(address, allow_network=scene.allow_network, roots=tuple(scene.roots))
+    return dem if item is None else item.heights(key).href
+
+
 def _chosen(image: Any, scene: SceneOptions) -> tuple[Item, Asset]:
     address, key = split(image)
     item = read_item(address, allow_network=scene.allow_network, roots=tuple(scene.roots))
@@ -99,7 +115,7 @@ def _in_options(value: Any, scene: SceneOptions) -> Any:
         return _chosen(path, scene)[1].href if is_item(path) else path
 
     if isinstance(value, SurfaceOptions):
-        return replace(value, dem=raster(value.dem), sigma=raster(value.sigma))
+        return replace(value, dem=heights_given(value.dem, scene), sigma=raster(value.sigma))
     if isinstance(value, MatchOptions):
         return replace(value, reference=tuple(map(raster, value.reference)))
     if isinstance(value, OutputOptions):
@@ -128,7 +144,7 @@ def _far(given: dict[str, Any]) -> list[Any]:
     images = [given.get(_IMAGE), *(given.get(_IMAGES) or ())]
     for value in given.values():
         if isinstance(value, SurfaceOptions):
-            images.append(value.dem)
+            images.append(None if value.dem is None or is_collection(split(value.dem)[0]) else value.dem)
         elif isinstance(value, MatchOptions):
             images += value.reference
         elif isinstance(value, OutputOptions):

@@ -14,6 +14,8 @@ from ortho_pipeline.files.reading import parse_json, read_json
 from ortho_pipeline.files.storage.objects import Objects, is_address
 from ortho_pipeline.files.traffic import count
 
+#: Types of documents that hold items, or lead to them.
+COLLECTIONS = ("Collection", "Catalog", "FeatureCollection")
 REMEDY = "give a STAC item as the specification has it (a JSON object with stac_version, type and assets)"
 _MAX_BYTES = 20_000_000
 _ATTEMPTS, _PAUSE, _TIMEOUT = 5, 0.2, 30.0

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import fnmatch
+import json
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import PurePosixPath
 from typing import Any
 
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files.locations import AnyPath, url_of
-from ortho_pipeline.files.stac.documents import REMEDY, read_document, target
+from ortho_pipeline.files.stac.documents import COLLECTIONS, REMEDY, read_document, target
+from ortho_pipeline.files.stac.places import Box, boxes_of
 from ortho_pipeline.files.storage.objects import is_address
 
 #: Roles of what an image or a DEM is read from, the first first.
 _ROLES = ("data", "visual")
+#: Roles and keys of heights among other rasters.
+_OF_HEIGHTS = {"dem", "elevation"}
 _NO_RASTER = ("thumbnail", "overview", "metadata")
 _RASTER_TYPE = re.compile(r"image/(?!png|jpeg|webp|svg|gif)|application/(x-hdf5?|x-erdas-hfa|gml\+xml)")
 _RASTER_NAME = re.compile(r"\.(tiff?|jp2|ntf|nitf|img|vrt|dt[0-2]|hgt)$", re.IGNORECASE)
@@ -24,16 +30,24 @@ _TABLE_NAME = re.compile(r"\.(csv|geojson|points|pts)$", re.IGNORECASE)
 _RPC_NAME = re.compile(r"rpc[^/]*\.(txt|xml)$|\.rpb$|\.rpc$", re.IGNORECASE)
 _ITEMS = re.compile(r"https?://[^?]*/collections/[^/?]+/items/[^/?#]+$")
 _SHOWN = 12
+#: How the projection extension names a system, the most explicit first; `proj:epsg` is that of its first version.
+_SYSTEMS = ("proj:wkt2", "proj:projjson", "proj:code", "proj:epsg")
+_CODE = re.compile(r"[A-Za-z][\w-]*:[\w.+-]+")
+_SYSTEM_CHARS = 50_000
 
 
 @dataclass(frozen=True)
 class Asset:
-    """A file of an item: its key there, where it lies, its roles, its media type (empty where none is said)."""
+    """A file of an item: its key there, where it lies, its roles, its media type (empty where none is said).
+
+    `systems` are the coordinate systems that the item says it to be in, as `geodesy.parse_crs` takes them.
+    """
 
     key: str
     href: str
     roles: tuple[str, ...]
     type: str
+    systems: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -60,14 +74,21 @@ class Asset:
 
 @dataclass(frozen=True)
 class Item:
-    """A STAC item: where it lies, its id, and its assets."""
+    """A STAC item: its address, its id and its assets; the boxes it lies in, and its date (s since 1970; 0: none)."""
 
     address: str
     id: str
     assets: tuple[Asset, ...]
+    boxes: tuple[Box, ...] = ()
+    date: float = 0.0
 
     def image(self, key: str = "") -> Asset:
-        """Return the raster that an image, a DEM or a reference is read from.
+        """Return the raster that an image or a reference is read from.
+
+        Parameters
+        ----------
+        key : str
+            Which one, or a pattern of its key; empty where the role tells.
 
         Raises
         ------
@@ -78,6 +99,14 @@ class Item:
         groups = [[asset for asset in rasters if role in asset.roles] for role in _ROLES]
         groups.append(rasters)
         return self._chosen(key, groups, "raster")
+
+    def heights(self, key: str = "") -> Asset:
+        """Return the raster that a DEM is read from, which is no picture of heights; see `image`."""
+        rasters = [asset for asset in self.assets if asset.is_raster]
+        named = [asset for asset in rasters if _OF_HEIGHTS & {asset.key.lower(), *asset.roles}]
+        data = [asset for asset in rasters if _ROLES[0] in asset.roles]
+        plain = [asset for asset in rasters if _ROLES[1] not in asset.roles]
+        return self._chosen(key, [named, data, plain, rasters], "raster of heights")
 
     def table(self, key: str = "") -> Asset:
         """Return the table that points are read from; see `image`."""
@@ -110,12 +139,14 @@ class Item:
 
     def _chosen(self, key: str, groups: Iterable[list[Asset]], what: str) -> Asset:
         if key:
-            for asset in self.assets:
-                if asset.key == key:
-                    return asset
+            found = [asset for asset in self.assets if asset.key == key]
+            found = found or [asset for asset in self.assets if fnmatch.fnmatchcase(asset.key, key)]
+            if len(found) == 1:
+                return found[0]
             raise InputError(
-                f"there is no asset {key!r}", file=self.address, field="assets", remedy=f"one of {self._keys()}"
-            )
+                f"{'several assets are' if found else 'there is no asset'} {key!r}", file=self.address, field="assets",
+                remedy=f"one of {self._keys(found or None)}",
+            )  # fmt: skip
         several: list[Asset] = []
         for group in groups:
             if len(group) == 1:
@@ -170,6 +201,13 @@ def read_item(path: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPat
     return item_of(read_document(path, allow_network=allow_network), path, roots)
 
 
+@reads(REMEDY)
+def item_at(path: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPath, ...] = ()) -> Item | None:
+    """Read a STAC item as `read_item` does; None where a collection lies there."""
+    document = read_document(path, allow_network=allow_network)
+    return None if document.get("type") in COLLECTIONS else item_of(document, path, roots)
+
+
 def item_of(document: Mapping[str, Any], address: AnyPath, roots: tuple[AnyPath, ...] = ()) -> Item:
     """Return the item that a JSON object is; see `read_item`."""
     if document.get("type") != "Feature" or not isinstance(document.get("stac_version"), str):
@@ -188,8 +226,35 @@ def item_of(document: Mapping[str, Any], address: AnyPath, roots: tuple[AnyPath,
             raise InputError("an asset has an href", file=address, field=f"assets.{key[:60]}", remedy=REMEDY)
         roles = tuple(role for role in _list(asset.get("roles")) if isinstance(role, str))
         kind = asset.get("type") if isinstance(asset.get("type"), str) else ""
-        found.append(Asset(key, target(asset["href"], own, roots), roles, kind or ""))
-    return Item(url_of(address), str(document.get("id", "")), tuple(found))
+        systems = tuple(_systems(asset, document.get("properties")))
+        found.append(Asset(key, target(asset["href"], own, roots), roles, kind or "", systems))
+    properties = document.get("properties")
+    date = _date(properties) if isinstance(properties, dict) else 0.0
+    return Item(url_of(address), str(document.get("id", "")), tuple(found), boxes_of(document), date)
+
+
+def _systems(*places: Any) -> Iterator[str]:
+    """Yield the coordinate systems that an asset states, then those of its item."""
+    for place in places:
+        for name in _SYSTEMS:
+            value = place.get(name) if isinstance(place, dict) else None
+            if name == "proj:epsg" and isinstance(value, int):
+                yield f"EPSG:{value}"
+            elif name == "proj:projjson" and isinstance(value, dict):
+                yield json.dumps(value)[:_SYSTEM_CHARS]
+            elif isinstance(value, str) and (name == "proj:wkt2" or _CODE.fullmatch(value)):
+                yield value[:_SYSTEM_CHARS]
+
+
+def _date(properties: Mapping[str, Any]) -> float:
+    """Return the time of an item in seconds since 1970: the end of a span of time; 0 where it says none."""
+    for name in ("datetime", "end_datetime", "start_datetime"):
+        try:
+            given = datetime.fromisoformat(str(properties.get(name)))
+            return (given if given.tzinfo else given.replace(tzinfo=UTC)).timestamp()
+        except (ValueError, OverflowError):
+            continue
+    return 0.0
 
 
 def _list(value: Any) -> list[Any]:

@@ -48,6 +48,7 @@ _LOOK: dict[str, str] = {
     "few-ties": "Measure some ties by hand between these images.",
     "no-matches": "Give this image control points, or a reference that resembles it more.",
     "dem-datum-by-name": "State the height datum of the DEM, so that nothing rests on its name.",
+    "dem-items-overlap": "Give a list of the items that shall count, if others than the latest ones are meant.",
     "dem-covers-part": "Give a DEM that covers the scene: what lies outside of it has no value or a guessed height.",
     "accuracy-in-part": "State the accuracy of what is named, so that the figures include it.",
     "memory-exceeded": "Allow more memory, or take the engine of ortho-pipeline.",

@@ -1,0 +1,169 @@
+"""The DEM that the items of a STAC collection make at a place: which count where several lie, and its datum."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import pyproj
+
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.errors import CoverageError, CrsError, DatumError, completed, counted
+from ortho_pipeline.files.beside import ask_beside
+from ortho_pipeline.files.locations import is_far
+from ortho_pipeline.files.stac.collection import Collection
+from ortho_pipeline.files.stac.item import Asset, split
+from ortho_pipeline.geodesy.crs import Vertical, horizontal, parse_crs
+from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
+from ortho_pipeline.surface.base import parse_fill
+from ortho_pipeline.surface.cells.copernicus import Extent
+from ortho_pipeline.surface.dem import DemSurface, dem_of
+from ortho_pipeline.surface.dem_file import DemFile, SampleGrid
+from ortho_pipeline.surface.mosaic import DemMosaic, Samples, laid_out
+
+#: Items that one DEM may have.
+_MOST_ITEMS = 10_000
+#: Two items that share more than this part of the smaller one show the same ground; neighbours share rims.
+_SAME_GROUND = 0.5
+_SHOWN = 6
+_CHOOSE = "give a FeatureCollection file of the items that belong together, or make one grid of their files (gdalwarp)"
+Placed = tuple[Samples, pyproj.CRS, SampleGrid, str]
+
+
+def open_collected(
+    address: str | os.PathLike[str],
+    extents: Iterable[Extent],
+    vertical: Vertical | str | None = None,
+    override: bool = False,
+    fill: str | float = "error",
+    memory: int = 512_000_000,
+    access: Mapping[str, Any] | None = None,
+) -> DemSurface:
+    """Return the items of a collection under some extents as a DEM.
+
+    Where several have a height, that of the finest columns counts, of them the one with the latest date.
+
+    Parameters
+    ----------
+    address : path or address
+        With the key of the asset, or a pattern of it, after a ``#``, where its role does not tell.
+    vertical, override, fill, memory
+        As for `Surface.open`.
+    access : mapping
+        What `raster.open_pixels` may do for its files.
+
+    Raises
+    ------
+    CoverageError
+        If no item lies there.
+    DatumError
+        If items say different things of what their heights are measured above, or nobody says it.
+    InputError
+        If it is no collection, an item has no raster of heights, or there are too many items.
+    """
+    access = access or {}
+    network, roots = bool(access.get("allow_network")), tuple(access.get("roots", ()))
+    place, key = split(address)
+    name = os.fspath(address)
+    items, documents = Collection(place, allow_network=network, roots=roots).under(
+        [extent.widened() for extent in extents]
+    )
+    if not 0 < len(items) <= _MOST_ITEMS:
+        raise CoverageError(
+            f"{counted(len(items), 'item')} of this collection {'lies' if len(items) == 1 else 'lie'} under the scene",
+            file=name, field="surface.dem", remedy="give a DEM of this place" if not items else _CHOOSE,
+        )  # fmt: skip
+    chosen = [item.heights(key) for item in items]
+    ask_beside(*(asset.href for asset in chosen if is_far(asset.href)), allow_network=network)
+    opened = [_placed(asset, access, override) for asset in chosen]
+    try:
+        mosaic = laid_out(name, [placed for placed, _ in opened])
+    except (CrsError, DatumError) as error:
+        raise type(error)(error.message, file=error.file, field=error.field, remedy=_CHOOSE) from error
+    made = dem_of(mosaic, vertical, override, parse_fill(fill), memory)
+    ids = {placed[0].path: item.id for item, (placed, _) in zip(items, opened, strict=True)}
+    found = {
+        "warnings": [*made.record["warnings"], *_same_ground(mosaic, ids)],
+        "items": [item.id for item in items],
+        "documents": documents,
+        "declared_in": None if made.record["declared_vertical"] is None else ("items" if opened[0][1] else "files"),
+    }
+    return replace(made, record={**made.record, **found})
+
+
+def _placed(asset: Asset, access: Mapping[str, Any], override: bool) -> tuple[Placed, bool]:
+    """Return the file of an asset, where it lies and its unit; and whether its datum is what the item says of it."""
+    file = DemFile(asset.href, access)
+    crs, grid = file.place()
+    unit = file.unit
+    file.close()
+    stated = _stated(asset, grid)
+    own = declared_vertical(crs)
+    if stated is None:
+        return (file, crs, grid, unit), False
+    system, declared = stated
+    if own is None:
+        return (file, system, grid, unit), True
+    if own.vertical != declared.vertical and not override:
+        raise DatumError(
+            f"this file declares its heights as {own.name!r}, and its STAC item says {declared.name!r}", file=file.path,
+            field="surface.vertical",
+            remedy="say which is true: `surface.vertical` together with `surface.override_vertical`",
+        )  # fmt: skip
+    return (file, crs, grid, unit), False
+
+
+def _stated(asset: Asset, grid: SampleGrid) -> tuple[pyproj.CRS, DeclaredVertical] | None:
+    """Return the system with heights that an item states for a file of this grid; None where it states none."""
+    for text in asset.systems:
+        try:
+            crs = parse_crs(text)
+            with completed(asset.href):
+                declared = declared_vertical(crs)
+            if declared is not None and horizontal(crs).equals(grid.crs, ignore_axis_order=True):
+                return crs, declared
+        except CrsError:
+            # What cannot be read says nothing; the file itself has the say of where it lies.
+            continue
+    return None
+
+
+def _same_ground(mosaic: DemMosaic, ids: Mapping[str, str]) -> list[Notice]:
+    """Return a notice if items show the same ground, so that one hides the other."""
+    places: list[tuple[str, float, float, float, float]] = []
+    for layer in mosaic.layers:
+        for part in layer.parts:
+            (height, width), left = part.shape, layer.first + part.column * layer.step
+            places.append((ids[part.samples.path], left, part.row, left + width * layer.step, part.row + height))
+    hidden = list(dict.fromkeys(first[0] for first, second in _neighbours(places) if _shared(first, second)))
+    if not hidden:
+        return []
+    shown = ", ".join(hidden[:_SHOWN]) + (" and others" if len(hidden) > _SHOWN else "")
+    return [
+        Notice(
+            "dem-items-overlap",
+            f"{counted(len(hidden), 'item')} of the DEM's collection {'shows' if len(hidden) == 1 else 'show'} ground "
+            f"that another one shows too: there the finer one counts, of equal ones that of the later date ({shown})",
+            items=hidden,
+        )
+    ]
+
+
+def _neighbours(places: Sequence[tuple[Any, ...]]) -> Iterable[tuple[Any, Any]]:
+    """Yield pairs of places whose columns overlap, in the order in which they are laid on each other."""
+    order = sorted(range(len(places)), key=lambda index: places[index][1])
+    for number, index in enumerate(order):
+        for after in range(number + 1, len(order)):
+            other = order[after]
+            if places[other][1] >= places[index][3]:
+                break
+            yield places[min(index, other)], places[max(index, other)]
+
+
+def _shared(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
+    wide = min(one[3], other[3]) - max(one[1], other[1])
+    high = min(one[4], other[4]) - max(one[2], other[2])
+    least = min((place[3] - place[1]) * (place[4] - place[2]) for place in (one, other))
+    return wide > 0 and high > 0 and wide * high > _SAME_GROUND * least
