@@ -132,8 +132,9 @@ class _Gate:
         if there.is_dir():
             self._see_folder(there)
             allowed = ["DIMAP"]
+            product = self._product_in(there)
             _require_driver("DIMAP", there)
-            if (product := self._product_in(there)) is not None:
+            if product is not None:
                 name = os.fspath(product)
                 self._see_named(product, "DIMAP", frozenset())
         else:
