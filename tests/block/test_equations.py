@@ -264,6 +264,23 @@ def test_what_control_tells_nothing_of_needs_no_part_in_the_grid(monkeypatch: py
         np.testing.assert_allclose((one.sigma_xy, one.sigma_h), (other.sigma_xy, other.sigma_h), rtol=1e-8)
 
 
+def test_sigmas_are_there_where_rounding_drowns_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measurements a hundred times as good as stated: the factor is the smallest at which the equations still hold."""
+    models, points = strip(6, 120)
+    points = replace(points, sigma_image=100.0 * points.sigma_image)
+    exact = control_equations.ControlEquations.likelihoods
+
+    def drowned(self: control_equations.ControlEquations, nodes: np.ndarray) -> np.ndarray:
+        return np.where(nodes[:, 0] < 0.02, -np.inf, exact(self, nodes))
+
+    free = adjust(models, points, robust=False).variances.image
+    monkeypatch.setattr(control_equations.ControlEquations, "likelihoods", drowned)
+    found = adjust(models, points, robust=False)
+    assert free < 0.05
+    assert np.sqrt(0.02) <= found.variances.image < np.sqrt(0.02) * np.exp(0.5)
+    assert (found.sigmas > 0).all()
+
+
 def test_nodes_are_the_least_squares_problems_with_their_variances() -> None:
     """Cofactors, solution and restricted likelihood of a node, by one dense problem of all unknowns."""
     models, points = strip(6, 120)

@@ -106,6 +106,9 @@ class _Grid:
             self.free, self.separable = [False, False], False
         self.unseen = self._unseen()
         self.centre = self._centre()
+        # So much better than stated that rounding of the equations drowns the ground: no better than they can tell.
+        while not np.isfinite(self.chances(self.centre[None])[0]) and self.centre[0] < 0.0:
+            self.centre[0] = min(self.centre[0] + _COARSE, 0.0)
 
     def _variances(self, logs: Array) -> Array:
         """Return the variances ``(..., 3)`` at nodes."""
