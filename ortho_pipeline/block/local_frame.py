@@ -113,9 +113,10 @@ class Places:
 
     def _geodetic_partials(self) -> Array:
         if self._slopes is None:
-            axes = self.frame.enu_at(self.geodetic)
-            axes[:, :2] /= metres_per_degree(self.geodetic)[:, :, None]
-            self._slopes = axes
+            from ortho_pipeline.block.equations import point_kernel
+
+            self._slopes = np.empty((len(self.local), 3, 3))
+            point_kernel.slopes(self.geodetic, metres_per_degree(self.geodetic), self.frame.turn, self._slopes)
         return self._slopes
 
     def _differences(self, crs: str) -> Array:

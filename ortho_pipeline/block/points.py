@@ -6,6 +6,7 @@ ground, one role and one identity however many images show it.
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -180,10 +181,22 @@ class BlockPoints:
 
     @cached_property
     def rays_of_images(self) -> tuple[Index, ...]:
-        """Rays of each image, in the order of their points."""
-        order = np.lexsort((self.point, self.image))
+        """Rays of each image, as they follow each other here."""
+        order = np.argsort(self.image, kind="stable")
         ends = np.searchsorted(self.image[order], np.arange(len(self.images) + 1))
         return tuple(order[a:b] for a, b in itertools.pairwise(ends))
+
+    @cached_property
+    def by_point(self) -> Index:
+        """Rays by point, those of a point by image."""
+        return np.lexsort((self.image, self.point))
+
+    def with_image_sigmas(self, sigmas: Array) -> BlockPoints:
+        """Return these points with other standard deviations ``(M,)`` (px) of their measurements, positive ones."""
+        # Nothing else depends on them, nor what was found of it, for which a large block would be gone through again.
+        found = copy.copy(self)
+        object.__setattr__(found, "sigma_image", sigmas)
+        return found
 
     def with_roles(self, roles: ArrayLike) -> BlockPoints:
         """Return these points with other roles ``(N,)``."""

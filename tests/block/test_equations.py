@@ -281,8 +281,10 @@ def test_sigmas_are_there_where_rounding_drowns_the_ground(monkeypatch: pytest.M
     assert (found.sigmas > 0).all()
 
 
-def test_nodes_are_the_least_squares_problems_with_their_variances() -> None:
+@pytest.mark.parametrize("many", [0, 10**6], ids=["LAPACK", "compiled"])
+def test_nodes_are_the_least_squares_problems_with_their_variances(many: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Cofactors, solution and restricted likelihood of a node, by one dense problem of all unknowns."""
+    monkeypatch.setattr(control_equations, "_MANY", many)
     models, points = strip(6, 120)
     points = replace(points, sigma_ground=np.where(np.arange(len(points))[:, None] % 16 == 0, 0.0, points.sigma_ground))
     ordered, frame = tuple(models.values()), frame_of(tuple(models.values()), points)
@@ -327,7 +329,9 @@ def test_equations_with_a_few_points_elsewhere_are_those_of_the_state(linear: Li
     moved = np.arange(len(linear.problem.points)) % 7 == 0
     local = linear.state.local + 5.0 * moved[:, None]
     wanted = Linear.at(linear.problem, State(linear.state.models, local), linear.weights)
-    found = linear.with_points_moved(local, moved)
+    own = Linear.at(linear.problem, linear.state, linear.weights)
+    found = own.with_points_moved(local, moved)
+    assert not hasattr(own, "by_params"), "partials, most of the memory of a block, are kept twice"
     np.testing.assert_allclose(found.misfits.vector, wanted.misfits.vector, rtol=0, atol=1e-8)
     np.testing.assert_allclose(found.by_point, wanted.by_point, rtol=0, atol=1e-8)
     np.testing.assert_allclose(found.by_params, wanted.by_params, rtol=0, atol=1e-8)

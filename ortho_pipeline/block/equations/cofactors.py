@@ -13,6 +13,9 @@ from ortho_pipeline.block.points import Index
 from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models.base import Array
 
+#: Numbers of a matrix that is made for some of the pairs at once.
+_AT_ONCE = 1 << 19
+
 
 @dataclass(frozen=True, eq=False)
 class Cofactors:
@@ -34,7 +37,10 @@ class Cofactors:
         found = self.factor * self.inverse.blocks
         if self.root.size:
             right = np.vstack([self.root, np.zeros((1, self.root.shape[1]))])[padded]
-            found += (right @ self.inner)[pairs.first] @ right[pairs.second].swapaxes(1, 2)
+            left, step = right @ self.inner, max(_AT_ONCE // max(right[0].size, 1), 1)
+            for begin in range(0, len(found), step):
+                part = slice(begin, begin + step)
+                found[part] += left[pairs.first[part]] @ right[pairs.second[part]].swapaxes(1, 2)
         return np.asarray(found)
 
     @cached_property

@@ -18,7 +18,6 @@ Source: Brown 1976 (elimination of points); Demmel et al. 2021 (orthogonally); G
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,7 +42,7 @@ class Elimination:
 
     linear: Linear
 
-    @cached_property
+    @property
     def _rows(self) -> point_kernel.Rows:
         """These equations for compiled code."""
         from ortho_pipeline.block.equations import point_kernel

@@ -35,7 +35,7 @@ class ImagePairs:
     @classmethod
     def of(cls, points: BlockPoints) -> ImagePairs:
         """Return the pairs of all points, whether they take part or not."""
-        order = np.lexsort((points.image, points.point))
+        order = points.by_point
         image, point = points.image[order], points.point[order]
         tied = np.eye(len(points.images), dtype=bool)
         for apart in range(1, len(order)):
@@ -47,6 +47,17 @@ class ImagePairs:
         slot = np.full(tied.shape, -1, dtype=np.int64)
         slot[first, second] = slot[second, first] = np.arange(len(first))
         return cls(first, second, slot)
+
+    @cached_property
+    def _by_second(self) -> Index:
+        return np.argsort(self.second, kind="stable")
+
+    def summed(self, values: Array, *, of_second: bool = False) -> Array:
+        """Return the sums ``(images, p)`` of values ``(S, p)`` of pairs over those with one first (second) image."""
+        numbers = self.second[self._by_second] if of_second else self.first
+        values = values[self._by_second] if of_second else values
+        # Each image has a pair with itself, so there is one of all of them.
+        return np.asarray(np.add.reduceat(values, np.searchsorted(numbers, np.arange(len(self.slot)))))
 
     @cached_property
     def levels(self) -> tuple[Index, ...]:

@@ -25,25 +25,30 @@ from ortho_pipeline.models.base import Array
 
 #: Up to so many parameters all eigenvalues are computed, beyond that the extreme ones are iterated for.
 _FEW = 200
+#: Where that iteration ends, as part of the eigenvalue's length: its error is about the square of this.
+_NEARLY = 1e-6
 
 
 class LevelMatrix:
     """Normal equations with blocks ``(S, p, p)`` of pairs of images, their diagonal scaled to ones."""
 
     def __init__(self, levels: Levels, blocks: Array, damping: float = 0.0) -> None:
-        self.levels = levels
+        self.levels, self.damping = levels, damping
         padded = levels.columns.padded
         images = np.arange(len(padded))
         diagonal = np.diagonal(blocks[levels.pairs.slot[images, images]], axis1=1, axis2=2)
         self.lengths = lengths_of(np.sqrt(np.maximum(diagonal, 0.0)))
-        self._own, self._between = levels.split(self._scaled(blocks))
-        if damping:
-            self._own = [part + damping * np.eye(len(part)) for part in self._own]
+        self.scaled = self._scaled(blocks)
 
     def _scaled(self, blocks: Array) -> Array:
         pairs = self.levels.pairs
         lengths = self.lengths[pairs.first][:, :, None] * self.lengths[pairs.second][:, None, :]
         return np.asarray(blocks / lengths)
+
+    def _split(self) -> tuple[list[Array], list[Array]]:
+        """Return the matrices of the levels, and those between a level and the next."""
+        own, between = self.levels.split(self.scaled)
+        return [part + self.damping * np.eye(len(part)) if self.damping else part for part in own], between
 
     @property
     def _lengths(self) -> Array:
@@ -52,21 +57,21 @@ class LevelMatrix:
 
     def _product(self, right: Array) -> Array:
         """Return the scaled matrix times ``(P,)``."""
-        columns, found = self.levels.of_level, np.zeros_like(right)
-        for number, part in enumerate(self._own):
-            found[columns[number]] += part @ right[columns[number]]
-        for number, part in enumerate(self._between):
-            found[columns[number + 1]] += part @ right[columns[number]]
-            found[columns[number]] += part.T @ right[columns[number + 1]]
-        return found
+        pairs, padded = self.levels.pairs, self.levels.columns.padded
+        wide = np.append(right, 0.0)[padded]
+        found = pairs.summed((self.scaled @ wide[pairs.second][:, :, None])[:, :, 0])
+        turned = (wide[pairs.first][:, None, :] @ self.scaled)[:, 0]
+        turned[pairs.first == pairs.second] = 0.0
+        found += pairs.summed(turned, of_second=True)
+        return np.asarray(found[padded >= 0] + self.damping * right)
 
     def dense(self) -> Array:
         """Return the scaled matrix ``(P, P)``."""
         columns, size = self.levels.of_level, self.levels.columns.size
-        found = np.zeros((size, size))
-        for number, part in enumerate(self._own):
+        found, (own, between) = np.zeros((size, size)), self._split()
+        for number, part in enumerate(own):
             found[np.ix_(columns[number], columns[number])] = part
-        for number, part in enumerate(self._between):
+        for number, part in enumerate(between):
             found[np.ix_(columns[number + 1], columns[number])] = part
             found[np.ix_(columns[number], columns[number + 1])] = part.T
         return found
@@ -85,12 +90,13 @@ class LevelFactor(LevelMatrix):
         super().__init__(levels, blocks, damping)
         self._lower: list[Array] = []
         self._along: list[Array] = []
-        for number, own in enumerate(self._own):
-            left = own
+        own, between = self._split()
+        for number, part in enumerate(own):
+            left = part
             if number:
-                along = _back(self._lower[-1], self._between[number - 1].T)
+                along = _back(self._lower[-1], between[number - 1].T)
                 self._along.append(along)
-                left = own - along.T @ along
+                left = part - along.T @ along
             self._lower.append(_root(left))
 
     def solve(self, right: Array) -> Array:
@@ -121,8 +127,7 @@ class LevelFactor(LevelMatrix):
         between: list[Array] = []
         for number in reversed(range(len(self._lower))):
             lower = self._lower[number]
-            root = _back(lower, np.eye(len(lower)))
-            part = root.T @ root
+            part = _inverse(lower)
             if own:
                 back = _back(lower, self._along[number], turned=True)
                 across = back @ own[-1]
@@ -145,7 +150,7 @@ class LevelFactor(LevelMatrix):
 
             def largest(product: Callable[[Array], Array]) -> float:
                 operator = LinearOperator((size, size), product, dtype=np.float64)
-                return float(eigsh(operator, 1, which="LA", v0=start, return_eigenvectors=False)[0])
+                return float(eigsh(operator, 1, which="LA", v0=start, return_eigenvectors=False, tol=_NEARLY)[0])
 
             try:
                 high, low = largest(self._product), 1.0 / largest(self._solve)
@@ -163,6 +168,16 @@ def _root(matrix: Array) -> Array:
     if failed or not np.isfinite(found).all():
         raise np.linalg.LinAlgError("not positive definite")
     return np.asarray(found)
+
+
+def _inverse(lower: Array) -> Array:
+    """Return the inverse of the matrix that has a lower Cholesky factor."""
+    from scipy.linalg.lapack import dpotri
+
+    found, failed = dpotri(lower, lower=1)
+    if failed:
+        raise np.linalg.LinAlgError("singular")
+    return np.asarray(np.tril(found) + np.tril(found, -1).T)
 
 
 def _back(lower: Array, right: Array, *, turned: bool = False) -> Array:

@@ -51,8 +51,18 @@ class Linear:
         ground_by_point[rows] = problem.enu[rows] * scale[:, :, None]
         return cls(problem, state, ordering, weights, misfits, by_params, by_point, ground_by_point, pseudo)
 
+    def _handed_over(self) -> tuple[Array, Array, Array]:
+        """Return the partials, and leave none here: they are most of a block's memory, and are changed in place."""
+        found = self.by_params, self.by_point, self.ground_by_point
+        for name in ("by_params", "by_point", "ground_by_point"):
+            object.__delattr__(self, name)
+        return found
+
     def with_points_moved(self, local: Array, moved: Mask) -> Linear:
-        """Return these equations with points at `local` ``(N, 3)``; only those `moved` ``(N,)`` are elsewhere."""
+        """Return these equations with points at `local` ``(N, 3)``; only those `moved` ``(N,)`` are elsewhere.
+
+        They take the partials of these along.
+        """
         problem, points, numbers = self.problem, self.problem.points, np.flatnonzero(moved)
         place = np.zeros(len(points), dtype=np.int64)
         place[numbers] = np.arange(len(numbers))
@@ -63,25 +73,27 @@ class Linear:
         root = np.sqrt(self.weights.ray_weights[used]) / points.sigma_image[used]
         places, widest = problem.frame.places(local[numbers]), problem.columns.widest
         seen = linearised(places, self.state.models, of_images, place[points.point[used]], root, widest)
-        rays, by_point, by_params = self.misfits.rays.copy(), self.by_point.copy(), self.by_params.copy()
+        rays, (by_params, by_point, ground_by_point) = self.misfits.rays.copy(), self._handed_over()
         rays[used] = points.whitened((points.measured[used] - seen.image) * root[:, None], used)
         by_point[used] = points.whitened(seen.by_point, used)
         by_params[used] = points.whitened(seen.by_params, used)
         ground = problem.ground_misfits(local, self.ordering, self.weights)
         return replace(
             self, state=replace(self.state, local=local), by_point=by_point, by_params=by_params,
-            misfits=replace(self.misfits, rays=rays, ground=ground),
+            ground_by_point=ground_by_point, misfits=replace(self.misfits, rays=rays, ground=ground),
         )  # fmt: skip
 
     def reweighted(self, weights: Selection) -> Linear:
-        """Return these equations with other weights of what takes part."""
+        """Return these equations with other weights of what takes part; they take the partials of these along."""
         of_rays = np.sqrt(weights.ray_weights / self.weights.ray_weights)
         of_ground = np.sqrt(weights.ground_weights / self.weights.ground_weights)
-        misfits, each = self.misfits, (slice(None), None, None)
+        misfits, (by_params, by_point, ground_by_point) = self.misfits, self._handed_over()
+        by_params *= of_rays[:, None, None]
+        by_point *= of_rays[:, None, None]
+        ground_by_point *= of_ground[:, None, None]
         return replace(
-            self, weights=weights, by_params=self.by_params * of_rays[each], by_point=self.by_point * of_rays[each],
+            self, weights=weights, by_params=by_params, by_point=by_point, ground_by_point=ground_by_point,
             misfits=replace(misfits, rays=misfits.rays * of_rays[:, None], ground=misfits.ground * of_ground[:, None]),
-            ground_by_point=self.ground_by_point * of_ground[each],
         )  # fmt: skip
 
     @property

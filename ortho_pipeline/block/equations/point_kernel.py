@@ -369,6 +369,52 @@ def ground(rows, begin, end, blocks, factor, found):
 
 
 @compiled
+def slopes(ground, lengths, turn, found):
+    """Fill `found` ``(N, 3, 3)`` with d(lon, lat, h)/d(frame) of points lon, lat (degrees), h.
+
+    `lengths` ``(N, 2)`` are those of a degree, `turn` ``(3, 3)`` leads from ECEF to the frame.
+    """
+    axes = np.empty((3, 3))
+    for k in range(ground.shape[0]):
+        lon, lat = np.radians(ground[k, 0]), np.radians(ground[k, 1])
+        sin_lon, cos_lon, sin_lat, cos_lat = np.sin(lon), np.cos(lon), np.sin(lat), np.cos(lat)
+        axes[0, 0], axes[0, 1], axes[0, 2] = -sin_lon, cos_lon, 0.0
+        axes[1, 0], axes[1, 1], axes[1, 2] = -sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat
+        axes[2, 0], axes[2, 1], axes[2, 2] = cos_lat * cos_lon, cos_lat * sin_lon, sin_lat
+        for row in range(3):
+            scale = 1.0 / lengths[k, row] if row < 2 else 1.0
+            for along in range(3):
+                value = axes[row, 0] * turn[along, 0] + axes[row, 1] * turn[along, 1] + axes[row, 2] * turn[along, 2]
+                found[k, row, along] = value * scale
+
+
+@compiled
+def squares(used, hats, misfits, testable, found, rank):
+    """Fill squared standardised residuals `found` ``(M,)`` of rays, and their degrees of freedom `rank` ``(M,)``.
+
+    Of those `used`, with hat matrices ``(M, 2, 2)`` and misfits ``(M, 2)``, along the axes of their redundancy, where
+    this is more than `testable`. Others stay as they are.
+    """
+    for k in range(len(used)):
+        ray = used[k]
+        a, b, c = 1.0 - hats[ray, 0, 0], -hats[ray, 1, 0], 1.0 - hats[ray, 1, 1]
+        half, spread = 0.5 * (a + c), np.hypot(0.5 * (a - c), b)
+        # Twice the angle of the first axis, by the sum or the difference that loses no digits.
+        along = 0.5 * (a - c)
+        x, y = (along + spread, b) if along >= 0.0 else (b, spread - along)
+        length = np.hypot(x, y)
+        cos, sin = (x / length, y / length) if length > 0.0 else (1.0, 0.0)
+        first = cos * misfits[ray, 0] + sin * misfits[ray, 1]
+        second = cos * misfits[ray, 1] - sin * misfits[ray, 0]
+        square, free = 0.0, 0
+        if half + spread > testable:
+            square, free = square + first * first / (half + spread), free + 1
+        if half - spread > testable:
+            square, free = square + second * second / (half - spread), free + 1
+        found[ray], rank[ray] = square, free
+
+
+@compiled
 def chained(by_ground, way, rows):
     """Return d(image)/d(frame) ``(n, 2, 3)`` of d(image)/d(ground) ``(n, 2, 3)`` and `way` ``(N, 3, 3)`` of `rows`."""
     found = np.empty(by_ground.shape)

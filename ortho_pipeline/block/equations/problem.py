@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -143,6 +144,14 @@ class BlockProblem:
     def levels(self) -> Levels:
         """The parameters in an order in which the normal equations of many images are solved."""
         return Levels(ImagePairs.of(self.points), self.columns)
+
+    def with_sigmas(self, image: Array, assumed: tuple[float, float]) -> BlockProblem:
+        """Return this problem with other sigmas of measurements ``(M,)``, and of known ground that states none."""
+        found = copy.copy(self)
+        found.__dict__.pop("ground_sigmas", None)
+        object.__setattr__(found, "points", self.points.with_image_sigmas(image))
+        object.__setattr__(found, "assumed", assumed)
+        return found
 
     def with_pseudo(self, more: Sequence[Pseudo]) -> BlockProblem:
         """Return this problem with further pseudo-observations."""

@@ -94,8 +94,7 @@ class Ordering:
         grounded : ndarray (N,) of bool
             Points whose ground is known; those without rays do not take part.
         """
-        rays = np.flatnonzero(taking_part)
-        rays = rays[np.lexsort((points.image[rays], points.point[rays]))]
+        rays = points.by_point[taking_part[points.by_point]]
         counts = np.bincount(points.point[rays], minlength=len(points))
         numbers = np.flatnonzero(counts)
         starts = np.cumsum(counts[numbers]) - counts[numbers]

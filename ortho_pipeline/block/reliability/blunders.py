@@ -56,7 +56,8 @@ def find_blunders(solved: Solved, selection: Selection) -> Found:
     Parameters
     ----------
     solved : Solved
-        The solution of everything in the selection, or near it: what is found is no more than a selection.
+        The solution of everything in the selection, or near it: what is found is no more than a selection. Its
+        equations are used up.
 
     Raises
     ------
@@ -68,15 +69,15 @@ def find_blunders(solved: Solved, selection: Selection) -> Found:
     significant = _significant(solved, tests, variances)
     if not significant.any() and not _suspects(problem, tests, variances, _DOUBT).any():
         return Found(selection, solved.state)
-    problem, robust = _robust(solved, selection, tests, variances)
-    tests = standardise(robust)
+    state = solved.state
+    problem, robust, tests = _robust(solved, selection, tests, variances)
     suspects = _suspects(problem, tests, variances, _SUSPECT)
     worst = _worst(problem, tests, variances)
-    trusted = _trusted(problem, (robust, solved), selection, suspects)
+    trusted = _trusted(problem, (robust, state), selection, suspects)
     if trusted is None:
         # Weights of few points fall at random, and may leave too few: then only what all others contradict is doubted.
         suspects = significant
-        trusted = _trusted(problem, (solved,), selection, suspects)
+        trusted = _trusted(problem, (state,), selection, suspects)
     kept, rejected = selection, dict[int, Rejected]()
     for _ in range(_TEST_ROUNDS):
         if trusted is None:
@@ -84,11 +85,12 @@ def find_blunders(solved: Solved, selection: Selection) -> Found:
             if suspects[problem.active(selection) & selection.ground].all():
                 _refuse_many(problem, selection, doubted)
             names = tuple(problem.points.ids[i] for i in doubted)
-            return Found(kept, solved.state, tuple(rejected.values()), names)
+            return Found(kept, state, tuple(rejected.values()), names)
         kept, rejected = judge(trusted, selection, suspects)
         _refuse_many(problem, selection, list(rejected))
-        solved, kept = solve_inside(trusted.solved.problem, trusted.solved.state, kept, NEAR)
-        more = _significant(solved, standardise(solved), trusted.variances)
+        # Only one solution of a large block is kept at a time: its equations are most of the memory.
+        weighed, near, variances, trusted = trusted.solved.problem, trusted.solved.state, trusted.variances, None
+        state, kept, more = _kept(weighed, near, kept, variances)
         if variances.estimated:
             # Suspects were the worst, and without them a sigma is found too small: the others return into it.
             more[list(rejected)] = True
@@ -99,11 +101,17 @@ def find_blunders(solved: Solved, selection: Selection) -> Found:
         if (more == suspects).all() or not more.any():
             break
         suspects = more
-        trusted = _trusted(trusted.solved.problem, (trusted.solved,), selection, suspects)
-    return Found(kept, solved.state, tuple(rejected[number] for number in sorted(rejected)))
+        trusted = _trusted(weighed, (near,), selection, suspects)
+    return Found(kept, state, tuple(rejected[number] for number in sorted(rejected)))
 
 
-def _trusted(problem: BlockProblem, starts: tuple[Solved, ...], selection: Selection, suspects: Mask) -> Trusted | None:
+def _kept(problem: BlockProblem, start: State, kept: Selection, variances: Variances) -> tuple[State, Selection, Mask]:
+    """Return the solution without gross errors, what takes part in it, and the points that it contradicts."""
+    solved, kept = solve_inside(problem, start, kept, NEAR)
+    return solved.state, kept, _significant(solved, standardise(solved), variances)
+
+
+def _trusted(problem: BlockProblem, starts: tuple[State, ...], selection: Selection, suspects: Mask) -> Trusted | None:
     """Return the solution without the suspects; None if that leaves no control to judge them by, or is undetermined.
 
     It is sought from the best of some starts: steps with robust weights can lead far away where few points keep theirs.
@@ -112,7 +120,7 @@ def _trusted(problem: BlockProblem, starts: tuple[Solved, ...], selection: Selec
     others = Selection.of(selection.rays & of_others, selection.ground & ~suspects)
     if selection.ground.any() and not (problem.active(others) & others.ground).any():
         return None
-    start = min((one.state for one in starts), key=lambda state: problem.square(state, others))
+    start = min(starts, key=lambda state: problem.square(state, others))
     solved = attempt(problem, start, others, NEAR)
     if solved.condition > CONDITION_LIMIT or not solved.converged:
         return None
@@ -123,8 +131,8 @@ def _trusted(problem: BlockProblem, starts: tuple[Solved, ...], selection: Selec
 
 def _robust(
     solved: Solved, selection: Selection, tests: StandardisedResiduals, variances: Variances
-) -> tuple[BlockProblem, Solved]:
-    """Return a solution that gross errors have little part in, and the problem with the sigmas that it has by itself.
+) -> tuple[BlockProblem, State, StandardisedResiduals]:
+    """Return a solution that gross errors have little part in, its tests, and the problem with its own sigmas.
 
     Sigmas of measurements are often guessed. Were good ground judged by how much better than that the images agree with
     each other, it would look wrong.
@@ -140,19 +148,18 @@ def _robust(
             weights = replace(selection, ray_weights=weigh(rays), ground_weights=weigh(ground))
             found, ahead = once(linear.reweighted(weights))
             if not np.isfinite(found.linear.misfits.rays).all():
-                return problem, replace(solved, linear=replace(solved.linear, state=linear.state))
-            solved, linear = found, ahead
-            tests = standardise(solved)
+                return problem, linear.state, tests
+            tests, linear = standardise(found), ahead
+            del found  # and with it the memory of its equations
             if np.abs(weights.ray_weights - before).mean() < _SETTLED:
                 break
             before = weights.ray_weights
         if weigh is _huber:
-            points = problem.points
-            sigma_image = points.sigma_image * tests.scale_of_rays()
+            sigma_image = problem.points.sigma_image * tests.scale_of_rays()
             scale = tests.scale_of_ground(estimated) if estimated.any() else 1.0
             assumed = (problem.assumed[0] * scale, problem.assumed[1] * scale)
-            problem = replace(problem, points=replace(points, sigma_image=sigma_image), assumed=assumed)
-    return problem, replace(solved, linear=replace(solved.linear, state=linear.state))
+            problem = problem.with_sigmas(sigma_image, assumed)
+    return problem, linear.state, tests
 
 
 def _huber(size: Array) -> Array:

@@ -53,9 +53,12 @@ def _root_median(ratio: Array) -> float:
 
 def standardise(solved: Solved) -> StandardisedResiduals:
     """Standardise the residuals of everything that takes part, one by one."""
+    from ortho_pipeline.block.equations import point_kernel
+
     linear, weights = solved.linear, solved.linear.weights
     of_rays, of_ground = solved.points.hats(solved.cofactors)
-    rays, ray_rank = _standardised(linear.ordering.rays, of_rays, linear.misfits.rays)
+    rays, ray_rank = np.zeros(len(of_rays)), np.zeros(len(of_rays), dtype=np.int64)
+    point_kernel.squares(linear.ordering.rays, of_rays, linear.misfits.rays, _TESTABLE, rays, ray_rank)
     ground, ground_rank = _standardised(linear.ordering.grounded, of_ground, linear.misfits.ground)
     return StandardisedResiduals(rays / weights.ray_weights, ray_rank, ground / weights.ground_weights, ground_rank)
 
@@ -73,21 +76,9 @@ def _standardised(used: Index, hats: Array, misfits: Array) -> tuple[Array, Inde
     that it was taken from.
     """
     squares, rank = np.zeros(len(hats)), np.zeros(len(hats), dtype=np.int64)
-    redundancy, axes = _axes_of(np.eye(hats.shape[1]) - hats[used])
+    redundancy, axes = np.linalg.eigh(np.eye(hats.shape[1]) - hats[used])
     turned = np.einsum("nij,ni->nj", axes, misfits[used])
     testable = redundancy > _TESTABLE
     squares[used] = np.where(testable, turned**2 / np.where(testable, redundancy, 1.0), 0.0).sum(axis=1)
     rank[used] = testable.sum(axis=1)
     return squares, rank
-
-
-def _axes_of(matrices: Array) -> tuple[Array, Array]:
-    """Return eigenvalues ``(n, k)`` and eigenvectors ``(n, k, k)`` of symmetric matrices; of 2 x 2 in closed form."""
-    if matrices.shape[1] != 2:
-        return np.linalg.eigh(matrices)
-    a, b, c = matrices[:, 0, 0], matrices[:, 1, 0], matrices[:, 1, 1]
-    angle = 0.5 * np.arctan2(2.0 * b, a - c)
-    cos, sin = np.cos(angle), np.sin(angle)
-    half, spread = 0.5 * (a + c), np.hypot(0.5 * (a - c), b)
-    axes = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
-    return np.stack([half + spread, half - spread], axis=1), axes

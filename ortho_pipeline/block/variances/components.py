@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -88,7 +88,7 @@ class Variances:
         perfect = (PERFECT_GROUND, PERFECT_GROUND)
         assumed = perfect if not self.separable else (self.sigma_xy or PERFECT_GROUND, self.sigma_h or PERFECT_GROUND)
         sigma_image = problem.points.sigma_image * self.image
-        return replace(problem, points=replace(problem.points, sigma_image=sigma_image), assumed=assumed)
+        return problem.with_sigmas(sigma_image, assumed)
 
     def notes(self) -> list[Notice]:
         """Return what people ought to know of them."""

@@ -12,6 +12,7 @@ import numpy as np
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.solver import Solved
+from ortho_pipeline.block.variances import dense_nodes
 from ortho_pipeline.block.variances.components import diagonal
 from ortho_pipeline.models.base import Array
 
@@ -23,6 +24,8 @@ _FINEST = 1e-4
 #: Below this part of the parameters, those that control tells of are taken alone; what is told less than this part of
 #: what is known counts as nothing.
 _FAR_LESS, _TOLD = 0.5, 1e-13
+#: Beyond so many parameters z nodes are solved by LAPACK: compiled loops take ten times as long then, and less below.
+_MANY = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +65,13 @@ class ControlEquations:
         own = self.u + diagonal(self.weights)
         self.root = _root(solved.cofactors, own, by_params, linear.pseudo_design)
         self.rest = self.size - self.root.shape[1]
-        self.k: Array = by_params @ self.root
+        # As one product: BLAS is slow at many of three rows.
+        flat = by_params.reshape(3 * len(self.rows), self.size) @ self.root
+        self.k: Array = flat.reshape(len(self.rows), 3, self.rank)
         pseudo = linear.pseudo_design @ self.root
         self.pseudo, self.pseudo_right = pseudo.T @ pseudo, pseudo.T @ linear.misfits.pseudo
         inverse = np.linalg.inv(own)
         taken = inverse @ self.k
-        flat = self.k.reshape(3 * len(self.rows), self.rank)
         # The normal matrix of the solution is the unit matrix, its gradient zero: what is not control is the rest.
         self.image = np.eye(self.rank) - self.pseudo + flat.T @ taken.reshape(flat.shape)
         right = (inverse @ (self.ue + self.weights * self.d)[:, :, None])[:, :, 0]
@@ -122,6 +126,8 @@ class ControlEquations:
         """Return the log likelihoods ``(b,)`` with variances ``(b, 3)`` of image, plan and height."""
         from ortho_pipeline.block.variances import node_kernel
 
+        if self.rank > _MANY:
+            return np.array([dense_nodes.solved(self._compiled, node).likelihood for node in nodes])
         found = np.empty(len(nodes))
         node_kernel.likelihoods(self._compiled, nodes, found)
         return found
@@ -137,6 +143,8 @@ class ControlEquations:
     def _over(self, nodes: Array, chances: Array, *, moved: bool) -> Node:
         from ortho_pipeline.block.variances import node_kernel
 
+        if self.rank > _MANY:
+            return Node(*dense_nodes.means(self._compiled, nodes, chances, moved=moved))
         count, size = len(self.rows), self.rank
         weights, z, shift = np.empty((count, 3)), np.empty(size), np.empty((count, 3))
         cofactors, ground = np.zeros((size, size)), np.zeros((count, 3, 3))

@@ -99,9 +99,9 @@ class _Grid:
         self.equations = equations = ControlEquations(solved)
         self.free = [bool(equations.unstated[:, :2].any()), bool(equations.unstated[:, 2].any())]
         self.separable = True
+        self._last: tuple[Array, Node] | None = None
         far = np.log([1.0, 1e3 * equations.pixel, 1e3 * equations.pixel])
-        alone = equations.redundancy(self._at(far))[0]
-        if any(self.free) and alone < _LEAST:
+        if any(self.free) and equations.redundancy(self._at(far))[0] < _LEAST:
             # One image, or no redundancy: an error of the ground is one of the measurement.
             self.free, self.separable = [False, False], False
         self.unseen = self._unseen()
@@ -118,8 +118,10 @@ class _Grid:
         return np.asarray(nodes)
 
     def _at(self, logs: Array) -> Node:
-        """Return the solution at a node ``(3,)``."""
-        return self.equations.at(self._variances(logs))
+        """Return the solution at a node ``(3,)``; the last one is asked for again and again."""
+        if self._last is None or not np.array_equal(self._last[0], logs):
+            self._last = logs.copy(), self.equations.at(self._variances(logs))
+        return self._last[1]
 
     def _unseen(self) -> float:
         """Return the sigma (m) of ground below which nothing could be seen of it, times the factor of measurements."""
@@ -202,6 +204,8 @@ class _Grid:
             images = np.linspace(-4.0, 6.0, 31) / math.sqrt(2.0 * redundancy)
         axes = self._axes(len(images))
         logs = np.concatenate([self._plane(self.centre[0] + shift, axes) for shift in images])
+        if len(logs) == 1:
+            return logs, np.ones(1)
         chances = self.chances(logs)
         weights = np.exp(chances - chances.max())
         return logs, weights / weights.sum()
