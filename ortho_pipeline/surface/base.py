@@ -188,9 +188,16 @@ class Surface(abc.ABC):
     def sampler(self, crs: str | pyproj.CRS) -> Callable[[Array], Array]:
         """Return the function from ground ``(N, 3)`` in `crs` to sample coordinates (u, v) ``(N, 2)``."""
 
-    @abc.abstractmethod
     def window_under(self, samples: Array) -> Window | None:
         """Return the samples that cubic interpolation at sample coordinates ``(N, 2)`` needs; None without heights."""
+        samples = samples[np.isfinite(samples).all(axis=1)]
+        if not len(samples):
+            return None
+        return self.window_around(*samples.min(axis=0).tolist(), *samples.max(axis=0).tolist())
+
+    @abc.abstractmethod
+    def window_around(self, left: float, top: float, right: float, bottom: float) -> Window | None:
+        """Return the samples that cubic interpolation in a box of sample coordinates needs; None without heights."""
 
     @abc.abstractmethod
     def window(self, u0: int, v0: int, nu: int, nv: int) -> Array:

@@ -283,17 +283,14 @@ class DemSurface(Surface):
 
     # -- windows -----------------------------------------------------------------------------------------------------
 
-    def window_under(self, samples: Array) -> Window | None:
-        """Return the samples that cubic interpolation at sample coordinates ``(N, 2)`` needs; None without heights."""
-        samples = samples[np.isfinite(samples).all(axis=1)]
+    def window_around(self, left: float, top: float, right: float, bottom: float) -> Window | None:
+        """Return the samples around a box of sample coordinates: see `Surface.window_around`."""
         rows, columns = self.shape
-        if not len(samples):
-            return None
-        low, high = (np.floor(edge).astype(int) for edge in (samples.min(axis=0), samples.max(axis=0)))
-        low, high = low - _BEFORE, high + _AFTER
+        u0, v0 = math.floor(left) - _BEFORE, math.floor(top) - _BEFORE
+        u1, v1 = math.floor(right) + _AFTER, math.floor(bottom) + _AFTER
         if self.fill in ("error", "mask"):  # with any other rule there are heights beyond the DEM
-            low, high = np.maximum(low, -2), np.minimum(high, (columns + 2, rows + 2))
-        return None if (high - low < 2).any() else (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+            u0, v0, u1, v1 = max(u0, -2), max(v0, -2), min(u1, columns + 2), min(v1, rows + 2)
+        return None if u1 - u0 < 2 or v1 - v0 < 2 else (u0, v0, u1, v1)
 
     def window(self, u0: int, v0: int, nu: int, nv: int) -> Array:
         """Return the heights ``(nv, nu)`` of samples, from column `u0` and row `v0`: see `Surface.window`."""

@@ -91,7 +91,7 @@ class FlatSurface(Surface):
         """Return the function that puts all ground in the middle of the same four samples."""
         return lambda ground: np.full((len(ground), 2), 0.5)
 
-    def window_under(self, samples: Array) -> Window | None:
+    def window_around(self, left: float, top: float, right: float, bottom: float) -> Window | None:
         """Return the four samples that stand for all."""
         return 0, 0, 2, 2
 

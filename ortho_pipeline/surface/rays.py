@@ -8,6 +8,8 @@ meet the terrain (`ray_kernel`). The exact model has the last word: it gives the
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -99,8 +101,13 @@ def polynomials(values: Array) -> Array:
     values : (..., n, k)
         At the n `levels`.
     """
-    inverse = np.linalg.inv(np.vander(levels(values.shape[-2]), increasing=True))
-    return np.einsum("kl,...la->...ka", inverse, values)
+    return np.einsum("kl,...la->...ka", _from_values(values.shape[-2]), values)
+
+
+@functools.cache
+def _from_values(count: int) -> Array:
+    """Return the matrix ``(count, count)`` from values at the `levels` to coefficients."""
+    return np.asarray(np.linalg.inv(np.vander(levels(count), increasing=True)), dtype=np.float64)
 
 
 class _Ray:

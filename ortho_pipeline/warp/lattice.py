@@ -32,6 +32,7 @@ size, memory or number of threads.
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 from collections.abc import Iterator
@@ -39,6 +40,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ortho_pipeline.errors import CoverageError
 from ortho_pipeline.geodesy.crs import ground_transform
@@ -148,6 +150,7 @@ class _Exact:
         return samples.reshape(*np.shape(columns), 2)
 
 
+@functools.cache
 def _positions(spacing: int) -> tuple[Array, Array]:
     """Return offsets (columns, rows) of lattice nodes from a block's first pixel, each ``(n, n)``."""
     steps = np.arange(0, BLOCK + spacing, spacing, dtype=float)
@@ -197,7 +200,7 @@ class Lattices:
         averages: bool,
     ) -> None:
         self._exact = _Exact(model, surface, grid)
-        self._size = np.array(size)
+        self._size = size
         self._domain, self._detail = self._exact.domain(), model.detail
         self._tolerance, self._reach, self._averages = tolerance, reach, averages
         self._lock = threading.Lock()
@@ -231,7 +234,10 @@ class Lattices:
         error, plan = self._evaluate(blocks, *REFINEMENTS[0], uv)
         limit = self._tolerance / 2
         for spacing, count in REFINEMENTS[1:]:
-            lacking = [k for k in np.flatnonzero(error > limit) if spacing < blocks[k].spacing or plan[k] <= limit]
+            failing = np.flatnonzero(error > limit)
+            if not len(failing):
+                break
+            lacking = [k for k in failing if spacing < blocks[k].spacing or plan[k] <= limit]
             step = max(1, _TOGETHER // ((BLOCK // spacing + 1) ** 2 * count))
             for part in (lacking[first : first + step] for first in range(0, len(lacking), step)):
                 some = [blocks[k] for k in part]
@@ -257,24 +263,24 @@ class Lattices:
         heights = np.broadcast_to(middle + half * levels(count), (*columns.shape, count))
         image = self._exact.image(columns, rows, heights)
         coefficients = polynomials(image)
-        for k, block in enumerate(blocks):
-            self._set(block, spacing, coefficients[k], image[k], uv[k])
+        self._set(blocks, spacing, coefficients, image, uv)
         return self._bounds(blocks, image, coefficients, uv)
 
     def _project(self, block: OutputBlock, terrain: Terrain) -> None:
         """Give a block the exact image points of all its pixels, each at its own height."""
         columns, rows = self._offsets([block], *_positions(1))
         heights = terrain.heights(block, self._exact.dem(columns, rows)[0])
-        image = self._exact.image(columns, rows, heights[None, :, :, None])[0]
-        self._set(block, 1, image, image, np.full((*heights.shape, 2), 0.5))
+        image = self._exact.image(columns, rows, heights[None, :, :, None])
+        self._set([block], 1, image, image, np.full((1, *heights.shape, 2), 0.5))
 
-    def _set(self, block: OutputBlock, spacing: int, coefficients: Array, image: Array, uv: Array) -> None:
-        block.spacing, block.nodes, block.dem_nodes, block.image = spacing, coefficients, uv, image
-        block.reach = self._reach
-        if self._averages:
-            block.box = _box(block)
-            block.reach += math.ceil(max(block.box) / 2)
-        block.window = self.source_window(block)
+    def _set(self, blocks: list[OutputBlock], spacing: int, coefficients: Array, image: Array, uv: Array) -> None:
+        for k, (block, box) in enumerate(zip(blocks, _extents(image.reshape(len(blocks), -1, 2)), strict=True)):
+            block.spacing, block.nodes, block.dem_nodes, block.image = spacing, coefficients[k], uv[k], image[k]
+            block.reach = self._reach
+            if self._averages:
+                block.box = _box(block)
+                block.reach += math.ceil(max(block.box) / 2)
+            block.window = self._window_around(box, block.reach)
 
     def _bounds(self, blocks: list[OutputBlock], image: Array, coefficients: Array, uv: Array) -> tuple[Array, Array]:
         """Return a bound on the error (source px) of each block's lattice where it may show some of the image.
@@ -303,14 +309,16 @@ class Lattices:
     ) -> tuple[int, int, int, int] | None:
         """Return the window of the source (left, top, right, bottom) under some nodes of a block; None if empty."""
         assert block.image is not None
-        points, pad = block.image[rows, columns].reshape(-1, 2), block.reach + _MARGIN
-        points = points[np.isfinite(points).all(axis=1)]
-        if not len(points):
+        return self._window_around(_extents(block.image[rows, columns].reshape(1, -1, 2))[0], block.reach)
+
+    def _window_around(self, box: list[float], reach: int) -> tuple[int, int, int, int] | None:
+        left, top, right, bottom = box
+        if not left < math.inf:
             return None
-        size = self._size
-        low = np.clip(np.floor(points.min(axis=0)) - pad, 0, size).astype(int)
-        high = np.clip(np.ceil(points.max(axis=0)) + pad, 0, size).astype(int)
-        return None if (high <= low).any() else (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        pad, (width, height) = reach + _MARGIN, self._size
+        left, right = (min(max(side, 0), width) for side in (math.floor(left) - pad, math.ceil(right) + pad))
+        top, bottom = (min(max(side, 0), height) for side in (math.floor(top) - pad, math.ceil(bottom) + pad))
+        return None if right <= left or bottom <= top else (left, top, right, bottom)
 
     def _in_domain(self, block: OutputBlock) -> bool:
         left, top, right, bottom = self._domain
@@ -327,7 +335,7 @@ class Terrain:
 
     def ranges(self, blocks: list[OutputBlock], uv: Array) -> list[int]:
         """Set the height range of each block from its lattice in the DEM; return the indices of those with heights."""
-        windows = [self._window(nodes) for nodes in uv]
+        windows = self._windows(uv.reshape(len(uv), -1, 2))
         present = [k for k, window in enumerate(windows) if window is not None]
         if not present:
             return []
@@ -335,7 +343,13 @@ class Terrain:
         whole = (*together[:, :2].min(axis=0), *together[:, 2:].max(axis=0))
         if self._fits(whole):
             self._whole = self._read(whole)
-        return [k for k in present if self._range(blocks[k], windows[k])]
+        found = self._height_ranges(together)
+        for k, window, (lowest, highest) in zip(present, together.tolist(), found, strict=True):
+            # A cubic DEM overshoots between its samples by up to a quarter of their range.
+            extra = 0.25 * (highest - lowest) if self._cubic else 0.0
+            blocks[k].terrain, blocks[k].middle = tuple(window), (lowest + highest) / 2
+            blocks[k].half = max((highest - lowest) / 2 + extra, 0.5)
+        return [k for k, (lowest, highest) in zip(present, found, strict=True) if lowest <= highest]
 
     def groups(
         self, blocks: list[OutputBlock]
@@ -376,31 +390,36 @@ class Terrain:
 
     def _window(self, nodes: Array) -> Window | None:
         """Return the samples (left, top, right, bottom) under lattice nodes, with those that interpolation needs."""
-        return self._surface.window_under(nodes.reshape(-1, 2))
+        return self._windows(nodes.reshape(1, -1, 2))[0]
+
+    def _windows(self, nodes: Array) -> list[Window | None]:
+        boxes = _extents(nodes)
+        return [self._surface.window_around(*box) if box[0] < math.inf else None for box in boxes]
 
     def _read(self, window: Any) -> DemWindow:
         left, top, right, bottom = (int(value) for value in window)
         heights = self._surface.window(left, top, right - left, bottom - top)
         return DemWindow(heights, left, top, self._cubic)
 
-    def _range(self, block: OutputBlock, window: Any) -> bool:
-        left, top, right, bottom = block.terrain = window
-        if self._whole is None:
+    def _height_ranges(self, windows: NDArray[np.int64]) -> list[list[float]]:
+        """Return lowest and highest height in windows ``(n, 4)``; infinity and minus infinity where all are voids."""
+        found = np.empty((len(windows), 2))
+        if self._whole is not None:
+            lattice_kernel.height_ranges(self._whole.heights, self._whole.left, self._whole.top, windows, found)
+            return found.tolist()
+        for k, (left, top, right, bottom) in enumerate(windows.tolist()):
             try:
-                lowest, highest = self._surface.range_within(left, top, right - left, bottom - top)
+                found[k] = self._surface.range_within(left, top, right - left, bottom - top)
             except CoverageError:
-                return False
-        else:
-            heights, first, above, _ = self._whole
-            under = heights[top - above : bottom - above, left - first : right - first]
-            if not np.isfinite(under).any():
-                return False
-            lowest, highest = float(np.nanmin(under)), float(np.nanmax(under))
-        # A cubic DEM overshoots between its samples by up to a quarter of their range.
-        extra = 0.25 * (highest - lowest) if self._cubic else 0.0
-        block.middle = (lowest + highest) / 2
-        block.half = max((highest - lowest) / 2 + extra, 0.5)
-        return True
+                found[k] = math.inf, -math.inf
+        return found.tolist()
+
+
+def _extents(points: Array) -> list[list[float]]:
+    """Return left, top, right, bottom of the finite points ``(blocks, n, 2)`` of each block; infinite without any."""
+    boxes = np.empty((len(points), 4))
+    lattice_kernel.extents(np.ascontiguousarray(points), boxes)
+    return boxes.tolist()
 
 
 def block_cells(spacing: int) -> Iterator[tuple[tuple[int, int, int, int], tuple[slice, slice]]]:

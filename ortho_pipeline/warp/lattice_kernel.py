@@ -20,6 +20,37 @@ _TRUST = 3.0
 
 
 @compiled
+def extents(points: Any, boxes: Any) -> None:
+    """Fill `boxes` ``(blocks, 4)``: least x and y, greatest x and y of each block's finite points ``(blocks, n, 2)``.
+
+    The least is infinite where there are none.
+    """
+    for b in range(points.shape[0]):
+        left, top, right, bottom = np.inf, np.inf, -np.inf, -np.inf
+        for k in range(points.shape[1]):
+            x, y = points[b, k, 0], points[b, k, 1]
+            if abs(x) < np.inf and abs(y) < np.inf:
+                left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
+        boxes[b, 0], boxes[b, 1], boxes[b, 2], boxes[b, 3] = left, top, right, bottom
+
+
+@compiled
+def height_ranges(heights: Any, left: int, top: int, windows: Any, found: Any) -> None:
+    """Fill `found` ``(blocks, 2)`` with lowest and highest of the heights in `windows` ``(blocks, 4)``, voids left out.
+
+    `heights` begin at column `left` and row `top`. The lowest is infinite where all are voids.
+    """
+    for b in range(windows.shape[0]):
+        low, high = np.inf, -np.inf
+        for j in range(windows[b, 1] - top, windows[b, 3] - top):
+            for i in range(windows[b, 0] - left, windows[b, 2] - left):
+                height = heights[j, i]
+                if abs(height) < np.inf:
+                    low, high = min(low, height), max(high, height)
+        found[b, 0], found[b, 1] = low, high
+
+
+@compiled
 def visible(image: Any, width: float, height: float, unknown: Any, cells: Any, area: Any) -> None:
     """Mark the cells that may show some of the image, and find the rectangle of cells around them.
 

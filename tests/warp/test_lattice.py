@@ -24,6 +24,7 @@ from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp.engine import WarpResult, rectify
+from ortho_pipeline.warp.lattice import Lattices, OutputBlock, Terrain
 
 UTM = pyproj.CRS.from_epsg(32651)
 EAST, NORTH = 500_000.0, 1_000_000.0
@@ -231,6 +232,21 @@ def test_a_cubic_in_height_takes_a_height_more_and_all_blocks_of_a_tile_at_once(
     assert (result.refined_blocks, result.blocks, result.finest_spacing) == (4, 4, 64)
     # Nodes and check points, at three heights and at four.
     assert model.calls == [4 * 25 * 3, 4 * 24, 4 * 25 * 4, 4 * 24]
+
+
+def test_a_block_more_takes_few_calls(tmp_path, calls):
+    """What a tile takes beside its pixels is the interpreter's work most of all."""
+    model, surface = Rising(0.0, 1), mountains(tmp_path)
+    grid = Grid(UTM, EAST - 250.3, NORTH + 250.2, 0.5, 0.5, 1024, 1024)
+    lattices = Lattices(model, surface, grid, (6000, 6000), tolerance=TOLERANCE, reach=1, averages=False)
+    taken = []
+    for count in (1, 1, 16):
+        blocks = [OutputBlock(number // 4, number % 4) for number in range(count)]
+        with calls:
+            assert len(lattices.build(blocks, Terrain(surface, False, 64_000_000))) == count
+        taken.append(calls.count)
+        calls.count = 0
+    assert taken[2] - taken[1] < 15 * 60
 
 
 def shaken(rate: float, roll_px: float, glitch: bool = False) -> Pushbroom:
