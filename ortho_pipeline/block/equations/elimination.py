@@ -83,7 +83,8 @@ class Elimination:
 
         linear, points, rows = self.linear, self.linear.problem.points, self._rows
         step = np.append(values, 0.0)[linear.problem.columns.padded]
-        found, of_rays, of_ground = np.zeros((len(points), 3)), np.zeros((points.rays, 2)), np.zeros((len(points), 3))
+        of_rays = linear.problem.buffers.zeros((points.rays, 2))
+        found, of_ground = np.zeros((len(points), 3)), np.zeros((len(points), 3))
         made = found, of_rays, of_ground
         side_by_side(lambda _, begin, end: point_kernel.shifts(rows, begin, end, step, *made), self._parts)
         pseudo = (linear.pseudo.rows * step[linear.pseudo.image]).sum(axis=1)
@@ -94,7 +95,7 @@ class Elimination:
         from ortho_pipeline.block.equations import point_kernel
 
         points, rows, blocks = self.linear.problem.points, self._rows, cofactors.blocks
-        found = np.zeros((points.rays, 2, 2)), np.zeros((len(points), 3, 3))
+        found = self.linear.problem.buffers.zeros((points.rays, 2, 2)), np.zeros((len(points), 3, 3))
         side_by_side(lambda _, begin, end: point_kernel.hats(rows, begin, end, blocks, *found), self._parts)
         return found
 

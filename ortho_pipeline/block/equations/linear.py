@@ -38,7 +38,8 @@ class Linear:
         ordering = problem.ordering(weights) if ordering is None else ordering
         places = problem.frame.places(state.local)
         root = np.sqrt(weights.ray_weights) / points.sigma_image
-        seen = linearised(places, state.models, ordering.rays_of_image, points.point, root, problem.columns.widest)
+        of_images, widest, zeros = ordering.rays_of_image, problem.columns.widest, problem.buffers.zeros
+        seen = linearised(places, state.models, of_images, points.point, root, widest, zeros)
         left_out = np.ones(points.rays, dtype=bool)
         left_out[ordering.rays] = False
         seen.image[left_out] = points.measured[left_out]

@@ -14,6 +14,7 @@ from ortho_pipeline.block.equations.image_pairs import ImagePairs, Levels
 from ortho_pipeline.block.equations.unknowns import Columns, Mask, Ordering
 from ortho_pipeline.block.local_frame import GroundFrame
 from ortho_pipeline.block.points import BlockPoints, Index
+from ortho_pipeline.block.projection.buffers import Buffers
 from ortho_pipeline.models.base import Array, SensorModel
 
 #: Ground is never weighted with less than this sigma (m): far below any pixel, far above rounding.
@@ -124,6 +125,7 @@ class BlockProblem:
     known: Array
     pseudo: tuple[Pseudo, ...] = ()
     assumed: tuple[float, float] = (PERFECT_GROUND, PERFECT_GROUND)
+    buffers: Buffers = field(default_factory=Buffers, repr=False)
     columns: Columns = field(init=False)
     target: Array = field(init=False)
     enu: Array = field(init=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +32,13 @@ class Projected:
 
 
 def linearised(
-    places: Places, models: Sequence[SensorModel], of_images: Sequence[Index], point: Index, scale: Array, widest: int
+    places: Places,
+    models: Sequence[SensorModel],
+    of_images: Sequence[Index],
+    point: Index,
+    scale: Array,
+    widest: int,
+    zeros: Callable[[tuple[int, ...]], Array] = np.zeros,
 ) -> Projected:
     """Project rays.
 
@@ -46,9 +52,11 @@ def linearised(
         What partials are multiplied with.
     widest : int
         Columns p of partials by parameters, 0 for none of them.
+    zeros : callable
+        What makes the arrays.
     """
     count = len(point)
-    found = Projected(np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros((count, 2, widest)))
+    found = Projected(zeros((count, 2)), zeros((count, 2, 3)), zeros((count, 2, widest)))
     rational = [n for n, model in enumerate(models) if _rpc_of(model) is not None and len(of_images[n])]
     if rational:
         parts = [of_images[n] for n in rational]
