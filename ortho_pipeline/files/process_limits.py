@@ -15,7 +15,6 @@ import os
 import resource
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -147,16 +146,32 @@ def parts_of(count: int, least: int) -> list[tuple[int, int]]:
 def side_by_side(work: Callable[[int, int, int], None], parts: list[tuple[int, int]]) -> None:
     """Do a work on parts, each given by its number, begin and end, with as many threads as there are processors.
 
-    It has to let the interpreter go, as compiled code does, and each part to write to a place of its own.
+    It has to let the interpreter go, as compiled code does, and each part to write to a place of its own. This thread
+    works too; threads that cannot be started, or fail before they begin, leave their parts to the others.
     """
-    jobs = [(number, *part) for number, part in enumerate(parts)]
-    threads = startable_threads(min(os.cpu_count() or 1, len(jobs))) if len(jobs) > 1 else 1
-    if threads == 1:
+    jobs = iter([(number, *part) for number, part in enumerate(parts)])
+    done, failed = threading.Semaphore(0), list[BaseException]()
+
+    def take_part() -> None:
         for job in jobs:
-            work(*job)
-        return
-    with ThreadPoolExecutor(threads, thread_name_prefix="parts") as pool:
-        list(pool.map(lambda job: work(*job), jobs))
+            try:
+                if not failed:
+                    work(*job)
+            except BaseException as error:  # told by the thread that asked for the work
+                failed.append(error)
+            done.release()
+
+    try:
+        for _ in range(min(os.cpu_count() or 1, len(parts)) - 1):
+            # Not `Thread.start`, which waits until it has begun, and without end if it does not.
+            _thread.start_new_thread(take_part, ())
+    except (RuntimeError, MemoryError):
+        pass
+    take_part()
+    for _ in parts:
+        done.acquire()
+    if failed:
+        raise failed[0]
 
 
 class _Blas:

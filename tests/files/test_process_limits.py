@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from ortho_pipeline.errors import OrthoError
-from ortho_pipeline.files.process_limits import MOST_THREADS, require_memory, startable_threads
+from ortho_pipeline.files import process_limits
+from ortho_pipeline.files.process_limits import MOST_THREADS, parts_of, require_memory, side_by_side, startable_threads
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 EXTENT = ("530600", "4122000", "530800", "4122200")
@@ -112,3 +113,31 @@ def test_threads_share_a_heap() -> None:
     ]
     assert heaps[0] >= 2
     assert heaps[1] == 0
+
+
+def _cannot(*_: object) -> int:
+    raise RuntimeError("can't start new thread")
+
+
+@pytest.mark.parametrize(
+    "start", [None, _cannot, lambda *_: 1], ids=["threads", "no threads", "threads that never begin"]
+)
+def test_each_part_of_a_work_is_done_once(monkeypatch: pytest.MonkeyPatch, start: object) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 4)
+    if start is not None:
+        monkeypatch.setattr(process_limits._thread, "start_new_thread", start)
+    parts, done = parts_of(1003, 10), list[tuple[int, int, int]]()
+    side_by_side(lambda *job: done.append(job), parts)
+    assert sorted(done) == [(number, *part) for number, part in enumerate(parts)]
+    assert len(parts) == 8
+
+
+def test_what_fails_in_a_part_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+
+    def work(number: int, _begin: int, _end: int) -> None:
+        if number == 5:
+            raise ZeroDivisionError(number)
+
+    with pytest.raises(ZeroDivisionError, match="5"):
+        side_by_side(work, parts_of(80, 10))
