@@ -1,35 +1,21 @@
-"""How kernels are compiled: once per machine where a cache can be written, in the memory of each process elsewhere.
+"""Functions that are compiled: kernels, made with the two decorators of this module.
 
-What was compiled before, in a folder that cannot be written any more (an image of a container, a package that somebody
-else installed), is taken from there.
+A kernel is compiled once per machine where a cache can be written, in the memory of each process elsewhere; see
+`kernels.compiler`. Where it was compiled before, it is called without numba, which is not even loaded; see
+`kernels.machine_code`.
 """
 
 from __future__ import annotations
 
 import functools
-import hashlib
-import inspect
-import logging
-import os
 import sys
+import threading
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import numba
-from numba.core.caching import (
-    CompileResultCacheImpl,
-    FunctionCache,
-    InTreeCacheLocator,
-    NullCache,
-    UserProvidedCacheLocator,
-)
-from numba.core.dispatcher import Dispatcher
-from numba.core.runtime import rtsys
+from ortho_pipeline.files.kernels import machine_code
 
-log = logging.getLogger(__name__)
-
-_njit = functools.partial(numba.njit, nogil=True, error_model="numpy", boundscheck=False)
+_lock = threading.Lock()
 
 
 def compiled(function: Callable[..., Any]) -> Any:
@@ -38,19 +24,7 @@ def compiled(function: Callable[..., Any]) -> Any:
     Kernels are loops over numbers and arrays. Hashes (dictionaries, sets) and BLAS (``np.dot``, ``np.linalg``) are
     missing when compiled code is loaded from its cache.
     """
-    made: Any = _njit()(function)
-    own, shared = _cache_of(_Cache, function), _cache_of(_Shared, function)
-    if own is not None and shared is not None and own.cache_path != shared.cache_path:
-        own.shared = shared
-    made._cache = own or shared or _Nowhere()  # as enable_caching() does with numba's own
-    return made
-
-
-def _cache_of(kind: type[_Cache], function: Callable[..., Any]) -> _Cache | None:
-    try:
-        return kind(function)
-    except RuntimeError:
-        return None
+    return Kernel(function)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
@@ -59,90 +33,57 @@ def inlined(function: Callable[..., Any]) -> Any:
     LLVM does it: numba's own ``inline="always"`` copies the function before types are known, and infers them anew for
     each copy, which took most of the time of compiling.
     """
-    return _njit(forceinline=True)(function)
+    return Kernel(function, inline=True)
 
 
-class _Cache(FunctionCache):
-    """Machine code that is made again if anything that it was made from has changed.
+class Kernel:
+    """A function that is compiled for the types of its arguments when it is first called with such.
 
-    numba looks at the module of the function alone, not at those of functions that are compiled into it.
+    It has all that numba's own object (`dispatcher`) has, which is made when it is first needed.
     """
 
-    shared: _Cache | None = None
+    def __init__(self, function: Callable[..., Any], inline: bool = False) -> None:
+        functools.update_wrapper(self, function)
+        self.py_func, self.inline = function, inline
+        self._calls: dict[Any, Callable[..., Any]] = {}
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load what is compiled with the runtime that it calls, and nothing else.
+    def __call__(self, *given: Any, **named: Any) -> Any:
+        if named:
+            return self.dispatcher(*given, **named)
+        kinds = machine_code.kind(given)
+        call = self._calls.get(kinds)
+        if call is None:
+            call = self._found(kinds)
+        return call(*given)
 
-        numba would first load all that it can compile, SciPy's linear algebra too: a fifth of a small scene's time. It
-        does so by itself where something is to be compiled. What kernels may use is thereby narrow: see `compiled`.
-        """
-        rtsys.initialize(target_context)
-        with self._guard_against_spurious_io_errors():
-            found = self._load_overload(sig, target_context)
-        return self.shared.load_overload(sig, target_context) if found is None and self.shared is not None else found
+    @functools.cached_property
+    def dispatcher(self) -> Any:
+        """What numba makes of the function."""
+        from ortho_pipeline.files.kernels import compiler
 
-    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
-        return (*super()._index_key(sig, codegen), _others(self._py_func.__module__))
+        return compiler.dispatcher(self)
 
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # asked of any object, and no reason to load numba
+            raise AttributeError(name)
+        return getattr(self.dispatcher, name)
 
-def _must_hold_code(place: Any) -> None:
-    """Refuse a folder that holds nothing of a module; numba's own places have to be writable instead."""
-    stem = Path(place._py_file).stem
-    if not any(name.startswith(f"{stem}.") and name.endswith(".nbi") for name in os.listdir(place.get_cache_path())):
-        raise FileNotFoundError
+    def _found(self, kinds: tuple[Any, ...] | None) -> Callable[..., Any]:
+        """Return what is called with arguments of such kinds: machine code that was kept, or numba."""
+        with _lock:
+            call = self._calls.get(kinds)
+            # Where numba is loaded already, its own cache tells what it did.
+            if call is None and kinds is not None and not self.inline and "numba" not in sys.modules:
+                call = machine_code.find(self.py_func, kinds)
+            if call is None:
+                call = self.dispatcher if kinds is None or self.inline else functools.partial(self._first, kinds)
+            self._calls[kinds] = call
+        return call
 
+    def _first(self, kinds: tuple[Any, ...], *given: Any) -> Any:
+        from ortho_pipeline.files.kernels import compiler
 
-class _Named(UserProvidedCacheLocator):
-    """The folder of NUMBA_CACHE_DIR, where it is only read."""
-
-    ensure_cache_path = _must_hold_code
-
-
-class _BesideSources(InTreeCacheLocator):
-    """The folder of the package, where it is only read."""
-
-    ensure_cache_path = _must_hold_code
-
-
-class _SharedPlace(CompileResultCacheImpl):
-    _locator_classes: Any = (_Named, _BesideSources)
-
-
-class _Shared(_Cache):
-    """Machine code that somebody else has kept; what is compiled is not."""
-
-    _impl_class: Any = _SharedPlace
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep nothing, and say so."""
-        _say_once()
-
-
-class _Nowhere(NullCache):
-    """Where nothing can be written and nobody has compiled, as in many containers."""
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep nothing, and say so."""
-        _say_once()
-
-
-@functools.cache
-def _others(module: str) -> str:
-    """Return a digest of the other modules whose compiled functions and records a module uses."""
-    found, todo = {module}, [module]
-    while todo:
-        for value in vars(sys.modules[todo.pop()]).values():
-            record = isinstance(value, type) and issubclass(value, tuple)
-            if (record or isinstance(value, Dispatcher)) and value.__module__ not in found:
-                found.add(value.__module__)
-                todo.append(value.__module__)
-    sources = (inspect.getsource(sys.modules[name]) for name in sorted(found - {module}) if name != "typing")
-    return hashlib.sha256("".join(sources).encode()).hexdigest()
-
-
-@functools.cache
-def _say_once() -> None:
-    log.warning(
-        "what was compiled cannot be kept, because neither this package's folder nor the home can be written: every "
-        "run compiles it again, for some seconds. Remedy: set NUMBA_CACHE_DIR to a folder that can be written"
-    )
+        result = self.dispatcher(*given)
+        self._calls[kinds] = self.dispatcher
+        compiler.keep(self, kinds, given)
+        return result

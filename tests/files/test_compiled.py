@@ -1,4 +1,4 @@
-"""Where no cache can be written, kernels are compiled in memory, and that is said once."""
+"""numba's caches: where none can be written, kernels are compiled in memory, and that is said once."""
 
 import ast
 import os
@@ -12,13 +12,14 @@ import pytest
 KERNELS = [
     path
     for path in sorted((Path(__file__).parents[2] / "ortho_pipeline").rglob("*.py"))
-    if "files.compiled import" in path.read_text(encoding="utf-8")
+    if "@compiled" in path.read_text(encoding="utf-8")
 ]
 SCENE = Path(__file__).parents[2] / "sample_data/ikonos/po_39001_pan_0000000.tif"
 #: What numba does where neither the package's folder nor the home can be written: it finds no place for a cache.
 READ_ONLY = "import sys; from numba.core import caching; caching.CacheImpl._locator_classes = []\n"
 #: And nobody has compiled before.
-NOWHERE = READ_ONLY + "from ortho_pipeline.files import compiled; compiled._SharedPlace._locator_classes = ()\n"
+NOWHERE = READ_ONLY + "from ortho_pipeline.files import compiled; from ortho_pipeline.files.kernels import compiler\n"
+NOWHERE += "compiler._SharedPlace._locator_classes = ()\n"
 
 
 def run(code: str) -> subprocess.CompletedProcess[str]:
@@ -109,7 +110,7 @@ def test_kept_code_is_made_again_when_a_function_of_another_module_changes(tmp_p
     found = []
     for added in (1, 1, 20):
         (tmp_path / "below.py").write_text(below.format(added))
-        code = "from above import run; print(run(0), sum(run.stats.cache_hits.values()))"
+        code = "import numba; from above import run; print(run(0), sum(run.stats.cache_hits.values()))"
         command = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(tmp_path)!r}); {code}"]
         found.append(subprocess.run(command, env=surroundings, capture_output=True, text=True, check=True).stdout)
     assert found == ["2 0\n", "2 1\n", "40 0\n"]
@@ -122,7 +123,7 @@ def test_kept_code_is_loaded_without_what_only_compiling_needs(tmp_path: Path) -
         "@compiled\ndef total(x):\n    sum = 0.0\n    for k in range(x.size):\n        sum += x[k]\n    return sum\n"
     )
     code = (
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import numpy as np; from one import total\n"
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import numba, numpy as np; from one import total\n"
         "def say(x): print(total(x), sum(total.stats.cache_hits.values()), 'scipy.linalg' in sys.modules)\n"
         "say(np.ones(3))\n"
         "if len(sys.argv) > 1: say(np.ones(4, 'f4'))\n"  # the same process can still compile
@@ -158,7 +159,7 @@ def test_what_was_compiled_before_is_taken_from_where_nothing_can_be_written(tmp
         "from ortho_pipeline.files.compiled import compiled\n@compiled\ndef half(x):\n    return x / 2\n"
     )
     code = (
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from one import double\n"
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import numba; from one import double\n"
         "print(double(21), sum(double.stats.cache_hits.values()), double(0.5), sum(double.stats.cache_hits.values()))"
     )
     surroundings = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
