@@ -201,15 +201,12 @@ def main() -> None:
 
 def _begin() -> None:
     """Prepare the process for a command, before it is loaded."""
-    import gc
     import logging
 
     from ortho_pipeline.files.locations import close_network
     from ortho_pipeline.files.process_limits import share_freed_memory
 
     share_freed_memory()
-    # What a command loads is never garbage: looking through it over and over takes a twelfth of a small scene's time.
-    gc.set_threshold(50_000, 20, 50)
     # Before GDAL is loaded, which reads the environment; worker processes inherit it.
     close_network()
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING, stream=sys.stderr)

@@ -35,7 +35,6 @@ from ortho_pipeline.raster import source as raster
 from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.report import document as report
-from ortho_pipeline.report import stac as stac_items
 from ortho_pipeline.surface import footprint
 from ortho_pipeline.surface.base import Surface
 
@@ -121,7 +120,9 @@ def rectify(
     made = report.with_layers(made, accuracy=accuracy, angles=angles)
     write_report(made, adjusted.fit, files, adjusted.matched, source)
     if acquired is not None:
-        stac_items.write_item(files["stac"], made, files, acquired, name or stem)
+        from ortho_pipeline.report.stac import write_item
+
+        write_item(files["stac"], made, files, acquired, name or stem)
     inputs.refuse_changed(begun)
     retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
     return Result(files, {"report": json_value(made)}, report.summary_text(made))
@@ -233,7 +234,9 @@ def _of_earlier_run(folder: Path, stem: str, files: Mapping[str, Path], *, all_o
 def _acquired(facts: Mapping[str, Any], output: OutputOptions) -> Any:
     """Return the time of acquisition for the STAC item, None where none is asked for."""
     if output.stac:
-        return stac_items.acquisition_time(facts, output.acquired)
+        from ortho_pipeline.report.stac import acquisition_time
+
+        return acquisition_time(facts, output.acquired)
     if output.acquired is not None:
         raise InputError("only a STAC item says when", field="output.acquired",
                          remedy="give `output.stac` too, or leave it out")  # fmt: skip

@@ -156,7 +156,8 @@ class Fit:
             if which == "matched":
                 checks = self.points.check & ~checks
             elif which == "agreeing":
-                checks = checks & ~np.isin(np.array(self.points.ids), [one.id for one in self.outlying])
+                off = {one.id for one in self.outlying}
+                checks = checks & np.array([name not in off for name in self.points.ids], dtype=bool)
             residuals = self.residuals[checks]
             # A point that does not project has no residual; a warning names it.
             residuals = residuals[np.isfinite(residuals).all(axis=1)]
@@ -378,7 +379,8 @@ def _posed(
             remedy="check the CRS and the heights of the points, and that they and the model belong to this scene",
         )
     usable = points.control & projected
-    wrong = np.isin(np.arange(len(points)), list(without))
+    wrong = np.zeros(len(points), dtype=bool)
+    wrong[list(without)] = True
     warnings = _unusable(points, usable | wrong, projected)
     usable &= ~wrong
     return Problem.of(model, points, usable, dict(priors or {})), warnings

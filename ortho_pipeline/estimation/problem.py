@@ -186,7 +186,7 @@ class Solution:
         NaN is a point, or a group, that is indispensable.
         """
         left = self.leave_each_out()
-        shared = [np.flatnonzero(self.groups == group) for group in np.unique(self.groups[self.groups >= 0])]
+        shared = [np.flatnonzero(self.groups == group) for group in sorted({*self.groups.tolist()} - {-1})]
         if shared:
             left[self.groups >= 0] = self.leave_out(shared)[self.groups >= 0]
         return left

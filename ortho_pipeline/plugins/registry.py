@@ -101,8 +101,12 @@ class Registry:
 
     def register_installed(self) -> None:
         """Register the plugins that installed distributions name as entry points."""
+        known: dict[int, tuple[str, str]] = {}  # each look at a name or a version parses all metadata
         for entry in sorted(metadata.entry_points(group=PROJECT_NAME), key=lambda entry: entry.name):
-            distribution, version = (entry.dist.name, entry.dist.version) if entry.dist else ("(unknown)", "")
+            if id(entry.dist) not in known:
+                told = entry.dist.metadata if entry.dist else {"Name": "(unknown)", "Version": ""}
+                known[id(entry.dist)] = told["Name"], told["Version"]
+            distribution, version = known[id(entry.dist)]
             origin = Provenance(entry.name, entry.value, distribution, version)
             if origin.bundled:
                 self._reserved.add(entry.name)

@@ -133,7 +133,7 @@ class Points:
         object.__setattr__(self, "groups", checked_groups(self.groups, count))
         object.__setattr__(self, "sigma_common", checked_common(self.sigma_common, count))
         roles = np.asarray(self.roles, dtype="<U7")
-        if roles.shape != (count,) or not np.isin(roles, ROLES).all():
+        if roles.shape != (count,) or not set(roles.tolist()) <= set(ROLES):
             raise InputError(f"each point has one role of {', '.join(ROLES)}", field="roles")
         object.__setattr__(self, "roles", roles)
         if len(set(self.ids)) != count:

@@ -61,6 +61,16 @@ def _stretched(values: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[np.uint
     seen = values[mask & np.isfinite(values)]
     if not len(seen):
         return np.zeros(values.shape, dtype=np.uint8)
-    low, high = np.percentile(seen, [1.0, 99.0])
+    low, high = percentile(seen, 1.0), percentile(seen, 99.0)
     scaled = np.clip((values - low) / max(high - low, 1e-12), 0.0, 1.0)
     return np.nan_to_num(scaled * 255.0).astype(np.uint8)
+
+
+def percentile(values: NDArray[np.float64], percent: float) -> float:
+    """Return a percentile of some finite values, as `np.percentile` has it, which loads masked arrays first."""
+    place = (len(values) - 1) * (percent / 100)
+    below = int(place)
+    above, part = min(below + 1, len(values) - 1), place - below
+    low, high = np.partition(values, (below, above))[[below, above]]
+    # As there: the way from the nearer end, so that what lies between equal values is that value.
+    return float(high - (high - low) * (1 - part) if part >= 0.5 else low + (high - low) * part)

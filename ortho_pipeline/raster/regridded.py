@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 import threading
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -17,16 +18,32 @@ import pyproj
 from numpy.typing import NDArray
 from osgeo import gdal
 
-from ortho_pipeline.errors import InputError, counted
-from ortho_pipeline.geodesy.crs import crs_text
+from ortho_pipeline.errors import InputError, counted, reads
+from ortho_pipeline.geodesy.crs import crs_text, parse_crs
 from ortho_pipeline.raster.ortho import Profile
-from ortho_pipeline.raster.source import MEMORY, Grid, RasterSource, first_line
-from ortho_pipeline.raster.valid_area import grid_of
+from ortho_pipeline.raster.source import MEMORY, Grid, RasterSource, first_line, open_dataset
 
 #: Part of a pixel by which grids may differ: rounding of coordinates, no more.
 _SAME = 1e-3
 #: GDAL gives alpha 0 to 255 as the share of a pixel's footprint that has values: of a pixel at least half.
 _ENOUGH = 128
+
+
+@reads("make this ortho again")
+def grid_of(path: str | PathLike[str]) -> Grid:
+    """Return the grid of an orthoimage.
+
+    Raises
+    ------
+    InputError
+        If it is none: a raster without a CRS, or one that is not north up.
+    """
+    dataset = open_dataset(path)
+    left, dx, skew, top, other, dy = dataset.GetGeoTransform()
+    if skew or other:
+        raise InputError("this raster is turned against the axes of its CRS", field="geotransform")
+    crs = parse_crs(dataset.GetProjection())
+    return Grid(crs, left, top, dx, -dy, dataset.RasterXSize, dataset.RasterYSize)
 
 
 class Regridded:

@@ -14,10 +14,10 @@ import pyproj
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.raster.source import Grid, open_dataset, open_pixels
+from ortho_pipeline.raster.regridded import grid_of
+from ortho_pipeline.raster.source import open_pixels
 
 #: Pixels per side at which the mask is looked at.
 _SIDE = 512
@@ -25,23 +25,6 @@ _SIDE = 512
 _STEPS = 32
 #: Decimals of a degree: a centimetre.
 _DECIMALS = 7
-
-
-@reads("make this ortho again")
-def grid_of(path: str | PathLike[str]) -> Grid:
-    """Return the grid of an orthoimage.
-
-    Raises
-    ------
-    InputError
-        If it is none: a raster without a CRS, or one that is not north up.
-    """
-    dataset = open_dataset(path)
-    left, dx, skew, top, other, dy = dataset.GetGeoTransform()
-    if skew or other:
-        raise InputError("this raster is turned against the axes of its CRS", field="geotransform")
-    crs = parse_crs(dataset.GetProjection())
-    return Grid(crs, left, top, dx, -dy, dataset.RasterXSize, dataset.RasterYSize)
 
 
 def valid_outline(path: str | PathLike[str], *, side: int = _SIDE) -> BaseGeometry:

@@ -19,8 +19,9 @@ import shapely
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import sha256, staged, whole_or_nothing, write_json
 from ortho_pipeline.raster.quicklook import preview_png
+from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import RasterSource
-from ortho_pipeline.raster.valid_area import grid_of, to_geojson, valid_outline
+from ortho_pipeline.raster.valid_area import to_geojson, valid_outline
 from ortho_pipeline.report.matching import is_relative
 from ortho_pipeline.report.records import SceneReport, View
 

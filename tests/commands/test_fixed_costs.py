@@ -9,6 +9,7 @@ import pyproj
 
 from ortho_pipeline import commands
 from ortho_pipeline.options import SurfaceOptions
+from ortho_pipeline.plugins import Host
 
 
 def test_a_second_scene_asks_proj_and_the_package_for_nothing_that_is_known(tiny, tmp_path, monkeypatch) -> None:
@@ -27,3 +28,15 @@ def test_a_second_scene_asks_proj_and_the_package_for_nothing_that_is_known(tiny
     counted(email.parser.Parser, "parsestr")
     commands.rectify(tiny.image, tmp_path / "second", surface=surface)
     assert asked == []
+
+
+def test_metadata_of_a_distribution_are_parsed_once_for_all_of_its_plugins(monkeypatch) -> None:
+    """The package's own were parsed twice for each of its twelve plugins."""
+    parsed: list[object] = []
+    parse = email.parser.Parser.parsestr
+    monkeypatch.setattr(email.parser.Parser, "parsestr", lambda *given: parsed.append(given) or parse(*given))
+    plugins = Host(installed=True).plugins()
+    assert len(plugins) > 10
+    assert {one.version for one in plugins if one.bundled} == {importlib.metadata.version("ortho-pipeline")}
+    # And once for what this test asks.
+    assert len(parsed) == len({one.distribution for one in plugins}) + 1

@@ -11,8 +11,7 @@ import numpy as np
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.measure.project import Project
 from ortho_pipeline.raster.quicklook import preview_png, reduced_grid, shaded_png
-from ortho_pipeline.raster.regridded import Regridded
-from ortho_pipeline.raster.valid_area import grid_of
+from ortho_pipeline.raster.regridded import Regridded, grid_of
 
 #: Longer side (px) of the pictures.
 _SIDE = 1400

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid, RasterSource
-from ortho_pipeline.raster.valid_area import grid_of
 
 #: Part of a pixel by which grids may differ: rounding of coordinates, no more.
 _SAME = 1e-3
