@@ -26,6 +26,8 @@ from ortho_pipeline.options import EXECUTORS
 _AHEAD = 256
 #: Seconds of work that travel together to a scheduler, and at most so many jobs.
 _TOGETHER, _MOST_TOGETHER = 3.0, 64
+#: So long a scheduler may take to answer.
+_PATIENCE = "5s"
 #: Environment variables that bound the threads of numerical libraries.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -319,7 +321,7 @@ def dask_executor(scheduler: str) -> Any:
             "dask is not installed", field="scheduler", remedy="pip install 'ortho-pipeline[dask]'"
         ) from error
     try:
-        client = Client(scheduler, timeout="5s", set_as_default=False)
+        client = Client(scheduler, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
             f"no dask scheduler answers at {scheduler!r} ({error or type(error).__name__})", field="scheduler",

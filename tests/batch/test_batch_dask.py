@@ -113,7 +113,8 @@ def test_on_the_command_line(folder, cluster):
     assert (again.exit_code, f"{SCENES - 1} unchanged, 0 failed" in again.stdout) == (0, True), again.output
 
 
-def test_no_scheduler(folder):
+def test_no_scheduler(folder, monkeypatch):
+    monkeypatch.setattr(executors, "_PATIENCE", "0.2s")
     with pytest.raises(InputError, match="no dask scheduler answers"):
         batch.run(folder / "p.yaml", executor="dask", scheduler="tcp://127.0.0.1:1")
 
