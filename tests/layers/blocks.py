@@ -63,7 +63,7 @@ class City:
         out = np.zeros(np.broadcast(x, y).shape)
         for west, south, east, north, height in self.boxes:
             inside = (x >= west) & (x <= east) & (y >= south) & (y <= north)
-            out = np.where(inside, np.maximum(out, height), out)
+            np.maximum(out, height, out=out, where=inside)
         return out
 
     def hidden(self, x: np.ndarray, y: np.ndarray, east: float, north: float) -> np.ndarray:
