@@ -45,7 +45,7 @@ def test_it_has_what_the_repository_has(unpacked):
     tracked = run("git", "ls-files", cwd=ROOT).splitlines()
     missing = [name for name in tracked if Path(name).parts[0] not in LEFT and not (unpacked / name).exists()]
     assert not missing
-    stray = [path for path in unpacked.rglob("*") if path.suffix in (".pyc", ".nbi", ".nbc")]
+    stray = [path for path in unpacked.rglob("*") if path.suffix in (".pyc", ".nbi", ".nbc", ".kernel")]
     assert not stray
 
 

@@ -132,7 +132,7 @@ def test_it_is_compiled_again_when_a_module_that_it_was_made_from_changes(tmp_pa
 
 def test_the_home_of_a_user_takes_what_the_folder_of_a_package_does_not(tmp_path: Path) -> None:
     (written(tmp_path) / "__pycache__").write_text("a file, where nobody can write a folder")
-    home = {"NUMBA_CACHE_DIR": "", "HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": ""}
+    home = {"NUMBA_CACHE_DIR": "", "HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": str(tmp_path / "home" / ".cache")}
     assert run(tmp_path, **home).splitlines()[-1] == "True"
     assert len(list((tmp_path / "home" / ".cache" / "ortho-pipeline").rglob("*.kernel"))) == 1
     assert run(tmp_path, **home).splitlines()[-1] == "False"

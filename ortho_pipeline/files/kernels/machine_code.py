@@ -125,25 +125,27 @@ def _places(function: Callable[..., Any], kinds: tuple[Any, ...]) -> Iterator[Pa
     yield Path(home) / "ortho-pipeline" / "kernels" / folder / name
 
 
-def _states(modules: Iterable[str]) -> dict[str, Any]:
-    """Return size and time of the files of modules; of one that is not loaded nothing."""
-    found: dict[str, Any] = {}
-    for name in sorted(modules):
-        path = getattr(sys.modules.get(name), "__file__", None)
-        state = os.stat(path) if path else None
-        found[name] = [state.st_size, state.st_mtime_ns] if state else None
-    return found
+def _states(modules: Iterable[str]) -> dict[str, str | None]:
+    """Return digests of the files of modules; none of a module that is not loaded."""
+    paths = {name: getattr(sys.modules.get(name), "__file__", None) for name in sorted(modules)}
+    return {name: _digest(path) if path else None for name, path in paths.items()}
+
+
+@functools.cache
+def _digest(path: str) -> str:
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 @functools.cache
 def _machine() -> dict[str, Any]:
-    """Return what machine code is made for and by: the processor, LLVM, numba and this module."""
+    """Return what machine code is made for and by: the processor, LLVM, numba and this module.
+
+    Not by the times of files, which differ between an image of a container and its copies.
+    """
     import llvmlite.binding as llvm
 
     folder = _numba()
-    libraries = [_library(folder, name) for name in _LIBRARIES]
-    files = [Path(__file__), Path(llvm.ffi.__file__), folder / "_version.py", *libraries]
-    states = [(os.fspath(path), os.stat(path).st_size, os.stat(path).st_mtime_ns) for path in files]
+    versions = [Path(__file__), folder / "_version.py", Path(llvm.ffi.__file__).parents[1] / "_version.py"]
     settings = {name: value for name, value in os.environ.items() if name.startswith("NUMBA_")}
     settings.pop("NUMBA_CACHE_DIR", None)
     # As numba has it: who names a processor names its features too, or wants those that all of its kind have.
@@ -152,7 +154,8 @@ def _machine() -> dict[str, Any]:
         "processor": named or llvm.get_host_cpu_name(),
         "features": "" if named else llvm.get_host_cpu_features().flatten(),
         "settings": settings,
-        "files": [list(state) for state in states],
+        "versions": [_digest(os.fspath(path)) for path in versions],
+        "libraries": [os.stat(_library(folder, name)).st_size for name in _LIBRARIES],
     }
 
 
