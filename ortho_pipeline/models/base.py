@@ -224,8 +224,9 @@ class SensorModel(ABC):
         for _ in range(_INVERSE_STEPS):
             if not len(left):
                 break
-            miss = image[left] - self.ground_to_image(ground[left])
-            step = solve_2x2(self.ground_partials(ground[left])[:, :, :2], miss)
+            found, partials = self.projected(ground[left])
+            miss = image[left] - found
+            step = solve_2x2(partials[:, :, :2], miss)
             # A step beyond the domain comes from a bad linearisation far from the solution: go half-way there.
             longest = np.abs(step / half[:2]).max(axis=1, initial=0.0)
             step /= np.maximum(longest, 1.0)[:, None]

@@ -37,11 +37,14 @@ def one_mark(points: HasGround) -> list[tuple[str, str]]:
     place = np.nan_to_num(points.ground[plan])
     if len(place) < 2:
         return []
-    from scipy.spatial import cKDTree  # takes as long to load as a small scene to warp
-
     place = ground_transform(points.crs, "EPSG:4978")(place)
     index = np.flatnonzero(plan)[np.isfinite(place).all(axis=1)]
     place = place[np.isfinite(place).all(axis=1)]
+    # Points that are near each other are so along each axis: with few points the next one is further along some axis.
+    if (np.diff(np.sort(place, axis=0), axis=0) > _ONE_MARK).all(axis=0).any():
+        return []
+    from scipy.spatial import cKDTree  # takes as long to load as a small scene to warp
+
     distance, neighbour = cKDTree(place).query(place, k=2, distance_upper_bound=_ONE_MARK)
     # Of points at one place the first neighbour may be the other.
     other = np.where(neighbour[:, 0] == np.arange(len(place)), neighbour[:, 1], neighbour[:, 0])

@@ -8,6 +8,7 @@ import importlib.metadata
 import pyproj
 
 from ortho_pipeline import commands
+from ortho_pipeline.models import rational
 from ortho_pipeline.options import SurfaceOptions
 from ortho_pipeline.plugins import Host
 
@@ -40,3 +41,16 @@ def test_metadata_of_a_distribution_are_parsed_once_for_all_of_its_plugins(monke
     assert {one.version for one in plugins if one.bundled} == {importlib.metadata.version("ortho-pipeline")}
     # And once for what this test asks.
     assert len(parsed) == len({one.distribution for one in plugins}) + 1
+
+
+def test_an_inverse_of_few_points_takes_terms_once_a_step(tiny, monkeypatch) -> None:
+    """Terms of the polynomials were made twice for each step of Newton's method: for the place and for its slopes."""
+    made: list[object] = []
+    terms = rational.rpc_terms
+    monkeypatch.setattr(rational, "rpc_terms", lambda *given: made.append(given) or terms(*given))
+    steps: list[object] = []
+    projected = rational.RPC.projected
+    monkeypatch.setattr(rational.RPC, "projected", lambda *given: steps.append(given) or projected(*given))
+    tiny.model.image_to_ground([[10.0, 20.0], [200.0, 150.0]], [700.0, 710.0])
+    # And once to see that it closes.
+    assert len(made) == len(steps) + 1 > 2
