@@ -133,7 +133,8 @@ def jobs(job: Job) -> dict[str, Callable[[Checkout], float]]:
         return float(json.loads(one.output(command, folder))["cpu"])
 
     def first(one: Checkout) -> float:
-        for kept in one.home.rglob("*.nbi"):  # what other jobs compiled, which is taken where the cache has nothing
+        # What other jobs compiled is taken where the cache has nothing.
+        for kept in (*one.home.rglob("*.nbi"), *one.home.rglob("*.kernel")):
             kept.unlink()
         with tempfile.TemporaryDirectory() as cache:
             empty = {**one.surroundings, "NUMBA_CACHE_DIR": cache}
