@@ -173,6 +173,7 @@ class _Planner:
         self.path, self.config, self.places = path, config, places
         if config.root is not None:
             places.root = places.inside(config.root, "root of the file")
+        self._rasters: dict[str, str] = {}
         # What another machine asks for is not written here: its outputs go to a store.
         self.output = Path("nowhere") if places.far else places.inside(config.output, "output")
 
@@ -257,9 +258,7 @@ class _Planner:
         values: dict[str, Any] = dict(settings.surface)
         if values["dem"] != AUTO:
             values["dem"] = self._file(values["dem"], image, f"{where}.surface.dem")
-            raster = heights_given(values["dem"], scene)
-            if raster != values["dem"]:  # of a STAC item
-                values["dem"] = self.places.name(str(raster), f"{where}.surface.dem")
+            values["dem"] = self._raster_of(values["dem"], scene, f"{where}.surface.dem")
         for cell in () if values["dem"] is None else matching_files(values["dem"]) or ():
             self.places.inside(cell, f"{where}.surface.dem")
         if values["source"] is not None and not is_address(values["source"]):
@@ -270,6 +269,15 @@ class _Planner:
         if values["vertical"] is not None:
             values["vertical"] = self._perhaps_file(values["vertical"], image, f"{where}.surface.vertical")
         return SurfaceOptions(**values)
+
+    def _raster_of(self, dem: str | None, scene: SceneOptions, field: str) -> str | None:
+        """Return the raster of a STAC item, which is read once for all scenes; anything else as it is."""
+        if dem is None:
+            return None
+        if dem not in self._rasters:
+            raster = heights_given(dem, scene)
+            self._rasters[dem] = dem if raster == dem else self.places.name(str(raster), field)
+        return self._rasters[dem]
 
     def _match(self, settings: Settings, image: Place, where: str) -> MatchOptions:
         values: dict[str, Any] = dict(settings.match)

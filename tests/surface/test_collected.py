@@ -17,11 +17,13 @@ from osgeo import gdal, osr
 from servers import PublicFolder, running
 
 from ortho_pipeline import ortho_array
+from ortho_pipeline.batch.plan import plan
 from ortho_pipeline.batch.runner import list_scenes, run
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import check, rectify
 from ortho_pipeline.errors import CoverageError, DatumError, InputError
 from ortho_pipeline.files.stac import collection as collections
+from ortho_pipeline.files.stac import item as stac_item
 from ortho_pipeline.files.stac.collection import Collection
 from ortho_pipeline.files.stac.item import item_of
 from ortho_pipeline.files.stac.places import boxes_of, meet, questions
@@ -281,6 +283,22 @@ def test_a_run_with_an_item_as_dem_is_made_again_when_the_item_names_another_fil
         (tiny.folder / "one.json").write_text(json.dumps(item(tiny.dem, href).to_dict()))
         assert [one["state"] for one in list_scenes(config)] == [state]
         assert run(config, executor="sequential").failed == 0
+
+
+def test_a_plan_reads_the_document_of_a_dem_once_for_all_scenes(
+    cells: Path, tiny: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(20):
+        (tiny.folder / f"s{number}.tif").write_bytes(tiny.image.read_bytes())
+    listed(cells)
+    config = tiny.folder / "run.yaml"
+    config.write_text("scenes: [{images: s*.tif}]\noutput: out\ndefaults: {surface: {dem: cells/items.json}}\n")
+    read: list[Any] = []
+    true = stac_item.read_document
+    monkeypatch.setattr(stac_item, "read_document", lambda path, **more: read.append(path) or true(path, **more))
+    planned = plan(config)
+    assert [job.surface.dem for job in planned.jobs] == [str(cells / "items.json")] * 20
+    assert len(read) == 1
 
 
 # -- which items, and which of their files -----------------------------------------------------------------------------
