@@ -4,6 +4,7 @@
     python benchmarks/warp.py --scaling        1000² to 40000², 32 bands, Float32, JPEG 2000, one thread
     python benchmarks/warp.py --kernels        by kernel, number of bands and sensor model
     python benchmarks/warp.py --layers         what layers beside the ortho cost, as shares of the warp alone
+    python benchmarks/warp.py --cog            COGs with ZSTD and overviews beside GDAL's COG driver on finished pixels
     python benchmarks/warp.py --accuracy       every output pixel of a ramp against an independent exact evaluation
 
 Every figure is of a whole process: wall time, CPU time, peak memory. Outputs are uncompressed tiled GeoTIFFs. What
@@ -319,6 +320,24 @@ def headline(job: Job, rounds: int, programs: list[str] | None = None) -> dict[s
     return runs
 
 
+def cogs(job: Job, pairs: int) -> dict[str, list[Run]]:
+    """Alternate `ortho rectify` to a COG with ZSTD and GDAL's COG driver, which copies finished pixels to the same."""
+    folder, runs = job.folder, {}
+    measure(ours(job, folder / "warm"))
+    options = [word for option in ("COMPRESS=ZSTD", "PREDICTOR=YES", "BIGTIFF=IF_SAFER") for word in ("-co", option)]
+    finished, copied = folder / "warm" / f"{job.image.stem}_ortho.tif", folder / "copied.tif"
+    translate = ["gdal_translate", "-q", "-of", "COG", *options, "-co", "NUM_THREADS=2", str(finished), str(copied)]
+    for number in range(pairs):
+        rectify_it = ours(job, folder / "ours", "bilinear", *options)
+        rectify_it[rectify_it.index("GTiff")] = "COG"
+        turn = {"ortho rectify to a COG": rectify_it, "gdal_translate (COG of finished pixels)": translate}
+        for name, command in turn.items():
+            copied.unlink(missing_ok=True)
+            runs.setdefault(name, []).append(measure(command))
+        print(f"pair {number + 1}: {', '.join(f'{name} {found[-1]}' for name, found in runs.items())}", file=sys.stderr)
+    return runs
+
+
 def table(runs: dict[str, list[Run]], megapixels: float, base: str) -> str:
     """Return medians, and ratios of wall and CPU time to `base` within each round with their range."""
     lines = [
@@ -537,9 +556,9 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=12000)
     parser.add_argument("--folder", type=Path, help="where scenes are kept between runs (default: a temporary one)")
     parser.add_argument("--json", type=Path, help="write all runs there")
-    parser.add_argument("--pairs", type=int, default=5, help="of runs, with --layers")
+    parser.add_argument("--pairs", type=int, default=5, help="of runs, with --layers and --cog")
     parser.add_argument("--program", action="append", help="of the table, only this one; may be repeated")
-    for option in ("scaling", "kernels", "accuracy", "layers"):
+    for option in ("scaling", "kernels", "accuracy", "layers", "cog"):
         parser.add_argument(f"--{option}", action="store_true")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="ortho_bench_") as temporary:
@@ -557,10 +576,12 @@ def main() -> None:
         else:
             job = Job(folder, arguments.side)
             apart(job.make)
-            runs = headline(job, arguments.rounds, arguments.program)
+            runs = cogs(job, arguments.pairs) if arguments.cog else headline(job, arguments.rounds, arguments.program)
             print(f"{job.side} x {job.side} UInt16, {job.megapixels:.0f} Mpx out; {document['machine']}\n")
-            print(table(runs, job.megapixels, "ortho rectify, bilinear"))
-            document["headline"] = {name: [asdict(run) for run in found] for name, found in runs.items()}
+            print(table(runs, job.megapixels, list(runs)[-1] if arguments.cog else "ortho rectify, bilinear"))
+            document["cog" if arguments.cog else "headline"] = {
+                name: [asdict(run) for run in found] for name, found in runs.items()
+            }
         if arguments.json:
             arguments.json.write_text(json.dumps(document, indent=1) + "\n")
 
