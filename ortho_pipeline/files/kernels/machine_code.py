@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 #: Versions of numba on which `tests/files/test_machine_code.py` has run.
-TESTED = ("0.68",)
+TESTED = ("0.63.", "0.65.", "0.67.", "0.68.")
 #: Types of arguments that numba takes by their type alone.
 _PLAIN = frozenset((float, bool, type(None), np.float64, np.float32, np.int64, np.uint16, np.uint8, np.bool_))
 #: Flags of an array that its type is made of: contiguous in C's order, or else in Fortran's; aligned and writable.
