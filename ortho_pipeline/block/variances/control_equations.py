@@ -14,6 +14,7 @@ from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.variances import dense_nodes
 from ortho_pipeline.block.variances.components import diagonal
+from ortho_pipeline.files.process_limits import parts_of, side_by_side
 from ortho_pipeline.models.base import Array
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ _FINEST = 1e-4
 _FAR_LESS, _TOLD = 0.5, 1e-13
 #: Beyond so many parameters z nodes are solved by LAPACK: compiled loops take ten times as long then, and less below.
 _MANY = 100
+#: Nodes that are worth a thread.
+_SHARE = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,8 +131,12 @@ class ControlEquations:
 
         if self.rank > _MANY:
             return np.array([dense_nodes.solved(self._compiled, node).likelihood for node in nodes])
-        found = np.empty(len(nodes))
-        node_kernel.likelihoods(self._compiled, nodes, found)
+        found, equations = np.empty(len(nodes)), self._compiled
+
+        def part(_: int, begin: int, end: int) -> None:
+            node_kernel.likelihoods(equations, nodes[begin:end], found[begin:end])
+
+        side_by_side(part, parts_of(len(nodes), _SHARE))
         return found
 
     def at(self, node: Array) -> Node:
