@@ -13,6 +13,7 @@ import pyproj
 import pytest
 from osgeo import gdal
 
+from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.geodesy.crs import GroundTransform
 from ortho_pipeline.models import Pushbroom, SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
@@ -232,6 +233,23 @@ def test_a_cubic_in_height_takes_a_height_more_and_all_blocks_of_a_tile_at_once(
     assert (result.refined_blocks, result.blocks, result.finest_spacing) == (4, 4, 64)
     # Nodes and check points, at three heights and at four.
     assert model.calls == [4 * 25 * 3, 4 * 24, 4 * 25 * 4, 4 * 24]
+
+
+@pytest.mark.parametrize(("amplitude", "power"), [(1.0, 3), (100.0, 8)], ids=["a height more", "closer nodes"])
+def test_refined_blocks_are_the_same_for_any_memory_and_threads(tmp_path, amplitude, power):
+    """They are evaluated together, with whatever other blocks of their tile lack."""
+    surface, found = mountains(tmp_path), []
+    grid = Grid(UTM, EAST - 300.3, NORTH + 300.2, 0.5, 0.5, 1200, 1100)
+    for memory, threads in ((512_000_000, 1), (512_000_000, 4), (3_000_000, 2)):
+        result = rectify(
+            Rising(amplitude, power), Ramp(tmp_path, 6000, 6000), surface, grid, tmp_path / "o.tif", driver="GTiff",
+            resources=Resources(memory, threads),
+        )  # fmt: skip
+        assert result.refined_blocks > 4
+        found.append((gdal.Open(str(tmp_path / "o.tif")).ReadAsArray(), result.max_error_px, result.finest_spacing))
+    for pixels, *other in found[1:]:
+        np.testing.assert_array_equal(pixels, found[0][0])
+        assert other == list(found[0][1:])
 
 
 def test_a_block_more_takes_few_calls(tmp_path, calls):
