@@ -137,7 +137,7 @@ def jobs(job: Job) -> dict[str, Callable[[Checkout], float]]:
         for kept in (*one.home.rglob("*.nbi"), *one.home.rglob("*.kernel")):
             kept.unlink()
         with tempfile.TemporaryDirectory() as cache:
-            empty = {**one.surroundings, "NUMBA_CACHE_DIR": cache}
+            empty = {**one.surroundings, "NUMBA_CACHE_DIR": cache, "XDG_CACHE_HOME": cache}
             return measure(ours(job, folder / "out"), empty, folder).cpu
 
     return {

@@ -138,6 +138,24 @@ def test_the_home_of_a_user_takes_what_the_folder_of_a_package_does_not(tmp_path
     assert run(tmp_path, **home).splitlines()[-1] == "False"
 
 
+def test_threads_that_keep_a_kernel_at_once_keep_it_in_one_place(tmp_path: Path) -> None:
+    """One used to take away the other's file, which then went to the next folder, or could not be written at all."""
+    more = (
+        "import threading\nfrom concurrent.futures import ThreadPoolExecutor\n"
+        "together, write = threading.Barrier(4), machine_code.Path.replace\n"
+        "def waits(*given):\n    together.wait(20)\n    return write(*given)\n"
+        "machine_code.Path.replace = waits\n"
+        "keep = lambda _: machine_code.keep(look.py_func, ('kind',), b'code', 'wrapper', {}, ['one'])\n"
+        "with ThreadPoolExecutor(4) as pool: list(pool.map(keep, range(4)))\n"
+    )
+    home = {"HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": str(tmp_path / "home" / ".cache")}
+    before = run(written(tmp_path), **home)
+    assert run(tmp_path, more, **home).startswith(before.removesuffix("True\n"))
+    assert not (tmp_path / "home").exists()
+    assert not list(tmp_path.rglob("*.part"))
+    assert len(list((tmp_path / "cache").rglob("*.kernel"))) == 2
+
+
 def test_settings_of_numba_are_another_machine(tmp_path: Path) -> None:
     run(written(tmp_path))
     assert run(tmp_path, NUMBA_CPU_NAME="x86-64").splitlines()[-1] == "True"

@@ -9,6 +9,7 @@ this processor, and for the files that it was made from; where any of these is a
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -18,6 +19,7 @@ import json
 import os
 import platform
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
@@ -91,15 +93,17 @@ def keep(
     }  # fmt: skip
     whole = json.dumps(told).encode() + b"\n" + code
     for place in _places(function, kinds):
-        temporary = place.with_name(f"{place.name}.{os.getpid()}.part")
+        # Another process may read it, and others, or another thread of this one, write it as well.
+        temporary = place.with_name(f"{place.name}.{os.getpid()}.{threading.get_ident()}.part")
         try:
             if place.is_file() and place.read_bytes() == whole:
                 return
             place.parent.mkdir(parents=True, exist_ok=True)
-            # Another process may read it, or write it as well.
             temporary.write_bytes(whole)
             temporary.replace(place)
         except OSError:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
             continue
         return
 
