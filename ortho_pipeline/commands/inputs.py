@@ -14,7 +14,8 @@ from typing import Any
 import pyproj
 
 from ortho_pipeline import plugins
-from ortho_pipeline.commands.heights.surfaces import dem_files, is_collected, sigma_file
+from ortho_pipeline.commands.heights.surfaces import dem_files, sigma_file
+from ortho_pipeline.commands.stac.given import is_collected
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange import crop
 from ortho_pipeline.exchange.model_file import read_model_file

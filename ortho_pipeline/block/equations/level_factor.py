@@ -127,7 +127,7 @@ class LevelFactor(LevelMatrix):
         between: list[Array] = []
         for number in reversed(range(len(self._lower))):
             lower = self._lower[number]
-            part = _inverse(lower)
+            part = inverse(lower)
             if own:
                 back = _back(lower, self._along[number], turned=True)
                 across = back @ own[-1]
@@ -170,7 +170,7 @@ def _root(matrix: Array) -> Array:
     return np.asarray(found)
 
 
-def _inverse(lower: Array) -> Array:
+def inverse(lower: Array) -> Array:
     """Return the inverse of the matrix that has a lower Cholesky factor."""
     from scipy.linalg.lapack import dpotri
 

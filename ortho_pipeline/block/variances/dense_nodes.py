@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ortho_pipeline.block.equations.level_factor import inverse
 from ortho_pipeline.models.base import Array
 
 if TYPE_CHECKING:
@@ -59,17 +60,11 @@ def means(
     of: Equations, nodes: Array, chances: Array, *, moved: bool
 ) -> tuple[Array, Array, Array, Array, Array, float]:
     """Return what `control_equations.Node` consists of, over nodes ``(b, 3)`` of some chances ``(b,)``."""
-    from scipy.linalg.lapack import dpotri
-
     count, size = of.u.shape[0], of.k.shape[2]
     cofactors, ground = np.zeros((size, size)), np.zeros((count, 3, 3))
     for node, chance in zip(nodes, chances, strict=True):
         at = solved(of, node)
-        if at.lower is None:
-            own = np.full((size, size), np.nan)
-        else:
-            own = np.tril(dpotri(at.lower, lower=1)[0])
-            own += np.tril(own, -1).T
+        own = np.full((size, size), np.nan) if at.lower is None else inverse(at.lower)
         shift = at.met - (at.taken @ at.z).reshape(count, 3)
         by_point = at.taken.reshape(count, 3, size)
         of_ground = at.inverse + (at.taken @ own).reshape(count, 3, size) @ by_point.swapaxes(1, 2)

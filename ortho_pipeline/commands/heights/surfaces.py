@@ -7,9 +7,8 @@ import os
 from collections.abc import Iterable, Sequence
 
 from ortho_pipeline.commands.heights.automatic import extents_under, is_automatic, open_automatic
-from ortho_pipeline.commands.stac.given import heights_given
+from ortho_pipeline.commands.stac.given import heights_given, is_collected
 from ortho_pipeline.errors import InputError, completed, of_option
-from ortho_pipeline.files.stac.collection import is_collection
 from ortho_pipeline.files.stac.item import split
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.hookspecs import Scene
@@ -125,11 +124,6 @@ def dem_files(options: SurfaceOptions) -> list[str]:
     if is_collected(options.dem):
         return [split(options.dem)[0]]
     return [*(matching_files(options.dem) or [os.fspath(options.dem)])]
-
-
-def is_collected(dem: str | os.PathLike[str]) -> bool:
-    """Tell by its name whether a DEM is a STAC collection; an item has given way to its raster before."""
-    return is_collection(split(dem)[0])
 
 
 def require_heights(options: SurfaceOptions) -> None:

@@ -74,6 +74,11 @@ def resolved(image: Any, scene: SceneOptions) -> tuple[Any, SceneOptions]:
     return chosen.href, scene if rpc is None else replace(scene, rpc=rpc.href)
 
 
+def is_collected(dem: str | os.PathLike[str]) -> bool:
+    """Tell by its name whether a DEM is a STAC collection; an item has given way to its raster before."""
+    return is_collection(split(dem)[0])
+
+
 def heights_given(dem: Any, scene: SceneOptions) -> Any:
     """Return the raster of heights that a STAC item stands for; a collection, and anything else, as it is.
 
@@ -144,7 +149,7 @@ def _far(given: dict[str, Any]) -> list[Any]:
     images = [given.get(_IMAGE), *(given.get(_IMAGES) or ())]
     for value in given.values():
         if isinstance(value, SurfaceOptions):
-            images.append(None if value.dem is None or is_collection(split(value.dem)[0]) else value.dem)
+            images.append(None if value.dem is None or is_collected(value.dem) else value.dem)
         elif isinstance(value, MatchOptions):
             images += value.reference
         elif isinstance(value, OutputOptions):
