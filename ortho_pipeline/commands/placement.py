@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import completed, of_option
-from ortho_pipeline.geodesy.crs import crs_text, map_crs
+from ortho_pipeline.geodesy.crs import map_crs
+from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions

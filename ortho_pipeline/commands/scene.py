@@ -21,7 +21,8 @@ from ortho_pipeline.files import write_json, write_text
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.files.storage import kept
-from ortho_pipeline.geodesy.crs import crs_text, ground_transform
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.geodesy.proj_grids import fetch_missing, grids, proj_info
 from ortho_pipeline.imaging import resolution
 from ortho_pipeline.models import families

@@ -483,18 +483,3 @@ _made_once = functools.lru_cache(maxsize=64)(GroundTransform)
 def ground_transform(source: str | pyproj.CRS, target: str | pyproj.CRS) -> GroundTransform:
     """Return a `GroundTransform`, the same one for the same pair: PROJ takes ten milliseconds to make one."""
     return _made_once(*(one if isinstance(one, str) else one.srs for one in (source, target)))
-
-
-# -- what is installed -----------------------------------------------------------------------------------------------
-
-
-def crs_text(crs: pyproj.CRS) -> str:
-    """Return a CRS as people read it: ``EPSG:n`` where it has such a code, its name otherwise."""
-    authority = crs.to_authority()
-    return ":".join(authority) if authority else crs.name
-
-
-def crs_definition(crs: pyproj.CRS) -> str:
-    """Return a CRS as programs read it again: ``EPSG:n`` where it is exactly that, WKT in one line otherwise."""
-    authority = crs.to_authority(min_confidence=100)
-    return ":".join(authority) if authority else crs.to_wkt().replace("\n", " ")

@@ -6,8 +6,9 @@ import numpy as np
 import pyproj
 
 from ortho_pipeline.errors import TooFewPoints, counted
-from ortho_pipeline.geodesy.crs import crs_definition, parse_crs, utm_crs
+from ortho_pipeline.geodesy.crs import parse_crs, utm_crs
 from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
+from ortho_pipeline.geodesy.naming import crs_definition
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.families import Family, exponents, family_of
 from ortho_pipeline.models.rational import GEOCENTRIC, Rational

@@ -22,13 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from ortho_pipeline.display.notebook import points_html
 from ortho_pipeline.errors import InputError, counted, reads
 from ortho_pipeline.files import json_text, write_text
-from ortho_pipeline.geodesy.crs import (
-    Vertical,
-    crs_definition,
-    ground_transform,
-    horizontal,
-    parse_crs,
-)
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, parse_crs
+from ortho_pipeline.geodesy.naming import crs_definition
 from ortho_pipeline.points.dataframes.geodataframe import frame_of, table_of
 from ortho_pipeline.points.formats import read_table
 from ortho_pipeline.points.geojson import feature_of

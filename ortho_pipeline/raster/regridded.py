@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, counted, reads
-from ortho_pipeline.geodesy.crs import crs_text, parse_crs
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import MEMORY, Grid, RasterSource, first_line, open_dataset
 

@@ -27,8 +27,9 @@ from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rm
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
 from ortho_pipeline.files.documents import DocumentError, json_position, json_value, made_of, record_of
-from ortho_pipeline.geodesy.crs import Vertical, crs_text, ground_transform, parse_crs
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.geodesy.ellipsoid import units_per_metre
+from ortho_pipeline.geodesy.naming import crs_definition, crs_name
 from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.adjustment_records import Adjustment, RmseOfView, RmsesOfView, RmsesOnGround, is_known
@@ -258,8 +259,8 @@ def _ortho(grid: Grid, warp: WarpResult | None) -> OrthoRecord:
     unit = grid.crs.axis_info[0].unit_name
     left, bottom, right, top = (float(value) for value in grid.extent)
     return OrthoRecord(
-        crs=crs_text(grid.crs),
-        crs_name=grid.crs.name,
+        crs=crs_definition(grid.crs, min_confidence=70),
+        crs_name=crs_name(grid.crs),
         unit={"metre": "m", "degree": "°"}.get(unit, unit),
         extent=(left, bottom, right, top),
         resolution=(float(grid.dx), float(grid.dy)),

@@ -328,7 +328,10 @@ class RpcRecord:
 
 @record
 class OrthoRecord:
-    """The grid of the ortho; extent is left, bottom, right, top."""
+    """The grid of the ortho; extent is left, bottom, right, top.
+
+    `crs` is what programs read: a code (``EPSG:n``), or WKT where the CRS has none.
+    """
 
     crs: str
     crs_name: str
@@ -337,6 +340,11 @@ class OrthoRecord:
     resolution: Pair
     size: Size
     valid_share: float | None
+
+    @property
+    def crs_label(self) -> str:
+        """The CRS as people read it: its code or its name."""
+        return self.crs_name if "[" in self.crs else self.crs
 
 
 @record

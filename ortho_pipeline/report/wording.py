@@ -274,7 +274,7 @@ def summary_text(report: SceneReport) -> str:
         rows.append(("heights", _surface_text(report.surface)))
     if ortho := report.ortho:
         steps = " x ".join(short(step) for step in ortho.resolution)
-        rows.append(("ortho", f"{size_text(ortho.size)} px of {steps} {ortho.unit}, {ortho.crs}"))
+        rows.append(("ortho", f"{size_text(ortho.size)} px of {steps} {ortho.unit}, {ortho.crs_label}"))
     if warp := report.warp:
         by = f" (GDAL's {warp.transformer} transformer)" if warp.transformer else ""
         rows.append(("warp", f"{px(warp.max_error_px)} at worst from the exact model{by}"))

@@ -10,7 +10,7 @@ import numpy as np
 
 from ortho_pipeline.display.numbers import share, short
 from ortho_pipeline.errors import counted
-from ortho_pipeline.geodesy.crs import crs_text
+from ortho_pipeline.geodesy.naming import crs_definition, crs_text
 from ortho_pipeline.warp.mosaic import Balance, Mosaic, Owners
 
 
@@ -26,7 +26,8 @@ def mosaic_document(
     lengths = [math.hypot(*seam["median_px"]) for seam in measured]
     worst = max(zip(lengths, measured, strict=True), key=lambda pair: pair[0], default=None)
     return {
-        "crs": crs_text(placed.grid.crs),
+        "crs": crs_definition(placed.grid.crs, min_confidence=70),
+        "crs_name": crs_text(placed.grid.crs),
         "extent": [float(value) for value in placed.grid.extent],
         "resolution": [placed.grid.dx, placed.grid.dy],
         "size": [placed.grid.width, placed.grid.height],

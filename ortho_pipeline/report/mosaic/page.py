@@ -8,10 +8,10 @@ from os import PathLike
 from typing import Any
 
 import numpy as np
-import pyproj
 
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.files import staged, write_text
+from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.mosaic.document import summary_text
 from ortho_pipeline.warp.mosaic import Owners
@@ -29,7 +29,7 @@ def write_page(
     page = render(
         "report/mosaic.html.j2",
         document=document,
-        unit={"metre": " m", "degree": "°"}.get(pyproj.CRS(document["crs"]).axis_info[0].unit_name, ""),
+        unit={"metre": " m", "degree": "°"}.get(parse_crs(document["crs"]).axis_info[0].unit_name, ""),
         lines=summary_text(document).split("\n")[1:],
         picture=base64.b64encode(png).decode(),
         drawn=None if owners is None else _outlines(owners),
