@@ -22,13 +22,12 @@ from ortho_pipeline.geodesy import crs as module
 from ortho_pipeline.geodesy.crs import (
     GroundTransform,
     Vertical,
-    crs_definition,
-    crs_text,
     horizontal,
     parse_crs,
     utm_crs,
 )  # fmt: skip
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
+from ortho_pipeline.geodesy.naming import crs_definition, crs_text
 from ortho_pipeline.geodesy.proj_grids import grids, proj_info
 
 EGM96 = Path("/usr/share/proj/egm96_15.gtx")
