@@ -1,9 +1,10 @@
 r"""The CSM state of a line scanner.
 
 Line l (0.5 at the first centre) is exposed at start + period (l - line + 0.5) of the last entry of ``m_intTimeLines``
-that is not after it; positions and quaternions are at t0 + k dt, between them Lagrange's polynomial of order 8. Sample
-s has :math:`t_2 = s \cdot sum_s + s_0 - o_s - S_0`, :math:`t_1 = l_0 - o_l - L_0`, and the place (x, y) in the focal
-plane that :math:`\binom{L_1\ L_2}{S_1\ S_2} (x, y)^T = (t_1, t_2)^T`, with L and S of ``m_iTransL``, ``m_iTransS``.
+that is not after it; the period is negative where the last line was exposed first. Positions and quaternions are at t0
++ k dt, between them Lagrange's polynomial of order 8. Sample s has :math:`t_2 = s \cdot sum_s + s_0 - o_s - S_0`,
+:math:`t_1 = l_0 - o_l - L_0`, and the place (x, y) in the focal plane that
+:math:`\binom{L_1\ L_2}{S_1\ S_2} (x, y)^T = (t_1, t_2)^T`, with L and S of ``m_iTransL``, ``m_iTransS``.
 A radial distortion (type 0) takes the part :math:`k_0 + k_1 r^2 + k_2 r^4` of x and y away, of the distorted place.
 The ray lies on the line through the camera along :math:`R(q)\,(x z, y z, f)`, z being ``m_zDirection``: of both
 directions the library takes the one that meets the ground.
@@ -68,11 +69,11 @@ def _times(state: State) -> tuple[float, float]:
     if not 1 <= len(lines) == len(starts) == len(periods) <= 100_000 or not (np.diff(lines) > 0).all():
         raise state.error("lines, times and periods belong together", "m_intTimeLines")
     period = float(periods[0])
-    if not 0 < period < 10:
+    if not 0 < abs(period) < 10:
         raise state.error(f"{period} s is not a time for a row", "m_intTimes")
     steady = starts[0] + (lines - lines[0]) * period
     # The period behind the last entry holds for the rest of the image only.
-    if np.abs(periods / period - 1).max() * state.size()[1] > 1 or np.abs(starts - steady).max() > _EVEN * period:
+    if np.abs(periods / period - 1).max() * state.size()[1] > 1 or np.abs(starts - steady).max() > _EVEN * abs(period):
         raise state.error("the lines have no constant period", "m_intTimes")
     return float(starts[0] + period * (0.5 - lines[0])), period
 
@@ -145,7 +146,8 @@ def line_scanner_fields(model: Pushbroom) -> dict[str, Any]:
         "m_opticalDistCoeffs": list(line.radial),
         "m_minElevation": model.heights[0], "m_maxElevation": model.heights[1],
         "m_majorAxis": SEMI_MAJOR, "m_minorAxis": minor, "m_referencePointXyz": place.tolist(),
-        "m_gsd": gsd, "m_halfSwath": gsd * camera.width / 2, "m_halfTime": duration / 2, "m_flyingHeight": distance,
+        "m_gsd": gsd, "m_halfSwath": gsd * camera.width / 2, "m_halfTime": abs(duration) / 2,
+        "m_flyingHeight": distance,
     }  # fmt: skip
 
 
@@ -169,9 +171,9 @@ def _sites(model: Pushbroom) -> Array:
     count = max(1, round(float(breaks[-1] - breaks[0]) / step))
     step = float(breaks[-1] - breaks[0]) / count
     # The library's polynomials want four rows beyond the image.
-    before = max(0, math.ceil((float(breaks[0]) + 4 * step) / step))
-    duration = model.camera.height * model.line_period
-    after = max(0, math.ceil((duration + 4 * step - float(breaks[-1])) / step))
+    earliest, latest = sorted((0.0, model.camera.height * model.line_period))
+    before = max(0, math.ceil((float(breaks[0]) + 4 * step - earliest) / step))
+    after = max(0, math.ceil((latest + 4 * step - float(breaks[-1])) / step))
     return np.asarray(breaks[0] + step * np.arange(-before, count + after + 1))
 
 

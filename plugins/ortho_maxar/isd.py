@@ -3,7 +3,8 @@ r"""ISD XML of WorldView 1 to 4, GeoEye-1 and QuickBird: orbit, attitude and det
 What the vendor's numbers mean:
 
 - row r, counted from 0 at the centre of the first, is exposed at TLCTIME + t, with t linear between the pairs (r, t) of
-  TLCLIST; positions and attitude are TIMEINTERVAL apart, the first of them at STARTTIME;
+  TLCLIST: t decreases where the scan ran against the flight (SCANDIRECTION Reverse); positions and attitude are
+  TIMEINTERVAL apart, the first of them at STARTTIME;
 - positions are ECEF; the quaternion, scalar last, turns the camera to ECEF, as it is at the moment of exposure;
 - column c, counted from 0 at the first centre, looks along (DETORIGINX, DETORIGINY - c DETPITCH, PD) of the camera, in
   millimetres, z to the ground;
@@ -109,15 +110,19 @@ class Isd:
 
     @cached_property
     def rows(self) -> tuple[float, float]:
-        """Time of the first centre (seconds of the day) and seconds per row."""
+        """Time of the first centre (seconds of the day) and seconds per row, which are negative in a reverse scan."""
         start = self.file.time("IMD/IMAGE/TLCTIME")
         listed = self.file.all("IMD/IMAGE/TLCLISTList/TLCLIST", 10_000)
         pairs = np.array([self.file.numbers_of(one.text or "", "TLCLIST", 2) for one in listed]).reshape(-1, 2)
-        if len(pairs) < 2 or not (np.diff(pairs, axis=0) > 0).all():
-            raise self.file.error("two growing pairs of row and time at least belong here", "TLCLISTList")
+        steps, times = np.diff(pairs, axis=0).T
+        if len(pairs) < 2 or not (steps > 0).all() or not ((times > 0).all() or (times < 0).all()):
+            raise self.file.error(
+                "TLCLIST needs at least two pairs, with rows that increase and times that all increase or all decrease",
+                "TLCLISTList",
+            )
         period = float((pairs[-1, 1] - pairs[0, 1]) / (pairs[-1, 0] - pairs[0, 0]))
-        uneven = np.abs(pairs[:, 1] - pairs[0, 1] - (pairs[:, 0] - pairs[0, 0]) * period).max() / period
-        if not (0 < period < 1 and uneven <= _EVEN):
+        uneven = np.abs(pairs[:, 1] - pairs[0, 1] - (pairs[:, 0] - pairs[0, 0]) * period).max() / abs(period)
+        if not (0 < abs(period) < 1 and uneven <= _EVEN):
             raise self.file.error(f"the rows are {uneven:.2g} rows off any one rate", "TLCLISTList")
         return start + float(pairs[0, 1] - pairs[0, 0] * period), period
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -143,7 +144,7 @@ def isd_text(*, size: tuple[int, int] = (60, 50), start: float = 0.0, catalogue:
     return (
         f'<?xml version="1.0" encoding="UTF-8"?>\n<isd{namespace}><IMD><NUMROWS>{rows}</NUMROWS><NUMCOLUMNS>{columns}'
         "</NUMCOLUMNS><BANDID>P</BANDID><BITSPERPIXEL>8</BITSPERPIXEL><PRODUCTLEVEL>LV1B</PRODUCTLEVEL><IMAGE><SATID>WV01</SATID>"
-        f"<CATID>{catalogue}</CATID><TLCTIME>{utc(start)}</TLCTIME><FIRSTLINETIME>{utc(start)}</FIRSTLINETIME>"
+        f"<SCANDIRECTION>Forward</SCANDIRECTION><CATID>{catalogue}</CATID><TLCTIME>{utc(start)}</TLCTIME><FIRSTLINETIME>{utc(start)}</FIRSTLINETIME>"
         f"<TLCLISTList><TLCLIST>0.0 0.0</TLCLIST><TLCLIST>{rows}.0 {rows * 1e-4:.15e}</TLCLIST></TLCLISTList>"
         "<MEANSUNEL>4.1e+01</MEANSUNEL><CLOUDCOVER>-9.99e+02</CLOUDCOVER></IMAGE></IMD>\n"
         f"{table('EPH', 'EPHEMLIST', np.hstack([places, rates, zeros[:, :6]]))}"
@@ -155,6 +156,32 @@ def isd_text(*, size: tuple[int, int] = (60, 50), start: float = 0.0, catalogue:
         f"<DETORIGINY>{columns * 0.004}</DETORIGINY><DETROTANGLE>0.0</DETROTANGLE><DETPITCH>0.008</DETPITCH>"
         f"</DETECTOR_ARRAY></BAND_P></DETECTOR_MOUNTING></GEO>{_rpb(rpc)}</isd>\n"
     )
+
+
+def reversed_scan(text: str, *, from_first_row: bool = False) -> str:
+    """Return ISD XML of the same image with its last row on top: a scan against the flight, whose times decrease.
+
+    Times count from the earliest row, or from the first row, where they are negative.
+    """
+    rows = int(re.search(r"<NUMROWS>(\d+)<", text)[1])
+    at, times = np.array(re.findall(r"<TLCLIST>(\S+)\s+(\S+)</TLCLIST>", text), dtype=float).T
+    ends = np.interp([rows - 1, 0], at, times)
+    shift = ends[0] if from_first_row else 0.0
+    listed = "".join(
+        f"<TLCLIST>{row}.0 {time - shift:.15e}</TLCLIST>" for row, time in zip((0, rows - 1), ends, strict=True)
+    )
+    text = re.sub(r"(?s)(<TLCLISTList>).*(</TLCLISTList>)", rf"\g<1>{listed}\g<2>", text)
+    began = np.datetime64(re.search(r"<TLCTIME>(.*?)Z?</TLCTIME>", text)[1], "us")
+    for name, after in (("FIRSTLINETIME", ends[0]), ("TLCTIME", shift)):
+        time = began + np.timedelta64(round(after * 1e6), "us")
+        text = re.sub(rf"(<{name}>).*?(</{name}>)", rf"\g<1>{time}Z\g<2>", text)
+    text = text.replace("<SCANDIRECTION>Forward", "<SCANDIRECTION>Reverse")
+
+    def turned(found: re.Match[str]) -> str:
+        return f"{found[1]}{' '.join(str(-float(term)) for term in found[2].split())}{found[3]}"
+
+    text = re.sub(r"(<LINEOFFSET>)(.*?)(</LINEOFFSET>)", lambda m: f"{m[1]}{rows - 1 - float(m[2])!r}{m[3]}", text)
+    return re.sub(r"(<LINENUMCOEF>)(.*?)(</LINENUMCOEF>)", turned, text)
 
 
 def _rpb(rpc: RPC | None) -> str:

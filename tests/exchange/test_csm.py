@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from ortho_maxar.isd import Isd, read_isd_pushbroom
 from ortho_spot.dimap import read_spot
-from products import isd_text, spot_text
+from products import isd_text, reversed_scan, spot_text
 from scipy.spatial.transform import Rotation
 
 from ortho_pipeline.errors import InputError
@@ -78,8 +78,8 @@ class Library:
         return sample, line
 
 
-def worldview(folder: Path, **light: bool) -> Pushbroom:
-    (folder / "one.XML").write_text(isd_text())
+def worldview(folder: Path, *, reverse: bool = False, **light: bool) -> Pushbroom:
+    (folder / "one.XML").write_text(reversed_scan(isd_text()) if reverse else isd_text())
     model = read_isd_pushbroom(folder / "one.XML")
     return replace(model, light=LightPath(**light), heights=(0.0, 300.0))
 
@@ -101,10 +101,11 @@ def points(model: SensorModel, size: tuple[int, int]) -> tuple[Array, Array]:
     return image, model.image_to_ground(image, np.linspace(0.0, 300.0, 25))
 
 
-@pytest.mark.parametrize("kind", ["worldview", "spot", "spot5", "frame"])
+@pytest.mark.parametrize("kind", ["worldview", "reverse", "spot", "spot5", "frame"])
 def test_there_and_back(tmp_path: Path, kind: str) -> None:
     model = {"worldview": lambda: worldview(tmp_path), "spot": lambda: spot(tmp_path), "frame": frame,
-             "spot5": lambda: spot(tmp_path, corrected=True)}[kind]()  # fmt: skip
+             "spot5": lambda: spot(tmp_path, corrected=True), "reverse": lambda: worldview(tmp_path, reverse=True)
+             }[kind]()  # fmt: skip
     size = (400, 300) if kind == "frame" else (60, 50)
     stated = write_csm(model, tmp_path / "one.json")
     once = read_csm(tmp_path / "one.json")
@@ -117,13 +118,13 @@ def test_there_and_back(tmp_path: Path, kind: str) -> None:
     assert stated < 0.01
 
 
-@pytest.mark.parametrize("kind", ["worldview", "light", "spot"])
+@pytest.mark.parametrize("kind", ["worldview", "reverse", "light", "spot"])
 def test_a_line_scanner_in_the_library(tmp_path: Path, kind: str) -> None:
     """Its rays pass the ground that the model sees, within 0.01 px; with light at the height that it is folded for."""
     if kind == "spot":
         model = spot(tmp_path)
     else:
-        model = worldview(tmp_path, aberration=kind == "light", refraction=kind == "light")
+        model = worldview(tmp_path, reverse=kind == "reverse", aberration=kind == "light", refraction=kind == "light")
     library = Library(csm_text(model)[0])
     image = np.random.default_rng(1).uniform(0.0, 1.0, (25, 2)) * model.camera.size
     ground = geocentric(model.image_to_ground(image, model.reference_height))
@@ -132,6 +133,22 @@ def test_a_line_scanner_in_the_library(tmp_path: Path, kind: str) -> None:
         line = point - place
         apart = np.linalg.norm(np.cross(line, direction))
         assert apart < 0.01 * np.linalg.norm(line) / model.camera.focal_length
+
+
+def test_a_state_whose_lines_were_taken_from_the_last_to_the_first(tmp_path: Path) -> None:
+    """As Ames Stereo Pipeline writes it of a reverse scan: the time of a line is negative."""
+    model = worldview(tmp_path)
+    write_csm(model, tmp_path / "one.json")
+    name, _, body = (tmp_path / "one.json").read_text().partition("\n")
+    state = json.loads(body)
+    rows = state["m_nLines"]
+    (start,), (period,) = state["m_intTimeStartTimes"], state["m_intTimes"]
+    state |= {"m_intTimeLines": [1.0, float(rows)], "m_intTimes": [-period, -period],
+              "m_intTimeStartTimes": [start + (rows - 1) * period, start]}  # fmt: skip
+    (tmp_path / "one.json").write_text(f"{name}\n{json.dumps(state)}")
+    image, ground = points(model, model.camera.size)
+    turned = np.column_stack([image[:, 0], rows - image[:, 1]])
+    assert np.abs(read_csm(tmp_path / "one.json").ground_to_image(ground) - turned).max() < 1e-6
 
 
 def test_a_frame_in_the_library() -> None:

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 from ortho_maxar.isd import Isd, read_isd_pushbroom
 from osgeo import gdal
-from products import isd_text, til_text
+from products import isd_text, reversed_scan, til_text
 from scipy.optimize import least_squares
 from used import pixels, ran, used
 
@@ -62,6 +62,30 @@ def test_rigorous_model_and_the_vendors_rpc(real: Path, part: Path) -> None:
     assert np.linalg.norm(airless.mean(axis=0)) > 1.0
     plain = against_rpc(replace(model, light=LightPath()), isd.rpc)
     assert np.linalg.norm(plain.mean(axis=(0, 1))) > 20
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("part", PARTS, ids=["P001", "P002"])
+@pytest.mark.parametrize("from_first_row", [False, True])
+def test_a_scan_against_the_flight(real: Path, tmp_path: Path, part: Path, from_first_row: bool) -> None:
+    """The same rays in rows that count the other way; the RPC and the model agree as well as they did."""
+    (tmp_path / "one.XML").write_text(reversed_scan((real / part).read_text(), from_first_row=from_first_row))
+    forward, isd = Isd(real / part), Isd(tmp_path / "one.XML")
+    model, its = read_isd_pushbroom(forward), read_isd_pushbroom(isd)
+    columns, rows = model.camera.size
+    image = np.random.default_rng(0).uniform(-0.2, 1.2, (200, 2)) * (columns, rows)
+    turned = np.column_stack([image[:, 0], rows - image[:, 1]])
+    ground = model.image_to_ground(image, 3400.0)
+    # The vendor prints times in microseconds, a fortieth of a row.
+    assert np.abs(its.ground_to_image(ground) - turned).max() < 0.03
+    closed = [np.abs(one.ground_to_image(one.image_to_ground(at, 3400.0)) - at).max()
+              for one, at in ((model, image), (its, turned))]  # fmt: skip
+    assert closed[1] == pytest.approx(closed[0], rel=0.01)
+    seen = forward.rpc.ground_to_image(ground)
+    assert np.abs(isd.rpc.ground_to_image(ground) - seen * (1, -1) - (0, rows)).max() < 1e-6
+    before, after = against_rpc(model, forward.rpc), against_rpc(its, isd.rpc)
+    assert np.abs(after.mean(axis=(0, 1)) * (1, -1) - before.mean(axis=(0, 1))).max() < 0.03
+    assert after.std(axis=(0, 1)) == pytest.approx(before.std(axis=(0, 1)), abs=0.001)
 
 
 @pytest.mark.realdata
@@ -192,6 +216,38 @@ def test_every_command(folder: Path, whole: tuple[Pushbroom, RPC], namespace: st
     assert info["models"] == {"rpc": "rpc", "pushbroom": "pushbroom"}
     assert info["facts"]["rigorous_model"] == f"{STEM}.XML"
     assert "cloud_cover" not in info["facts"]
+
+
+@pytest.mark.parametrize("from_first_row", [False, True])
+def test_rows_that_were_taken_from_the_last_to_the_first(
+    folder: Path, whole: tuple[Pushbroom, RPC], from_first_row: bool
+) -> None:
+    """The ground in them is that of the forward scan, in rows that count the other way."""
+    model, rpc = whole
+    image = pixels(folder / f"{STEM}.TIF", SIZE)
+    (folder / f"{STEM}.XML").write_text(reversed_scan(isd_text(size=SIZE, rpc=rpc), from_first_row=from_first_row))
+    scene = open_scene(image)
+    assert list(scene.models) == ["rpc", "pushbroom"]
+    assert not scene.warnings
+    at = np.random.default_rng(0).uniform(-0.2, 1.2, (50, 2)) * SIZE
+    turned = np.column_stack([at[:, 0], SIZE[1] - at[:, 1]])
+    ground = model.image_to_ground(at, 200.0)
+    reverse = scene.models["pushbroom"]
+    assert np.abs(reverse.ground_to_image(ground) - turned).max() < 0.01
+    assert np.abs(reverse.image_to_ground(turned, 200.0) - ground)[:, :2].max() < 1e-7
+    assert np.abs(scene.models["rpc"].ground_to_image(ground) - turned).max() < 0.05
+    check_sensor_model(reverse, ground[:20])
+    assert reverse.detail == pytest.approx(model.detail, rel=0.02)
+    # Beyond three half-sizes of the image nothing is seen, at either end.
+    far = reverse.image_to_ground(np.array([[30.0, -1.9 * SIZE[1]], [30.0, 2.9 * SIZE[1]]]), 200.0)
+    assert np.isnan(far).all()
+    # A part that was taken 30 rows later lies 30 rows above.
+    other = STEM.replace("120000", "120001").replace("P001", "P002")
+    pixels(folder / f"{other}.TIF", SIZE)
+    (folder / f"{other}.XML").write_text(reversed_scan(isd_text(size=SIZE, start=30e-4, rpc=rpc)))
+    assert [(Path(piece.path).name, piece.offset) for piece in open_scene(image).pieces] == [
+        (f"{other}.TIF", (0.0, -30.0))
+    ]
 
 
 TILES = tuple(

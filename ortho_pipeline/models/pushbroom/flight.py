@@ -24,7 +24,7 @@ class Flight:
     path, attitude : Spline
         s (m) and roll, pitch, yaw (rad), with offset and drift.
     duration : float
-        Seconds from the upper edge of the image to the lower.
+        Seconds from the upper edge of the image to the lower; negative where the lower was exposed first.
     """
 
     origin: Array

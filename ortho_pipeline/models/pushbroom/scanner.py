@@ -1,7 +1,8 @@
 r"""Rigorous line scanner (pushbroom): every row has its own position and attitude.
 
-The row coordinate r is exposed at :math:`t = r\,\Delta t`, so t counts seconds from the upper edge of the image. A
-ground point P (ECEF) is seen in column x and row r where
+The row coordinate r is exposed at :math:`t = r\,\Delta t`, so t counts seconds from the upper edge of the image. Where
+the last row was exposed first (agile satellites also scan against their flight), :math:`\Delta t` is negative. A ground
+point P (ECEF) is seen in column x and row r where
 
 .. math::
 
@@ -76,7 +77,7 @@ class Pushbroom(SensorModel):
     ----------
     camera : LineCamera
     line_period : float
-        Seconds from row to row.
+        Seconds from row to row; negative where the last row was exposed first.
     origin : (3,)
         S_O, the place (ECEF, m) about which the path is given.
     orbital, mounting : (3, 3)
@@ -124,8 +125,8 @@ class Pushbroom(SensorModel):
         for name in ("orbital", "mounting"):
             object.__setattr__(self, name, exact_rotation(getattr(self, name), name))
         object.__setattr__(self, "line_period", float(self.line_period))
-        if not (math.isfinite(self.line_period) and self.line_period > 0):
-            raise InputError("the line period is positive", field="line_period")
+        if not (math.isfinite(self.line_period) and self.line_period):
+            raise InputError(f"{self.line_period} s is not a time from row to row", field="line_period")
         low, high = (float(value) for value in self.heights)
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
             raise InputError(f"heights from {low} to {high} are not a range", field="heights")
@@ -164,7 +165,8 @@ class Pushbroom(SensorModel):
     @property
     def detail(self) -> float:
         """Shortest distance (px) of two knots of path or attitude."""
-        return float(min(np.diff(spline.breaks).min() for spline in (self.path, self.attitude)) / self.line_period)
+        shortest = min(np.diff(spline.breaks).min() for spline in (self.path, self.attitude))
+        return float(shortest / abs(self.line_period))
 
     @property
     def minimum_points(self) -> int:
@@ -251,8 +253,8 @@ class Pushbroom(SensorModel):
     @cached_property
     def _limits(self) -> Array:
         """Lowest and highest column and time ``(2, 2)`` that are answered."""
-        size = np.array([self.camera.width, 2 * self.flight.middle])
-        return np.stack([size * (1 - _REACH) / 2, size * (1 + _REACH) / 2], axis=1)
+        size = np.array([self.camera.width, self.flight.duration])
+        return np.sort(np.stack([size * (1 - _REACH) / 2, size * (1 + _REACH) / 2], axis=1), axis=1)
 
     def ground_to_image(self, ground: ArrayLike) -> Array:
         """Project ground points ``(N, 3)``; NaN behind the Earth and beyond three half-sizes of the image."""

@@ -54,7 +54,8 @@ def pushbroom_of_tables(
     Parameters
     ----------
     line_period, first_time : float
-        Seconds per row, and the time of the upper edge of the first row (half a period before its centre).
+        Seconds per row (negative where the last row was exposed first), and the time of the upper edge of the first
+        row, half a period before its centre.
     orbit : (N,), (N, 3)
         Times and positions (ECEF, m); at least one row more than the degree of the splines, around the image.
     attitude : (N,), (N, 3, 3)
@@ -77,7 +78,7 @@ def pushbroom_of_tables(
         If a table is not ordered in time, too short, or does not cover the image.
     """
     degree, last = splines.degree, camera.height * line_period
-    needed = (first_time, last, line_period)
+    needed = (first_time, last, abs(line_period))
     times, positions = _table(orbit, (3,), needed, degree, "orbit")
     if not (np.abs(positions) < _FARTHEST).all():
         raise InputError("a position of this table is no place of a satellite (ECEF metres)", field="orbit")
@@ -91,7 +92,8 @@ def pushbroom_of_tables(
     if not are_rotations(turns):
         raise InputError("a matrix of this table is not a rotation", field="attitude")
     # Half an image beyond both ends, as far as the tables go: points outside of the image are legal.
-    low, high = max(-last / 2, times[0], turn_times[0]), min(1.5 * last, times[-1], turn_times[-1])
+    before, after = sorted((-0.5 * last, 1.5 * last))
+    low, high = max(before, times[0], turn_times[0]), min(after, times[-1], turn_times[-1])
     origin, velocity = lagrange(times, positions, np.array([last / 2]))
     orbital = orbital_axes(origin[0], velocity[0])
     path_breaks = np.linspace(low, high, 1 + (splines.path or max(2, math.ceil((high - low) / _PATH_PIECE))))
@@ -171,19 +173,21 @@ def _table(
     degree: int,
     name: str,
 ) -> tuple[Array, Array]:
-    """Return times after the first row and values of a table, checked; `needed`: first time, duration, row (s)."""
+    """Return times after the first row and values of a table, checked; `needed`: first time, last after it, row (s)."""
     first, last, row = needed
-    slack = max(row, _BEYOND[name] * last)
+    slack = max(row, _BEYOND[name] * abs(last))
     times, values = (np.asarray(part, dtype=np.float64) for part in table)
     if times.ndim != 1 or values.shape != (len(times), *shape) or len(times) <= degree:
         raise InputError(f"more than {degree} times with {shape} values each are needed", field=name)
     if not (np.isfinite(times).all() and np.isfinite(values).all() and (np.diff(times) > 0).all()):
         raise InputError("a table has finite values at increasing times", field=name)
     times = times - first
+    earliest, latest = sorted((0.0, last))
     # The rim of a row more or less is not a reason to refuse a table: vendors' tables end at centres of rows.
-    if times[0] > slack or times[-1] < last - slack:
+    if times[0] > earliest + slack or times[-1] < latest - slack:
         raise InputError(
-            f"it is known from {times[0]:.6g} to {times[-1]:.6g} s after the first row, the image takes {last:.6g} s",
+            f"this table is from {times[0]:.6g} to {times[-1]:.6g} s after the first row, the image from"
+            f" {earliest:.6g} to {latest:.6g} s",
             field=name,
             remedy="give a table that covers the image, in the time system of first_time",
         )
