@@ -91,9 +91,7 @@ def pushbroom_of_tables(
     turn_times, turns = _table(attitude, (3, 3), needed, degree, "attitude")
     if not are_rotations(turns):
         raise InputError("a matrix of this table is not a rotation", field="attitude")
-    # Half an image beyond both ends, as far as the tables go: points outside of the image are legal.
-    before, after = sorted((-0.5 * last, 1.5 * last))
-    low, high = max(before, times[0], turn_times[0]), min(after, times[-1], turn_times[-1])
+    low, high = _followed(last, times, turn_times)
     origin, velocity = lagrange(times, positions, np.array([last / 2]))
     orbital = orbital_axes(origin[0], velocity[0])
     path_breaks = np.linspace(low, high, 1 + (splines.path or max(2, math.ceil((high - low) / _PATH_PIECE))))
@@ -192,6 +190,15 @@ def _table(
             remedy="give a table that covers the image, in the time system of first_time",
         )
     return times, values
+
+
+def _followed(last: float, *tables: Array) -> tuple[float, float]:
+    """Return the times for which path and attitude are made: half an image beyond both ends, as far as the tables go.
+
+    Points outside of the image are legal.
+    """
+    before, after = sorted((-0.5 * last, 1.5 * last))
+    return max(before, *(times[0] for times in tables)), min(after, *(times[-1] for times in tables))
 
 
 def lagrange(times: Array, values: Array, wanted: Array) -> tuple[Array, Array]:
