@@ -117,7 +117,7 @@ def _typed(option: Option) -> dict[str, Any]:
         "file": {"type": click.Path(dir_okay=False)},
         "number": {"type": number},
         "integer": {"type": whole},
-        "integers": {"type": whole, "multiple": True},
+        "integers": {"type": _Integers(whole), "callback": _joined, "multiple": True},
         "pair": {"callback": _pair},
         "box": {"type": float, "nargs": 4},
         "one or two": {"type": OneOrTwo()},
@@ -127,6 +127,22 @@ def _typed(option: Option) -> dict[str, Any]:
         "folders": {"type": click.Path(exists=True, file_okay=False), "multiple": True},
         "keys": {"callback": _keys, "multiple": True},
     }.get(option.kind, {})
+
+
+class _Integers(click.ParamType):
+    """Whole numbers with commas between, each within the range of a type."""
+
+    name = "integers"
+
+    def __init__(self, each: click.ParamType) -> None:
+        self._each = each
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
+        return tuple(self._each.convert(part.strip(), param, ctx) for part in str(value).split(","))
+
+
+def _joined(_: click.Context, __: click.Parameter, groups: Sequence[Sequence[int]]) -> tuple[int, ...]:
+    return tuple(number for group in groups for number in group)
 
 
 def _pair(_: click.Context, option: click.Parameter, text: str | None) -> tuple[float, float] | None:
@@ -182,8 +198,10 @@ block_options = _grouped("points", BlockOptions, "points", "gcps", "crs", "verti
 adjustment_options = click_options("points", BlockOptions, "ties", "correction", "ground_sigma", "model_crs", "hold")
 surface_options = _grouped("surface", SurfaceOptions)
 match_options = _grouped("match", MatchOptions)
-matching_options = _grouped("match", MatchOptions, "reference", "search", "points", "reference_sigma")
-reference_options = _grouped("match", MatchOptions, "reference", "search")
+matching_options = _grouped(
+    "match", MatchOptions, "reference", "reference_bands", "search", "points", "reference_sigma"
+)
+reference_options = _grouped("match", MatchOptions, "reference", "reference_bands", "search")
 tie_options = _grouped("match", MatchOptions, "search", "points")
 dem_datum_options = _grouped("surface", SurfaceOptions, "vertical", "override_vertical")
 network_option = _grouped("scene", SceneOptions, "allow_network")

@@ -308,8 +308,8 @@ class OutputOptions:
     bands: Annotated[
         Sequence[int] | None,
         Option(
-            "--band -b", "Only these bands of the image, from 1, in this order.", "N", unset="all", kind="integers",
-            above=0,
+            "--band -b", "Only these bands of the image, from 1, in this order.", "N[,...]", unset="all",
+            kind="integers", above=0,
         ),
     ] = None  # fmt: skip
     dtype: Annotated[
@@ -416,6 +416,13 @@ class MatchOptions:
             "first.", "ORTHO[,...]", kind="files",
         ),
     ] = ()  # fmt: skip
+    reference_bands: Annotated[
+        Sequence[int] | None,
+        Option(
+            "--reference-bands", "Bands of the reference to compare, from 1.", "N[,...]", kind="integers", above=0,
+            unset="the four with the most content",
+        ),
+    ] = None  # fmt: skip
     search: Annotated[
         float | None,
         Option(

@@ -1,9 +1,14 @@
 """A raster as one image of intensities, as a matcher wants it: windows that may reach outside, reduced by averaging.
 
-The bands are averaged, because a reference and a scene seldom have the same ones. What is not valid is NaN.
+The bands are averaged, because a reference and a scene seldom have the same ones. What is not valid is NaN. Bands
+without content (nodata, one value, flags of quality) have no part in it.
 """
 
 from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +17,14 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.source import RasterSource, first_line
 
-#: More bands than this are hyperspectral: so many of them, spread over the spectrum, stand for all.
-_BANDS = 4
+#: At most so many bands are averaged: those with the most content, if it is at least this part of the most.
+_BANDS, _WORTH = 4, 0.5
+#: Bands are compared in so many windows of so many pixels a side with values; at most so many windows are tried.
+_WINDOWS, _WINDOW, _TRIED = 9, 64, 150
+#: A band with values in less than this part of the pixels of the fullest band would cost the other ones theirs.
+_FULL = 0.9
+#: Values are told apart in so many steps between the percentiles 1 and 99 of a band.
+_STEPS = 256
 #: Up to this factor pixels are averaged here; beyond, GDAL does it, from overviews where there are some. Overviews may
 #: have been made by any rule, so they serve to find a place and never to measure it.
 EXACT = 8
@@ -25,21 +36,51 @@ class Intensity:
     Parameters
     ----------
     source : RasterSource
-        All of its bands but alpha count; of more than four, four.
+    bands : sequence of int
+        Numbers from 1 of the bands that are averaged; those with the most content (`contents`) without.
     """
 
-    def __init__(self, source: RasterSource) -> None:
+    def __init__(self, source: RasterSource, bands: Sequence[int] = ()) -> None:
         self.source = source
         self.width, self.height = source.width, source.height
-        kept = [
-            number for number, band in enumerate(source.bands) if band.GetColorInterpretation() != gdal.GCI_AlphaBand
-        ] or [0]  # fmt: skip
-        if len(kept) > _BANDS:
-            kept = [kept[round(place)] for place in np.linspace(0, len(kept) - 1, _BANDS)]
-        self._bands = kept
+        self.bands = tuple(bands)
         # The brightest value of whole numbers says "at least this".
         kind = source.dtype
         self.saturated = float(np.iinfo(kind).max) if kind.kind in "iu" else np.inf
+
+    @cached_property
+    def averaged(self) -> tuple[int, ...]:
+        """Numbers of the bands that are averaged; they are chosen when pixels are first asked for."""
+        return self.bands or self._best()
+
+    def _best(self) -> tuple[int, ...]:
+        """Return the numbers of the bands with the most content; alpha is none."""
+        colours = [band.GetColorInterpretation() for band in self.source.bands]
+        known = np.flatnonzero([colour != gdal.GCI_AlphaBand for colour in colours])
+        if len(known) < 2:
+            return (int(known[0]) + 1 if len(known) else 1,)
+        samples = list(itertools.islice(self._samples(), _WINDOWS))
+        found = contents(np.stack(samples, axis=1)[known]) if samples else np.zeros(len(known))
+        if not found.any():
+            # A raster of one value, or none where it was looked at: bands from its whole spectrum.
+            spread = np.linspace(0, len(known) - 1, min(_BANDS, len(known)))
+            return tuple((known[np.round(spread).astype(int)] + 1).tolist())
+        best = np.argsort(-found, kind="stable")[:_BANDS]
+        return tuple(sorted((known[best[found[best] >= _WORTH * found.max()]] + 1).tolist()))
+
+    def _samples(self) -> Iterator[NDArray[np.float32]]:
+        """Yield windows ``(bands, h, w)`` spread over the raster in which some band has values; NaN is not valid."""
+        height, width = min(_WINDOW, self.height), min(_WINDOW, self.width)
+        for number in range(1, _TRIED + 1):
+            across, down = (_part(number, base) for base in (2, 3))
+            left, top = int(across * (self.width - width + 1)), int(down * (self.height - height + 1))
+            pixels = self.source.read(left, top, width, height)
+            valid = self.source.read_valid(left, top, pixels)
+            found = pixels.astype(np.float32)
+            if valid is not None:
+                found[~valid] = np.nan
+            if np.isfinite(found).mean(axis=(1, 2)).max() > 0.5:
+                yield found
 
     def read(self, left: int, top: int, width: int, height: int, factor: int = 1) -> NDArray[np.float32]:
         """Return intensities ``(height, width)`` of means of `factor` x `factor` pixels; NaN where not valid.
@@ -67,9 +108,10 @@ class Intensity:
     def _means(self, left: int, top: int, rows: int, columns: int, factor: int) -> NDArray[np.float32]:
         pixels = self.source.read(left, top, columns * factor, rows * factor)
         valid = self.source.read_valid(left, top, pixels)
-        mean = pixels[self._bands].astype(np.float32).mean(axis=0)
+        bands = np.array(self.averaged) - 1
+        mean = pixels[bands].astype(np.float32).mean(axis=0)
         if valid is not None:
-            mean[~valid[self._bands].all(axis=0)] = np.nan
+            mean[~valid[bands].all(axis=0)] = np.nan
         if factor == 1:
             return mean
         return mean.reshape(rows, factor, columns, factor).mean(axis=(1, 3), dtype=np.float32)
@@ -90,9 +132,9 @@ class Intensity:
         size = {"buf_xsize": columns, "buf_ysize": rows}
         found = np.zeros((rows, columns), dtype=np.float32)
         valid = np.ones((rows, columns), dtype=bool)
+        bands = [self.source.bands[number - 1] for number in self.averaged]
         try:
-            for number in self._bands:
-                band = self.source.bands[number]
+            for band in bands:
                 way = gdal.GRIORA_NearestNeighbour if single and not band.GetOverviewCount() else gdal.GRIORA_Average
                 found += band.ReadAsArray(*window, **size, buf_type=gdal.GDT_Float32, resample_alg=way)
                 valid &= band.GetMaskBand().ReadAsArray(*window, **size) != 0
@@ -101,6 +143,41 @@ class Intensity:
                 f"the pixels cannot be read ({first_line(error, self.source.path)})", file=self.source.path,
                 remedy="the file is cut off or damaged: copy it again",
             ) from error  # fmt: skip
-        found /= len(self._bands)
+        found /= len(bands)
         found[~valid] = np.nan
         return found
+
+
+def contents(bands: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return how much structure bands ``(n, windows, h, w)`` show, 0 for one without; NaN is not valid.
+
+    Bits that a pixel tells beyond its neighbour: the entropy of differences between neighbours, in steps of the band's
+    range. Classes and what was enlarged have few. Noise has many, and is not correlated with its neighbour; so the bits
+    are multiplied by that correlation.
+    """
+    found = np.zeros(len(bands))
+    full = np.isfinite(bands).mean(axis=(1, 2, 3))
+    for number in np.flatnonzero((full > 0) & (full >= _FULL * full.max())).tolist():
+        band = bands[number]
+        low, high = np.nanpercentile(band, (1.0, 99.0))
+        if not high > low:
+            continue
+        values = np.clip((band - low) * ((_STEPS - 1) / (high - low)), 0, _STEPS - 1)
+        steps = [np.diff(values, axis=axis).ravel() for axis in (1, 2)]
+        steps = [step[np.isfinite(step)] for step in steps]
+        variance = float(np.nanvar(values))
+        for step in steps:
+            counts = np.unique(np.rint(step), return_counts=True)[1] / max(len(step), 1)
+            alike = 1.0 - float((step**2).mean()) / (2 * variance) if len(step) and variance > 0 else 0.0
+            found[number] += max(alike, 0.0) * float(-(counts * np.log2(counts)).sum()) / len(steps)
+    return found
+
+
+def _part(number: int, base: int) -> float:
+    """Return a number between 0 and 1; those of 1, 2, 3 ... are spread evenly (van der Corput's sequence)."""
+    part, unit = 0.0, 1.0
+    while number:
+        unit /= base
+        number, digit = divmod(number, base)
+        part += digit * unit
+    return part

@@ -7,6 +7,7 @@ from its overviews or, where it has none, by single pixels of every few rows; th
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +31,8 @@ def stretch(values: NDArray[np.float32]) -> tuple[float, float] | None:
 class Pyramid(Intensity):
     """Intensities of a raster for a viewer: as `Intensity`, with a coarse copy in memory for large reductions."""
 
-    def __init__(self, source: RasterSource) -> None:
-        super().__init__(source)
+    def __init__(self, source: RasterSource, bands: Sequence[int] = ()) -> None:
+        super().__init__(source, bands)
         self._lock = threading.Lock()
         self._copy: NDArray[np.float32] | None = None
         self._step = _COARSE

@@ -118,11 +118,12 @@ def _refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: 
                 field="surface.dem" if surface.dem is not None else "surface.height",
                 remedy="leave them out, or give `points.ties=auto`",
             )  # fmt: skip
-    if match.reference_sigma is not None and not match.reference:
-        raise InputError(
-            "this is said of a reference, and there is none", field="match.reference_sigma",
-            remedy="leave it out, or give `match.reference`",
-        )  # fmt: skip
+    for name in ("reference_bands", "reference_sigma"):
+        if getattr(match, name) is not None and not match.reference:
+            raise InputError(
+                "this is said of a reference, and there is none", field=f"match.{name}",
+                remedy="leave it out, or give `match.reference`",
+            )  # fmt: skip
 
 
 def relative_to_reference(fit: BlockFit, options: BlockOptions, match: MatchOptions) -> list[Notice]:

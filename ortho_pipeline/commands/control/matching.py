@@ -244,7 +244,7 @@ def open_reference_views(
             remedy="give control points by hand with `points.gcps`",
         )  # fmt: skip
     with _of_references():
-        references = open_references(options.reference, **opened.access)
+        references = open_references(options.reference, options.reference_bands or (), **opened.access)
     for one in references:
         _refuse_scene(scene, one)
     rasters = scene.rasters or (scene.path,)

@@ -12,7 +12,7 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import CrsError, InputError, completed
+from ortho_pipeline.errors import CrsError, InputError, completed, counted
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.intensity import Intensity
@@ -117,17 +117,28 @@ class Reference:
     pixel_from_map: Array
 
     @classmethod
-    def open(cls, path: str | os.PathLike[str], **access: Any) -> Reference:
+    def open(cls, path: str | os.PathLike[str], bands: Sequence[int] = (), **access: Any) -> Reference:
         """Open an orthoimage of any format, CRS, resolution and number of bands.
+
+        Parameters
+        ----------
+        bands : sequence of int
+            Numbers from 1 of the bands that are compared; those with the most content without.
 
         Raises
         ------
         CrsError
             If it has no CRS or no georeference.
         InputError
-            If it cannot be read.
+            If it cannot be read, or has no such band.
         """
         source = RasterSource(path, **access)
+        missing_band = next((number for number in bands if not 1 <= number <= source.count), None)
+        if missing_band is not None:
+            raise InputError(
+                f"the reference has {counted(source.count, 'band')}; there is no band {missing_band}", file=source.path,
+                field="match.reference_bands", remedy=f"give numbers from 1 to {source.count}",
+            )  # fmt: skip
         dataset = source.dataset
         text, transform = dataset.GetProjection(), dataset.GetGeoTransform(can_return_null=True)
         if not text or transform is None:
@@ -148,7 +159,7 @@ class Reference:
             crs = horizontal(parse_crs(text))
             # A system of no known datum is refused here, by the name of its file.
             ground_transform("EPSG:4979", crs)
-        return cls(Intensity(source), crs, np.column_stack([inverse, offset]))
+        return cls(Intensity(source, bands), crs, np.column_stack([inverse, offset]))
 
     @property
     def path(self) -> str:
@@ -177,8 +188,15 @@ class Reference:
         return plan @ self.pixel_from_map[:, :2].T + self.pixel_from_map[:, 2]
 
 
-def open_references(paths: Sequence[str | os.PathLike[str]], **access: Any) -> tuple[Reference, ...]:
+def open_references(
+    paths: Sequence[str | os.PathLike[str]], bands: Sequence[int] = (), **access: Any
+) -> tuple[Reference, ...]:
     """Open reference orthoimages; where several show the same ground, the first that does is taken.
+
+    Parameters
+    ----------
+    bands : sequence of int
+        Of each, as `Reference.open` takes them.
 
     Raises
     ------
@@ -187,7 +205,7 @@ def open_references(paths: Sequence[str | os.PathLike[str]], **access: Any) -> t
     """
     if not paths:
         raise InputError("there is no reference", field="reference", remedy="give an orthoimage")
-    return tuple(Reference.open(path, **access) for path in paths)
+    return tuple(Reference.open(path, bands, **access) for path in paths)
 
 
 def spread_over(view: View) -> Array:

@@ -302,7 +302,8 @@ def open_block_session(
     alone = [inputs.open_scene(image, scene) for image in images]
     heights = open_surface(surface, scene, under=alone)
     scenes = tuple(on_surface(one, heights) for one in alone)
-    references = open_references(match.reference, **scene.access) if match.reference else ()
+    bands = match.reference_bands or ()
+    references = open_references(match.reference, bands, **scene.access) if match.reference else ()
     places = tuple(
         Places(View(Intensity(RasterSource(*(one.rasters or (one.path,)), **scene.access)), one.model, heights),
                references)

@@ -14,6 +14,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.imaging.matching.chips import Renderer
 from ortho_pipeline.measure.project import Project
 from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.output import png_bytes
 from ortho_pipeline.raster.pyramid import Pyramid, stretch
 from ortho_pipeline.raster.source import RasterSource
@@ -37,19 +38,19 @@ class Tiles:
 
     def __init__(self, project: Project, opened: SceneOptions = SceneOptions(), memory: int = 256_000_000) -> None:
         self._project, self._access = project, opened.access
-        images = [view.intensity.source for view in project.views]
-        maps = [sheet.reference.intensity.source for sheet in project.sheets]
-        self._sources: dict[str, list[RasterSource]] = {}
-        for number, source in enumerate(images):
-            self._sources[f"scene-{number}"] = [source]
+        images = [view.intensity for view in project.views]
+        maps = [sheet.reference.intensity for sheet in project.sheets]
+        self._shown: dict[str, list[Intensity]] = {}
+        for number, image in enumerate(images):
+            self._shown[f"scene-{number}"] = [image]
             if maps:
-                self._sources[f"reference-{number}"] = maps
-        self._sources |= {f"map-{number}": [source] for number, source in enumerate(maps)}
+                self._shown[f"reference-{number}"] = maps
+        self._shown |= {f"map-{number}": [image] for number, image in enumerate(maps)}
         self._lock = threading.Lock()
-        self._open: dict[tuple[RasterSource, int], Pyramid] = {}
+        self._open: dict[tuple[Intensity, int], Pyramid] = {}
         self._kept: OrderedDict[Hashable, Pixels] = OrderedDict()
         self._most = max(1, memory // (4 * SIDE * SIDE))
-        self.bands = {name: sources[0].count for name, sources in self._sources.items()}
+        self.bands = {name: shown[0].source.count for name, shown in self._shown.items()}
 
     def png(
         self, name: str, version: int, factor: int, column: int, row: int, bands: Sequence[int],
@@ -125,11 +126,11 @@ class Tiles:
     def _pyramids(self, name: str, band: int) -> list[Pyramid]:
         """Return the rasters of a view, opened when they are first asked for."""
         with self._lock:
-            for one in self._sources[name]:
+            for one in self._shown[name]:
                 if (one, band) not in self._open:
-                    bands = [band] if 0 < band <= one.count else None
-                    self._open[one, band] = Pyramid(RasterSource(*one.paths, bands=bands, **self._access))
-            return [self._open[one, band] for one in self._sources[name]]
+                    bands = [band] if 0 < band <= one.source.count else one.bands
+                    self._open[one, band] = Pyramid(RasterSource(*one.source.paths, **self._access), bands)
+            return [self._open[one, band] for one in self._shown[name]]
 
 
 def _shade(plane: Pixels, low: float, high: float) -> NDArray[np.uint8]:
