@@ -89,7 +89,8 @@ class Footprint:
     middle : float
         Height (m) at which the middle of the image is seen.
     coverage : float
-        Share (0 to 1) of the scene for which the surface has heights of its own, filled ones not counted.
+        Share (0 to 1) of the area of the scene on the ground for which the surface has heights of its own: the same
+        for every fill, because it is measured without one. A ray that finds no height goes on to `middle` there.
     complete : bool
         Whether every ray met the surface at a height of its own; small voids between the rays may still be there.
     voids : int
@@ -175,6 +176,33 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
         If no border pixel meets the ground.
     """
     surface = facing(model, surface, width, height)
+    found, met, projects = _laid(model, surface, width, height)
+    if not len(found.reach):
+        raise _nowhere(model, surface)
+    found = replace(found, beyond=_beyond(model, surface, found))
+    if not isinstance(surface, DemSurface):
+        return found
+    unmet = bool((projects & ~met).any())
+    ring = found.ring
+    if surface.fill not in ("error", "mask"):  # what fills the rest has no say in how much there is
+        surface = surface.with_fill("mask")
+        bare, met, projects = _laid(model, surface, width, height)
+        ring = bare.ring
+    own = met.sum() / max(projects.sum(), 1)
+    voids, area, sampled = _voids(model, surface, ring)
+    # Whichever looks closer has the say; where a ray finds no height, the DEM does not cover all.
+    fine = area > _COVERAGE_SIDE**2 and (sampled < 1.0 or own >= 1.0)
+    covered = sampled if fine else min(own, sampled)
+    return replace(found, coverage=float(covered), complete=bool(own >= 1.0), voids=voids, unmet=unmet)
+
+
+def _laid(
+    model: SensorModel, surface: Surface, width: int, height: int
+) -> tuple[Footprint, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return where a scene lies on a surface, and which rays of a grid over the image find a height, and may find one.
+
+    The latter are ``(n,)`` each; a ray may find a height if it meets the ground at all.
+    """
     ring = border(width, height)
     image = np.concatenate([image_grid(width, height, _COVERAGE_SIDE), ring])
     ground = meet_surface(model, image, surface)
@@ -186,20 +214,8 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
     closed = ground[outer]
     ends = [model.image_to_ground(image[lost], level) for level in heights] if len(lost) else []
     reach = np.concatenate([closed, *ends])
-    found = Footprint(surface, _finite(closed), _finite(reach), heights, middle)
-    if not len(found.reach):
-        raise _nowhere(model, surface)
-    found = replace(found, beyond=_beyond(model, surface, found))
-    if not isinstance(surface, DemSurface):
-        return found
     projects = met[inner] | np.isfinite(model.image_to_ground(image[inner], middle)).all(axis=1)
-    own = surface.coverage(ground[inner][met[inner], :2], model.crs) * met[inner].sum() / max(projects.sum(), 1)
-    voids, area, sampled = _voids(model, surface, found.ring, whole=len(found.ring) == len(ring))
-    # Whichever looks closer has the say; where a ray finds no height, the DEM does not cover all.
-    fine = area > _COVERAGE_SIDE**2 and (sampled < 1.0 or own >= 1.0)
-    covered = sampled if fine else min(own, sampled)
-    unmet = bool((projects & ~met[inner]).any())
-    return replace(found, coverage=float(covered), complete=bool(own >= 1.0), voids=voids, unmet=unmet)
+    return Footprint(surface, _finite(closed), _finite(reach), heights, middle), met[inner], projects
 
 
 def _nowhere(model: SensorModel, surface: Surface) -> InputError:
@@ -253,8 +269,8 @@ def _heights_under(
     return (low, high), float(ground[centre, 2] if met[centre] else np.median(seen[:, 2]))
 
 
-def _voids(model: SensorModel, surface: DemSurface, ring: Array, *, whole: bool) -> tuple[int, float, float]:
-    """Count the samples of the DEM within a footprint that have no height of their own, whatever the fill rule.
+def _voids(model: SensorModel, surface: DemSurface, ring: Array) -> tuple[int, float, float]:
+    """Count the samples of the DEM within a footprint that have no height; both are without a fill.
 
     Returns
     -------
@@ -263,11 +279,11 @@ def _voids(model: SensorModel, surface: DemSurface, ring: Array, *, whole: bool)
     """
     import shapely
 
-    surface = surface.with_fill("mask")
     rows, columns = surface.shape
     samples = surface.sampler(model.crs)(ring)
     outline = shapely.Polygon(samples)
-    if not whole or not outline.is_valid:
+    # Without the rays that do not meet the ground the ring is open.
+    if len(ring) <= 4 * _BORDER_SIDE or not outline.is_valid:
         outline = shapely.MultiPoint(samples).convex_hull
     inside = shapely.intersection(outline, shapely.box(0, 0, columns - 1, rows - 1))
     if inside.is_empty or outline.area == 0:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 
 from ortho_pipeline.errors import CoverageError
 from ortho_pipeline.exchange.rpc import export_rpc
@@ -87,6 +88,33 @@ def test_voids_count_whatever_fills_them(tmp_path, fill):
     assert found.voids == 75
     # Of 4 m2 each, in 120 x 80.16 m, whose border cuts through samples.
     assert 1 - found.coverage == pytest.approx(300 / (120 * 80.16), rel=0.04)
+
+
+def on_the_ground(model: FrameCamera, height: float) -> Any:
+    """Return the outline of the image on level ground, by its corners: a pinhole keeps straight lines straight."""
+    corners = np.array([[0.0, 0.0], [WIDTH, 0.0], [WIDTH, HEIGHT], [0.0, HEIGHT]])
+    return shapely.Polygon(model.image_to_ground(corners, height)[:, :2])
+
+
+@pytest.mark.parametrize("tilt", [0.0, 35.0, 45.0])
+def test_coverage_is_of_the_ground_and_the_same_for_every_fill(tmp_path, tilt):
+    """Of level ground: the area of the image on it that the DEM has, with a height that was given far off."""
+    model, outline = drone(tilt), on_the_ground(drone(tilt), GROUND)
+    share = outline.intersection(shapely.box(X - 20.0, Y - 450.0, X + 450.0, Y + 450.0)).area / outline.area
+    for fill in ("error", "mask", "nearest", "20"):
+        found = laid(model, surface(tmp_path, west=-20.0, fill=fill))
+        assert found.coverage == pytest.approx(share, abs=2e-3), fill
+
+
+@pytest.mark.parametrize("tilt", [0.0, 35.0])
+def test_coverage_of_slopes_is_the_same_for_every_fill(tmp_path, tilt):
+    v, u = np.mgrid[:451, :236]
+    heights = GROUND + 20 * np.sin(u / 20) * np.cos(v / 15)
+    heights[210:240, 80:110] = -32768.0
+    on = [surface(tmp_path, heights, west=-20.0, fill=fill) for fill in ("error", "mask", "nearest", "20")]
+    found = [laid(drone(tilt), one) for one in on]
+    assert len({(one.coverage, one.complete) for one in found}) == 1
+    assert 0.3 < found[0].coverage < 0.9
 
 
 @pytest.mark.parametrize("tilt", [0.0, 35.0, 55.0])
