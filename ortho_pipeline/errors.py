@@ -13,6 +13,7 @@
             NotConverged      an iteration did not come to an end
         PluginError           a plugin broke the contract
         StorageError          a store of objects or a server failed, after requests were repeated
+        ReportError           the report could not be made; the other outputs are complete (exit code 3)
 
 A bad point is NaN; a bad request is one of these.
 """
@@ -22,6 +23,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from os import PathLike, fspath
 from typing import Any, ParamSpec, TypeVar
@@ -192,3 +194,17 @@ class PluginError(OrthoError):
 
 class StorageError(OrthoError):
     """A store of objects or a server failed, after requests were repeated."""
+
+
+class ReportError(OrthoError):
+    """The report could not be made; the other outputs of the command are complete."""
+
+
+def error_document(error: BaseException) -> dict[str, Any]:
+    """Return an error as JSON values: kind, message, file, field and remedy; of an unforeseen one the trace too."""
+    kind = type(error).__name__
+    if isinstance(error, OrthoError):
+        return {"kind": kind, "message": error.message, "file": error.file, "field": error.field,
+                "remedy": error.remedy}  # fmt: skip
+    trace = "".join(traceback.format_exception(error))
+    return {"kind": kind, "message": str(error) or kind, "file": None, "field": None, "remedy": None, "trace": trace}

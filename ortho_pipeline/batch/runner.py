@@ -10,7 +10,6 @@ import contextlib
 import json
 import os
 import time
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import asdict, replace
@@ -27,7 +26,7 @@ from ortho_pipeline.batch.shared.run import SharedFolder, run_shared
 from ortho_pipeline.batch.summary import paths_of
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.mosaic.assembly import assemble
-from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.errors import InputError, OrthoError, ReportError, error_document
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import is_far
@@ -86,10 +85,13 @@ def _make_locked(job: Job, verify: bool, begin: float) -> Outcome:
             job.image, job.folder, scene=job.scene, points=job.points, surface=job.surface, match=job.match,
             output=job.ortho, name=job.name, digest=_digests,
         )  # fmt: skip
-        report = result.document["report"]
-        read = _as_read(job, report)
         made = tuple(FileState.of(role, path, name=path.name) for role, path in result.files.items())
         _remove(job.folder, {one.path for one in before} - {one.path for one in made})
+        before = made
+        if result.failure is not None:
+            raise result.failure
+        report = result.document["report"]
+        read = _as_read(job, report)
         done = Record(
             job.name, key_of(read, job.configuration, job.versions), "done", read, made, listing,
             time.monotonic() - begin, _facts(report), run=job.run,
@@ -101,7 +103,9 @@ def _make_locked(job: Job, verify: bool, begin: float) -> Outcome:
         failed = Record(job.name, "", "failed", outputs=before, seconds=time.monotonic() - begin, error=told)
         with contextlib.suppress(OrthoError):
             failed.write(job.record)
-        return Outcome(job.name, "failed", failed.seconds, error=told)
+        # Without its report an ortho is there, but not finished: the next run makes the scene again.
+        kept = paths_of(failed, job) if isinstance(error, ReportError) else {}
+        return Outcome(job.name, "failed", failed.seconds, kept, error=told)
 
 
 def _check_versions(job: Job) -> None:
@@ -196,16 +200,6 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
         "warnings": list(report["warnings"]),
         "notices": list(report["notices"]),
     }  # fmt: skip
-
-
-def error_document(error: BaseException) -> dict[str, Any]:
-    """Return an error as JSON values."""
-    kind = type(error).__name__
-    if isinstance(error, OrthoError):
-        return {"kind": kind, "message": error.message, "file": error.file, "field": error.field,
-                "remedy": error.remedy}  # fmt: skip
-    trace = "".join(traceback.format_exception(error))
-    return {"kind": kind, "message": str(error) or kind, "file": None, "field": None, "remedy": None, "trace": trace}
 
 
 # -- all scenes ------------------------------------------------------------------------------------------------------
@@ -447,10 +441,14 @@ class _Mosaic:
         self.record.unlink(missing_ok=True)
         files = {"mosaic": self.path, "seams": self.report, "page": self.page}
         with together(self.output, "mosaic"):
-            document = assemble(self.orthos, files, self.settings, measure=lambda pairs: self._seams(pairs, crew))
+            document, failure = assemble(
+                self.orthos, files, self.settings, measure=lambda pairs: self._seams(pairs, crew)
+            )
             write_json(self.report, document)
             if record is not None:
                 retire({self.output / one.path for one in record.outputs} - set(files.values()))
+        if failure is not None:
+            return {**document, "status": "done", "error": error_document(failure)}
         made = tuple(FileState.of(role, path, name=path.name) for role, path in files.items())
         Record("mosaic", self.key, "done", self.inputs, made).write(self.record)
         return {**document, "status": "done"}

@@ -13,7 +13,7 @@ import click
 from ortho_pipeline.cli.flags import as_typed
 from ortho_pipeline.cli.options import json_option, mosaic_options, network_option
 from ortho_pipeline.cli.parsing import Command, Megabytes
-from ortho_pipeline.cli.printing import print_json, print_result, progress
+from ortho_pipeline.cli.printing import PARTLY_DONE, print_json, print_result, progress
 from ortho_pipeline.errors import counted
 from ortho_pipeline.options import EXECUTORS, MosaicOptions, SceneOptions
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.batch.plan import Plan
     from ortho_pipeline.batch.results import BatchResult, Outcome
 
-FAILED, PARTLY_DONE = 1, 3
+FAILED = 1
 #: More scenes than this are only counted, except for those that failed.
 _SHOWN = 60
 

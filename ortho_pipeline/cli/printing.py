@@ -7,6 +7,7 @@ import json
 import math
 import os
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ from ortho_pipeline.errors import counted
 if TYPE_CHECKING:
     from ortho_pipeline.commands.results import CompareResult, FitResult, Result
 
+#: Exit code of a command that made a part of what was asked for.
+PARTLY_DONE = 3
 #: More points than this are not all printed, but so many of them.
 _PRINTED, _WORST = 60, 20
 
@@ -34,13 +37,19 @@ def print_warnings(warnings: Any) -> None:
 
 
 def print_result(result: Result, as_json: bool) -> None:
-    """Print the summary of a result and its files, or its document."""
+    """Print the summary of a result and its files, or its document; end with exit code 3 if its report failed."""
     if as_json:
-        return print_json(result.to_json())
-    click.echo(as_typed(result.summary))
-    for name, path in result.files.items():
-        click.echo(f"  {name:<10} {path}")
-    return None
+        print_json(result.to_json())
+    else:
+        click.echo(as_typed(result.summary))
+        for name, path in result.files.items():
+            click.echo(f"  {name:<10} {path}")
+    if result.failure is not None:
+        context = click.get_current_context()
+        if context.meta.get("debug"):
+            click.echo("".join(traceback.format_exception(result.failure)), err=True)
+        click.echo(f"Error: {as_typed(str(result.failure))}", err=True)
+        context.exit(PARTLY_DONE)
 
 
 def print_fit(result: FitResult) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from ortho_pipeline.cli.signals import ended_by_signals
-from ortho_pipeline.errors import InputError, OrthoError, Terminated
+from ortho_pipeline.errors import InputError, OrthoError, Terminated, error_document
 
 FAILED, CORRECTABLE, INTERRUPTED = 1, 2, 130
 #: Every command: the module of this room that holds it, and the first sentence of its help.
@@ -138,7 +138,7 @@ class _Commands(click.Group):
         if ctx.meta.get("json"):
             from ortho_pipeline.cli.printing import print_json
 
-            print_json({"schema_version": 1, "error": _error_document(error)})
+            print_json({"schema_version": 1, "error": error_document(error)})
         ctx.exit(code)
 
 
@@ -178,16 +178,6 @@ def _without_gdal() -> InputError | None:
     return None
 
 
-def _error_document(error: OrthoError) -> dict[str, str | None]:
-    return {
-        "kind": type(error).__name__,
-        "message": error.message,
-        "file": error.file,
-        "field": error.field,
-        "remedy": error.remedy,
-    }
-
-
 def main() -> None:
     """Run the command line."""
     with ended_by_signals():
@@ -222,7 +212,7 @@ def _begin() -> None:
 def cli(ctx: click.Context) -> None:
     """Orthorectify satellite scenes, and say honestly how good the result is.
 
-    Exit codes: 0 done, 1 failed, 2 you can correct it (the message says how), 3 partly done (run), 130 interrupted.
+    Exit codes: 0 done, 1 failed, 2 you can correct it (the message says how), 3 partly done, 130 interrupted.
     """
     if ctx.invoked_subcommand is None:
         from ortho_pipeline.cli.survey.first_use import print_steps

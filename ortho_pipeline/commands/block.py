@@ -24,7 +24,7 @@ from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, start_of
 from ortho_pipeline.commands.control.block_points import gather, read_points, relative_to_reference
-from ortho_pipeline.commands.results import Result, to_store
+from ortho_pipeline.commands.results import Result, attempted, to_store
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, OrthoError, counted
@@ -117,9 +117,10 @@ def adjust(
     )
     pictures = _pictures(starts, scene)
     with together(folder, "block"):
-        _write(files, made, fit, starts, exported, record, pictures)
+        _write(files, made, fit, starts, exported, record)
+        failure = attempted(lambda: _write_report(files, made, pictures), files, "report", "html")
     text = "\n".join([*gathered.text, block_report.summary_text(made)])
-    return Result(files, {"report": json_value(made), **gathered.document}, text)
+    return Result(files, {"report": json_value(made), **gathered.document}, text, failure)
 
 
 @with_items
@@ -316,7 +317,6 @@ def _write(
     starts: Mapping[str, Start],
     exported: Mapping[str, rpc.RpcExport],
     record: Mapping[str, Any],
-    pictures: Mapping[str, bytes],
 ) -> None:
     rows = _ground_rows(fit.points, fit.ground, fit.ground_sigmas, fit.object_residuals)
     write_text(files["points"], _geojson(rows))
@@ -331,6 +331,9 @@ def _write(
         write_model_file(saved, files[f"{label} model"])
         if label in exported:
             rpc.write_rpc_txt(exported[label].rpc, files[f"{label} rpc"])
+
+
+def _write_report(files: Mapping[str, Path], made: BlockReport, pictures: Mapping[str, bytes]) -> None:
     write_json(files["report"], json_value(made), ascii_only=False)
     write_text(files["html"], block_report.page(made, pictures))
 

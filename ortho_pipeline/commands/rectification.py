@@ -15,11 +15,19 @@ from ortho_pipeline.commands.layers import budget as layers
 from ortho_pipeline.commands.layers.angles import sun_of, write_angles
 from ortho_pipeline.commands.layers.filling import other_of
 from ortho_pipeline.commands.placement import place_scene, source_of
-from ortho_pipeline.commands.results import ENDINGS, Result, outputs, outputs_together, write_report
+from ortho_pipeline.commands.results import (
+    ENDINGS,
+    OF_REPORT,
+    Result,
+    attempted,
+    outputs,
+    outputs_together,
+    write_report,
+)
 from ortho_pipeline.commands.scene_fit import adjust, open_adjustable
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError, completed
+from ortho_pipeline.errors import InputError, ReportError, completed
 from ortho_pipeline.exchange import export as formats_of_models
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
@@ -35,6 +43,7 @@ from ortho_pipeline.raster import source as raster
 from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.report import document as report
+from ortho_pipeline.report.records import SceneReport
 from ortho_pipeline.surface import footprint
 from ortho_pipeline.surface.base import Surface
 
@@ -75,7 +84,8 @@ def rectify(
     -------
     Result
         `files` has ortho, model, rpc, vrt (unless no RPC stands for the model), residuals and style (with points
-        only), report, html, and, if asked for, accuracy with its style, and stac with thumbnail and overview.
+        only), report, html, and, if asked for, accuracy with its style, and stac with thumbnail and overview. If the
+        report could not be made, the others are there, and `failure` says why.
 
     Raises
     ------
@@ -111,20 +121,27 @@ def rectify(
         record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
     whole = raster.open_dataset(image, **scene.access)
     _write_models(model, exported, opened, whole, files, {**record, "adjustment": adjusted.record()})
-    made = report.build_report(
-        scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
-        warp=warped, near=points.near, provenance=record | inputs.read_since(before), matching=adjusted.matching,
-        warnings=[*adjusted.warnings(heights), *found.notes(), *placed.sparse(warped.valid_pixels), *complaints,
-                  *notes, *warped.notes(output.memory)],
-    )  # fmt: skip
-    made = report.with_layers(made, accuracy=accuracy, angles=angles)
-    write_report(made, adjusted.fit, files, adjusted.matched, source)
-    if acquired is not None:
-        from ortho_pipeline.report.stac import write_item
 
-        write_item(files["stac"], made, files, acquired, name or stem)
+    def described() -> SceneReport:
+        made = report.build_report(
+            scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
+            warp=warped, near=points.near, provenance=record | inputs.read_since(before), matching=adjusted.matching,
+            warnings=[*adjusted.warnings(heights), *found.notes(), *placed.sparse(warped.valid_pixels), *complaints,
+                      *notes, *warped.notes(output.memory)],
+        )  # fmt: skip
+        made = report.with_layers(made, accuracy=accuracy, angles=angles)
+        write_report(made, adjusted.fit, files, adjusted.matched, source)
+        if acquired is not None:
+            from ortho_pipeline.report.stac import write_item
+
+            write_item(files["stac"], made, files, acquired, name or stem)
+        return made
+
+    made = attempted(described, files, *OF_REPORT)
     inputs.refuse_changed(begun)
     retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
+    if isinstance(made, ReportError):
+        return Result(files, {"report": None}, "Ortho and model are complete; there is no report.", made)
     return Result(files, {"report": json_value(made)}, report.summary_text(made))
 
 

@@ -14,11 +14,12 @@ from typing import Any, ParamSpec, TypeVar, cast
 from ortho_pipeline.commands.control.matching import Matched
 from ortho_pipeline.display import notebook
 from ortho_pipeline.display.notices import Notice, to_document
+from ortho_pipeline.errors import OrthoError, ReportError, error_document
 from ortho_pipeline.estimation import comparison as comparing
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
-from ortho_pipeline.files import staged, together, write_text
+from ortho_pipeline.files import part_of_outputs, staged, together, write_text
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.storage.delivery import address_of, delivered
 from ortho_pipeline.hookspecs import Scene
@@ -57,6 +58,9 @@ _ASKED = {
     "visibility": ("visibility",),
     "angles": ("angles", "angles_style", "shadow"),
 }
+
+#: Outputs of a scene that tell of the others.
+OF_REPORT = ("residuals", "style", "report", "html", "stac", "thumbnail", "overview")
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -103,11 +107,14 @@ class Result:
     files: Mapping[str, Any]
     document: Mapping[str, Any]
     summary: str
+    #: Why there is no report, where it could not be made: the files are complete without it.
+    failure: ReportError | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Return files and document as JSON values."""
+        """Return files and document as JSON values, and ``error`` where the report could not be made."""
         files = {name: str(path) for name, path in self.files.items()}
-        return {"schema_version": SCHEMA_VERSION, "files": files, **self.document}
+        failed = {} if self.failure is None else {"error": error_document(self.failure)}
+        return {"schema_version": SCHEMA_VERSION, "files": files, **self.document, **failed}
 
     def _repr_html_(self) -> str:
         """Show the report in a notebook, or the summary where there is none."""
@@ -218,6 +225,31 @@ def _to_store(
 def _goes_along(path: Path) -> bool:
     """Tell whether a file means the same elsewhere: a VRT names an image of this machine by its way from here."""
     return path.suffix != ".vrt" or 'relativeToVRT="1"' not in path.read_text(encoding="utf-8", errors="replace")
+
+
+def attempted(make: Callable[[], _R], files: dict[str, Path], *of_report: str) -> _R | ReportError:
+    """Make a report, which must not cost the other outputs: return the error if that fails.
+
+    Parameters
+    ----------
+    make : callable
+        Makes the report and writes its files.
+    files : dict
+        Outputs of the command; those `of_report` are taken out if it fails, and none of them is written.
+    """
+    try:
+        with part_of_outputs():
+            return make()
+    except Exception as error:
+        for kind in of_report:
+            files.pop(kind, None)
+        why = f"{type(error).__name__}: {error}".removesuffix(": ")
+        remedy = "this is a fault of ortho-pipeline: please report it with the traceback"
+        if isinstance(error, OrthoError):
+            why, remedy = error.message, error.remedy or remedy
+        failure = ReportError(f"the report could not be made ({why}); the other outputs are complete", remedy=remedy)
+        failure.__cause__ = error
+        return failure
 
 
 def write_report(

@@ -13,7 +13,7 @@ import hashlib
 import json
 import os
 import secrets
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -171,6 +171,11 @@ class Outputs:
             before.unlink(missing_ok=True)
         self.staged[final] = temporary
 
+    def take_back(self, kept: Mapping[Path, Path]) -> None:
+        """Remove the complete files that are not among those `kept`."""
+        for final in [path for path in self.staged if path not in kept]:
+            self.staged.pop(final).unlink(missing_ok=True)
+
     def drop(self, temporary: Path) -> None:
         """Remove a temporary file and the side-cars that a driver put beside it."""
         for left in self.folder.iterdir():
@@ -312,6 +317,22 @@ def whole_or_nothing(path: str | os.PathLike[str], *, side_cars: bool = True) ->
         except BaseException:
             outputs.drop(temporary)
             raise
+
+
+@contextlib.contextmanager
+def part_of_outputs() -> Iterator[None]:
+    """Let the files that are written within the block appear with the other outputs, or none of them on an exception.
+
+    The outputs that were complete before the block stay.
+    """
+    outer = _under_way.get()
+    before = {} if outer is None else dict(outer.staged)
+    try:
+        yield
+    except BaseException:
+        if outer is not None:
+            outer.take_back(before)
+        raise
 
 
 def retire(paths: Iterable[str | os.PathLike[str]]) -> None:

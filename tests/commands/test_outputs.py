@@ -9,10 +9,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 from ortho_pipeline import commands
+from ortho_pipeline.batch.runner import run
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import rectification
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.commands.mosaic import assembly
+from ortho_pipeline.errors import CrsError, InputError, ReportError
 from ortho_pipeline.options import OutputOptions, PointOptions, SurfaceOptions
 from ortho_pipeline.report import document as report
 
@@ -53,10 +57,72 @@ def test_a_failure_at_the_end_leaves_no_mixture(tiny, tmp_path, monkeypatch):
     def fail(*_, **__):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(report, "write_report_html", fail)
+    monkeypatch.setattr(rectification, "_write_models", fail)
     with pytest.raises(ZeroDivisionError):
         rectify(tiny, out, resampling="cubic")
     assert contents(out) == before
+
+
+def test_a_report_that_fails_does_not_cost_the_ortho(tiny, tmp_path, monkeypatch):
+    """Ortho and model are those of a run whose report does not fail; no report of an earlier run stays beside them."""
+    stac = {"stac": True, "acquired": "2005-08-03T08:12:31Z", "resampling": "cubic"}
+    good, out = tmp_path / "good", tmp_path / "out"
+    rectify(tiny, good, **stac)
+    rectify(tiny, out)
+
+    def fail(*_, **__):
+        raise ZeroDivisionError("no such CRS")
+
+    monkeypatch.setattr(report, "write_report_html", fail)
+    result = rectify(tiny, out, **stac)
+    assert isinstance(result.failure, ReportError)
+    assert "no such CRS" in result.failure.message
+    kept = {"tiny_ortho.tif", "tiny_model.json", "tiny_RPC.TXT", "tiny.vrt"}
+    assert {path.name for path in out.iterdir()} == {path.name for path in result.files.values()} == kept
+    assert (out / "tiny_ortho.tif").read_bytes() == (good / "tiny_ortho.tif").read_bytes()
+    assert result.to_json()["error"]["kind"] == "ReportError"
+
+
+def test_the_command_line_says_that_there_is_no_report(tiny, tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise CrsError("'unknown' is not a coordinate system", remedy="give EPSG:n")
+
+    monkeypatch.setattr(report, "build_report", fail)
+    given = ["rectify", str(tiny.image), "--dem", str(tiny.dem), "--dem-vertical", "ellipsoid", "-o", str(tmp_path)]
+    said = CliRunner().invoke(cli, given)
+    assert said.exit_code == 3
+    assert "Error: the report could not be made ('unknown' is not a coordinate system)" in said.output
+    assert "Remedy: give EPSG:n" in said.output
+    assert (tmp_path / "tiny_ortho.tif").is_file()
+
+
+def test_a_run_keeps_an_ortho_whose_report_fails_and_makes_it_again(tiny, tmp_path, monkeypatch):
+    dem = f"surface: {{dem: {tiny.dem.name}, vertical: ellipsoid}}"
+    config = tiny.folder / "run.yaml"
+    config.write_text(f"output: out\ndefaults:\n  {dem}\nscenes: [{{image: {tiny.image.name}}}]\n")
+
+    def fail(*_, **__):
+        raise KeyError("crs")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(report, "build_report", fail)
+        outcome = run(config, executor="sequential").scenes[0]
+        assert (outcome.status, (outcome.error or {})["kind"]) == ("failed", "ReportError")
+        assert Path(outcome.files["ortho"]).is_file()
+    outcome = run(config, executor="sequential").scenes[0]
+    assert (outcome.status, Path(outcome.files["report"]).is_file()) == ("done", True)
+
+
+def test_the_page_of_a_mosaic_does_not_cost_the_mosaic(tiny, tmp_path, monkeypatch):
+    ortho = rectify(tiny, tmp_path / "out").files["ortho"]
+
+    def fail(*_, **__):
+        raise KeyError("crs")
+
+    monkeypatch.setattr(assembly, "write_page", fail)
+    result = assembly.mosaic([ortho], tmp_path / "m.tif")
+    assert isinstance(result.failure, ReportError)
+    assert (sorted(result.files), (tmp_path / "m.tif").is_file()) == (["mosaic", "seams"], True)
 
 
 def test_what_an_earlier_run_wrote_and_this_one_does_not_goes(tiny, tmp_path):

@@ -20,7 +20,7 @@ from ortho_pipeline.batch.plan import STATE, Job, Plan
 from ortho_pipeline.batch.records import key_of
 from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.leases import PATIENCE, Lease, Leases, Lost
-from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.errors import OrthoError, error_document
 from ortho_pipeline.files import json_text
 from ortho_pipeline.files.storage.delivery import delivered
 from ortho_pipeline.files.storage.objects import Objects
@@ -75,8 +75,6 @@ def make_shared(where: SharedFolder, make: Make, order: Order) -> Outcome:
     except Lost:
         return Outcome(name, "busy", facts={"lease": ""})
     except OrthoError as error:
-        from ortho_pipeline.batch.runner import error_document
-
         return Outcome(name, "failed", time.monotonic() - begin, error=error_document(error))
 
 
@@ -84,7 +82,7 @@ def _made(where: SharedFolder, make: Make, job: Job, lease: Lease) -> Outcome:
     address = f"{where.address.rstrip('/')}/{job.name}"
     with tempfile.TemporaryDirectory(prefix="ortho_run_") as scratch:
         outcome = make(dataclasses.replace(job, output=Path(scratch)))
-        if outcome.status != "failed":
+        if outcome.files:
             lease.renew()
             with delivered(address, job.name, allow_network=where.allow_network, keep=_goes_along) as folder:
                 for path in (Path(scratch) / job.name).iterdir():

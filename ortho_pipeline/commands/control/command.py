@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.matching import match_scene
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
-from ortho_pipeline.commands.results import Result, to_store
+from ortho_pipeline.commands.results import Result, attempted, to_store
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust, on_surface
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import to_document
@@ -77,11 +78,12 @@ def match(
     # Those of a bundle or a strip serve its other images too, if they say where they were measured.
     said = bool(opened.pieces) and files["points"].suffix.lower() != ".geojson"
     write_points(points, output, images=[Path(opened.path).name] * len(points) if said else None)
+    failure = None
     if adjusted is not None:
-        _write_page(adjusted, heights, record, files)
+        failure = attempted(functools.partial(_write_page, adjusted, heights, record, files), files, "html", "report")
     document = {"matching": matched.to_json(), "provenance": record, **to_document([*opened.notices, *matched.notices])}
     text = "\n".join(f"{name:<10}{said}" for name, said in matched.summary())
-    return Result(files, document, text)
+    return Result(files, document, text, failure)
 
 
 def _page(report: str | os.PathLike[str] | None) -> dict[str, Path]:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.commands.inputs import refuse_changed
-from ortho_pipeline.commands.results import ENDINGS, Result, to_store
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.commands.results import ENDINGS, Result, attempted, to_store
+from ortho_pipeline.errors import InputError, ReportError
 from ortho_pipeline.files import states, together, write_json
 from ortho_pipeline.files.locations import is_far, located, place
 from ortho_pipeline.files.process_limits import Resources
@@ -68,10 +68,10 @@ def mosaic(
     layers = [_ortho(one, name) for one, name in zip(paths, _names(paths), strict=True)]
     begun = states([*paths, *(one.accuracy for one in layers if one.accuracy)])
     with together(path.parent, path.stem):
-        document = assemble(layers, files, options, resources=resources)
+        document, failure = assemble(layers, files, options, resources=resources)
         write_json(files["seams"], document)
         refuse_changed(begun)
-    return Result(files, {"mosaic": document}, summary_text(document))
+    return Result(files, {"mosaic": document}, summary_text(document), failure)
 
 
 def _refuse_far(orthos: Sequence[Path]) -> None:
@@ -96,18 +96,20 @@ def _check_paths(orthos: Sequence[Path], files: Mapping[str, Path]) -> None:
 
 def assemble(
     orthos: Sequence[Ortho],
-    files: Mapping[str, Path],
+    files: dict[str, Path],
     options: MosaicOptions,
     *,
     resources: Resources | None = None,
     measure: Measure | None = None,
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], ReportError | None]:
     """Write a mosaic and its page; return its document (docs/run.md), which the caller writes.
+
+    The error is that of a page that could not be made; it costs no mosaic.
 
     Parameters
     ----------
-    files : mapping
-        `mosaic` and `page`.
+    files : dict
+        `mosaic` and `page`, which is taken out if it could not be made.
     measure : callable, optional
         Measures all overlaps, as the processes of a run do; one after the other without.
 
@@ -145,8 +147,7 @@ def assemble(
         "file": files["mosaic"].name,
         **mosaic_document(placed, seams, balance, owners if options.seamlines else None, clamped),
     }
-    write_page(document, files["page"], files["mosaic"], owners)
-    return document
+    return document, attempted(lambda: write_page(document, files["page"], files["mosaic"], owners), files, "page")
 
 
 def _of(found: Mapping[tuple[str, str], dict[str, Any]], seam: Mapping[str, Any]) -> dict[str, Any] | None:
