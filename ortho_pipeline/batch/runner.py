@@ -191,7 +191,7 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a summary says of a scene."""
     scene, adjustment = report["scene"], report["adjustment"]
     return {
-        "sensor": scene["sensor"], "model": adjustment["model"],
+        "sensor": scene["sensor"], "model": adjustment["model"], "headline": report["headline"],
         "lean_m_per_m": scene["lean_m_per_m"],
         "rmse_px": {which: rmse and rmse["total"] for which, rmse in adjustment["rmse"].items()},
         "rmse_m": {which: rmse and rmse["total"] for which, rmse in report["rmse_m"].items()},

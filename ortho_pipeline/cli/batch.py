@@ -197,6 +197,8 @@ def _print_summary(result: BatchResult) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from ortho_pipeline.report.wording import refuted
+
     # A table is cut to the width of the terminal; a file or a pipe has none.
     wide = None if sys.stdout.isatty() else 10_000
     console = Console(highlight=False, soft_wrap=True, width=wide)
@@ -211,6 +213,8 @@ def _print_summary(result: BatchResult) -> None:
     for scene in scenes:
         if scene.error:
             console.print(f"\n{scene.name}: {_error_text(scene.error)}", markup=False)
+        elif against := refuted(scene.facts.get("notices", ())):
+            console.print(f"\n{scene.name}: Error: accuracy unknown: {against}", markup=False)
     counts = ", ".join(
         f"{result.count(status)} {status}"
         for status in ("done", "unchanged", "failed", "missing")
@@ -226,7 +230,9 @@ def _print_summary(result: BatchResult) -> None:
 def _row(scene: Outcome) -> list[str]:
     from rich.markup import escape
 
-    rmse = scene.facts.get("rmse_px", {})
+    from ortho_pipeline.report.wording import refuted
+
+    rmse = {} if refuted(scene.facts.get("notices", ())) else scene.facts.get("rmse_px", {})
     numbers = ["-" if rmse.get(which) is None else f"{rmse[which]:.3f}" for which in ("check", "loo", "control")]
     return [escape(scene.name), scene.status, str(scene.facts.get("model", "-")), *numbers, f"{scene.seconds:.1f}"]
 

@@ -54,7 +54,7 @@ def print_result(result: Result, as_json: bool) -> None:
 
 def print_fit(result: FitResult) -> None:
     """Print parameters, residuals (of many points the largest) and the RMSEs."""
-    from ortho_pipeline.report.wording import withheld
+    from ortho_pipeline.report.wording import NO_SCALE, refuted
 
     document = result.to_json()
     click.echo(f"Sensor {document['sensor']}, model {document['model']} of {document['model_source']}")
@@ -69,9 +69,9 @@ def print_fit(result: FitResult) -> None:
     if rest:
         click.echo(f"and {counted(rest, 'point')} with smaller residuals (--json has all)")
     click.echo("\nResiduals are measured minus predicted, in pixels; 'left out': had the point taken no part.")
-    against = withheld(document["notices"])
+    against = refuted(document["notices"])
     if against:
-        click.echo(against)
+        click.echo(f"Accuracy unknown: {against}. {NO_SCALE}")
     if document["raw_bias"] and document["parameters"]:
         bias = document["raw_bias"]
         click.echo(f"Model as delivered: column {bias['col']:+.3f}, row {bias['row']:+.3f} on average")

@@ -29,6 +29,7 @@ from ortho_pipeline.report import document as report
 from ortho_pipeline.report.map_scale import map_scale
 from ortho_pipeline.report.matching import MatchingRecord, matching_record
 from ortho_pipeline.report.records import SceneReport
+from ortho_pipeline.report.wording import refuted
 
 SCHEMA_VERSION = 1
 #: How the names of a scene's outputs end, after its stem.
@@ -86,7 +87,7 @@ class FitResult:
         """Return the document of ``ortho fit --json`` (docs/formats.md)."""
         document = self.fit.to_json() | to_document(self.warnings)
         pixels = viewing(self.fit.model, self.scene.width, self.scene.height)["ground_pixel_m"]
-        scale = map_scale(self.fit, max(pixels) if pixels else None)
+        scale = None if refuted(document["notices"]) else map_scale(self.fit, max(pixels) if pixels else None)
         return {
             "schema_version": SCHEMA_VERSION,
             "sensor": self.scene.sensor,

@@ -37,7 +37,18 @@ from ortho_pipeline.report.page.advice import WORDS, signals
 from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import plot_locator
 from ortho_pipeline.report.records import NOT_TESTED, MapScaleRecord, RpcRecord
-from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, FEW, NONE_APART, NOTICED, fitness, scale_rules, withheld
+from ortho_pipeline.report.wording import (
+    ENOUGH_CHECK_POINTS,
+    FEW,
+    NO_SCALE,
+    NONE_APART,
+    NOTICED,
+    UNKNOWN,
+    fitness,
+    instead,
+    refuted,
+    scale_rules,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.start import Start
@@ -87,9 +98,13 @@ def build_report(
         provenance=made_of(BlockProvenance, json_value(provenance)),
         warnings=tuple(noted["warnings"]),
         notices=tuple(noted["notices"]),
-        headline=headline(adjustment, relative=any(one.code == RELATIVE for one in warnings)),
+        headline=_corrected(
+            headline(adjustment, relative=any(one.code == RELATIVE for one in warnings)), noted["notices"]
+        ),
         network=network_record(network),
-        map_scale=None if suffices is None else made_of(MapScaleRecord, suffices.to_json()),
+        map_scale=None
+        if suffices is None or refuted(noted["notices"])
+        else made_of(MapScaleRecord, suffices.to_json()),
     )
 
 
@@ -132,10 +147,18 @@ def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHea
     )
 
 
+def _corrected(head: BlockHeadline, notices: Sequence[Mapping[str, Any]]) -> BlockHeadline:
+    """Return the headline as an error leaves it: without a figure that it makes untrue."""
+    found = instead(f"{head.figure} and {head.height}" if head.height else head.figure, head.what, notices)
+    return head if found is None else BlockHeadline(
+        figure=UNKNOWN, height=None, what=found[0], notes=(found[1], *head.notes)
+    )  # fmt: skip
+
+
 def verdict(report: BlockReport) -> str | None:
     """Say which known points contradict the block, and what the accuracy suffices for; None where there is neither."""
-    if against := withheld(report.notices):
-        return against
+    if refuted(report.notices):
+        return NO_SCALE
     said = []
     for role in ("check", "control"):
         names = list(dict.fromkeys(one.point for one in report.adjustment.outlying if one.role == role))
@@ -181,7 +204,7 @@ def summary_text(report: BlockReport) -> str:
         f"Redundancy {adjustment.redundancy}, sigma0 {sigma0}, {counted(len(adjustment.rejected), 'gross error')}"
     )
     height = f", height {head.height}" if head.height else ""
-    lines += [f"{head.figure}{height}: {head.what}", *filter(None, [withheld(report.notices)]), *head.notes]
+    lines += [f"{head.figure}{height}: {head.what}", *head.notes]
     return "\n".join([*lines, *(f"Warning: {text}" for text in report.warnings)])
 
 
@@ -233,7 +256,6 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
         verdict=verdict(report),
         marks=_marks(report),
         scale_rules=None if report.map_scale is None else scale_rules(report.map_scale),
-        contradicted=withheld(report.notices) is not None,
         ground_sigmas=variance_lines(adjustment.variances),
         roles={role: sum(point.role == role for point in adjustment.points) for role in ROLES},
         points=sorted(

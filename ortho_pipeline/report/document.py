@@ -56,7 +56,7 @@ from ortho_pipeline.report.records import (
     SceneReport,
     WarpRecord,
 )
-from ortho_pipeline.report.wording import headline, summary_text
+from ortho_pipeline.report.wording import UNKNOWN, corrected, headline, refuted, summary_text
 from ortho_pipeline.surface.flat import FlatSurface
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def build_report(
         rmse_m=rmse_m,
         view_rmse=_view_rmse(fit),
         covariance=_covariances(fit, near),
-        map_scale=_map_scale(fit, seen),
+        map_scale=None if refuted(noted["notices"]) else _map_scale(fit, seen),
         control_hull=None if hull is None else made_of(ControlHull, hull),
         comparison=None if comparison is None else made_of(ComparisonRecord, json_value(comparison)),
         matching=matched,
@@ -153,8 +153,9 @@ def build_report(
         provenance=made_of(Provenance, json_value(provenance or {})),
         warnings=tuple(noted["warnings"]),
         notices=tuple(noted["notices"]),
-        headline=headline(
-            adjustment, rmse_m, accuracy_before(scene), adjusted=scene.adjusted is not None, matching=matched
+        headline=corrected(
+            headline(adjustment, rmse_m, accuracy_before(scene), adjusted=scene.adjusted is not None, matching=matched),
+            noted["notices"],
         ),
     )
 
@@ -241,7 +242,8 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
             f"the points lie {metres(abs(median))} {side} the DEM (median; spread {metres(spread)}): their heights "
             f"probably have another datum than the DEM's{_undulation_there(points.ground, points.crs)}{moved}"
         )
-        doubts = [Notice("heights-disagree", text, median_m=median, spread_m=spread)]
+        by = None if displacement is None else abs(median) * displacement
+        doubts = [Notice("heights-disagree", text, median_m=median, spread_m=spread, moved_m=by)]
     warning = str(doubts[0]) if doubts else None
     return PointHeights(median_m=median, spread_m=spread, n=len(difference), warning=warning), doubts
 
@@ -282,6 +284,8 @@ def with_layers(
     if accuracy is None:
         return report
     head = report.headline
+    if head.figure == UNKNOWN:  # nor does the layer know of the error
+        return replace(report, accuracy=accuracy)
     return replace(report, accuracy=accuracy, headline=replace(head, notes=(accuracy.statement, *head.notes)))
 
 

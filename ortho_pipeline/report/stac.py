@@ -24,6 +24,7 @@ from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.raster.valid_area import to_geojson, valid_outline
 from ortho_pipeline.report.matching import is_relative
 from ortho_pipeline.report.records import SceneReport, View
+from ortho_pipeline.report.wording import refuted
 
 if TYPE_CHECKING:
     from ortho_pipeline.raster.source import Grid
@@ -223,6 +224,8 @@ def _filled(report: SceneReport) -> dict[str, Any]:
 def _accuracy(report: SceneReport) -> dict[str, Any]:
     """Return what points that took no part say: a radial RMSE in metres, bias and spread of check points."""
     found: dict[str, Any] = {}
+    if refuted(report.notices):
+        return found
     if report.matching or is_relative(report.adjustment):
         # Matches say nothing of where the reference lies; only points that somebody measured do.
         tested = report.matching and report.matching.absolute

@@ -20,6 +20,15 @@ from ortho_pipeline.report.records import NOT_TESTED, Dem, FlatGround, Headline,
 ENOUGH_CHECK_POINTS = 30
 #: From so many measured points on their figure leads before that of matches.
 _LEADING = 3
+#: In place of a figure that an error makes untrue, and of the sentence on map scales.
+UNKNOWN = "Accuracy unknown"
+NO_SCALE = "No map scale can be stated until this error is corrected."
+#: Errors that make a figure untrue, besides those that say by how much.
+_UNTRUE = {
+    "reference-made-of-scene": "the reference seems to be made of the scene itself, so the matches test nothing",
+    "model-elsewhere": "the delivered model and the points are several images apart",
+    "undecided-contradiction": "points contradict each other, and the block does not tell which one is wrong",
+}
 #: Notes of headlines that a notice says too, with what to do.
 FEW = f"Fewer than {ENOUGH_CHECK_POINTS} check points: an indication, not a claim of accuracy (ASPRS 2023)."
 
@@ -87,8 +96,8 @@ def headline(
 
 def verdict(report: SceneReport) -> str:
     """Say in one sentence what the accuracy suffices for, and under which conditions."""
-    if against := withheld(report.adjustment.notices):
-        return against
+    if refuted(report.notices):
+        return NO_SCALE
     found = report.map_scale
     if found is None:
         if report.headline.figure == NOT_TESTED:
@@ -97,15 +106,40 @@ def verdict(report: SceneReport) -> str:
     return fitness(found)
 
 
-def withheld(notices: Iterable[Mapping[str, Any]]) -> str | None:
-    """Say why no fitness is claimed, where notices say that check points contradict the control; None elsewhere."""
+def refuted(notices: Iterable[Mapping[str, Any]]) -> str | None:
+    """Say which error makes a figure of accuracy and a map scale untrue; None where there is none.
+
+    Every output asks this: report, terminal, JSON, the page of a run and the STAC item.
+    """
     for one in notices:
         if one["code"] == "checks-apart":
             what = "the block" if "rmse_m" in one else "the control points"  # a block has metres
             # Earlier versions did not count them.
-            against = contradicting(one.get("off", 0), one["count"], one["points"], what)
-            return f"{against}; no fitness for maps is claimed until that is settled."
+            return contradicting(one.get("off", 0), one["count"], one["points"], what)
+        if one["code"] == "heights-disagree":
+            apart = f"the heights of points and DEM differ by {metres(abs(one['median_m']))}"
+            moved = one.get("moved_m")
+            return apart if moved is None else f"{apart}, which moves the ortho by {metres(moved)}"
+        if one["code"] in _UNTRUE:
+            return _UNTRUE[one["code"]]
     return None
+
+
+def instead(figure: str, what: str, notices: Iterable[Mapping[str, Any]]) -> tuple[str, str] | None:
+    """Return what a headline says in place of a figure that an error makes untrue, and a note; None where none does."""
+    against = refuted(notices)
+    if against is None or figure == NOT_TESTED:
+        return None
+    return against, f"Do not rely on this figure: {figure}, {what}."
+
+
+def corrected(head: Headline, notices: Iterable[Mapping[str, Any]]) -> Headline:
+    """Return the headline of a scene as an error leaves it: without a figure that it makes untrue."""
+    figure = f"{head.figure} ({head.metres})" if head.metres else head.figure
+    found = instead(figure, head.what, notices)
+    return (
+        head if found is None else Headline(figure=UNKNOWN, metres=None, what=found[0], notes=(found[1], *head.notes))
+    )
 
 
 def unsettled(report: SceneReport) -> str | None:
@@ -241,7 +275,7 @@ def _fit_notes(adjustment: Adjustment) -> list[str]:
 def _outlying_notes(adjustment: Adjustment) -> list[str]:
     """Say which check points contradict the others, and what the figure would be without them."""
     names = [one.id for one in adjustment.outlying if one.role == "check"]
-    if not names or withheld(adjustment.notices):
+    if not names or refuted(adjustment.notices):
         return []  # the verdict and a notice say it
     said = f"Probably wrong, but counted: check point{'s' if len(names) > 1 else ''} {', '.join(names)}"
     rest = adjustment.rmse_of_agreeing_checks
@@ -262,10 +296,10 @@ def summary_text(report: SceneReport) -> str:
     if report.matching:
         rows.append(("matching", report.matching.text()))
     ground = f" ({head.metres})" if head.metres else ""
-    rows.append(("accuracy", f"{head.figure}{ground}: {head.what}"))
+    rows.append(("accuracy", f"{head.figure.removeprefix('Accuracy ')}{ground}: {head.what}"))
     rows += [("", note) for note in head.notes]
-    if report.map_scale:
-        rows.append(("map scale", withheld(adjustment.notices) or report.map_scale.statement))
+    if report.map_scale or refuted(report.notices):
+        rows.append(("map scale", report.map_scale.statement if report.map_scale else NO_SCALE))
     for role, found in (("control", report.covariance.control), ("check", report.covariance.check)):
         if found and found.verdict == "systematic":
             rows.append(("pattern", f"{role} points: {found.statement}"))

@@ -23,6 +23,7 @@ from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.exchange.rpc import export_rpc, read_rpc, rpc_metadata
 from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.models import RPC
+from ortho_pipeline.report.wording import NO_SCALE
 from ortho_pipeline.simulation.scanner import LineScanner
 
 LON, LAT, SIZE = 24.4, -33.65, 400
@@ -285,9 +286,9 @@ def test_the_verdict_leads_with_known_points_that_contradict_the_block(stereo: S
     stereo.ground[9, 2] += 60.0
     out = tmp_path / "wrong"
     said = run("adjust", *stereo.images, "--points", stereo.write(), "-o", out)
-    against = "1 of 12 check points contradicts the block (p9); no fitness for maps is claimed until that is settled."
-    assert verdict_of(out) == against
-    assert against in said.split("Warning")[0]
+    against = "1 of 12 check points contradicts the block (p9)"
+    assert verdict_of(out) == NO_SCALE
+    assert f"Accuracy unknown: {against}" in said.split("Warning")[0]
     report = json.loads((out / "block_report.json").read_text())
     (notice,) = [one for one in report["notices"] if "p9" in one["text"]]
     assert notice["code"] == "checks-apart"

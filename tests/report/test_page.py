@@ -28,7 +28,7 @@ from ortho_pipeline.report.page.advice import WORDS, advised, signals
 from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import degrees, plot_ortho
 from ortho_pipeline.report.records import NOT_TESTED, MapScaleRecord, SceneReport
-from ortho_pipeline.report.wording import few_check_points, fitness, scale_rules, verdict
+from ortho_pipeline.report.wording import NO_SCALE, UNKNOWN, few_check_points, fitness, scale_rules, verdict
 from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
 from ortho_pipeline.simulation.terrain import Terrain
 
@@ -221,22 +221,21 @@ def test_verdict_leads_with_check_points_that_contradict_the_control(tmp_path, w
         image[index] += by
         names.append(points.ids[index])
     said = made(dataclasses.replace(points, image=image))
-    text = verdict(said)
     verb = "contradicts" if wrong == 1 else "contradict"
-    assert text == (
-        f"{wrong} of 6 check points {verb} the control points ({', '.join(names)}); no fitness for maps is claimed "
-        "until that is settled."
-    )
+    text = f"{wrong} of 6 check points {verb} the control points ({', '.join(names)})"
+    assert (said.headline.figure, said.headline.what, said.map_scale) == (UNKNOWN, text, None)
+    assert verdict(said) == NO_SCALE
     # The light is that of the verdict, and one notice says it, not one of all and one of each.
     shown = signals(said.warnings, said.notices)
     assert [one.level for one in shown][:1] == ["stop"]
     assert sum("contradict" in one.text for one in shown) == 1
     assert "Probably wrong" not in "".join(said.headline.notes)
-    assert f"map scale {text}" in report.summary_text(said)
+    assert f"accuracy  unknown: {text}" in report.summary_text(said)
+    assert f"map scale {NO_SCALE}" in report.summary_text(said)
     report.write_report_html(said, tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert "Fit for maps" not in page
-    assert "Map scales, not claimed until the contradiction is settled" in page
+    assert "Map scales" not in page
     # Beside the figure, with what it is without them; in the picture in rings; what to do is of these points.
     assert said.adjustment.notices[0]["rest"] == pytest.approx(0.5, abs=0.5)
     assert re.search(rf'class="unsettled">Not settled: 0\.\d+ px without {", ".join(names)}<', page)

@@ -20,6 +20,7 @@ from ortho_pipeline.files import write_text
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.page.advice import WORDS, Signal, signals
 from ortho_pipeline.report.page.behaviour import policy, script
+from ortho_pipeline.report.wording import refuted
 
 #: Longer side of a thumbnail, px, and how many scenes have one: a page of thousands would be no page.
 _SIDE, _MOST = 88, 300
@@ -42,7 +43,8 @@ class Row:
     """A scene of the page; `page` is the address of its report from here, `rmse` px of the best `evidence` there is.
 
     `signal` is the gravest of its notices, if it is to be looked at; `state` is ``failed``, ``stop`` (something is to
-    be settled first), ``untested`` or ``ready``; `tested_at` the evidence in words.
+    be settled first), ``untested`` or ``ready``; `tested_at` the evidence in words;
+    `untrue` tells that an error makes its figures untrue.
     """
 
     name: str
@@ -52,6 +54,7 @@ class Row:
     evidence: str | None
     rmse: float | None
     metres: float | None
+    untrue: bool = False
     signal: Signal | None = None
     thumbnail: str | None = None
 
@@ -67,6 +70,8 @@ class Row:
     @property
     def tested_at(self) -> str:
         """The evidence in words, with the number of points."""
+        if self.untrue:
+            return "unknown: see the error"
         if self.evidence is None:
             return "not tested"
         one, many = EVIDENCE[self.evidence]
@@ -132,7 +137,9 @@ def _row(scene: Mapping[str, Any], folder: Path) -> Row:
     if not error and not facts:
         error = _NOT_MADE
     rmses, metres = facts.get("rmse_px") or {}, facts.get("rmse_m") or {}
-    if not error:
+    # A figure that an error makes untrue is not shown.
+    untrue = not error and refuted(facts.get("notices") or ()) is not None
+    if not error and not untrue:
         found = next((kind for kind in EVIDENCE if rmses.get(kind) is not None), None)
     page = scene["files"].get("html")
     return Row(
@@ -143,7 +150,8 @@ def _row(scene: Mapping[str, Any], folder: Path) -> Row:
         evidence=found,
         rmse=None if found is None else rmses[found],
         metres=None if found is None else metres.get(found),
-        signal=None if error else _gravest(facts, tested=found is not None),
+        untrue=untrue,
+        signal=None if error else _gravest(facts, tested=untrue or found is not None),
     )
 
 

@@ -24,7 +24,7 @@ from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import LONGEST_ARROW, plot_ortho
 from ortho_pipeline.report.plots import plots
 from ortho_pipeline.report.records import NOT_TESTED, Provenance, SceneReport
-from ortho_pipeline.report.wording import NOTICED, runner_up, scale_rules, unsettled, verdict, withheld
+from ortho_pipeline.report.wording import NOTICED, runner_up, scale_rules, unsettled, verdict
 
 if TYPE_CHECKING:
     from ortho_pipeline.imaging.matching import Matches
@@ -66,7 +66,6 @@ def write_report_html(
         notes=[note for note in report.headline.notes if note not in NOTICED or not said],
         verdict=verdict(report),
         scale_rules=None if report.map_scale is None else scale_rules(report.map_scale),
-        contradicted=withheld(adjustment.notices) is not None,
         unsettled=unsettled(report),
         runner_up=runner_up(report),
         doubted=doubted(adjustment.notices) & {one.id for one in adjustment.points},

@@ -1,0 +1,81 @@
+"""An error that makes the accuracy untrue replaces it in every output: the control points lie 100 m above the DEM."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.report.wording import NO_SCALE
+
+PIPELINE = """
+output: out
+defaults:
+  points: {gcps: gcps.csv, crs: "EPSG:4979", vertical: ellipsoid, check: "every:3"}
+  surface: {dem: dem.tif, vertical: ellipsoid}
+  output: {stac: true, acquired: "2005-08-03T08:12:31Z"}
+scenes: [{image: tiny.tif}]
+"""
+
+
+@pytest.fixture
+def outputs(tiny, monkeypatch):
+    """Return a function that runs the pipeline for points at a height, and returns what was printed and the folder."""
+
+    def of(height: float):
+        lon_lat = np.array([row[3:5] for row in tiny.points(18)], dtype=float)
+        ground = np.column_stack([lon_lat, np.full(18, height)])
+        image = tiny.model.ground_to_image(ground) + tiny.bias + np.random.default_rng(1).normal(0, 0.1, (18, 2))
+        tiny.write(tiny.gcps, [(f"p{i}", *map(float, (*image[i], *ground[i]))) for i in range(18)])
+        (tiny.folder / "run.yaml").write_text(PIPELINE)
+        monkeypatch.chdir(tiny.folder)
+        done = CliRunner().invoke(cli, ["run", "run.yaml", "--executor", "sequential"])
+        assert done.exit_code == 0, done.output
+        return done.output, tiny.folder / "out"
+
+    return of
+
+
+def test_no_output_shows_a_figure_that_an_error_makes_untrue(outputs, tiny):
+    printed, out = outputs(600.0)
+    document = json.loads((out / "tiny" / "tiny_report.json").read_text())
+    rmse = f"{document['adjustment']['rmse']['check']['total']:.2f} px"
+    why = "the heights of points and DEM differ by"
+    (notice,) = [one for one in document["notices"] if one["code"] == "heights-disagree"]
+    assert notice["median_m"] == pytest.approx(100.0, abs=25.0)
+    head = document["headline"]
+    assert (head["figure"], head["metres"], document["map_scale"]) == ("Accuracy unknown", None, None)
+    assert head["what"].startswith(why)
+    assert f"which moves the ortho by {notice['moved_m']:.2f} m" in head["what"]
+    assert head["notes"][0].startswith(f"Do not rely on this figure: {rmse}")
+    page = (out / "tiny" / "tiny_report.html").read_text()
+    first = page[page.index('<p class="figure">') : page.index('<dl class="facts">')]
+    assert first.index("Accuracy unknown") < first.index(why[4:]) < first.index(NO_SCALE) < first.index(rmse)
+    assert "Map scales" not in page
+    # The run: its terminal, its record and its page.
+    row = next(line for line in printed.splitlines() if line.startswith("tiny "))
+    assert row.split()[3:6] == ["-", "-", "-"]
+    assert f"Error: accuracy unknown: {why}" in printed
+    assert json.loads((out / "run.json").read_text())["scenes"][0]["facts"]["headline"] == head
+    assert "unknown: see the error" in (out / "index.html").read_text()
+    item = json.loads((out / "tiny" / "tiny_stac.json").read_text())
+    assert not [name for name in item["properties"] if name.startswith("accuracy:")]
+    # `ortho rectify` in the terminal.
+    given = ["rectify", "tiny.tif", "--gcps", "gcps.csv", "--points-crs", "EPSG:4979", "--points-vertical", "ellipsoid",
+             "--check", "every:3", "--dem", "dem.tif", "--dem-vertical", "ellipsoid", "-o", "one"]  # fmt: skip
+    said = CliRunner().invoke(cli, given).output
+    assert f"accuracy  unknown: {why}" in said
+    assert f"map scale {NO_SCALE}" in said
+
+
+def test_with_the_right_heights_all_of_them_show_it(outputs):
+    printed, out = outputs(500.0)
+    document = json.loads((out / "tiny" / "tiny_report.json").read_text())
+    assert document["headline"]["figure"].endswith(" px")
+    assert document["map_scale"] is not None
+    assert "unknown" not in printed
+    item = json.loads((out / "tiny" / "tiny_stac.json").read_text())
+    assert item["properties"]["accuracy:geometric_rmse"] > 0
