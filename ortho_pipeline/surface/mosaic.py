@@ -1,8 +1,10 @@
 """A DEM in many files: one grid of samples over all of them, of one horizontal system and one height datum.
 
-Files of one spacing have to lie on one grid, as the cells of a DEM do. Where cells become wider towards the poles
-(Copernicus, DTED), the grid has the finest columns, and a row of the others is interpolated between their own samples,
-over the border of two cells of one kind too. Rows are the same everywhere.
+Files of one spacing have to lie on one grid, as the cells of a DEM do. Rows are the same everywhere. Where cells become
+wider towards the poles (Copernicus, DTED), the grid has columns on which the samples of all cells lie: 3600 and 2400
+columns per degree make 7200. A row is linear between the samples of its own cell, over the border of two cells of one
+kind too, so bilinear heights are those of the cell's own grid. Between the last row of one width and the first of
+another, heights go linearly from one row to the other.
 """
 
 from __future__ import annotations
@@ -31,8 +33,10 @@ from ortho_pipeline.surface.dem_file import DemFile, SampleGrid
 _OPEN_FILES = 32
 #: Files that one DEM may have.
 _MOST_FILES = 30_000
-#: Part of a sample by which a file may lie off the grid.
-_OFF_GRID = 0.01
+#: Part of a sample by which a file may lie off the grid, and part of a spacing by which another may differ.
+_OFF_GRID, _SAME_STEP = 0.01, 1e-6
+#: So many columns of the grid may lie between two of the finest file. Copernicus needs 3 (2400, 1800, 1200 columns).
+_MOST_BETWEEN = 12
 #: Samples of an arc that says to be the whole circle.
 _CIRCLE = 360.0
 _WARP = "make one grid of them (gdalwarp in1.tif in2.tif out.tif), or leave out what does not belong"
@@ -110,17 +114,17 @@ class Layer:
     ----------
     parts : tuple of Part
         Of two at one place the later one counts where it has a height.
-    first : float
+    first : int
         Column of the mosaic at which its column 0 lies.
-    step : float
-        Columns of the mosaic from one of its own columns to the next, 1 or more.
+    step : int
+        Columns of the mosaic from one of its own columns to the next.
     columns : int
         How many it has; all of them go round the world if `closed`.
     """
 
     parts: tuple[Part, ...]
-    first: float
-    step: float
+    first: int
+    step: int
     columns: int
     closed: bool = False
 
@@ -177,14 +181,14 @@ class DemMosaic:
         """Return the heights ``(height, width)`` of a window in metres; NaN where no file has one."""
         out = np.full((height, width), np.nan)
         for layer in self.layers:
-            if layer.step == 1.0:
-                self._lay(layer, out, left - round(layer.first), top, metres_per_unit)
+            if layer.step == 1:
+                self._lay(layer, out, left - layer.first, top, metres_per_unit)
                 continue
-            at = (np.arange(left, left + width, dtype=np.float64) - layer.first) / layer.step
-            first, last = int(np.floor(at[0])), int(np.floor(at[-1])) + 1
+            at, rest = np.divmod(np.arange(left, left + width) - layer.first, layer.step)
+            first, last = int(at[0]), int(at[-1]) + 1
             own = np.full((height, last - first + 1), np.nan)
             self._lay(layer, own, first, top, metres_per_unit)
-            found = _between(own, at - first)
+            found = _between(own, at - first, rest / layer.step)
             out = np.where(np.isnan(found), out, found)
         return out
 
@@ -214,16 +218,9 @@ class DemMosaic:
         return samples
 
 
-def _between(own: Array, at: Array) -> Array:
-    """Interpolate rows linearly at columns `at`; a void counts only where its weight is not zero."""
-    low = np.floor(at).astype(int)
-    part = at - low
-    # Places that are a column but for rounding are that column.
-    nearest = np.rint(at)
-    exact = np.abs(at - nearest) < 1e-6
-    low, part = np.where(exact, nearest, low).astype(int), np.where(exact, 0.0, part)
-    high = np.minimum(low + 1, own.shape[1] - 1)
-    return np.where(part > 0, own[:, low] * (1 - part) + own[:, high] * part, own[:, low])
+def _between(own: Array, at: NDArray[np.int64], part: Array) -> Array:
+    """Interpolate rows linearly, a part behind the columns `at`; a void counts only where its weight is not zero."""
+    return np.where(part > 0, own[:, at] * (1 - part) + own[:, at + 1] * part, own[:, at])
 
 
 # -- laying out ------------------------------------------------------------------------------------------------------
@@ -267,15 +264,14 @@ def laid_out(name: str, placed: Sequence[tuple[Samples, pyproj.CRS, SampleGrid, 
                 "DEM", file=other.path, field="height datum",
                 remedy="leave one of the two out, or bring them to one datum and unit (gdalwarp -t_srs)",
             )  # fmt: skip
-    grids = [grid for _, _, grid, _ in placed]
-    whole = _whole_grid(name, grids)
     layers: dict[float, list[tuple[Samples, SampleGrid]]] = {}
     for samples, _, own, _ in placed:
-        steps = [step for step in layers if abs(own.crs_from_pixel[1] / step - 1) < 1e-6]
+        steps = [step for step in layers if abs(own.crs_from_pixel[1] / step - 1) < _SAME_STEP]
         layers.setdefault(steps[0] if steps else own.crs_from_pixel[1], []).append((samples, own))
     # The finest last: it counts where it has heights.
-    made = (_layer(whole, layers[step]) for step in sorted(layers, key=abs, reverse=True))
-    return DemMosaic(name, crs, whole, unit, tuple(made))
+    members = [layers[step] for step in sorted(layers, key=abs, reverse=True)]
+    whole = _whole_grid(name, [grid for _, _, grid, _ in placed], _between_columns(members))
+    return DemMosaic(name, crs, whole, unit, tuple(_layer(whole, theirs) for theirs in members))
 
 
 def _refuse_other_system(
@@ -304,9 +300,40 @@ def _said(crs: pyproj.CRS, unit: str) -> str:
     return f"heights in {declared.name if declared else 'a datum that it does not say'!r} ({unit or 'no unit'})"
 
 
-def _whole_grid(name: str, grids: Sequence[SampleGrid]) -> SampleGrid:
-    """Return the grid over all grids: from the first sample in x and y to the last ones, with the finest columns."""
-    dx = min((grid.crs_from_pixel[1] for grid in grids), key=abs)
+def _west(members: Sequence[tuple[Samples, SampleGrid]]) -> float:
+    """Return x of the first column of files of one spacing."""
+    sign = np.sign(members[0][1].crs_from_pixel[1])
+    return min((grid.crs_from_pixel[0] for _, grid in members), key=lambda value: value * sign)
+
+
+def _between_columns(members: Sequence[Sequence[tuple[Samples, SampleGrid]]]) -> int:
+    """Return into how many columns the finest spacing is divided, so that the columns of all spacings are among them.
+
+    `members` are files of one spacing each, the finest last.
+    """
+    fine = members[-1][0][1].crs_from_pixel[1]
+    x = min((_west(theirs) for theirs in members), key=lambda value: value * np.sign(fine))
+    steps = np.array([theirs[0][1].crs_from_pixel[1] / fine for theirs in members])
+    # A layer may lie off by a part of its own samples, as its files may.
+    offsets, slack = np.array([(_west(theirs) - x) / fine for theirs in members]), _OFF_GRID * steps
+    for count in range(1, _MOST_BETWEEN + 1):
+        even = np.abs(steps * count - np.rint(steps * count)) < _SAME_STEP * steps * count
+        on = np.abs(offsets * count - np.rint(offsets * count)) <= slack * count
+        if (even & on).all():
+            return count
+    one, other = members[-1][0][0], members[0][0][0]
+    raise CrsError(
+        f"there are no common columns for the samples of this file and those of {other.path}", file=one.path,
+        field="geotransform", remedy=_WARP,
+    )  # fmt: skip
+
+
+def _whole_grid(name: str, grids: Sequence[SampleGrid], between: int) -> SampleGrid:
+    """Return the grid over all grids, from the first sample in x and y to the last ones.
+
+    Its columns are the finest, each divided into so many.
+    """
+    dx = min((grid.crs_from_pixel[1] for grid in grids), key=abs) / between
     dy = grids[0].crs_from_pixel[5]
     x = min((grid.crs_from_pixel[0] for grid in grids), key=lambda value: value * np.sign(dx))
     y = min((grid.crs_from_pixel[3] for grid in grids), key=lambda value: value * np.sign(dy))
@@ -327,10 +354,8 @@ def _layer(whole: SampleGrid, members: Sequence[tuple[Samples, SampleGrid]]) -> 
     """Return parts of one spacing as a layer of the whole."""
     x, dx, _, y, _, dy = whole.crs_from_pixel
     step = members[0][1].crs_from_pixel[1]
-    west = min((grid.crs_from_pixel[0] for _, grid in members), key=lambda value: value * np.sign(step))
     # Columns that are those of the whole are counted in it, whatever rounding says of the spacing.
-    fine = abs(step / dx - 1) < 1e-6
-    first, width = (x, dx) if fine else (west, step)
+    first, width = (x, dx) if round(step / dx) == 1 else (_west(members), step)
     parts = []
     for samples, grid in members:
         column, row = (grid.crs_from_pixel[0] - first) / width, (grid.crs_from_pixel[3] - y) / dy
@@ -342,4 +367,4 @@ def _layer(whole: SampleGrid, members: Sequence[tuple[Samples, SampleGrid]]) -> 
         parts.append(Part(samples, round(column), round(row), grid.shape))
     circle = round(_CIRCLE / abs(step)) if whole.crs.is_geographic else 0
     closed = whole.crs.is_geographic and abs(whole.shape[1] * dx) > _CIRCLE - 1e-9
-    return Layer(tuple(parts), (first - x) / dx, 1.0 if fine else step / dx, circle, closed)
+    return Layer(tuple(parts), round((first - x) / dx), round(step / dx), circle, closed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import subprocess
 import sys
@@ -153,23 +154,26 @@ def test_land_that_the_public_dem_withholds_is_not_sea(tmp_path: Path, geoid: st
 
 
 @pytest.mark.parametrize(("lat", "other"), [(49, 50), (-51, -50), (84, 85)])
-def test_where_cells_become_wider_heights_are_interpolated_along_their_rows(
+def test_where_cells_become_wider_rows_are_linear_between_the_samples_of_each(
     lat: int, other: int, tmp_path: Path, geoid: str
 ) -> None:
     cells = [Cell(lon, row) for lon in (10, 11) for row in (lat, other)]
     for cell in cells:
         write_cell(tmp_path, cell)
     dem = found(str(tmp_path), Extent(10.3, max(lat, other) - 0.2, 11.3, max(lat, other) + 0.2), geoid, fill="mask")
-    fine, wide = sorted((Cell(10, lat), Cell(10, other)), key=lambda cell: -cell.columns)
-    assert dem.shape == (2 * ROWS, 2 * fine.columns)
-    top = 0 if fine.lat > wide.lat else ROWS
-    raw = dem.file.read(0, 0, 2 * fine.columns, 2 * ROWS, 1.0)
-    np.testing.assert_array_equal(raw[top : top + ROWS, : fine.columns], heights_of(fine))
-    known = np.concatenate([heights_of(wide), heights_of(Cell(11, wide.lat))], axis=1)
-    at = np.arange(2 * fine.columns) * wide.columns / fine.columns
-    inside = at <= known.shape[1] - 1
-    wanted = np.array([np.interp(at[inside], np.arange(known.shape[1]), row) for row in known])
-    np.testing.assert_allclose(raw[ROWS - top : 2 * ROWS - top][:, inside], wanted, rtol=1e-12)
+    both = Cell(10, lat), Cell(10, other)
+    # Columns on which the samples of both lie; the last is the last one of the narrower cells.
+    columns = math.lcm(*(cell.columns for cell in both))
+    between = columns // max(cell.columns for cell in both)
+    assert dem.shape == (2 * ROWS, 2 * columns - between + 1)
+    raw = dem.file.read(0, 0, *dem.shape[::-1], 1.0)
+    for cell in both:
+        top, step = (max(lat, other) - cell.lat) * ROWS, columns // cell.columns
+        known = np.concatenate([heights_of(cell), heights_of(Cell(11, cell.lat))], axis=1)
+        np.testing.assert_array_equal(raw[top : top + ROWS, ::step][:, : known.shape[1]], known)
+        at = np.arange((known.shape[1] - 1) * step + 1)
+        wanted = np.array([np.interp(at / step, np.arange(known.shape[1]), row) for row in known])
+        np.testing.assert_allclose(raw[top : top + ROWS, : len(at)], wanted, rtol=1e-12)
 
 
 def test_cells_on_both_sides_of_the_antimeridian_and_around_a_pole(tmp_path: Path, geoid: str) -> None:

@@ -7,13 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import pytest
 from osgeo import gdal, osr
 
 from ortho_pipeline.commands import rectify
 from ortho_pipeline.errors import CrsError, DatumError, InputError
+from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.options import SurfaceOptions
+from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.warp.engine import rectify as warp
 
 gdal.UseExceptions()
 #: Samples from one degree to the next in this test's cells.
@@ -69,23 +73,61 @@ def test_many_files_are_the_dem_that_gdals_mosaic_of_them_is(tmp_path: Path) -> 
     assert set(many.file.files) == set(map(str, paths))
 
 
-def test_cells_that_are_wider_towards_the_poles_are_one_grid_of_the_finest_columns(tmp_path: Path) -> None:
-    """Rows of the wide cells are interpolated between their own samples, over the border of two of them too."""
-    for lon in (30, 31):
-        write_cell(tmp_path, lon, 49, 30)
-        write_cell(tmp_path, lon, 50, 20)
+def own_bilinear(cells: dict[tuple[int, int], np.ndarray], places: np.ndarray) -> np.ndarray:
+    """Return heights at (lon, lat), bilinear between the samples of a cell, which go on with those of its neighbours.
+
+    Between the last row of a cell and the first of the one below, each row is linear between its own samples.
+    """
+
+    def on_row(lon: float, row: int) -> float:
+        lat, at = -(row // ROWS) - 1, row % ROWS
+        columns = cells[30, lat].shape[1]
+        samples = np.concatenate([cells[30, lat][at], cells[31, lat][at]])
+        place = (lon - 30) * columns
+        return float(np.interp(place, np.arange(2 * columns), samples, right=np.nan))
+
+    found = []
+    for lon, lat in places:
+        down = -lat * ROWS  # row 0 is on the parallel of 0 degrees, counted from north to south
+        row = int(np.floor(down))
+        found.append(on_row(lon, row) * (1 - down + row) + on_row(lon, row + 1) * (down - row))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("columns", [(30, 20), (30, 15), (30, 20, 15), (36, 24, 18), (12, 7, 4)])
+def test_cells_of_several_widths_are_each_sampled_in_their_own_grid(tmp_path: Path, columns: tuple[int, ...]) -> None:
+    """Rough ground, at any place and over the border of two widths; the same for every window."""
+    noise, cells = np.random.default_rng(0), {}
+    for lat, count in enumerate(columns):
+        for lon in (30, 31):
+            cells[lon, -1 - lat] = noise.uniform(0, 900, (ROWS, count)).astype(np.float32)
+            write_cell(tmp_path, lon, -1 - lat, count, heights=cells[lon, -1 - lat])
     dem = Surface.open(tmp_path / "*.tif", "ellipsoid", fill="mask")
-    assert dem.shape == (40, 60)
-    v, u = np.mgrid[:40, :60]
-    lon, lat = dem.grid.lonlat(u.ravel().astype(float), v.ravel().astype(float))
-    found = dem.window(0, 0, 60, 40)
-    known = ~np.isnan(found)
-    # Beyond the last sample of a wide cell in the east there is nothing.
-    assert known.sum() == known.size - 20
-    np.testing.assert_allclose(found[known], terrain(lon, lat).reshape(40, 60)[known], atol=2e-4)
-    for window in ((13, 15, 20, 10), (29, 18, 2, 4)):
-        left, top, width, height = window
-        np.testing.assert_array_equal(dem.window(*window), found[top : top + height, left : left + width])
+    last = -len(columns) + 1.01 / ROWS
+    places = noise.uniform((30.0, last), (31.7, 0.0), (400, 2))
+    border = np.column_stack([places[:100, 0], noise.uniform(-1.0, -1.0 + 1 / ROWS, 100)])
+    places = np.concatenate([places, border, border * (1, 0) - (0, 1), border * (1, 0) - (0, 1 - 1 / ROWS)])
+    wanted = own_bilinear(cells, places)
+    assert np.isfinite(wanted).all()
+    np.testing.assert_allclose(dem.heights(places), wanted, atol=1e-6)
+    # The samples of every cell are samples of the whole.
+    for (lon, lat), heights in cells.items():
+        own = np.column_stack([part.ravel() for part in np.meshgrid(
+            lon + np.arange(heights.shape[1]) / heights.shape[1], lat + 1 - np.arange(ROWS) / ROWS)])  # fmt: skip
+        np.testing.assert_allclose(dem.heights(own), heights.ravel(), atol=1e-6)
+    whole = dem.window(0, 0, *dem.shape[::-1])
+    for left, top, width, height in ((13, 15, 20, 10), (29, 18, 2, 4), (0, 5, 7, 31)):
+        part = whole[top : top + height, left : left + width]
+        np.testing.assert_array_equal(dem.window(left, top, width, height), part)
+
+
+def test_columns_without_a_common_multiple_are_refused(tmp_path: Path) -> None:
+    odd = write_cell(tmp_path, 30, 41, 31)
+    write_cell(tmp_path, 30, 42, 30)
+    with pytest.raises(CrsError, match=r"no common columns.*N42") as caught:
+        Surface.open(tmp_path / "*.tif", "ellipsoid")
+    assert caught.value.file == str(odd)
+    assert caught.value.remedy
 
 
 def test_cells_on_both_sides_of_the_antimeridian_are_neighbours(tmp_path: Path) -> None:
@@ -148,3 +190,45 @@ def test_an_ortho_on_many_files_is_that_on_one_and_names_them_all(tiny: Any, tmp
         inputs = made.document["report"]["provenance"]["inputs"]
     np.testing.assert_array_equal(*orthos)
     assert {Path(one["path"]).name for one in inputs if one["role"] == "DEM"} == {"west.tif", "east.tif"}
+
+
+def write_band(path: Path, heights: np.ndarray, north: float, step: float) -> None:
+    """Write samples from 19.985 degrees east, the first row at latitude `north`, rows of a second of arc."""
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), *heights.shape[::-1], 1, gdal.GDT_Float64)
+    reference = osr.SpatialReference()
+    reference.ImportFromEPSG(4326)
+    reference.SetAxisMappingStrategy(osr.OAMS_TRADITIONAL_GIS_ORDER)
+    dataset.SetSpatialRef(reference)
+    dataset.SetGeoTransform((19.985 - step / 2, step, 0, north + 0.5 / 3600, 0, -1 / 3600))
+    dataset.WriteArray(heights)
+    dataset = None
+
+
+def test_an_ortho_over_the_border_of_two_widths(tiny: Any, tmp_path: Path) -> None:
+    """On rough ground, as on a DEM whose columns hold the samples of both; the same bytes for any tiles and threads."""
+    folder, noise = tmp_path / "cells", np.random.default_rng(0)
+    folder.mkdir()
+    narrow, wide = noise.uniform(400, 600, (36, 109)), noise.uniform(400, 600, (36, 73))
+    write_band(folder / "north.tif", narrow, -29.99, 1 / 3600)
+    write_band(folder / "south.tif", wide, -30.0, 1 / 2400)
+    every = np.arange(217)
+    both = [
+        np.interp(every, np.arange(len(row)) * step, row) for part, step in ((narrow, 2), (wide, 3)) for row in part
+    ]
+    write_band(tmp_path / "whole.tif", np.array(both), -29.99, 1 / 7200)
+    grid = Grid.of_extent(pyproj.CRS(4326), (19.991, -30.005, 20.009, -29.995), (5e-5, 5e-5))
+    orthos = []
+    for k, (dem, resources) in enumerate([
+        (tmp_path / "whole.tif", Resources()), (folder / "*.tif", Resources()),
+        (folder / "*.tif", Resources(threads=1, memory=30_000_000)), (folder / "*.tif", Resources(threads=3)),
+    ]):  # fmt: skip
+        made = tmp_path / f"{k}.tif"
+        on = Surface.open(dem, "ellipsoid")
+        warp(tiny.model, RasterSource(tiny.image), on, grid, made, driver="GTiff", resources=resources)
+        orthos.append(gdal.Open(str(made)).ReadAsArray())
+    assert (orthos[0] > 0).mean() > 0.9
+    for ortho in orthos[2:]:
+        np.testing.assert_array_equal(ortho, orthos[1])
+    # Heights on the columns differ by rounding.
+    assert np.abs(orthos[1].astype(float) - orthos[0]).max() <= 1
+    assert (orthos[1] == orthos[0]).mean() > 0.999
