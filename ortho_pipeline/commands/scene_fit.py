@@ -293,7 +293,7 @@ def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:
     """Return the correction that many matches justify, as `ortho compare` recommends it, and what people read of it.
 
     Of shift, shift-drift, affine, and the model's own parameters where it has some, the one with the fewest parameters
-    whose error at points that took no part is within 5 % of the smallest.
+    whose error is expected to be within 2 % of the smallest over the scene.
     """
     own = shared_model(scene)
     kinds = [name for name in comparing.CORRECTIONS if name != "none"] + ([OWN] if own.param_names else [])

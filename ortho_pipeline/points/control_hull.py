@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.points.table import Array
 
-#: Below this share of the image, with the margin, the rest is not covered: of the recommendations on simulated scenes
-#: whose true error is more than 1.3 times that of the best model nearly all are there (docs/accuracy.md).
+#: Below this share of the image, with the margin, the rest is not covered: models that fit the points alike differ
+#: there (docs/accuracy.md).
 COVERED = 0.7
 #: An empty part is named from this share of what is empty on.
 _PART = 0.2

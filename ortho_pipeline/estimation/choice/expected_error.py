@@ -1,0 +1,156 @@
+r"""How large an error a model is expected to have over a whole scene, and whether its control points contradict it.
+
+Leave-one-out residuals say what a model errs where control is. Over the scene its parameters are less certain, and
+control at one height does not show what a model of the plane does at others. With the mean square :math:`m` (px²) of
+the residuals of points that took no part, the stated noise :math:`q` of a point, the variances :math:`v_t` and
+:math:`v_s` that come from the parameters at these points and over the scene (both for the stated noise), the expected
+mean square over the scene, noise of measuring included, is
+
+.. math:: e = u (q + v_s) + h, \qquad u = \max(m / (q + v_t), u_0)
+
+:math:`u_0` is the noise itself: a smaller error is chance. It is 1 (the stated noise), or less where the model that the
+points support most has less. :math:`h` is the parallax of heights that control does not cover, zero for 3D models.
+
+Whether the points support a model is Akaike's criterion, corrected for few observations: with the whitened sum of
+squares :math:`S`, :math:`N` observations and :math:`K` parameters (one of them the noise), and the stated noise as
+:math:`\nu` observations more,
+
+.. math:: (N + \nu) \ln\frac{S + \nu}{N + \nu} + 2 K + \frac{2 K (K + 1)}{N + \nu - K - 1}
+
+A model that is larger by more than 10 has essentially no support (Burnham and Anderson 2002, section 2.6).
+
+Source: Hurvich and Tsai 1989 (the correction); Allen 1974 (prediction by leaving out).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_pipeline.estimation.fit import Fit
+from ortho_pipeline.estimation.ground_residuals import metre_partials
+from ortho_pipeline.estimation.problem import ImageErrors
+from ortho_pipeline.models.base import Array
+
+#: Criteria that are larger than the smallest one by this contradict the model.
+_CONTRADICTED = 10.0
+#: The stated noise counts as so many observations: the sigma of a point is rarely known better than by half of itself.
+_STATED = 8
+#: Places at which the scene is looked at, to each side and in height.
+_PLACES, _LEVELS = 9, 3
+#: Mean square tangent of the angle off nadir of images whose view nobody states: 17.5 degrees.
+_VIEW = 0.1
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """What the points say of one model.
+
+    Parameters
+    ----------
+    criterion : float
+        Akaike's, corrected; infinite without redundancy.
+    noise : float
+        Mean square of whitened residuals by redundancy; infinite without.
+    stated, tested, scene : float
+        Mean variances (px²): of measuring a point as stated, and of the parameters at the points that test the model
+        and over the scene.
+    unseen : float
+        Mean square parallax (px²) of heights that control does not cover.
+    """
+
+    criterion: float
+    noise: float
+    stated: float
+    tested: float
+    scene: float
+    unseen: float
+
+    def square(self, mean_square: float, least: float) -> float:
+        """Return the expected mean square (px²) over the scene for that at the tests; `least` is the noise."""
+        return max(mean_square / (self.stated + self.tested), least) * (self.stated + self.scene) + self.unseen
+
+
+def expectation(found: Fit, tests: NDArray[np.bool_], size: tuple[int, int] | None) -> Expectation:
+    """Return what is expected of a fit that the points in the mask `tests` ``(N,)`` test, in an image of this size."""
+    points, model = found.points, found.model
+    measured = points.select(found.used | tests)
+    stated = float(np.trace(ImageErrors.of(model, measured).covariance, axis1=1, axis2=2).mean())
+    places = _places(found, size)
+    return Expectation(
+        _criterion(found), _noise(found), stated, _variance(found, points.ground[tests]), _variance(found, places),
+        _unseen(found, places),
+    )  # fmt: skip
+
+
+def supported(expected: Mapping[str, Expectation], worth: float) -> tuple[list[str], float]:
+    """Return the models that the points do not contradict, and the noise as a multiple of the stated one (squared).
+
+    A model whose noise is within the factor `worth` of that of the most supported one is not contradicted: many points
+    prove differences that matter to nobody.
+    """
+    best = min(expected, key=lambda name: expected[name].criterion)
+    lowest = expected[best].criterion
+    if not math.isfinite(lowest):
+        return list(expected), 1.0
+    names = [
+        name for name, one in expected.items()
+        if one.criterion <= lowest + _CONTRADICTED or one.noise <= worth**2 * expected[best].noise
+    ]  # fmt: skip
+    return names, min(1.0, expected[best].noise)
+
+
+def _criterion(found: Fit) -> float:
+    freedom, count = found.degrees_of_freedom, int(found.used.sum())
+    parameters = found.effective_parameters + 1
+    # Points that share errors are fewer observations than their number.
+    observations = 2 * found.effective_points + _STATED
+    left = observations - parameters - 1
+    if found.sigma0 is None or not count or left <= 0:
+        return math.inf
+    squares = found.sigma0**2 * freedom * found.effective_points / count
+    penalty = 2 * parameters * (1 + (parameters + 1) / left)
+    return observations * math.log((squares + _STATED) / observations) + penalty
+
+
+def _noise(found: Fit) -> float:
+    return math.inf if found.sigma0 is None else found.sigma0**2
+
+
+def _variance(found: Fit, ground: Array) -> float:
+    """Return the mean variance (px²) from the parameters at places, for the stated noise; 0 without parameters."""
+    if not len(found.model.params):
+        return 0.0
+    if not len(ground):
+        return math.inf
+    partials = found.model.param_partials(ground)
+    factors = found.relative_covariance / (1.0 if found.sigma0 is None else found.sigma0**2)
+    return float(np.einsum("nij,jk,nik->n", partials, factors, partials).mean())
+
+
+def _places(found: Fit, size: tuple[int, int] | None) -> Array:
+    """Return places ``(n, 3)`` spread evenly over the ground for which a model is meant, as far as its image shows."""
+    centre, half = found.model.domain
+    side = (np.arange(_PLACES) + 0.5) / _PLACES * 2 - 1
+    level = (np.arange(_LEVELS) + 0.5) / _LEVELS * 2 - 1
+    places = centre + half * np.array(list(itertools.product(side, side, level)))
+    image = found.model.ground_to_image(places)
+    seen = np.isfinite(image).all(axis=1)
+    if size is not None:
+        seen &= ((image >= 0) & (image <= size)).all(axis=1)
+    return np.asarray(places[seen])
+
+
+def _unseen(found: Fit, places: Array) -> float:
+    """Return the mean square (px²) of what heights move that control does not cover, for a model that ignores them."""
+    heights = found.points.ground[found.used, 2]
+    if found.model.uses_height or not len(places):
+        return 0.0
+    missing = places[:, 2].var() - heights.var()
+    scale, _ = metre_partials(found.model, places)
+    return max(0.0, _VIEW * float(missing)) * float(np.abs(np.linalg.det(scale)).mean())
