@@ -34,6 +34,11 @@ def metres(value: float) -> str:
     return f"{value:.2f} m" if abs(value) < 10 else f"{value:.1f} m"
 
 
+def size_m(value: float) -> str:
+    """Return a size or an error in metres with two digits: 0.48 m, 2.5 m, 14 m."""
+    return f"{float(f'{value:.2g}'):g} m"
+
+
 def class_size(centimetres: int) -> str:
     """Return an accuracy class: whole centimetres; from a metre on metres of three digits, rounded up."""
     if centimetres < 100:

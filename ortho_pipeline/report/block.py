@@ -169,7 +169,7 @@ def verdict(report: BlockReport) -> str | None:
     if report.map_scale is not None:
         part = any(one["code"] == "points-cover-part" for one in report.notices)
         where = " in plan" + (", where there are points" if part else "")
-        said.append(f"{fitness(report.map_scale, where)} No fitness is claimed for heights.")
+        said.append(f"{fitness(report.map_scale, where)} No scale is stated for heights.")
     return " ".join(said) or None
 
 

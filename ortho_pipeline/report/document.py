@@ -28,7 +28,7 @@ from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
 from ortho_pipeline.files.documents import DocumentError, json_position, json_value, made_of, record_of
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
-from ortho_pipeline.geodesy.ellipsoid import units_per_metre
+from ortho_pipeline.geodesy.ellipsoid import geocentric, units_per_metre
 from ortho_pipeline.geodesy.naming import crs_definition, crs_name
 from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
@@ -141,7 +141,7 @@ def build_report(
         rmse_m=rmse_m,
         view_rmse=_view_rmse(fit),
         covariance=_covariances(fit, near),
-        map_scale=None if refuted(noted["notices"]) else _map_scale(fit, seen),
+        map_scale=None if refuted(noted["notices"]) else _map_scale(fit, seen, grid),
         control_hull=None if hull is None else made_of(ControlHull, hull),
         comparison=None if comparison is None else made_of(ComparisonRecord, json_value(comparison)),
         matching=matched,
@@ -200,10 +200,20 @@ def _covariances(fit: Fit, near: float | None) -> Covariances:
     return made_of(Covariances, {role: one and one.to_json() for role, one in found.items()})
 
 
-def _map_scale(fit: Fit, seen: Mapping[str, Any]) -> MapScaleRecord | None:
-    pixels = seen["ground_pixel_m"]
+def _map_scale(fit: Fit, seen: Mapping[str, Any], grid: Grid | None) -> MapScaleRecord | None:
+    pixels = [*(seen["ground_pixel_m"] or ()), *(() if grid is None else _pixel_on_ground(grid))]
     found = map_scale(fit, max(pixels) if pixels else None)
     return None if found is None else made_of(MapScaleRecord, found.to_json())
+
+
+def _pixel_on_ground(grid: Grid) -> list[float]:
+    """Return width and height of the ortho's middle pixel in metres on the ellipsoid; nothing where it has no place."""
+    left, bottom, right, top = grid.extent
+    middle = np.array([(left + right) / 2, (bottom + top) / 2, 0.0])
+    corners = middle + np.array([[0.0, 0.0, 0.0], [grid.dx, 0.0, 0.0], [0.0, grid.dy, 0.0]])
+    places = geocentric(ground_transform(grid.crs, "EPSG:4979")(corners))
+    sizes = np.linalg.norm(places[1:] - places[0], axis=1)
+    return [float(size) for size in sizes if np.isfinite(size)]
 
 
 def _view_rmse(fit: Fit) -> RmsesOfView:

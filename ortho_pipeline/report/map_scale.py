@@ -3,10 +3,11 @@
 All three take the errors on the ground (where the ortho shows a point minus where it belongs, on the assumption that
 the DEM is right there) of points that took no part in the adjustment. Points that contradict the others count.
 
-- The paper: a position to 0.25 mm in the map (2.5 m for 1 : 10,000), and pixels of at most 0.1 mm in it (1 m).
+- The paper: a position to 0.25 mm in the map (2.5 m for 1:10,000), and pixels of at most 0.1 mm in it (1 m): those of
+  the image or of the ortho, whichever are larger.
 - ASPRS 2023: the horizontal accuracy class is the RMSE of both axes together, with that of the check points' own
   coordinates, in whole centimetres; no class may be claimed with fewer than 30 check points.
-- NMAS: of the points tested at most one in ten is off by more than 1/30 inch in the map, or 1/50 inch at 1 : 20,000 and
+- NMAS: of the points tested at most one in ten is off by more than 1/30 inch in the map, or 1/50 inch at 1:20,000 and
   smaller scales. So the largest such scale is asked for among the usual ones: the rule has a step.
 
 Source: Bueyueksalih et al. (OrbView-3), conclusion; ASPRS Positional Accuracy Standards for Digital Geospatial Data,
@@ -33,13 +34,13 @@ SCALES = tuple(int(step * 10**power) for power in range(2, 7) for step in (1, 2,
 ENOUGH_CHECK_POINTS = 30
 #: In the map, metres: what the paper asks of positions and of pixels.
 POSITION, PIXEL = 0.25e-3, 0.1e-3
-#: NMAS: 1/30 inch at scales larger than 1 : 20,000, 1/50 inch from there on.
+#: NMAS: 1/30 inch at scales larger than 1:20,000, 1/50 inch from there on.
 _INCH, _STEP = 0.0254, 20_000
 
 
 @dataclass(frozen=True)
 class MapScale:
-    """The verdicts; a scale is its denominator, None where even 1 : 5,000,000 is too large.
+    """The verdicts; a scale is its denominator, None where even 1:5,000,000 is too large.
 
     `evidence` is ``check`` (check points), ``delivered`` (any points, of a model that was not adjusted) or ``loo``
     (control points left out in turn); only the first two are independent of the adjustment. `ce90` (m) is the distance
@@ -61,23 +62,19 @@ class MapScale:
 
     @property
     def statement(self) -> str:
-        """The verdicts in words, with what they rest on."""
+        """The map scale in words, with what it rests on."""
         base = {
             "check": counted(self.n, "check point"),
-            "delivered": f"{counted(self.n, 'point')} of the model as delivered",
+            "delivered": f"{counted(self.n, 'point')} of the delivered model",
             "loo": f"{counted(self.n, 'control point')} left out in turn",
         }[self.evidence]
-        by = "" if self.limited_by is None else f" (limited by the {self.limited_by})"
-        said = f"{base}: {_scale(self.paper_scale)}{by} by 0.25 mm in the map; "
-        claim = "ASPRS 2023 class" if self.claim else "it would be ASPRS 2023 class"
-        said += f"{claim} {class_size(self.class_cm)}; NMAS {_scale(self.nmas_scale)}."
-        if self.evidence == "loo":
-            said += " No check points were kept apart: an indication, no claim."
-        elif not self.claim:
-            said += f" Fewer than {ENOUGH_CHECK_POINTS} points: an indication, no claim."
-        if self.claim and not self.survey:
-            said += " The accuracy of the check points is not stated and not in it."
-        return said
+        by = {"pixel": " (limited by the pixel size)", "accuracy": " (limited by the error)", None: ""}[self.limited_by]
+        said = f"{scale_text(self.paper_scale, none='no usual map scale')}{by}."
+        if not self.claim:
+            asks = "30 check points" if self.evidence != "check" else "30"
+            return f"{said} Indicative: {base}; ASPRS 2023 asks for {asks}."
+        said += f" ASPRS 2023 class {class_size(self.class_cm)} at {base}."
+        return said if self.survey else f"{said} It does not include the error of the check points themselves."
 
     def to_json(self) -> dict[str, Any]:
         """Return the verdicts as JSON values."""
@@ -90,7 +87,7 @@ def map_scale(fit: Fit, pixel: float | None) -> MapScale | None:
     Parameters
     ----------
     pixel : float, optional
-        Width of a pixel on the ground, metres.
+        Size of a pixel on the ground, metres: the larger of image and ortho.
     """
     for evidence, residuals in _evidence(fit).items():
         errors = in_metres(fit, residuals)
@@ -116,7 +113,11 @@ def _evidence(fit: Fit) -> dict[str, Array]:
 
 
 def judge(errors: Array, evidence: str, pixel: float | None, survey: float = 0.0) -> MapScale:
-    """Return the verdicts on errors ``(N, 2)`` in metres of at least one point."""
+    """Return the verdicts on errors ``(N, 2)`` in metres of at least one point.
+
+    The pixel counts in two digits: 2.503 m is a pixel of 2.5 m.
+    """
+    pixel = None if pixel is None else float(f"{pixel:.2g}")
     squares = (errors**2).sum(axis=1)
     count, rmse = len(squares), float(np.sqrt(squares.mean()))
     ce90 = float(np.sqrt(np.sort(squares)[count - 1 - count // 10]))
@@ -131,7 +132,7 @@ def judge(errors: Array, evidence: str, pixel: float | None, survey: float = 0.0
 
 def usual_scale(smallest: float) -> int | None:
     """Return the first usual denominator from the smallest possible on, None beyond the last."""
-    # A hair, so that an RMSE of 2.5 m serves 1 : 10,000.
+    # A hair, so that an RMSE of 2.5 m serves 1:10,000.
     return next((scale for scale in SCALES if scale >= smallest * (1 - 1e-9)), None)
 
 
@@ -140,5 +141,6 @@ def nmas_limit(scale: float) -> float:
     return scale * _INCH / (30 if scale < _STEP else 50)
 
 
-def _scale(denominator: int | None) -> str:
-    return "no usual map scale" if denominator is None else f"1 : {denominator:,}"
+def scale_text(denominator: int | None, none: str = "no usual scale") -> str:
+    """Return a map scale as people write it, such as ``1:25,000``."""
+    return none if denominator is None else f"1:{denominator:,}"

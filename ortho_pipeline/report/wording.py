@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.display.notices import Notice, texts_but
-from ortho_pipeline.display.numbers import class_size, metres, plain_size, px, share, short, signed, size_text
+from ortho_pipeline.display.numbers import class_size, metres, plain_size, px, share, short, signed, size_m, size_text
 from ortho_pipeline.errors import counted
 from ortho_pipeline.estimation.blunders import contradicting
 from ortho_pipeline.report.adjustment_records import Adjustment, Bias, Parameter, Rmse, RmseOnGround, RmsesOnGround
-from ortho_pipeline.report.map_scale import PIXEL, POSITION, SCALES, usual_scale
+from ortho_pipeline.report.map_scale import PIXEL, POSITION, scale_text, usual_scale
 from ortho_pipeline.report.matching import MatchingRecord, Tested, is_relative
 from ortho_pipeline.report.records import NOT_TESTED, Dem, FlatGround, Headline, MapScaleRecord, SceneReport
 
@@ -95,14 +95,14 @@ def headline(
 
 
 def verdict(report: SceneReport) -> str:
-    """Say in one sentence what the accuracy suffices for, and under which conditions."""
+    """Say which map scale the accuracy suffices for, and what sets the limit."""
     if refuted(report.notices):
         return NO_SCALE
     found = report.map_scale
     if found is None:
         if report.headline.figure == NOT_TESTED:
-            return "What it is fit for nobody can say: no point tests it."
-        return "What it is fit for depends on the reference: no measured point tests it."
+            return "No map scale can be stated: there are no check points."
+        return "No map scale can be stated: no check point was measured, so the accuracy is relative to the reference."
     return fitness(found)
 
 
@@ -188,23 +188,16 @@ def _rms_of(parts: Iterable[Rmse | None]) -> float | None:
 
 
 def fitness(found: MapScaleRecord, where: str = "") -> str:
-    """Say in one sentence which map scale an accuracy suffices for, `where`, and what limits it."""
-    by_pixel = found.limited_by == "pixel" and found.pixel is not None
-    size, limit = (found.pixel or 0.0, PIXEL) if by_pixel else (found.rmse, POSITION)
-    what = f"pixels of {size:.4g} m are" if by_pixel else f"an RMSE of {size:.4g} m is"
-    larger = max((scale for scale in SCALES if scale < (found.paper_scale or math.inf)), default=None)
-    why = (
-        "" if larger is None else f": {what} more than the {limit * larger:g} m ({1000 * limit:g} mm) of 1 : {larger:,}"
-    )
-    said = f"{scale_text(found.paper_scale, 'maps of 1 : {:,}', 'no usual map scale')}{where}{why}"
-    if by_pixel:
-        said += f"; the RMSE would do for {scale_text(usual_scale(found.rmse / POSITION))}"
-    return f"Fit for {said}." if found.claim else f"By this indication fit for {said}."
-
-
-def scale_text(denominator: int | None, text: str = "1 : {:,}", none: str = "no usual scale") -> str:
-    """Return a map scale in words."""
-    return none if denominator is None else text.format(denominator)
+    """Say which map scale an accuracy suffices for, `where`, and what sets the limit."""
+    error, pixel = f"error ({size_m(found.rmse)})", f"pixel size ({size_m(found.pixel or 0.0)})"
+    by_error, by_pixel = usual_scale(found.rmse / POSITION), usual_scale((found.pixel or 0.0) / PIXEL)
+    limit, other, alone = (pixel, error, by_error) if found.limited_by == "pixel" else (error, pixel, by_pixel)
+    if found.paper_scale is None:
+        return f"Not good enough for a usual map scale{where}: the {limit} is too large."
+    said = f"Good enough for maps at {scale_text(found.paper_scale)}{where}. The {limit} sets this limit"
+    if found.pixel is None or alone == found.paper_scale:
+        return f"{said}."
+    return f"{said}; the {other} alone would allow {scale_text(alone)}."
 
 
 def scale_rules(found: MapScaleRecord) -> list[tuple[str, str, str, str]]:
@@ -212,13 +205,13 @@ def scale_rules(found: MapScaleRecord) -> list[tuple[str, str, str, str]]:
     rows = [("RMSE in plan", "at most 0.25 mm in the map", f"{found.rmse:.4g} m",
              scale_text(usual_scale(found.rmse / POSITION)))]  # fmt: skip
     if found.pixel is not None:
-        rows.append(("Pixels of the image", "at most 0.1 mm in the map", f"{found.pixel:.4g} m",
+        rows.append(("Pixel size", "at most 0.1 mm in the map; the larger of image and ortho", size_m(found.pixel),
                      scale_text(usual_scale(found.pixel / PIXEL))))  # fmt: skip
     survey = f", {found.survey:.4g} m of the check points themselves" if found.survey else ""
     needs = "" if found.claim else f" (a claim needs {ENOUGH_CHECK_POINTS} check points)"
     rows.append(("ASPRS 2023, horizontal class", "RMSE, with that of the check points themselves, up to the next cm",
                  f"{found.rmse:.4g} m{survey}", f"{class_size(found.class_cm)}{needs}"))  # fmt: skip
-    rows.append(("NMAS 1947", "nine of ten points within 1/30 inch in the map, 1/50 from 1 : 20,000 on; pixels do "
+    rows.append(("NMAS 1947", "nine of ten points within 1/30 inch in the map, 1/50 from 1:20,000 on; pixels do "
                  "not count", f"{found.ce90:.4g} m", scale_text(found.nmas_scale)))  # fmt: skip
     return rows
 

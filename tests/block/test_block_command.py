@@ -258,7 +258,7 @@ def test_the_report_is_one_page_in_both_lights(stereo: Stereo, tmp_path: Path) -
     assert page.count('data-plot="network"') == 1
     assert page.count('src="data:image/png;base64,') == 2
     assert '<tr><td>aft_BAND</td><td>fore_BAND</td><td class="n">30</td>' in page
-    assert "By this indication fit for maps of 1 :" in page
+    assert "Good enough for maps at 1:" in page
     network = report["network"]
     assert [(one["first"], one["second"], one["points"]) for one in network["pairs"]] == [("aft_BAND", "fore_BAND", 30)]
     # The cameras look 12 and 16 degrees from the vertical to either side, a little more where the Earth is round.
@@ -301,8 +301,8 @@ def test_the_verdict_leads_with_known_points_that_contradict_the_block(stereo: S
     stereo.ground[9] = truth + np.array([0.0, 0.0, 20.0])
     said = run("adjust", *stereo.images, "--points", stereo.write(), "-o", tmp_path / "near")
     assert verdict_of(tmp_path / "near").startswith("1 of 12 check points contradicts the block (p9): without it 0.")
-    assert "By this indication fit for maps of 1 :" in verdict_of(tmp_path / "near")
-    assert verdict_of(tmp_path / "near").endswith("No fitness is claimed for heights.")
+    assert "Good enough for maps at 1:" in verdict_of(tmp_path / "near")
+    assert verdict_of(tmp_path / "near").endswith("No scale is stated for heights.")
     assert (tmp_path / "near" / "block_report.html").read_text().count('class="doubted"') == 1
     assert "Warning: check point p9: its height is" in said
 

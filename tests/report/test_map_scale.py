@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import pyproj
 import pytest
 
 from ortho_pipeline.estimation.fit import Fit, fit
+from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.points import Points
+from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.report.document import build_report
 from ortho_pipeline.report.map_scale import judge, map_scale, nmas_limit
+from ortho_pipeline.report.records import SceneReport
 from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
 from ortho_pipeline.simulation.terrain import Terrain
 
@@ -22,6 +27,13 @@ def points(control: int, check: int) -> Points:
 
 def adjusted(measured: Points, correction: str = "shift") -> Fit:
     return fit(ImageCorrection(CAMERA, correction, (500.0, 500.0), np.zeros(6)), measured)
+
+
+def made_on(grid: Grid | None) -> SceneReport:
+    """Return the report of a scene whose ortho has a grid."""
+    done = adjusted(points(12, 6))
+    scene = Scene("simulated", "scene.tif", 1000, 1000, {"camera": done.model}, "from a seed", {})
+    return build_report(scene=scene, fit=done, grid=grid)
 
 
 def errors(count: int, rmse: float, seed: int = 0) -> np.ndarray:
@@ -70,8 +82,10 @@ def test_asprs_class_has_the_survey_in_it_and_is_claimed_from_thirty_on():
     assert (found.class_cm, found.claim) == (50, True)
     few = judge(errors(29, 0.30), "check", 0.5)
     assert not few.claim
-    assert "no claim" in few.statement
-    assert "would be" in few.statement
+    assert few.statement == (
+        "1:5,000 (limited by the pixel size). Indicative: 29 check points; ASPRS 2023 asks for 30."
+    )
+    assert "ASPRS 2023 class 50 cm at 30 check points." in found.statement
     assert not judge(errors(200, 0.30), "loo", 0.5).claim
 
 
@@ -84,9 +98,33 @@ def test_the_evidence_is_named():
     control = map_scale(adjusted(points(12, 0)), 2.5)
     assert control is not None
     assert (control.evidence, control.n, control.claim) == ("loo", 12, False)
-    assert "No check points" in control.statement
+    assert "12 control points left out in turn; ASPRS 2023 asks for 30 check points." in control.statement
     raw = map_scale(adjusted(points(40, 0), "none"), 2.5)
     assert raw is not None
     assert (raw.evidence, raw.n, raw.claim) == ("delivered", 40, True)
     assert map_scale(adjusted(points(1, 0)), 2.5) is None
     assert map_scale(adjusted(points(1, 0).select([False]), "none"), 2.5) is None
+
+
+def test_a_pixel_counts_in_two_digits():
+    """2.503 m on the ground is a pixel of 2.5 m: it is no reason for the next smaller scale."""
+    assert (judge(errors(6, 0.48), "check", 2.503).paper_scale, judge(errors(6, 0.48), "check", 2.56).paper_scale) == (
+        25_000, 50_000,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("crs", "step", "pixel"),
+    # At 37.25° N, EPSG:3857 has 42 m for 33.4 m on the ground, and 0.0001° of latitude are 11.1 m.
+    [("EPSG:32636", 10.0, 10.0), ("EPSG:32636", 0.5, None), ("EPSG:3857", 42.0, 33.0), ("EPSG:4326", 1e-4, 11.0)],
+)
+def test_the_larger_of_ground_sample_and_output_pixel_counts(crs, step, pixel):
+    plain = made_on(None)
+    assert plain.map_scale is not None
+    there = pyproj.Transformer.from_crs(4979, crs, always_xy=True).transform(
+        *np.mean([point.lon_lat for point in plain.adjustment.points if point.lon_lat], axis=0)
+    )
+    grid = Grid(pyproj.CRS(crs), there[0], there[1], step, step, 100, 100)
+    found = made_on(grid).map_scale
+    assert found is not None
+    assert found.pixel == (plain.map_scale.pixel if pixel is None else pixel)

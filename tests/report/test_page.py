@@ -198,17 +198,17 @@ def test_the_gravest_notice_comes_first():
     [
         (
             measured(control=10, check=30),
-            r"^Fit for maps of 1 : ([\d,]+): (an RMSE|pixels) of [\d.]+ m \w+ more than the [\d.]+ m \(0\.\d+ mm",
+            r"^Good enough for maps at 1:[\d,]+\. The (error|pixel size) \([\d.]+ m\) sets ",
         ),
-        (measured(), r"^By this indication fit for maps of 1 : [\d,]+: "),
-        (measured(check=0), r"^By this indication fit for maps of 1 : "),
-        (measured().select(np.arange(18) < 1), r"What it is fit for nobody can say"),
+        (measured(), r"^Good enough for maps at 1:[\d,]+\. The "),
+        (measured(check=0), r"^Good enough for maps at 1:"),
+        (measured().select(np.arange(18) < 1), r"^No map scale can be stated: there are no check points"),
     ],
 )
-def test_verdict_is_one_sentence_with_its_conditions(points, said):
+def test_verdict_says_the_scale_and_what_sets_its_limit(points, said):
     text = verdict(made(points))
     assert re.search(said, text)
-    assert text.count(". ") == 0
+    assert text.count(". ") <= 1
     assert text.endswith(".")
 
 
@@ -234,7 +234,7 @@ def test_verdict_leads_with_check_points_that_contradict_the_control(tmp_path, w
     assert f"map scale {NO_SCALE}" in report.summary_text(said)
     report.write_report_html(said, tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert "Fit for maps" not in page
+    assert "Good enough for maps" not in page
     assert "Map scales" not in page
     # Beside the figure, with what it is without them; in the picture in rings; what to do is of these points.
     assert said.adjustment.notices[0]["rest"] == pytest.approx(0.5, abs=0.5)
@@ -243,29 +243,32 @@ def test_verdict_leads_with_check_points_that_contradict_the_control(tmp_path, w
     assert ("off in different ways" if wrong == 3 else f"Measure {names[0]} again") in page
 
 
-def test_a_scale_says_which_larger_one_it_is_too_coarse_for():
+def test_a_scale_says_what_sets_its_limit():
     found = judge(np.full((30, 2), 10.0), "check", None)
     record = MapScaleRecord(**found.to_json())
     assert fitness(record, " in plan") == (
-        "Fit for maps of 1 : 100,000 in plan: an RMSE of 14.14 m is more than the 12.5 m (0.25 mm) of 1 : 50,000."
+        "Good enough for maps at 1:100,000 in plan. The error (14 m) sets this limit."
     )
+    coarse = MapScaleRecord(**judge(np.full((30, 2), 1e5), "check", None).to_json())
+    assert fitness(coarse) == "Not good enough for a usual map scale: the error (140000 m) is too large."
     rows = {rule: (here, result) for rule, _, here, result in scale_rules(record)}
-    assert rows["RMSE in plan"] == ("14.14 m", "1 : 100,000")
+    assert rows["RMSE in plan"] == ("14.14 m", "1:100,000")
     # 14.142 m is 1415 cm: what is rounded is no better than it was.
     assert rows["ASPRS 2023, horizontal class"] == ("14.14 m", "14.2 m")
     assert "pixels" not in " ".join(rows).lower()
 
 
-def test_a_scale_that_pixels_limit_names_the_pixel_and_what_the_rmse_would_do():
+def test_a_scale_that_pixels_limit_names_the_pixel_and_what_the_error_would_allow():
     found = judge(np.full((6, 2), 0.339), "check", 2.53, survey=0.14)
     record = MapScaleRecord(**found.to_json())
     assert fitness(record) == (
-        "By this indication fit for maps of 1 : 50,000: pixels of 2.53 m are more than the 2.5 m (0.1 mm) of "
-        "1 : 25,000; the RMSE would do for 1 : 2,000."
+        "Good enough for maps at 1:25,000. The pixel size (2.5 m) sets this limit; "
+        "the error (0.48 m) alone would allow 1:2,000."
     )
+    assert found.statement.startswith("1:25,000 (limited by the pixel size). Indicative: 6 check points;")
     rows = {rule: (here, result) for rule, _, here, result in scale_rules(record)}
-    assert rows["RMSE in plan"] == ("0.4794 m", "1 : 2,000")
-    assert rows["Pixels of the image"] == ("2.53 m", "1 : 50,000")
+    assert rows["RMSE in plan"] == ("0.4794 m", "1:2,000")
+    assert rows["Pixel size"] == ("2.5 m", "1:25,000")
     assert rows["ASPRS 2023, horizontal class"] == (
         "0.4794 m, 0.14 m of the check points themselves", "50 cm (a claim needs 30 check points)",
     )  # fmt: skip
