@@ -45,7 +45,14 @@ class OrthoError(Exception):
         The field, key, column or option.
     remedy : str, optional
         What the user can do about it.
+
+    Attributes
+    ----------
+    choices : tuple of (str, str)
+        Options of which one decides, each with what it says; the command line prints a command of each.
     """
+
+    choices: tuple[tuple[str, str], ...] = ()
 
     def __init__(
         self,

@@ -40,7 +40,7 @@ def adjust(
     models: tuple[str, ...],
     match: MatchOptions,
     surface: SurfaceOptions,
-    scene: SceneOptions,
+    scene: SceneOptions | list[SceneOptions],
     as_json: bool,
 ) -> None:
     """Adjust several IMAGEs and the points that they share (bundle adjustment of a stereo pair or a block).
@@ -73,7 +73,7 @@ def intersect(
     points: BlockOptions,
     models: tuple[str, ...],
     output: str | None,
-    scene: SceneOptions,
+    scene: SceneOptions | list[SceneOptions],
     as_json: bool,
 ) -> None:
     """Intersect the rays of points that were measured in several IMAGEs: ground coordinates with their sigmas.

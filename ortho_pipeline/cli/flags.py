@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Mapping
 
 import click
@@ -62,7 +63,28 @@ def as_typed(text: str) -> str:
 def name_as_typed(error: OrthoError, command: click.Command) -> None:
     """Let an error name the options of a command as they are typed there."""
     flags = flags_of(command)
+    if error.choices:
+        _offer(error, command, flags)
     error.message = with_flags(error.message, flags)
     error.remedy = None if error.remedy is None else with_flags(error.remedy, flags)
     if error.field is not None:
         error.field = ", ".join(flags.get(part, part) for part in error.field.split(", "))
+
+
+def _offer(error: OrthoError, command: click.Command, flags: Mapping[str, str]) -> None:
+    """Add the command that was typed with each of the options that an error offers, ready to be pasted."""
+    of_each = {f"scene.{one.name[6:]}" for one in command.params if one.multiple and str(one.name).startswith("scene_")}
+
+    def of_image(text: str) -> str:
+        # Of several images, an option names the one that it is of.
+        for name in of_each:
+            text = text.replace(f"`{name}=", f"`{name}={error.file}=")
+        return text
+
+    error.remedy = of_image(error.remedy or "")
+    typed = click.get_current_context().meta.get("command")
+    if typed is None or not all(name in flags for name in (error.field or "").split(", ")):
+        return
+    for option, meaning in error.choices:
+        flag, value = with_flags(of_image(option), flags).split(" ", 1)
+        error.remedy += f"\n    {typed} {flag} {shlex.quote(value)}  # {meaning}"

@@ -61,7 +61,7 @@ def ties(
     match: MatchOptions,
     surface: SurfaceOptions,
     output: str,
-    scene: SceneOptions,
+    scene: SceneOptions | list[SceneOptions],
     as_json: bool,
 ) -> None:
     """Find tie points between overlapping IMAGEs: places that two of them or more show, with their covariances.

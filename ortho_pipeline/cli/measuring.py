@@ -13,7 +13,7 @@ from ortho_pipeline.cli.options import (
     json_option,
     point_options,
     reference_options,
-    scene_options,
+    scenes_options,
     surface_options,
 )
 from ortho_pipeline.cli.parsing import Command
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 )  # fmt: skip
 @click.option("--no-browser", is_flag=True, help="Print the address, and open nothing.")
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="On this machine.  [default: any that is free]")
-@scene_options
+@scenes_options
 @json_option
 def measure(
     images: tuple[str, ...], match: MatchOptions, points: PointOptions, surface: SurfaceOptions, output: str | None,
-    no_browser: bool, port: int, scene: SceneOptions, as_json: bool,
+    no_browser: bool, port: int, scene: SceneOptions | list[SceneOptions], as_json: bool,
 ) -> None:  # fmt: skip
     """Measure points of an IMAGE in the browser, beside its reference in the geometry of the image, or of several.
 
@@ -70,19 +70,24 @@ def measure(
 
             webbrowser.open(address)
 
-    serve(session, scene, ready, port)
+    serve(session, _first(scene), ready, port)
+
+
+def _first(scene: SceneOptions | list[SceneOptions]) -> SceneOptions:
+    """Return the options of the first image; what may be opened is the same for all."""
+    return scene if isinstance(scene, SceneOptions) else scene[0]
 
 
 def _session(
-    images: tuple[str, ...], output: str | None, scene: SceneOptions, points: PointOptions, surface: SurfaceOptions,
-    match: MatchOptions,
+    images: tuple[str, ...], output: str | None, scene: SceneOptions | list[SceneOptions], points: PointOptions,
+    surface: SurfaceOptions, match: MatchOptions,
 ) -> Project:  # fmt: skip
     """Open the session of one image, or of several."""
     name = output or "_".join([*(Path(image).stem for image in images[:2]), "points.geojson"])
     if len(images) == 1:
         from ortho_pipeline.measure.session import open_session
 
-        return open_session(images[0], name, scene=scene, points=points, surface=surface, match=match)
+        return open_session(images[0], name, scene=_first(scene), points=points, surface=surface, match=match)
     from ortho_pipeline.measure.block.session import open_block_session
 
     for field in ("select", "fit_model", "model_crs", "prune", "params", "significance", "ridge", "near"):

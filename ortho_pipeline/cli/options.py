@@ -6,13 +6,15 @@ import functools
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
+from pathlib import Path
 from typing import Any
 
 import click
 
 from ortho_pipeline.cli.flags import FLAGS, with_flags
 from ortho_pipeline.cli.parsing import Megabytes, OneOrTwo
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import (
     BlockOptions,
     MatchOptions,
@@ -146,12 +148,14 @@ def _joined(_: click.Context, __: click.Parameter, groups: Sequence[Sequence[int
 
 
 def _pair(_: click.Context, option: click.Parameter, text: str | None) -> tuple[float, float] | None:
-    if text is None:
-        return None
+    return None if text is None else _numbers(text, str(option.metavar))
+
+
+def _numbers(text: str, form: str) -> tuple[float, float]:
     try:
         column, row = (float(part) for part in text.split(","))
     except ValueError:
-        raise click.BadParameter(f"{text!r} is not {option.metavar}") from None
+        raise click.BadParameter(f"{text!r} is not {form}") from None
     return column, row
 
 
@@ -188,10 +192,66 @@ def _grouped(group: str, options: type, *names: str) -> Decorator:
     return decorate
 
 
-_OF_IMAGES = ("sensor", "rpc", "sensor_options", "allow_network", "roots")
+def _of_each(*names: str) -> Decorator:
+    """Add the options of scenes to a command with `images`; they arrive as those of all, or as a list of each's."""
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(command)
+        def chosen(*, rpcs: Sequence[str], offsets: Sequence[str], scene: SceneOptions, **given: Any) -> Any:
+            return command(scene=_scenes(given["images"], scene, rpcs, offsets), **given)
+
+        @functools.wraps(command)
+        def wrapper(*, scene_rpc: Sequence[str], scene_crop_offset: Sequence[str], **given: Any) -> Any:
+            return grouped(rpcs=scene_rpc, offsets=scene_crop_offset, **given)
+
+        grouped = _grouped("scene", SceneOptions, *names)(chosen)
+        made: Callable[..., Any] = wrapper
+        for field, metavar, text in (
+            ("crop_offset", "IMAGE=COL,ROW", _OFFSET_OF_EACH), ("rpc", "tag|sidecar|IMAGE=FILE", _RPC_OF_EACH)
+        ):  # fmt: skip
+            flag = options_of(SceneOptions)[field].flags
+            made = click.option(flag, f"scene_{field}", multiple=True, metavar=metavar, help=text)(made)
+        return made
+
+    return decorate
+
+
+def _scenes(
+    images: Sequence[str], scene: SceneOptions, rpcs: Sequence[str], offsets: Sequence[str]
+) -> SceneOptions | list[SceneOptions]:
+    """Return the options of all images, or of each."""
+    if not rpcs and not offsets:
+        return scene
+    from ortho_pipeline.commands.block_images import image_named
+
+    scenes = [scene] * len(images)
+    for field, texts in (("rpc", rpcs), ("crop_offset", offsets)):
+        for text in texts:
+            name, equals, value = text.partition("=")
+            if len(images) == 1 and (not equals or os.path.exists(text)):
+                name, value = images[0], text
+            elif field == "rpc" and text in ("tag", "sidecar"):
+                scenes = [replace(one, rpc=text) for one in scenes]
+                continue
+            elif not equals:
+                raise InputError(
+                    f"{text} is said of one image, and there are {len(images)}", field=f"scene.{field}",
+                    remedy=f"name the image: `scene.{field}={Path(images[0]).name}={text}`",
+                )  # fmt: skip
+            number = image_named(name, images, f"scene.{field}")
+            changed: dict[str, Any] = {field: value if field == "rpc" else _numbers(value, "COL,ROW")}
+            scenes[number] = replace(scenes[number], **changed)
+    return scenes
+
+
+_OF_IMAGES = ("sensor", "sensor_options", "allow_network", "roots")
+_RPC_OF_EACH = "Which RPC: 'tag' or 'sidecar' of all images, or a file of one; may be repeated."
+_OFFSET_OF_EACH = "First pixel of an image in the one that its model belongs to, where it is a crop; may be repeated."
 scene_options = _grouped("scene", SceneOptions)
 #: The same for the images of a block, where a saved model cannot take the place of all.
-sensor_options = _grouped("scene", SceneOptions, *_OF_IMAGES)
+sensor_options = _of_each(*_OF_IMAGES)
+#: The same for one image or several.
+scenes_options = _of_each(*_OF_IMAGES, "model")
 point_options = _grouped("points", PointOptions)
 block_options = _grouped("points", BlockOptions, "points", "gcps", "crs", "vertical", "pixel_origin", "check", "model")
 #: The rest of that group, which is taken by its decorator too.

@@ -22,8 +22,8 @@ from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
-from ortho_pipeline.commands.block_images import labels_of, start_of
-from ortho_pipeline.commands.control.block_points import gather, read_points, relative_to_reference
+from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
+from ortho_pipeline.commands.control.block_points import gather, read_points, relative_to_reference, settled_scenes
 from ortho_pipeline.commands.results import Result, attempted, to_store
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
@@ -53,7 +53,7 @@ def adjust(
     images: Sequence[str | os.PathLike[str]],
     folder: str | os.PathLike[str],
     points: BlockOptions,
-    scene: SceneOptions = SceneOptions(),
+    scene: SceneOptions | Sequence[SceneOptions] = SceneOptions(),
     *,
     models: Sequence[str | os.PathLike[str]] = (),
     match: MatchOptions = MatchOptions(),
@@ -68,6 +68,8 @@ def adjust(
         Of one or many scenes; each is opened with its own sensor.
     folder : path
         Where all files go; those of images are called by their stems (with folders ahead where stems are the same).
+    scene : SceneOptions or sequence of SceneOptions
+        How all images are opened, or each.
     models : sequence of path
         Saved models (``*_model.json``) to start from, one for each image in their order; none: each image's own.
     match : MatchOptions
@@ -88,11 +90,11 @@ def adjust(
     """
     labels = labels_of(images)
     files = _files(labels, Path(folder))
-    _check_models(images, models)
-    scenes = [replace(scene, model=model) for model in models] or [scene] * len(images)
-    _check_paths(files, images, points, scene, *models, match=match, surface=surface)
+    scenes = scenes_of(images, scene, models)
+    _check_paths(files, images, points, scenes, *models, match=match, surface=surface)
+    scenes, placed = settled_scenes(images, labels, scenes, points, surface)
     gathered = gather(images, labels, scenes, points, match, surface)
-    table, notes = gathered.table, gathered.notices
+    table, notes = gathered.table, [*placed, *gathered.notices]
     heights = _heights(table)
     starts = {
         label: start_of(image, points, own, table.in_image(label), heights)
@@ -115,7 +117,7 @@ def adjust(
     made = block_report.build_report(
         fit=fit, starts=starts, exported=exported, provenance=record, warnings=[*_warnings(fit, starts), *notes]
     )
-    pictures = _pictures(starts, scene)
+    pictures = _pictures(starts, scenes[0])
     with together(folder, "block"):
         _write(files, made, fit, starts, exported, record)
         failure = attempted(lambda: _write_report(files, made, pictures), files, "report", "html")
@@ -128,7 +130,7 @@ def adjust(
 def intersect(
     images: Sequence[str | os.PathLike[str]],
     points: BlockOptions,
-    scene: SceneOptions = SceneOptions(),
+    scene: SceneOptions | Sequence[SceneOptions] = SceneOptions(),
     *,
     models: Sequence[str | os.PathLike[str]] = (),
     output: str | os.PathLike[str] | None = None,
@@ -137,6 +139,8 @@ def intersect(
 
     Parameters
     ----------
+    scene : SceneOptions or sequence of SceneOptions
+        How all images are opened, or each.
     models : sequence of path
         Saved models (``*_model.json``), one for each image; none: each image's own.
     output : path, optional
@@ -148,22 +152,24 @@ def intersect(
         If there are not as many models as images, and for whatever else the user can correct.
     """
     labels = labels_of(images)
-    _check_models(images, models)
     writer = None if output is None else _writer(output)
     files = {} if output is None else {"points": Path(output)}
-    _check_paths(files, images, points, scene, *models)
-    table, notes = read_points(images, labels, points, scene.allow_network)
+    scenes = scenes_of(images, scene, models)
+    _check_paths(files, images, points, scenes, *models)
+    table, notes = read_points(images, labels, points, scenes[0].allow_network)
     if models:
         plugins.Host.discover()  # model families of plugins, which a file may name
         files_of = dict(zip(labels, models, strict=True))
         chosen = {
-            label: read_model_file(located(path, allow_network=scene.allow_network)).model
+            label: read_model_file(located(path, allow_network=scenes[0].allow_network)).model
             for label, path in files_of.items()
         }
     else:
+        scenes, placed = settled_scenes(images, labels, scenes, points)
+        notes = [*placed, *notes]
         chosen = {
-            label: _own(inputs.open_scene(image, scene), points.model)
-            for label, image in zip(labels, images, strict=True)
+            label: _own(inputs.open_scene(image, own), points.model)
+            for label, image, own in zip(labels, images, scenes, strict=True)
         }
     found = intersect_rays(chosen, table)
     rows = _ground_rows(table, found.ground, found.sigmas, _apart(table, found.ground), found.angles_deg)
@@ -194,14 +200,6 @@ def _own(scene: Any, name: str | None) -> SensorModel:
     return model
 
 
-def _check_models(images: Sequence[str | os.PathLike[str]], models: Sequence[str | os.PathLike[str]]) -> None:
-    if models and len(models) != len(images):
-        raise InputError(
-            f"{counted(len(models), 'model')} for {counted(len(images), 'image')}", field="models",
-            remedy="give one model file for each image, in their order",
-        )  # fmt: skip
-
-
 # -- paths -----------------------------------------------------------------------------------------------------------
 
 
@@ -220,14 +218,14 @@ def _check_paths(
     files: Mapping[str, Path],
     images: Sequence[str | os.PathLike[str]],
     options: BlockOptions,
-    scene: SceneOptions,
+    scenes: Sequence[SceneOptions],
     *more: str | os.PathLike[str],
     match: MatchOptions = MatchOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
 ) -> None:
     if not files:
         return
-    for image in images:
+    for image, scene in zip(images, scenes, strict=True):
         for read in (options.points, options.gcps, *more):
             inputs.check_paths(files, image, scene, PointOptions(gcps=read), surface, match)
 

@@ -50,6 +50,48 @@ def labels_of(images: Sequence[str | os.PathLike[str]]) -> list[str]:
     return labels
 
 
+def scenes_of(
+    images: Sequence[str | os.PathLike[str]],
+    scene: SceneOptions | Sequence[SceneOptions],
+    models: Sequence[str | os.PathLike[str]] = (),
+) -> list[SceneOptions]:
+    """Return how each image is opened: by options of all or of each, and by its saved model if there are such.
+
+    Raises
+    ------
+    InputError
+        If there are not as many as images.
+    """
+    scenes = [scene] * len(images) if isinstance(scene, SceneOptions) else list(scene)
+    for field, given in (("scene", scenes), ("models", models)):
+        if given and len(given) != len(images):
+            what = counted(len(given), field.removesuffix("s"))
+            raise InputError(
+                f"{what} for {counted(len(images), 'image')}", field=field,
+                remedy=f"give one {field.removesuffix('s')} file for each image, in their order"
+                if field == "models" else "give one for each image, in their order",
+            )  # fmt: skip
+    return [replace(one, model=model) for one, model in zip(scenes, models, strict=True)] if models else scenes
+
+
+def image_named(name: str, images: Sequence[str | os.PathLike[str]], field: str) -> int:
+    """Return the number of the image that a name means: its stem or its file, with folders ahead where they differ.
+
+    Raises
+    ------
+    InputError
+        If it means none of them, or several.
+    """
+    meant = [number for number, image in enumerate(images) if _means(name, image)]
+    if len(meant) != 1:
+        which = " or ".join(os.fspath(images[number]) for number in meant)
+        raise InputError(
+            f"{name!r} could mean {which}" if meant else f"no image is called {name!r}", field=field,
+            remedy=f"name one of {', '.join(labels_of(images))}",
+        )  # fmt: skip
+    return meant[0]
+
+
 def points_of_images(
     points: BlockPoints, images: Sequence[str | os.PathLike[str]], labels: Sequence[str], *, whole: bool = True
 ) -> tuple[BlockPoints, list[str]]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.control.crops import open_by_evidence
 from ortho_pipeline.commands.control.points import control_of, has_control, match_asked
 from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
 from ortho_pipeline.commands.placement import source_of
@@ -46,7 +47,7 @@ def fit(
         If there are no points, or a file is wrong (message names file, field and remedy).
     """
     _require_points(points, match)
-    opened = open_adjustable(image, scene, points, match)
+    opened = open_adjustable(image, scene, points, match, surface)
     heights = open_surface(surface, scene, under=[opened]) if has_surface(surface) else None
     adjusted = adjust(opened, points, scene, heights, match)
     return FitResult(
@@ -95,7 +96,7 @@ def compare(
             field="points.params" if points.params else "points.prune",
             remedy="take ortho fit",
         )
-    opened = inputs.open_image(image, scene, needs_model=False)
+    opened = open_by_evidence(lambda: inputs.open_image(image, scene, needs_model=False), scene, points, surface, match)
     names = comparing.choose_models(models, opened.model if opened.models else None)
     heights = open_surface(surface, scene, under=[opened]) if has_surface(surface) else None
     opened = on_surface(opened, heights)

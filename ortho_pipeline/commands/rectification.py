@@ -101,7 +101,7 @@ def rectify(
     begun = states(inputs.given_files(image, scene, points, surface, match, output.fill_from))
     # Before the DEM is read: left alone, GDAL keeps blocks in a share of the machine's memory.
     limit_cache(output.memory, 1)
-    opened = open_adjustable(image, scene, points, match)
+    opened = open_adjustable(image, scene, points, match, surface)
     heights = open_surface(surface, scene, output.memory, [opened])
     acquired, sun = _acquired(opened.facts, output), sun_of(opened.facts, output)
     read = inputs.files_read(image, scene, points, surface, match, opened, output.fill_from, heights)
@@ -168,7 +168,7 @@ def check(
         As `rectify`.
     """
     require_heights(surface)
-    opened = open_adjustable(image, scene, points, match)
+    opened = open_adjustable(image, scene, points, match, surface)
     _acquired(opened.facts, output)
     sun_of(opened.facts, output)
     placed = place_scene(opened, points, scene, open_surface(surface, scene, output.memory, [opened]), output, match)
@@ -213,7 +213,7 @@ def export(
     stem = Path(image).stem
     files = {name: Path(folder) / f"{stem}{formats_of_models.ENDINGS[name]}" for name in formats}
     inputs.check_paths(files, image, scene, points, surface, match)
-    opened = open_adjustable(image, scene, points, match)
+    opened = open_adjustable(image, scene, points, match, surface)
     heights = open_surface(surface, scene, under=[opened]) if has_surface(surface) else None
     adjusted = adjust(opened, points, scene, heights, match)
     dataset = raster.open_dataset(image, **scene.access)

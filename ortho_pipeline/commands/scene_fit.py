@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.control.crops import open_by_evidence
 from ortho_pipeline.commands.control.matching import Matched
 from ortho_pipeline.commands.control.points import control_of, has_control, with_heights
 from ortho_pipeline.display.notices import Notice
@@ -24,7 +26,7 @@ from ortho_pipeline.estimation.ground_residuals import in_metres
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.points.control_hull import uncovered
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
@@ -148,9 +150,15 @@ class Adjusted:
 
 
 def open_adjustable(
-    image: Any, scene: SceneOptions, points: PointOptions, match: MatchOptions = MatchOptions()
+    image: Any,
+    scene: SceneOptions,
+    points: PointOptions,
+    match: MatchOptions = MatchOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
 ) -> Scene:
     """Open the scene; only where a model family is fitted may it be without a model of its own.
+
+    Points, heights and matches settle whether the model of a crop belongs to it.
 
     Raises
     ------
@@ -168,7 +176,8 @@ def open_adjustable(
             raise InputError(
                 "`points.ridge` regularises a fitted model", field="points.ridge", remedy="give `points.fit_model`"
             )
-        return inputs.open_scene(image, scene)
+        opening = functools.partial(inputs.open_scene, image, scene)
+        return open_by_evidence(opening, scene, points, surface, match)
     if scene.model is not None or points.correction is not None:
         other = "scene.model" if scene.model is not None else "points.correction"
         raise InputError(
@@ -185,7 +194,8 @@ def open_adjustable(
             f"no model is called {points.fit_model!r}", field="points.fit_model",
             remedy=f"one of {', '.join(family.name for family in families())} (see `ortho models`)",
         )  # fmt: skip
-    return inputs.open_image(image, scene, needs_model=False)
+    opening = functools.partial(inputs.open_image, image, scene, needs_model=False)
+    return open_by_evidence(opening, scene, points, surface, match)
 
 
 def on_surface(scene: Scene, surface: Surface | None) -> Scene:

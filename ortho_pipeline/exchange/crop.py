@@ -2,24 +2,77 @@
 
 A model belongs to the pixels of the image that it came with. GDAL moves an RPC along when it crops; other programs
 leave the RPC as it was and note the place of the crop as a geotransform in pixels (column, 1, 0, row, 0, 1).
+
+Which of both was done, the numbers of an RPC do not tell: its range may begin before the first pixel of its image. So
+the decision needs evidence: the size of the whole image in the metadata, or a range that excludes one of the two.
+Commands have more (`commands.control.crops`): heights, points, matches. Without evidence opening stops.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.rpc_files import size_of_image
+from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC, Cropped, ImageCorrection, SensorModel
+from ortho_pipeline.models.base import Array
 
 #: Below this part of the size for which an RPC is meant, an image is remarkably small.
 _SMALL = 0.5
-#: An RPC whose range of pixels begins this near to the image's first pixel (in parts of the range) is of the whole.
-_AT_THE_START = 0.05
+#: An RPC's range covers an image if it begins and ends not later and not earlier than so (in parts of the range).
+_COVERED = 0.05
+#: A hypothesis is right if it leaves at most this part of the distance between the two.
+_CLOSE = 0.25
+#: The last row and column of the whole image, as Airbus' products name them in the tags of their images.
+_GML_SIZE = re.compile(r"<gml:high>\s*(\d{1,7})\s+(\d{1,7})\s*</gml:high>")
+
+
+class UndecidedCrop(InputError):
+    """A crop notes its place, and nothing says whether its RPC has been moved there already.
+
+    Parameters
+    ----------
+    scene : Scene
+        With the models as they were read.
+    offset : (float, float)
+        The first pixel of the crop in the whole image, as the image notes it.
+    """
+
+    def __init__(self, scene: Scene, offset: tuple[float, float]) -> None:
+        self.scene, self.offset = scene, offset
+        moved, kept = f"`scene.crop_offset={offset[0]:g},{offset[1]:g}`", "`scene.crop_offset=0,0`"
+        super().__init__(
+            f"this image is a crop that begins at {_text(offset)} of a larger image, and nothing shows whether its RPC "
+            "belongs to the crop or to the larger image",
+            file=scene.path, field="scene.crop_offset",
+            remedy=f"give {moved} if the RPC belongs to the larger image, or {kept} if it belongs to this crop; "
+            "control points, a DEM of the crop alone, or a reference decide it too",
+        )  # fmt: skip
+        self.choices = ((moved, "the RPC belongs to the larger image"), (kept, "the RPC belongs to this crop"))
+
+    def __reduce__(self) -> Any:
+        # A scene need not cross the border of a process: what there is to read does.
+        function, (_, *told) = super().__reduce__()
+        return function, (InputError, *told)
+
+    @property
+    def both(self) -> tuple[Scene, Scene]:
+        """The scene as it is, and with its models moved to the crop."""
+        return self.scene, _with_models_moved(self.scene, self.offset)
+
+    def settled(self, moved: bool, why: str) -> Scene:
+        """Return the scene as it is by evidence, with a notice."""
+        return _settled(self.scene, self.offset, moved, why)
 
 
 def checked(offset: Sequence[float]) -> tuple[float, float]:
@@ -73,19 +126,26 @@ def placed(scene: Scene, dataset: Any, offset: Sequence[float] | None = None) ->
     ------
     InputError
         If the offset is none.
+    UndecidedCrop
+        If the image notes an offset, and nothing shows whether its RPC is of the whole.
     """
     if offset is not None:
-        place = checked(offset)
-        text = f"the image is taken for a crop whose first pixel is {_text(place)} of the whole"
-        return _moved(scene, place, Notice("crop-stated", text, offset=place))
+        stated = checked(offset)
+        text = f"the image is taken for a crop whose first pixel is {_text(stated)} of the whole"
+        return _moved(scene, stated, Notice("crop-stated", text, offset=stated))
     noted = noted_offset(dataset)
-    if noted is not None and _is_of_the_whole(scene, noted):
-        text = (
-            f"the image notes that it is a crop whose first pixel is {_text(noted)} of the whole, and so the model was "
-            "moved; if it is not, give `scene.crop_offset=0,0`"
-        )
-        return _moved(scene, noted, Notice("crop-noted", text, offset=noted))
-    remark = _elsewhere(scene) or (None if noted is not None else _small(scene))
+    if noted is None:
+        remark = _elsewhere(scene) or _small(scene)
+        return scene if remark is None else replace(scene, warnings=(*scene.warnings, remark))
+    if not isinstance(scene.model, RPC):
+        return _settled(scene, noted, True, "other models than RPCs are of the whole image")
+    ranges = _ranges(scene.model)
+    decided = _by_size(scene, dataset, ranges, noted) or _by_range(scene, ranges, noted)
+    if decided is None:
+        raise UndecidedCrop(scene, noted)
+    if decided[0]:
+        return _settled(scene, noted, *decided)
+    remark = _elsewhere(scene)
     return scene if remark is None else replace(scene, warnings=(*scene.warnings, remark))
 
 
@@ -101,11 +161,27 @@ def moved(model: SensorModel, offset: tuple[float, float]) -> SensorModel:
     return Cropped(model, offset)
 
 
+def nearer(kept: float, moved: float, offset: tuple[float, float]) -> bool | None:
+    """Tell whether a model is to be moved, of its distance (px) from the evidence as it is and if it is moved.
+
+    None where the better of both leaves more than a quarter of the distance between them.
+    """
+    if not min(kept, moved) <= _CLOSE * math.hypot(*offset):
+        return None
+    return moved < kept
+
+
 def _moved(scene: Scene, offset: tuple[float, float], said: Notice) -> Scene:
-    column, row = offset
     if offset == (0.0, 0.0):
         return scene
-    found = replace(
+    found = _with_models_moved(scene, offset)
+    remark = _elsewhere(found)
+    return replace(found, warnings=(*scene.warnings, said, *([] if remark is None else [remark])))
+
+
+def _with_models_moved(scene: Scene, offset: tuple[float, float]) -> Scene:
+    column, row = offset
+    return replace(
         scene,
         models={name: moved(model, offset) for name, model in scene.models.items()},
         pieces=tuple(
@@ -113,34 +189,92 @@ def _moved(scene: Scene, offset: tuple[float, float], said: Notice) -> Scene:
         ),
         facts={**scene.facts, "crop_offset": [column, row]},
     )
-    remark = _elsewhere(found)
-    return replace(found, warnings=(*scene.warnings, said, *([] if remark is None else [remark])))
 
 
-def _ranges(model: SensorModel) -> list[tuple[float, float]] | None:
-    """Return the first and last column and row for which an RPC is meant."""
-    if not isinstance(model, RPC):
+def _settled(scene: Scene, offset: tuple[float, float], is_moved: bool, why: str) -> Scene:
+    where = f"this image is a crop that begins at {_text(offset)} of a larger image"
+    if is_moved:
+        text = f"{where}, and its model was moved there ({why}); if it belongs to the crop: `scene.crop_offset=0,0`"
+        return _moved(scene, offset, Notice("crop-noted", text, offset=offset))
+    other = f"`scene.crop_offset={offset[0]:g},{offset[1]:g}`"
+    text = f"{where}, and its model belongs to the crop ({why}); if it belongs to the larger image: {other}"
+    return replace(scene, warnings=(*scene.warnings, Notice("crop-kept", text, offset=offset)))
+
+
+# -- evidence in the image and its RPC -------------------------------------------------------------------------------
+
+
+def _by_size(scene: Scene, dataset: Any, ranges: Array, offset: tuple[float, float]) -> tuple[bool, str] | None:
+    """Return whether the RPC is of the whole image, of whose size metadata tell; None where they do not."""
+    size = scene.width, scene.height
+    own = size_of_image(place(scene.model_source))
+    if own is not None and (own == size or fits(size, own, offset)):
+        return own != size, f"the file of the RPC is of an image of {own[0]} x {own[1]} pixels"
+    whole = _size_of_whole(dataset)
+    if whole is None or not fits(size, whole, offset):
         return None
-    sides = ((model.col_off, model.col_scale), (model.row_off, model.row_scale))
-    return [(off - abs(scale), off + abs(scale)) for off, scale in sides]
+    # The middle of the range is that of the image, however far the range reaches beyond it on both sides.
+    middle = ranges.mean(axis=1) - np.array(whole) / 2
+    decided = nearer(float(np.hypot(*(middle + offset))), float(np.hypot(*middle)), offset)
+    return None if decided is None else (decided, f"by the size of the whole, {whole[0]} x {whole[1]} pixels")
 
 
-def _is_of_the_whole(scene: Scene, offset: tuple[float, float]) -> bool:
-    """Tell whether a noted offset is still to be applied: GDAL keeps the note, but moves the RPC along."""
-    ranges = _ranges(scene.model)
-    if ranges is None:
-        return True
-    # An RPC begins at the first pixel of its image: of the whole, or as far before that of the crop as that lies in it.
-    whole = math.hypot(*(first for first, _ in ranges))
-    along = math.hypot(*(first + place for (first, _), place in zip(ranges, offset, strict=True)))
-    return whole <= along
+def _size_of_whole(dataset: Any) -> tuple[int, int] | None:
+    """Return columns and rows of the vendor's image, where the metadata of a crop still tell them."""
+    described, delivered = dataset.GetMetadata() or {}, dataset.GetMetadata("IMD") or {}
+    if match := _GML_SIZE.search(str(described.get("gml.root-instance", ""))[:20_000]):
+        return int(match[2]), int(match[1])
+    columns, rows = (str(delivered.get(key, "")).strip() for key in ("numColumns", "numRows"))
+    return (int(columns), int(rows)) if columns.isdecimal() and rows.isdecimal() else None
+
+
+def _by_range(scene: Scene, ranges: Array, offset: tuple[float, float]) -> tuple[bool, str] | None:
+    """Return whether the RPC is of the whole image, where its range is possible for one of the two alone.
+
+    The range of an RPC covers its image, and may reach far beyond it. Of one that was moved along it covers what of the
+    whole image lies before the crop; of one that was made for the crop it lies evenly about that.
+    """
+    size, first_of_crop = np.array((scene.width, scene.height)), np.array(offset)
+    slack = _COVERED * np.ptp(ranges, axis=1)
+
+    def covers(first: Array, last: Array) -> bool:
+        return bool((ranges[:, 0] <= first + slack).all() and (ranges[:, 1] >= last - slack).all())
+
+    evenly = bool((np.abs(ranges.mean(axis=1) - size / 2) <= slack).all())
+    of_whole = covers(np.minimum(0.0, first_of_crop), first_of_crop + size)
+    of_crop = covers(np.minimum(0.0, -first_of_crop), size) or (covers(np.zeros(2), size) and evenly)
+    # A program that moved the RPC wrote it into the crop; a range that begins elsewhere tells nothing of either.
+    in_the_crop = not place(scene.model_source).is_file()
+    if of_crop and of_whole and in_the_crop and (np.abs(ranges[:, 0] + first_of_crop) <= 1.0).all():
+        return False, "the range of the RPC in the crop begins at the first pixel of the larger image"
+    if of_crop == of_whole:
+        return None
+    return of_whole, f"for the {'crop' if of_whole else 'larger image'} its range would be too small"
+
+
+def _ranges(model: RPC) -> Array:
+    """Return the first and last column, and the first and last row, for which an RPC is meant ``(2, 2)``.
+
+    Some programs write new offsets and scales of pixels with coefficients that undo them: then it is the image of the
+    ground for which the RPC is meant.
+    """
+    middle, half = np.array([model.col_off, model.row_off]), np.abs([model.col_scale, model.row_scale])
+    stated = np.stack([middle - half, middle + half], axis=1)
+    centre, reach = model.domain
+    if (np.abs(model.ground_to_image([centre])[0] - middle) <= half).all():
+        return stated
+    corners = model.ground_to_image([centre + reach * signs for signs in itertools.product((-1, 0, 1), repeat=3)])
+    corners = corners[np.isfinite(corners).all(axis=1)]
+    return np.stack([corners.min(axis=0), corners.max(axis=0)], axis=1) if len(corners) else stated
 
 
 def _elsewhere(scene: Scene) -> Notice | None:
-    """Return a warning where the RPC is meant for pixels none of which are in the image."""
-    ranges = _ranges(scene.model)
-    size = scene.width, scene.height
-    if ranges is None or all(first <= side and last >= 0 for (first, last), side in zip(ranges, size, strict=True)):
+    """Return a warning where the RPC is meant for other ground than that of the image."""
+    model, size = scene.model, (scene.width, scene.height)
+    if not isinstance(model, RPC):
+        return None
+    ranges = _ranges(model)
+    if all(first <= side and last >= 0 for (first, last), side in zip(ranges, size, strict=True)):
         return None
     (left, right), (top, bottom) = ranges
     text = (
@@ -148,16 +282,16 @@ def _elsewhere(scene: Scene) -> Notice | None:
         f"this image of {scene.width} x {scene.height} pixels: is it a crop with the RPC of the whole? Say where "
         "it lies with `scene.crop_offset=COL,ROW`"
     )
-    return Notice("rpc-elsewhere", text, columns=[left, right], rows=[top, bottom])
+    return Notice("rpc-elsewhere", text, **dict(zip(("columns", "rows"), ranges.tolist(), strict=True)))
 
 
 def _small(scene: Scene) -> Notice | None:
     """Return a notice where the image is much smaller than what its RPC is meant for, and may be a crop of that."""
-    ranges = _ranges(scene.model)
-    if ranges is None:
+    if not isinstance(scene.model, RPC):
         return None
-    sizes = [last - first for first, last in ranges]
-    begins = all(abs(first) <= _AT_THE_START * size for (first, _), size in zip(ranges, sizes, strict=True))
+    ranges = _ranges(scene.model)
+    sizes = np.ptp(ranges, axis=1).tolist()
+    begins = all(abs(first) <= _COVERED * size for first, size in zip(ranges[:, 0], sizes, strict=True))
     small = scene.width < _SMALL * sizes[0] or scene.height < _SMALL * sizes[1]
     if not (begins and small):
         return None

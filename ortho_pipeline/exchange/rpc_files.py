@@ -20,9 +20,11 @@ import math
 import re
 from collections.abc import Mapping
 from os import PathLike
+from pathlib import Path
 
 from ortho_pipeline import files
 from ortho_pipeline.errors import InputError, completed, reads
+from ortho_pipeline.files.locations import VsiPath
 from ortho_pipeline.models.rational import RPC
 
 #: Files of more bytes are refused unread: XML, and the other formats, of which 20 kB are usual.
@@ -101,6 +103,14 @@ def read_rpc_text(path: str | PathLike[str]) -> RPC:
     else:
         fields, origin = _fields_of_lines(text, path), 0.0
     return rpc_of_fields(fields, path, origin=origin)
+
+
+def size_of_image(path: Path | VsiPath) -> tuple[int, int] | None:
+    """Return columns and rows of the image that a file of an RPC says it is of; None where it does not say."""
+    if path.suffix.lower() != ".geom" or not path.is_file():
+        return None
+    found = dict(re.findall(r"^\s*number_(samples|lines):\s*(\d{1,9})\s*$", _text_of(path), re.MULTILINE | re.ASCII))
+    return (int(found["samples"]), int(found["lines"])) if len(found) == 2 else None
 
 
 def rpc_of_fields(fields: Mapping[str, str], file: str | PathLike[str] | None = None, *, origin: float = 0.0) -> RPC:

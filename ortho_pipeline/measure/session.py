@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.control.crops import open_by_evidence
 from ortho_pipeline.commands.control.matching import open_reference_views, search_of
 from ortho_pipeline.commands.control.points import read_control, with_heights
 from ortho_pipeline.commands.fitting import compare
@@ -218,7 +220,8 @@ def open_session(
         raise InputError("the reference is shown by the scene's own model", field="points.fit_model",
                          remedy="leave it out, and fit the model to the saved points")  # fmt: skip
     require_heights(surface)
-    opened = inputs.open_scene(image, scene)
+    opening = functools.partial(inputs.open_scene, image, scene)
+    opened = open_by_evidence(opening, scene, points, surface, match)
     heights: Surface = open_surface(surface, scene, under=[opened])
     opened = on_surface(opened, heights)
     view, references = open_reference_views(opened, match, heights, scene)

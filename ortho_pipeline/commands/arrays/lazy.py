@@ -77,7 +77,7 @@ def ortho_array(
     surface = dem if isinstance(dem, SurfaceOptions) else SurfaceOptions(dem=dem)
     require_heights(surface)
     given = PointOptions(gcps=points) if isinstance(points, Points) else points
-    opened = open_adjustable(image, scene, given, match)
+    opened = open_adjustable(image, scene, given, match, surface)
     heights = open_surface(surface, scene, output.memory, [opened])
     placed = place_scene(opened, given, scene, heights, output, match)
     path = opened.path if isinstance(image, Scene) else image

@@ -14,6 +14,7 @@ from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.block.points import BlockPoints, joined
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import points_of_images
+from ortho_pipeline.commands.control.crops import settled_options
 from ortho_pipeline.commands.control.matching import match_scene
 from ortho_pipeline.commands.control.ties import tie_scenes
 from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface, require_heights
@@ -90,6 +91,30 @@ def gather(
             document |= found.document
             text += found.text
     return Gathered(joined(labels, tables), notices, document, text, heights)
+
+
+def settled_scenes(
+    images: Sequence[str | os.PathLike[str]],
+    labels: Sequence[str],
+    scenes: Sequence[SceneOptions],
+    options: BlockOptions,
+    surface: SurfaceOptions = SurfaceOptions(),
+) -> tuple[list[SceneOptions], list[Notice]]:
+    """Return how images are opened, with the place of crops that their points or the DEM settle, and notices.
+
+    Raises
+    ------
+    UndecidedCrop
+        If neither settles it.
+    """
+
+    def points_in(number: int) -> Points | None:
+        if options.points is None:
+            return None
+        table, _ = read_points(images, labels, options, scenes[number].allow_network, whole=False)
+        return table.in_image(labels[number])
+
+    return settled_options(images, scenes, surface, points_in)
 
 
 def _refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: SurfaceOptions) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.control.crops import open_by_evidence
 from ortho_pipeline.commands.control.matching import match_scene
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
 from ortho_pipeline.commands.results import Result, attempted, to_store
@@ -64,7 +65,8 @@ def match(
     files |= _page(report)
     require_heights(surface)
     inputs.check_paths(files, image, scene, PointOptions(), surface, match)
-    opened = inputs.open_scene(image, scene)
+    opening = functools.partial(inputs.open_scene, image, scene)
+    opened = open_by_evidence(opening, scene, surface=surface, match=match)
     heights = open_surface(surface, scene, under=[opened])
     adjusted = None if report is None else adjust(opened, PointOptions(), scene, heights, match)
     matched = None if adjusted is None else adjusted.matched

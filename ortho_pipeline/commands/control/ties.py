@@ -15,7 +15,8 @@ import pyproj
 
 from ortho_pipeline.block.points import BlockPoints, shape_of
 from ortho_pipeline.commands import inputs
-from ortho_pipeline.commands.block_images import labels_of
+from ortho_pipeline.commands.block_images import labels_of, scenes_of
+from ortho_pipeline.commands.control.crops import settled_options
 from ortho_pipeline.commands.control.matching import search_of
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
 from ortho_pipeline.commands.results import Result, to_store
@@ -187,7 +188,7 @@ def ties(
     output: str | os.PathLike[str],
     match: MatchOptions = MatchOptions(),
     *,
-    scene: SceneOptions = SceneOptions(),
+    scene: SceneOptions | Sequence[SceneOptions] = SceneOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
 ) -> Result:
     """Find tie points between overlapping scenes and write them as points of a block.
@@ -196,6 +197,8 @@ def ties(
     ----------
     output : path
         A ``.csv`` file (docs/formats/block-points.md), written whole or not at all.
+    scene : SceneOptions or sequence of SceneOptions
+        How all images are opened, or each.
 
     Raises
     ------
@@ -207,13 +210,16 @@ def ties(
     if files["ties"].suffix.lower() != ".csv":
         raise InputError("ties are not written in this format", file=output, field="output", remedy="give a .csv file")
     require_heights(surface)
-    for image in images:
-        inputs.check_paths(files, image, scene, PointOptions(), surface)
-    scenes = {name: inputs.open_scene(image, scene) for name, image in zip(names, images, strict=True)}
-    heights = open_surface(surface, scene, under=scenes.values())
-    tied = tie_scenes(scenes, match, heights, scene)
+    given = scenes_of(images, scene)
+    for image, own in zip(images, given, strict=True):
+        inputs.check_paths(files, image, own, PointOptions(), surface)
+    given, placed = settled_options(images, given, surface)
+    opened = (inputs.open_scene(image, own) for image, own in zip(images, given, strict=True))
+    scenes = dict(zip(names, opened, strict=True))
+    heights = open_surface(surface, given[0], under=scenes.values())
+    tied = tie_scenes(scenes, match, heights, given[0])
     write_text(output, _csv(tied.points))
-    notices = [notice.in_image(name) for name, one in scenes.items() for notice in one.notices]
+    notices = placed + [notice.in_image(name) for name, one in scenes.items() for notice in one.notices]
     return Result(files, {"ties": tied.to_json(), **to_document([*notices, *tied.notices])}, tied.summary())
 
 

@@ -38,7 +38,7 @@ def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
         bound.apply_defaults()
         given = bound.arguments
         place = next((name for name, value in given.items() if isinstance(value, SceneOptions)), None)
-        scene = SceneOptions() if place is None else cast(SceneOptions, given[place])
+        scene = _of_first(given) if place is None else cast(SceneOptions, given[place])
         for name, value in given.items():
             if name == _IMAGE:
                 given[name], scene = resolved(value, scene)
@@ -55,6 +55,12 @@ def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
         return command(*bound.args, **bound.kwargs)
 
     return wrapper
+
+
+def _of_first(given: dict[str, Any]) -> SceneOptions:
+    """Return how the first image is opened, where there are options for each: their permissions are the same."""
+    lists = (value for value in given.values() if isinstance(value, list | tuple) and value)
+    return next((value[0] for value in lists if isinstance(value[0], SceneOptions)), SceneOptions())
 
 
 def resolved(image: Any, scene: SceneOptions) -> tuple[Any, SceneOptions]:

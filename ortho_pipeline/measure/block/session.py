@@ -12,8 +12,8 @@ import numpy as np
 
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
-from ortho_pipeline.commands.block_images import labels_of, start_of
-from ortho_pipeline.commands.control.block_points import read_points
+from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
+from ortho_pipeline.commands.control.block_points import read_points, settled_scenes
 from ortho_pipeline.commands.control.matching import search_of
 from ortho_pipeline.commands.control.ties import DEM_SIGMA, FLAT_SIGMA, names_of
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
@@ -72,13 +72,14 @@ class BlockSession(Project):
 
     def __init__(
         self, images: BlockImages, references: tuple[Reference, ...], output: Path, options: BlockOptions,
-        opened: SceneOptions = SceneOptions(), match: MatchOptions = MatchOptions(),
+        opened: Sequence[SceneOptions] = (), match: MatchOptions = MatchOptions(),
         heights: SurfaceOptions = SurfaceOptions(),
     ) -> None:  # fmt: skip
         surface = images.places[0].surface
         maps = [Sheet(one, surface) for one in references]
         super().__init__(output, surface, [one.view for one in images.places], maps)
-        self.images, self._options, self._opened, self._heights = images, options, opened, heights
+        self.images, self._options, self._heights = images, options, heights
+        self._opened = list(opened) or [SceneOptions()] * len(images.paths)
         self._starts: dict[str | None, dict[str, Start]] = {}
         self._search = [
             search_of(scene, match, metres_per_pixel(one.view)).distance / metres_per_pixel(one.view)
@@ -116,7 +117,7 @@ class BlockSession(Project):
         if self._options.points is None:
             return None
         images = self.images
-        table, _ = read_points(images.paths, images.labels, self._options, self._opened.allow_network, whole=False)
+        table, _ = read_points(images.paths, images.labels, self._options, self._opened[0].allow_network, whole=False)
         return marks_of_block(table, now())
 
     def _document(self) -> dict[str, Any]:
@@ -137,8 +138,8 @@ class BlockSession(Project):
         if correction not in self._starts:
             asked = replace(self._options, points=None, correction=correction or self._options.correction)
             self._starts[correction] = {
-                label: start_of(path, asked, self._opened, _nothing(), None)
-                for label, path in zip(self.images.labels, self.images.paths, strict=True)
+                label: start_of(path, asked, opened, _nothing(), None)
+                for label, path, opened in zip(self.images.labels, self.images.paths, self._opened, strict=True)
             }
         return self._starts[correction]
 
@@ -261,8 +262,8 @@ class BlockSession(Project):
             asked = self._asked()
         label, folder = self.images.labels[number], self.output.with_name(f"{self.output.stem}_ortho")
         block = adjust(self.images.paths, folder / "block", asked, self._opened)
-        opened = replace(self._opened, model=block.files[f"{label} model"])
-        path = self.images.paths[number]
+        path, own = self.images.paths[number], self._opened[number]
+        opened = SceneOptions(model=block.files[f"{label} model"], allow_network=own.allow_network, roots=own.roots)
         return rectify(path, folder / label, scene=opened, surface=self._heights, progress=progress)
 
 
@@ -277,7 +278,7 @@ def open_block_session(
     images: Sequence[str | os.PathLike[str]],
     output: str | os.PathLike[str],
     *,
-    scene: SceneOptions = SceneOptions(),
+    scene: SceneOptions | Sequence[SceneOptions] = SceneOptions(),
     points: BlockOptions = BlockOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
     match: MatchOptions = MatchOptions(),
@@ -288,6 +289,8 @@ def open_block_session(
     ----------
     output : path
         A ``.geojson`` file.
+    scene : SceneOptions or sequence of SceneOptions
+        How all images are opened, or each.
 
     Raises
     ------
@@ -297,17 +300,20 @@ def open_block_session(
     path = points_file(output)
     require_heights(surface)
     labels, names = labels_of(images), names_of(images)
-    for image in images:
-        inputs.check_paths({"points": path}, image, scene, PointOptions(), surface, match)
-    alone = [inputs.open_scene(image, scene) for image in images]
-    heights = open_surface(surface, scene, under=alone)
+    given = scenes_of(images, scene)
+    for image, own in zip(images, given, strict=True):
+        inputs.check_paths({"points": path}, image, own, PointOptions(), surface, match)
+    given, _ = settled_scenes(images, labels, given, points, surface)
+    alone = [inputs.open_scene(image, own) for image, own in zip(images, given, strict=True)]
+    access = given[0].access
+    heights = open_surface(surface, given[0], under=alone)
     scenes = tuple(on_surface(one, heights) for one in alone)
     bands = match.reference_bands or ()
-    references = open_references(match.reference, bands, **scene.access) if match.reference else ()
+    references = open_references(match.reference, bands, **access) if match.reference else ()
     places = tuple(
-        Places(View(Intensity(RasterSource(*(one.rasters or (one.path,)), **scene.access)), one.model, heights),
+        Places(View(Intensity(RasterSource(*(one.rasters or (one.path,)), **access)), one.model, heights),
                references)
         for one in scenes
     )  # fmt: skip
     known = BlockImages(tuple(os.fspath(image) for image in images), tuple(labels), tuple(names), scenes, places)
-    return BlockSession(known, references, path, points, scene, match, surface)
+    return BlockSession(known, references, path, points, given, match, surface)

@@ -76,6 +76,7 @@ _KNOW: dict[str, str] = {
     "no-rpc": "Use the ortho or the model file; programs that need an RPC cannot have one.",
     "crop-stated": "Nothing, if the offset is right.",
     "crop-noted": "Nothing.",
+    "crop-kept": "Nothing.",
     "rigorous-left-out": "Nothing, if the RPC is the model that you want.",
     "part-left-out": "Rectify the other parts as scenes of their own.",
     "radar-on-a-plane": "Give a DEM.",
