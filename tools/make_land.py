@@ -9,13 +9,35 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
-from shapely.geometry import Polygon
+import numpy as np
+from shapely import intersection
+from shapely.affinity import translate
+from shapely.geometry import Polygon, box
 
 #: Islands smaller than this (square degrees) and details smaller than that (degrees) are less than a pixel.
 SMALLEST, DETAIL = 3.0, 0.6
+#: The southern edge of the map.
+SOUTH = -60.0
 TARGET = Path(__file__).resolve().parent.parent / "ortho_pipeline" / "report" / "page" / "land.json"
+
+
+def parts(ring: list[tuple[float, float]]) -> Iterator[Polygon]:
+    """Yield what a map from 180° W to 180° E shows of a ring that may cross the antimeridian.
+
+    TopoJSON joins the halves of such land: drawn as it is, its outline would run once around the world.
+    """
+    lon, lat = np.array(ring).T
+    lon = np.unwrap(lon, period=360.0)
+    # Antarctica runs around the pole and does not close; the map ends north of it.
+    if lat.max() <= SOUTH or abs(lon[-1] - lon[0]) > 180.0:
+        return
+    whole = Polygon(np.column_stack([lon, lat])).buffer(0)
+    for turn in (-360.0, 0.0, 360.0):
+        shown = intersection(translate(whole, turn), box(-180.0, SOUTH, 180.0, 90.0))
+        yield from (part for part in getattr(shown, "geoms", [shown]) if isinstance(part, Polygon))
 
 
 def main(source: str) -> None:
@@ -33,10 +55,10 @@ def main(source: str) -> None:
     for geometry in topology["objects"]["land"]["geometries"]:
         for outer, *_ in geometry["arcs"] if geometry["type"] == "MultiPolygon" else [geometry["arcs"]]:
             ring = [place for k in outer for place in (arcs[k] if k >= 0 else arcs[~k][::-1])]
-            polygon = Polygon(ring)
-            if polygon.area >= SMALLEST:
-                shape = polygon.simplify(DETAIL)
-                rings.append([[round(10 * lon), round(10 * lat)] for lon, lat in shape.exterior.coords])
+            for polygon in parts(ring):
+                if polygon.area >= SMALLEST:
+                    shape = polygon.simplify(DETAIL)
+                    rings.append([[round(10 * lon), round(10 * lat)] for lon, lat in shape.exterior.coords])
     TARGET.write_text(json.dumps(rings, separators=(",", ":")) + "\n", encoding="ascii")
 
 

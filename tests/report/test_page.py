@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import itertools
 import json
 import math
 import re
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
+import shapely
 from osgeo import gdal
 
 from ortho_pipeline.display.drawing import Drawing
@@ -24,6 +26,7 @@ from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.gallery.points import SIDE, point_chips
 from ortho_pipeline.report.map_scale import judge
+from ortho_pipeline.report.page import locator
 from ortho_pipeline.report.page.advice import WORDS, advised, signals
 from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import degrees, plot_ortho
@@ -318,3 +321,16 @@ def test_the_legend_of_the_map_and_the_notices_have_no_check_points_where_there_
         legend = re.findall(r'<span class="legend">(.*?)</span>\.', path.read_text(encoding="utf-8"))[0]
         assert re.findall(r'class="dot (\w+)"', legend) == ["control", "check"][: 1 + bool(checks)]
     assert few_check_points(0) == "no check points, and 30 are what ASPRS 2023 asks for before accuracy is claimed"
+
+
+def test_the_map_of_the_world_is_whole_at_the_antimeridian():
+    """No outline runs around the world, and what is land and sea there are as atlases have them."""
+    rings = json.loads((Path(locator.__file__).parent / "land.json").read_text(encoding="ascii"))
+    assert max(abs(a[0] - b[0]) for ring in rings for a, b in itertools.pairwise(ring)) < 600
+    land = shapely.union_all([shapely.Polygon(np.array(ring) / 10).buffer(0) for ring in rings])
+    dry = {"Chukotka": (-173.0, 66.6), "Yakutia": (130.0, 66.0), "Alaska": (-150.0, 68.0), "Chad": (18.0, 14.0),
+           "Anadyr": (176.0, 66.0), "Queensland": (145.0, -20.0)}  # fmt: skip
+    wet = {"Norwegian Sea": (0.0, 68.0), "Baffin Bay": (-65.0, 73.0), "Coral Sea": (155.0, -17.0), "Pacific":
+           (-120.0, -17.0), "Atlantic": (-20.0, -17.0), "Laptev Sea": (120.0, 76.0)}  # fmt: skip
+    assert {name for name, place in dry.items() if not land.contains(shapely.Point(place))} == set()
+    assert {name for name, place in wet.items() if land.contains(shapely.Point(place))} == set()
