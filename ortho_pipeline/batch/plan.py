@@ -287,7 +287,8 @@ class _Planner:
 
     def _ortho(self, settings: Settings, image: Place, where: str) -> OutputOptions:
         values: dict[str, Any] = dict(settings.output)
-        values["fill_from"] = self._file(values["fill_from"], image, f"{where}.output.fill_from")
+        for name in ("fill_from", "like"):
+            values[name] = self._file(values[name], image, f"{where}.output.{name}")
         values["creation_options"] = {key: str(value) for key, value in values["creation_options"].items()}
         return OutputOptions(**values)
 

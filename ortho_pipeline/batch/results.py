@@ -31,6 +31,12 @@ class Outcome:
     facts: Mapping[str, Any] = field(default_factory=dict)
     error: Mapping[str, Any] | None = None
 
+    def text(self) -> str:
+        """Return the outcome as one line."""
+        if self.error is not None:
+            return f"{self.name}: {self.status}: {self.error['message']}"
+        return f"{self.name}: {self.status}, {self.seconds:.1f} s"
+
 
 @dataclass(frozen=True)
 class BatchResult:

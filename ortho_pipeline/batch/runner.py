@@ -10,7 +10,7 @@ import contextlib
 import json
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
@@ -30,6 +30,7 @@ from ortho_pipeline.errors import InputError, OrthoError, ReportError, error_doc
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import is_far
+from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.report.page.run import write_run_page
 from ortho_pipeline.report.stac import write_catalog
 from ortho_pipeline.warp.mosaic import Ortho, Overlap, measure_seam
@@ -128,7 +129,7 @@ def _still_good(record: Record | None, job: Job, listing: str, verify: bool) -> 
         _digests.learn(record.inputs)
     known = {one.path: one.role for one in record.inputs if os.path.isfile(one.path)}
     found = inputs.hashed(
-        inputs.files_read(job.image, job.scene, job.points, job.surface, job.match, fill_from=job.ortho.fill_from),
+        inputs.files_read(job.image, job.scene, job.points, job.surface, job.match, output=job.ortho),
         _digests,
     )
     read = _states(job, {**{one["path"]: one["role"] for one in found}, **known})
@@ -157,7 +158,7 @@ def _as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
 def _folders(job: Job) -> list[str | os.PathLike[str]]:
     """Return the files in whose folders a new name could change the scene."""
     return [path for path in (job.image, inputs.point_file(job.points), job.surface.dem, *job.match.reference,
-                          job.ortho.fill_from, *job.scene.files.values())
+                          *job.ortho.files.values(), *job.scene.files.values())
             if path is not None and os.path.isabs(path) and not is_far(path)]  # fmt: skip
 
 
@@ -216,7 +217,7 @@ def run(
     only: Sequence[str] = (),
     shard: tuple[int, int] | None = None,
     verify: bool = False,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
     allow_network: bool = False,
     store: SharedFolder | None = None,
 ) -> BatchResult:
@@ -231,11 +232,14 @@ def run(
     scheduler : str, optional
         Address of a dask scheduler.
     only, shard : optional
-        Names of scenes, or (k, n) for the k-th of n parts. The mosaic is made by a run of all scenes.
+        Names of scenes, or (k, n) for the k-th of n parts. The mosaic is made by a run of all scenes. In a shared
+        `store` a worker that has finished its part goes on with what is left of the other parts of `only`.
     verify : bool
         Take all checksums again.
     allow_network : bool
         Let the scenes be read from URLs, and `surface.dem=auto` fetch cells.
+    progress : callable, optional
+        Told the outcome of each scene as one line, and the finished share of the scenes.
     store : SharedFolder, optional
         Where the outputs go in place of the folder of the file: a folder of objects, which other workers share.
 
@@ -254,7 +258,7 @@ def run(
     if store is not None:
         _refuse_unshared(planned)
         with crew_of(executor, workers, threads, scheduler, len(jobs)) as (crew, budget):
-            ready = for_run(planned.jobs, _run_id(), memory, budget, allow_network=allow_network)
+            ready = for_run(planned.chosen(only), _run_id(), memory, budget, allow_network=allow_network)
             own = [job for job in ready if job.name in {chosen.name for chosen in jobs}]
             return run_shared(replace(planned, jobs=tuple(ready)), own, store, crew, make_scene, progress)
     lock = planned.output / STATE / "run.lock"
@@ -294,35 +298,11 @@ def list_scenes(config: str | os.PathLike[str] | Plan) -> list[dict[str, Any]]:
     return listed
 
 
-def check_scenes(
-    config: str | os.PathLike[str] | Plan, only: Sequence[str] = (), shard: tuple[int, int] | None = None
-) -> list[dict[str, Any]]:
-    """Open what every scene is made from (images, points, DEM and its coverage) and read no pixel.
-
-    Returns
-    -------
-    list of dict
-        Name and image, and what `commands.check` says or ``error``.
-    """
-    planned = config if isinstance(config, Plan) else plan(config)
-    checked: list[dict[str, Any]] = []
-    for job in planned.chosen(only, shard):
-        one: dict[str, Any] = {"name": job.name, "image": str(job.image)}
-        try:
-            one |= commands.check(
-                job.image, scene=job.scene, points=job.points, surface=job.surface, match=job.match, output=job.ortho
-            )  # fmt: skip
-        except OrthoError as error:
-            one["error"] = error_document(error)
-        checked.append(one)
-    return checked
-
-
 class _Run:
     """One call of `run`: the log, the count, the end."""
 
     def __init__(
-        self, planned: Plan, part: bool, verify: bool, progress: Callable[[float], None] | None
+        self, planned: Plan, part: bool, verify: bool, progress: Progress | None
     ) -> None:  # fmt: skip
         self.planned, self.part, self.verify, self.progress = planned, part, verify, progress
         self.begin = time.monotonic()
@@ -372,7 +352,7 @@ class _Run:
         self.outcomes[outcome.name] = outcome
         self.log("scene", **vars(outcome))
         if self.progress:
-            self.progress(len(self.outcomes) / total)
+            self.progress(outcome.text(), len(self.outcomes) / total)
 
     def _finish(self, jobs: Sequence[Job], made: dict[str, Any] | None) -> BatchResult:
         ordered = tuple(self.outcomes[job.name] for job in jobs)
@@ -489,9 +469,7 @@ def _reads_the_same(record: Record, job: Job) -> bool:
         return False
     try:
         with confined(job.output):
-            found = inputs.files_read(
-                job.image, job.scene, job.points, job.surface, job.match, fill_from=job.ortho.fill_from
-            )
+            found = inputs.files_read(job.image, job.scene, job.points, job.surface, job.match, output=job.ortho)
     except OrthoError:
         return False
     known = {one.path for one in record.inputs}

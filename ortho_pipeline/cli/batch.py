@@ -5,15 +5,16 @@ from __future__ import annotations
 import dataclasses
 import re
 import sys
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ortho_pipeline.cli.flags import as_typed
-from ortho_pipeline.cli.options import json_option, mosaic_options, network_option
+from ortho_pipeline.cli.options import dry_run_option, json_option, mosaic_options, network_option
 from ortho_pipeline.cli.parsing import Command, Megabytes
-from ortho_pipeline.cli.printing import PARTLY_DONE, print_json, print_result, progress
+from ortho_pipeline.cli.printing import PARTLY_DONE, checked_text, print_json, print_result, progress
 from ortho_pipeline.errors import counted
 from ortho_pipeline.options import EXECUTORS, MosaicOptions, SceneOptions
 
@@ -76,7 +77,7 @@ class _Shard(click.ParamType):
 )
 @click.option("--verify", is_flag=True, help="Judge all files by their content, whatever their dates say.")
 @click.option("--list", "as_list", is_flag=True, help="List the scenes and their state, and do nothing.")
-@click.option("--check", "as_check", is_flag=True, help="Open images, points and DEM, look for gaps, and make nothing.")
+@dry_run_option
 @click.option("--schema", "as_schema", is_flag=True, help="Print the JSON Schema of the file, and do nothing.")
 @json_option
 def run(
@@ -84,11 +85,11 @@ def run(
     memory: int,
     root: str | None,
     as_list: bool,
-    as_check: bool,
     as_schema: bool,
     as_summary: bool,
     as_json: bool,
     address: str | None,
+    dry_run: bool,
     **options: Any,
 ) -> None:
     """Make the orthos of all scenes that PIPELINE.yaml names.
@@ -119,11 +120,11 @@ def run(
         for scene in listed:
             click.echo(f"{scene['name']}\t{scene['state']}\t{scene['image']}")
         return None
-    if as_check:
-        return _check(planned, options["only"], options["shard"], as_json)
+    if dry_run:
+        return _dry_run(planned, options["only"], options["shard"], as_json)
     store = None if address is None else SharedFolder(address, options["allow_network"])
     try:
-        with progress("Orthorectifying scenes") as advance:
+        with progress(lines=True) as advance:
             result = (
                 summarise(planned, store)
                 if as_summary
@@ -161,35 +162,29 @@ def mosaic(orthos: tuple[str, ...], output: str, mosaic: MosaicOptions, scene: S
     print_result(command(orthos, output, options, allow_network=scene.allow_network), as_json)
 
 
-def _check(planned: Plan, only: Sequence[str], shard: tuple[int, int] | None, as_json: bool) -> None:
+def _dry_run(planned: Plan, only: Sequence[str], shard: tuple[int, int] | None, as_json: bool) -> None:
     """Print what stands in the way of each scene; exit as a run would if that were all."""
-    from ortho_pipeline.batch import runner as batch
+    from ortho_pipeline.batch.dry_run import check_scenes
     from ortho_pipeline.batch.results import SCHEMA_VERSION
 
-    checked = batch.check_scenes(planned, only, shard)
+    checked = check_scenes(planned, only, shard)
     failed = [one for one in checked if "error" in one]
     if as_json:
         print_json({"schema_version": SCHEMA_VERSION, "scenes": checked})
     else:
+        said = Counter(text for one in checked for text in one.get("warnings", ()))
         for one in checked:
-            click.echo(_checked_text(one))
+            if "error" in one:
+                click.echo(f"{one['name']}: {_error_text(one['error'])}")
+            else:
+                own = [text for text in one["warnings"] if said[text] == 1]
+                click.echo(checked_text(one["name"], {**one, "warnings": own}))
+        for text, count in said.items():
+            if count > 1:
+                click.echo(f"Warning: {as_typed(text)} ({counted(count, 'scene')})")
         click.echo(f"{counted(len(checked), 'scene')}: {len(checked) - len(failed)} ready, {len(failed)} not")
     if failed:
         click.get_current_context().exit(FAILED if len(failed) == len(checked) else PARTLY_DONE)
-
-
-def _checked_text(one: Mapping[str, Any]) -> str:
-    if "error" in one:
-        return f"{one['name']}: {_error_text(one['error'])}"
-    points, grid = one["points"], one["grid"]
-    parts = [
-        f"{one['sensor']}, {one['model']}",
-        f"{counted(points['control'], 'control point')}, {counted(points['check'], 'check point')}",
-        f"DEM covers {100 * one['coverage']:.1f} %",
-        f"{grid['size'][0]} x {grid['size'][1]} px of {grid['resolution'][0]:g} in {grid['crs']}",
-    ]
-    warnings = (f"  Warning: {as_typed(str(text))}" for text in one["warnings"])
-    return "\n".join([f"{one['name']}: {'; '.join(parts)}", *warnings])
 
 
 def _print_summary(result: BatchResult) -> None:

@@ -269,8 +269,22 @@ output_options = _grouped("output", OutputOptions)
 #: The file says which format, and seams are always measured.
 mosaic_options = _grouped("mosaic", MosaicOptions, "order", "seamlines", "balance")
 
+dry_run_option = click.option(
+    "--dry-run", is_flag=True, help="Open and check everything, say what would be made, and make nothing."
+)
 image_argument = click.argument("image", type=click.Path())
 images_argument = click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
+
+
+def _folder(_: click.Context, __: click.Parameter, text: str) -> str:
+    """Return the name of a folder; that of a raster would become a folder by mistake."""
+    stem, ending = os.path.splitext(text)
+    if ending.lower() in (".tif", ".tiff", ".vrt", ".jp2") and not os.path.isdir(text):
+        raise click.BadParameter(f"{text!r} names a file, and outputs go to a folder; did you mean '-o {stem}'?")
+    return text
+
+
 folder_option = click.option(
-    "--output", "-o", "folder", type=click.Path(file_okay=False), required=True, metavar="DIR", help="Output folder."
-)
+    "--output", "-o", "folder", type=click.Path(file_okay=False), required=True, metavar="DIR", callback=_folder,
+    help="Output folder.",
+)  # fmt: skip

@@ -6,7 +6,9 @@ an option that exists, or an error; `HINTS` knows what to say of those that othe
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import io
 import logging
 import os
 import re
@@ -42,12 +44,11 @@ HINTS: Mapping[str, str] = {
     "-cutline": "cut the finished ortho: gdalwarp -cutline",
     "-crop_to_cutline": "cut the finished ortho: gdalwarp -cutline",
     "-ovr": "pixels are always read at full resolution; '-r average' is for orthos that are coarser than the image",
-    "-q": "nothing is printed but the result, and progress only to a terminal",
 }
 
 
 class Command(click.Command):
-    """A command that takes options as gdalwarp's users write them, ``-v`` for logs and ``--debug`` for tracebacks.
+    """A command that takes options as gdalwarp's users write them, and ``-v``, ``-q`` and ``--debug``.
 
     Parameters
     ----------
@@ -61,7 +62,11 @@ class Command(click.Command):
         self.params += [
             click.Option(
                 ["-v", "--verbose"], count=True, expose_value=False, callback=_verbose, is_eager=True,
-                help="Say on stderr what is done; -vv: GDAL's messages too.",
+                help="Verbose: log progress to stderr; -vv also shows GDAL's messages.",
+            ),
+            click.Option(
+                ["-q", "--quiet"], is_flag=True, expose_value=False, callback=_quiet, is_eager=True,
+                help="Quiet: print only warnings and errors (and the document of --json).",
             ),
             click.Option(
                 ["--debug"], is_flag=True, expose_value=False, callback=_debug, is_eager=True,
@@ -85,6 +90,9 @@ class Command(click.Command):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; what it refuses names options as they are typed."""
         try:
+            if ctx.meta.get("quiet") and not ctx.meta.get("json"):
+                with contextlib.redirect_stdout(io.StringIO()):
+                    return super().invoke(ctx)
             return super().invoke(ctx)
         except OrthoError as error:
             name_as_typed(error, self)
@@ -198,6 +206,10 @@ def _verbose(ctx: click.Context, _: click.Parameter, count: int) -> None:
     if count > 1:
         # GDAL is not loaded yet, and reads this when it is.
         os.environ.setdefault("CPL_DEBUG", "ON")
+
+
+def _quiet(ctx: click.Context, _: click.Parameter, value: bool) -> None:
+    ctx.meta["quiet"] = value
 
 
 def _debug(ctx: click.Context, _: click.Parameter, value: bool) -> None:

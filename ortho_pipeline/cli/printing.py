@@ -8,7 +8,7 @@ import math
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -18,6 +18,7 @@ from ortho_pipeline.errors import counted
 
 if TYPE_CHECKING:
     from ortho_pipeline.commands.results import CompareResult, FitResult, Result
+    from ortho_pipeline.files.process_limits import Progress
 
 #: Exit code of a command that made a part of what was asked for.
 PARTLY_DONE = 3
@@ -50,6 +51,19 @@ def print_result(result: Result, as_json: bool) -> None:
             click.echo("".join(traceback.format_exception(result.failure)), err=True)
         click.echo(f"Error: {as_typed(str(result.failure))}", err=True)
         context.exit(PARTLY_DONE)
+
+
+def checked_text(name: str, checked: Mapping[str, Any]) -> str:
+    """Return what a dry run found out about a scene (`commands.check`)."""
+    points, grid = checked["points"], checked["grid"]
+    parts = [
+        f"{checked['sensor']}, {checked['model']}",
+        f"{counted(points['control'], 'control point')}, {counted(points['check'], 'check point')}",
+        f"DEM covers {100 * checked['coverage']:.1f} %",
+        f"{grid['size'][0]} x {grid['size'][1]} px of {grid['resolution'][0]:g} in {grid['crs']}",
+    ]
+    warnings = (f"  Warning: {as_typed(str(text))}" for text in checked["warnings"])
+    return "\n".join([f"{name}: {'; '.join(parts)}", *warnings])
 
 
 def print_fit(result: FitResult) -> None:
@@ -141,17 +155,31 @@ def view_text(view: Mapping[str, Any] | None) -> str:
 
 
 @contextlib.contextmanager
-def progress(title: str) -> Iterator[Callable[[float], None] | None]:
-    """Yield a callable that moves a progress bar on stderr; None where nobody is watching."""
-    if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
+def progress(*, lines: bool = False) -> Iterator[Progress | None]:
+    """Yield what shows the stage of a job and its progress on stderr.
+
+    Parameters
+    ----------
+    lines : bool
+        Print each stage once, as a line, where there is no terminal. Without it there is nothing to call then.
+    """
+    if click.get_current_context().meta.get("quiet"):
         yield None
         return
+    if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
+        yield _print_stage if lines else None
+        return
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.markup import escape
+    from rich.progress import Progress as Bar
 
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(title, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
+    with Bar(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=1.0)
+        yield lambda stage, share: bar.update(task, description=escape(stage), completed=share)
+
+
+def _print_stage(stage: str, share: float) -> None:
+    click.echo(f"{share:4.0%}  {stage}", err=True)
 
 
 def print_models(models: list[dict[str, Any]]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 from typing import TYPE_CHECKING, Any
 
@@ -74,7 +75,8 @@ def _experiment(study: Study) -> click.Command:
     def run(folder: str | None, realisations: int, as_json: bool) -> None:
         from ortho_pipeline.commands import studies
 
-        with progress("Reproducing") as advance:
+        with progress() as show:
+            advance = None if show is None else functools.partial(show, "Reproducing")
             result = studies.reproduce(study.name, folder, realisations=realisations, progress=advance)
         print_result(result, as_json)
 

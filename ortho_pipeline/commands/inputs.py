@@ -26,7 +26,7 @@ from ortho_pipeline.files.locations import archive_of, is_far, located
 from ortho_pipeline.files.process_limits import startable_threads
 from ortho_pipeline.files.traffic import bytes_read
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.surface.base import Surface
@@ -156,7 +156,7 @@ def check_paths(
     match: MatchOptions = MatchOptions(),
     overwrite: bool = False,
     *,
-    fill_from: str | os.PathLike[str] | None = None,
+    output: OutputOptions = OutputOptions(),
 ) -> None:
     """Refuse to write what is read, and outputs that change the model of the source or of the ortho.
 
@@ -170,7 +170,7 @@ def check_paths(
     InputError
         With the path that is in the way.
     """
-    inputs = {Path(path).resolve() for path in given_files(image, scene, points, surface, match, fill_from)}
+    inputs = {Path(path).resolve() for path in given_files(image, scene, points, surface, match, output)}
     removed = old_side_cars(files["ortho"]) if overwrite and "ortho" in files else []
     for path in (*files.values(), *removed):
         if path.resolve() in inputs:
@@ -200,11 +200,11 @@ def given_files(
     points: PointOptions = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
     match: MatchOptions = MatchOptions(),
-    fill_from: str | os.PathLike[str] | None = None,
+    output: OutputOptions = OutputOptions(),
 ) -> list[str | os.PathLike[str]]:
     """Return the files that the user gave."""
     given = (image, *scene.files.values(), point_file(points), *dem_files(surface), sigma_file(surface),
-             *match.reference, fill_from)  # fmt: skip
+             *match.reference, *output.files.values())  # fmt: skip
     return [path for path in given if path is not None]
 
 
@@ -243,7 +243,7 @@ def files_read(
     surface: SurfaceOptions = SurfaceOptions(),
     match: MatchOptions = MatchOptions(),
     opened: Scene | None = None,
-    fill_from: str | os.PathLike[str] | None = None,
+    output: OutputOptions = OutputOptions(),
     heights: Surface | None = None,
 ) -> dict[Path, str]:
     """Return every file that is read and its role, side-cars and sources of a VRT included.
@@ -279,8 +279,8 @@ def files_read(
     add("DEM accuracy", [sigma_file(surface)])
     for reference in match.reference:
         add("reference", [reference, *_files_of(reference, scene)])
-    if fill_from is not None:
-        add("other ortho", [fill_from, *_files_of(fill_from, scene)])
+    for role, path in output.files.items():
+        add(role, [path, *_files_of(path, scene)])
     return read
 
 

@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust
 from ortho_pipeline.display.notices import Notice, to_document
-from ortho_pipeline.errors import completed, of_option
+from ortho_pipeline.errors import InputError, completed, of_option
 from ortho_pipeline.geodesy.crs import map_crs
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions
+from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.footprint import Footprint, choose_grid, lay, scene_pixels
@@ -86,13 +87,29 @@ def place_scene(
         found = lay(model, surface, *size)
         found.require_coverage()
         model = found.fitted(model)
-        with of_option("output.crs"):
-            crs = map_crs(output.crs) if output.crs else None
-        grid = choose_grid(
-            model, found, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
-        )
+        if output.like is not None:
+            grid = _grid_like(output, scene)
+        else:
+            with of_option("output.crs"):
+                crs = map_crs(output.crs) if output.crs else None
+            grid = choose_grid(
+                model, found, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
+            )
         scene_pixels(model, found, grid)
     return Placement(adjusted, model, found.surface, found, grid)
+
+
+def _grid_like(output: OutputOptions, scene: SceneOptions) -> Grid:
+    """Return the grid of the raster that an ortho is to match."""
+    given = [name for name in ("crs", "resolution", "extent", "align") if getattr(output, name)]
+    if given:
+        raise InputError(
+            f"`output.like` gives the grid, and `output.{given[0]}` would change it", field=f"output.{given[0]}",
+            remedy="leave out one of the two",
+        )  # fmt: skip
+    assert output.like is not None
+    with completed(os.fspath(output.like), field="output.like"):
+        return grid_of(output.like, **scene.access)
 
 
 def source_of(

@@ -33,7 +33,7 @@ from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import retire, sha256, states
 from ortho_pipeline.files.documents import json_value
-from ortho_pipeline.files.process_limits import Resources
+from ortho_pipeline.files.process_limits import Progress, Resources
 from ortho_pipeline.files.traffic import bytes_read
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
@@ -42,6 +42,8 @@ from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile
+from ortho_pipeline.raster.output import checked_options
+from ortho_pipeline.raster.stored_blocks import require_whole
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.records import SceneReport
 from ortho_pipeline.surface import footprint
@@ -50,6 +52,10 @@ from ortho_pipeline.surface.base import Surface
 if TYPE_CHECKING:
     from ortho_pipeline.warp import engine as warp
     from ortho_pipeline.warp.layers.hiding import Hiding
+
+
+#: Roles of the files of `inputs.files_read` that have pixels.
+_RASTERS = ("image", "DEM", "DEM accuracy", "reference", "other ortho")
 
 
 # -- commands --------------------------------------------------------------------------------------------------------
@@ -66,7 +72,7 @@ def rectify(
     surface: SurfaceOptions = SurfaceOptions(),
     match: MatchOptions = MatchOptions(),
     output: OutputOptions = OutputOptions(),
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
     command: str | None = None,
     name: str | None = None,
     digest: Callable[..., str] = sha256,
@@ -93,20 +99,21 @@ def rectify(
         For whatever the user can correct: no heights, a DEM that does not cover the scene, a path that is read and
         written, an old side-car that would attach to the ortho.
     """
-    stem, before = Path(image).stem, bytes_read()
+    stem, before, stage = Path(image).stem, bytes_read(), progress or _unwatched
     files = outputs(folder, stem, output)
     points = inputs.point_options(points)
-    inputs.check_paths(files, image, scene, points, surface, match, overwrite, fill_from=output.fill_from)
+    inputs.check_paths(files, image, scene, points, surface, match, overwrite, output=output)
     require_heights(surface)
-    begun = states(inputs.given_files(image, scene, points, surface, match, output.fill_from))
+    begun = states(inputs.given_files(image, scene, points, surface, match, output))
     # Before the DEM is read: left alone, GDAL keeps blocks in a share of the machine's memory.
     limit_cache(output.memory, 1)
     opened = open_adjustable(image, scene, points, match, surface)
     heights = open_surface(surface, scene, output.memory, [opened])
     acquired, sun = _acquired(opened.facts, output), sun_of(opened.facts, output)
-    read = inputs.files_read(image, scene, points, surface, match, opened, output.fill_from, heights)
+    read = inputs.files_read(image, scene, points, surface, match, opened, output, heights)
     begun = states(read) | begun
     with inputs.hashed_beside(read, digest) as hashing:
+        stage("Matching and adjusting" if match.reference else "Adjusting", 0.0)
         placed = place_scene(opened, points, scene, heights, output, match)
         adjusted, model, heights, found, grid = placed
         opened = adjusted.scene
@@ -114,7 +121,8 @@ def rectify(
         source = source_of(opened, image, scene, output)
         budget, notes = layers.budget_of(placed, output)
         path = layers.ortho_of(placed, files, output, other_of(placed, source, scene, output))
-        warped = _warp(model, exported, source, heights, grid, path, output, progress)
+        warped = _warp(model, exported, source, heights, grid, path, output, stage)
+        stage("Layers and report", 0.0)
         accuracy = layers.write_layers(placed, budget, warped, files, output)
         angles = write_angles(placed, sun, files, output)
         asked = {"scene": scene, "surface": surface, "output": output, **match_asked(match)}
@@ -140,6 +148,7 @@ def rectify(
     made = attempted(described, files, *OF_REPORT)
     inputs.refuse_changed(begun)
     retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
+    stage("Layers and report", 1.0)
     if isinstance(made, ReportError):
         return Result(files, {"report": None}, "Ortho and model are complete; there is no report.", made)
     return Result(files, {"report": json_value(made)}, report.summary_text(made))
@@ -165,7 +174,7 @@ def check(
     Raises
     ------
     InputError
-        As `rectify`.
+        As `rectify`, and for a raster whose file is truncated.
     """
     require_heights(surface)
     opened = open_adjustable(image, scene, points, match, surface)
@@ -174,6 +183,10 @@ def check(
     placed = place_scene(opened, points, scene, open_surface(surface, scene, output.memory, [opened]), output, match)
     other_of(placed, source_of(placed.scene, image, scene, output), scene, output)
     layers.budget_of(placed, output)
+    checked_options(output.format, dict(output.creation_options), 1)
+    for path, role in inputs.files_read(image, scene, points, surface, match, opened, output).items():
+        if role in _RASTERS:
+            require_whole(path, **scene.access)
     return placed.to_json()
 
 
@@ -235,6 +248,10 @@ def export(
 # -- parts -----------------------------------------------------------------------------------------------------------
 
 
+def _unwatched(stage: str, share: float) -> None:
+    """Tell nobody how far the work is."""
+
+
 def _of_earlier_run(folder: Path, stem: str, files: Mapping[str, Path], *, all_of_them: bool) -> list[Path]:
     """Return what an earlier run wrote for this scene and this one does not, and side-cars of the ortho it wrote.
 
@@ -277,7 +294,7 @@ def _warp(
     grid: raster.Grid,
     path: Path | Hiding,
     output: OutputOptions,
-    progress: Callable[[float], None] | None,
+    progress: Progress,
 ) -> warp.WarpResult:
     from ortho_pipeline.warp import engine as warp  # the compiled kernels take a while to load: beside the checksums
 

@@ -36,6 +36,10 @@ _PARTS = 8
 _PATIENCE = 10.0
 
 
+#: Told what is being done (or was done) and the finished share of it, 0 to 1.
+Progress = Callable[[str, float], None]
+
+
 @dataclass(frozen=True)
 class Resources:
     """Budget of a long job, and whom it tells how far it is.
@@ -47,12 +51,12 @@ class Resources:
     threads : int, optional
         As many as there are processors without.
     progress : callable, optional
-        Called with the finished share, 0 to 1.
+        Called with the name of a stage and its finished share, 0 to 1.
     """
 
     memory: int = 512_000_000
     threads: int | None = None
-    progress: Callable[[float], None] | None = None
+    progress: Progress | None = None
 
 
 def require_memory(size: int = LEAST, threads: int = 0) -> None:

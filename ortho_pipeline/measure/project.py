@@ -6,7 +6,7 @@ import abc
 import datetime
 import os
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import write_json
 from ortho_pipeline.files.documents import json_position, json_value
+from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.imaging.matching import View
 from ortho_pipeline.measure.journal import Journal
 from ortho_pipeline.measure.marks import GROUND_CRS, History, Mark, Marks, Written
@@ -96,7 +97,7 @@ class Project(abc.ABC):
         """Return the models, or corrections, that the points could be fitted with, compared, and the one to take."""
 
     @abc.abstractmethod
-    def ortho(self, progress: Callable[[float], None], number: int = 0) -> Result:
+    def ortho(self, progress: Progress, number: int = 0) -> Result:
         """Make the ortho of an image with the saved points, in a folder beside them."""
 
     # -- beginning and end -------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import sha256
 from ortho_pipeline.files.documents import json_position
+from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.matching import Reference, View
 from ortho_pipeline.imaging.matching.targets import metres_per_pixel
@@ -168,7 +169,7 @@ class Session(Project):
         asked = PointOptions(gcps=self.marks.points(self._called), significance=self._options.significance)
         return compare(self.scene, asked).to_json()
 
-    def ortho(self, progress: Callable[[float], None], number: int = 0) -> Result:
+    def ortho(self, progress: Progress, number: int = 0) -> Result:
         """Make what `ortho rectify` makes with the saved points, in a folder beside them."""
         from ortho_pipeline.commands.rectification import rectify
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust
-from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.errors import OrthoError, counted
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres, rmse_metres
 from ortho_pipeline.estimation.problem import ImageErrors
@@ -21,6 +21,8 @@ from ortho_pipeline.points import Points
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS
 from ortho_pipeline.surface.base import Surface
 
+#: With fewer check points the headline is the error of control points that are left out in turn, where there is one.
+LEAST_CHECK_POINTS = 3
 #: Chance that a good point is shown as suspicious.
 SUSPICIOUS = 0.001
 
@@ -129,17 +131,20 @@ def _headline(fit: Fit | None) -> dict[str, Any]:
         return {"px": None, "m": None, "what": "not tested: no fit"}
     relative = bool((fit.points.groups[fit.used] >= 0).any())
     to = ", relative to the reference" if relative else ""
-    kinds = {"check": "check points that took no part", "loo": "control points, each left out in turn"}
-    metres = rmse_metres(fit)
-    for which, what in kinds.items():
-        found = fit.rmse(which)
-        if found is None or (which == "loo" and not fit.redundancy):
-            continue
-        few = f"; fewer than {ENOUGH_CHECK_POINTS} check points, no claim" if found["n"] < ENOUGH_CHECK_POINTS else ""
-        few = "; no check points were kept apart" if which == "loo" else few
-        ground = metres.get(which)
-        return json_value({
-            "px": found["total"], "m": ground and ground.get("total"), "n": found["n"],
-            "what": f"RMSE at {found['n']} {what}{to}{few}",
-        })  # fmt: skip
-    return {"px": None, "m": None, "what": "not tested: nothing is left over to test the fit with"}
+    check, loo = fit.rmse("check"), fit.rmse("loo") if fit.redundancy else None
+    checks = 0 if check is None else int(check["n"])
+    which, found = ("loo", loo) if loo is not None and checks < LEAST_CHECK_POINTS else ("check", check)
+    if found is None:
+        return {"px": None, "m": None, "what": "not tested: nothing is left over to test the fit with"}
+    if which == "check":
+        what = f"{counted(checks, 'check point')} that took no part{to}"
+        few = f"; fewer than {ENOUGH_CHECK_POINTS} check points, no claim" if checks < ENOUGH_CHECK_POINTS else ""
+    else:
+        what = f"{counted(int(found['n']), 'control point')}, each left out in turn{to}"
+        few = "; no check points were kept apart"
+        if check is not None:
+            few = f"; {counted(checks, 'check point')} ({check['total']:.2f} px): too few to judge by"
+    ground = rmse_metres(fit).get(which)
+    return json_value({
+        "px": found["total"], "m": ground and ground.get("total"), "n": found["n"], "what": f"RMSE at {what}{few}",
+    })  # fmt: skip

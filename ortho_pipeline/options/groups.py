@@ -301,6 +301,13 @@ class OutputOptions:
             unset="the scene's footprint",
         ),
     ] = None  # fmt: skip
+    like: Annotated[
+        PathLike | None,
+        Option(
+            "--like", "Take CRS, resolution and extent from this raster, so that pixels fall on pixels.", "RASTER",
+            kind="file",
+        ),
+    ] = None  # fmt: skip
     align: Annotated[
         bool, Option("--align -tap", "Widen `output.extent` to whole multiples of the resolution.")
     ] = False  # fmt: skip
@@ -402,6 +409,12 @@ class OutputOptions:
     acquired: Annotated[
         str | None, Option("--acquired", "Time of acquisition (RFC 3339), where the metadata have none.", "TIME")
     ] = None
+
+    @property
+    def files(self) -> dict[str, str | os.PathLike[str]]:
+        """Rasters besides the image that an ortho is made with, by what they are."""
+        given = {"other ortho": self.fill_from, "grid": self.like}
+        return {role: path for role, path in given.items() if path is not None}
 
 
 @documented

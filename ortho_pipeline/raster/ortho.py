@@ -17,6 +17,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import whole_or_nothing
+from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.raster.output import abandon, check_written, checked_options, close, gdal_errors
 from ortho_pipeline.raster.source import Grid, RasterSource, holds, pixel_type
 
@@ -201,6 +202,7 @@ class RasterWriter:
         driver: str = "COG",
         creation_options: Mapping[str, str] | None = None,
         threads: int = 1,
+        progress: Progress | None = None,
     ) -> None:
         if driver not in ("COG", "GTiff"):
             raise InputError(f"orthos are not written as {driver!r}", field="format", remedy="COG or GTiff")
@@ -209,7 +211,7 @@ class RasterWriter:
         self._side = square_side(profile, 512)
         self.options = checked_options(driver, dict(creation_options or {}), threads, self._side)
         self._lock = threading.Lock()
-        self._written = 0
+        self._written, self._progress = 0, progress
         self._open = contextlib.ExitStack()
 
     def __enter__(self) -> RasterWriter:
@@ -292,12 +294,23 @@ class RasterWriter:
             if self.driver == "COG":
                 source = source or gdal.OpenEx(str(self._work), gdal.OF_RASTER, allowed_drivers=["GTiff"])
                 options = [f"{k}={v}" for k, v in self.options.items()]
-                close(gdal.GetDriverByName("COG").CreateCopy(str(self._temporary), source, options=options))
+                advance = None if self._progress is None else self._advance
+                close(
+                    gdal.GetDriverByName("COG").CreateCopy(
+                        str(self._temporary), source, options=options, callback=advance
+                    )
+                )
             self._dataset = None
         # GDAL leaves out blocks of a file beyond 4 GB into which nothing was written.
         partly = self._written < self.grid.width * self.grid.height
         sparse = partly or self.options.get("SPARSE_OK", "NO").upper() in ("YES", "TRUE", "ON")
         check_written(self._temporary, self.path, size=(self.grid.width, self.grid.height), sparse=sparse)
+
+    def _advance(self, share: float, *_: Any) -> int:
+        """Pass GDAL's progress on, and let it go on."""
+        assert self._progress is not None
+        self._progress("Writing the COG", share)
+        return 1
 
     def scratch(self, name: str) -> Path:
         """Return the path of a temporary raster beside the output, which is removed with the output's own."""

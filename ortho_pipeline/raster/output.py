@@ -8,7 +8,7 @@ the place of every block in the file and reads some of them.
 from __future__ import annotations
 
 import contextlib
-import math
+import difflib
 import os
 import secrets
 from collections.abc import Iterator
@@ -23,6 +23,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.files.locations import VsiPath
 from ortho_pipeline.raster.source import first_line
+from ortho_pipeline.raster.stored_blocks import stored_blocks, stored_images
 
 #: Blocks of a file that are read again before it gets its name.
 _SAMPLES = 12
@@ -158,8 +159,8 @@ def check_written(
         if size is not None and (dataset.RasterXSize, dataset.RasterYSize) != size:
             raise InputError("the output was not written whole", **told)
         end = written.stat().st_size
-        for band in _images(dataset):
-            blocks = _blocks(band)
+        for band in stored_images(dataset):
+            blocks = stored_blocks(band)
             if any(offset + count > end or not (count or sparse) for offset, count, _, _ in blocks):
                 raise InputError("the output was not written whole", **told)
             # The last in the file, and some from everywhere.
@@ -173,31 +174,6 @@ def check_written(
         raise InputError(f"the output cannot be read again ({first_line(error)})", **told) from error
 
 
-def _images(dataset: gdal.Dataset) -> Iterator[gdal.Band]:
-    """Yield a band of every image in a file: bands that are stored apart, overviews, mask."""
-    apart = dataset.GetMetadataItem("INTERLEAVE", "IMAGE_STRUCTURE") == "BAND"
-    for index in range(dataset.RasterCount if apart else 1):
-        band = dataset.GetRasterBand(index + 1)
-        yield band
-        yield from (band.GetOverview(k) for k in range(band.GetOverviewCount()))
-    if dataset.GetRasterBand(1).GetMaskFlags() == gdal.GMF_PER_DATASET:
-        mask = dataset.GetRasterBand(1).GetMaskBand()
-        yield mask
-        yield from (mask.GetOverview(k) for k in range(mask.GetOverviewCount()))
-
-
-def _blocks(band: gdal.Band) -> list[tuple[int, int, int, int]]:
-    """Return offset and count of bytes, column and row of each block; an absent one has 0 bytes at 0."""
-    width, height = band.GetBlockSize()
-    found = []
-    for row in range(math.ceil(band.YSize / height)):
-        for column in range(math.ceil(band.XSize / width)):
-            place = f"{column}_{row}"
-            offset, count = (band.GetMetadataItem(f"BLOCK_{what}_{place}", "TIFF") for what in ("OFFSET", "SIZE"))
-            found.append((int(offset or 0), int(count or 0), column, row))
-    return found
-
-
 # -- creation options --------------------------------------------------------------------------------------------------
 
 
@@ -207,9 +183,10 @@ def checked_options(driver: str, given: dict[str, str], threads: int, side: int 
     known = _known_options(driver)
     for key, value in given.items():
         if key not in known:
+            meant = difflib.get_close_matches(key, known, 1)
             raise InputError(
                 f"the {driver} driver has no creation option {key}", field="creation option",
-                remedy=f"see the page of the {driver} driver in GDAL's documentation",
+                remedy=f"did you mean {meant[0]}?" if meant else f"see the {driver} driver in GDAL's documentation",
             )  # fmt: skip
         if not _fits(known[key], value):
             values = ", ".join(choice.text or "" for choice in known[key].findall("Value")) or known[key].get("type")

@@ -31,15 +31,15 @@ _ENOUGH = 128
 
 
 @reads("make this ortho again")
-def grid_of(path: str | PathLike[str]) -> Grid:
-    """Return the grid of an orthoimage.
+def grid_of(path: str | PathLike[str], **access: Any) -> Grid:
+    """Return the grid of an orthoimage; `access` as of `raster.source.open_dataset`.
 
     Raises
     ------
     InputError
         If it is none: a raster without a CRS, or one that is not north up.
     """
-    dataset = open_dataset(path)
+    dataset = open_dataset(path, **access)
     left, dx, skew, top, other, dy = dataset.GetGeoTransform()
     if skew or other:
         raise InputError("this raster is turned against the axes of its CRS", field="geotransform")

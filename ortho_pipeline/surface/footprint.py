@@ -381,6 +381,13 @@ def choose_grid(
             f"the scene does not lie in the domain of {crs.name!r}", field="output.crs", remedy="choose another CRS"
         )
     low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
+    if (np.array(step) > (high - low)[:2]).all():
+        unit = crs.axis_info[0].unit_name
+        usual = f"{two_digits(ground_sample_distance(model, crs, width, height, found.middle)):.12f}".rstrip("0")
+        raise InputError(
+            f"the scene is smaller than one pixel of {step[0]:g} {unit}s, which is the unit of {crs.name!r}",
+            field="output.resolution", remedy=f"did you mean `output.resolution={usual}`?",
+        )  # fmt: skip
     return Grid.of_extent(crs, (low[0], low[1], high[0], high[1]), step, align=True)
 
 

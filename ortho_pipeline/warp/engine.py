@@ -40,7 +40,7 @@ from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp import kernels
 from ortho_pipeline.warp.block_kernel import DemWindow, Target, warp_block
-from ortho_pipeline.warp.gdal_engine import warp_with_gdal
+from ortho_pipeline.warp.gdal_engine import WARPING, warp_with_gdal
 from ortho_pipeline.warp.lattice import BLOCK, Lattices, OutputBlock, Terrain, block_cells
 from ortho_pipeline.warp.layers.hiding import Hiding, Looked
 from ortho_pipeline.warp.reused import Reused
@@ -149,8 +149,9 @@ def rectify(
         if isinstance(path, Hiding):
             job.looked, path = path.begun(model, surface, grid, window), path.ortho
         writer = stack.enter_context(
-            RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads)
-        )
+            RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads,
+                         progress=resources.progress)
+        )  # fmt: skip
         mask = None if job.looked is None else stack.enter_context(job.looked.writer(driver, threads))
         tiles = list(_tiles(grid, square_side(profile, TILE)))
         for done, made in enumerate(_in_order(threads, job, tiles, ahead), start=1):
@@ -159,7 +160,7 @@ def rectify(
                 mask.write(made.left, made.top, made.classes[None], None)
             job.give_back(made)
             if resources.progress:
-                resources.progress(done / len(tiles))
+                resources.progress(WARPING, done / len(tiles))
         refuse_empty(job.valid_pixels, path)
     return WarpResult(
         max_error_px=job.lattices.worst,

@@ -40,6 +40,8 @@ from ortho_pipeline.raster.output import gdal_errors, written
 from ortho_pipeline.raster.source import Grid, RasterSource, first_line
 from ortho_pipeline.surface.base import Excerpt, Surface
 
+#: The stage of a job that makes pixels, for its progress.
+WARPING = "Warping"
 #: GDAL's fit to points of a model expresses it if it repeats it this closely (px); another fit only resembles it.
 EXPRESSED = 1e-3
 #: Points per side of the ortho at which a transformer is held against the model.
@@ -184,8 +186,9 @@ def warp_with_gdal(
     exact = Exact(model, surface, grid, (source.width, source.height))
     profile = profile or Profile.of(source)
     writer = RasterWriter(
-        path, grid, profile, driver=driver, creation_options=creation_options, threads=resources.threads or 1
-    )
+        path, grid, profile, driver=driver, creation_options=creation_options, threads=resources.threads or 1,
+        progress=resources.progress,
+    )  # fmt: skip
     with writer, gdal_errors(path), contextlib.ExitStack() as scratch:
         arrays, target = writer.scratch("arrays"), writer.scratch("gdal")
         for temporary in (arrays, target):
@@ -337,7 +340,7 @@ def _warp_exactly(
     resources: Resources,
 ) -> None:
     progress, threads = resources.progress, resources.threads or 1
-    callback = None if progress is None else (lambda share, *_: progress(share) or 1)
+    callback = None if progress is None else (lambda share, *_: progress(WARPING, share) or 1)
     # Without the first two the values depend on how the warper cuts the image into chunks; the next two let it find
     # the window of a chunk in the image from points all over it, because terrain moves them.
     settings = ["XSCALE=1", "YSCALE=1", "SAMPLE_GRID=YES", "SAMPLE_STEPS=101", "SOURCE_EXTRA=32"]

@@ -234,6 +234,9 @@ def test_the_command_delivers_to_a_store_and_collects(store: str, tiny: Any, mon
     files = [one["files"]["ortho"] for one in json.loads(summary.stdout)["scenes"]]
     assert files == [f"{store}/s{k}/s{k}_ortho.tif" for k in range(2)]
     names = {name for name, _ in Objects(store, allow_network=True).names()}
+    only = CliRunner().invoke(cli, [*common, "--allow-network", "--only", "s1", "-o", f"{store}/only"])
+    assert [one["name"] for one in json.loads(only.stdout)["scenes"]] == ["s1"]
+    assert not [name for name, _ in Objects(f"{store}/only", allow_network=True).names() if "s0" in name]
     assert {"run.json", f"{STATE}/s0.result.json", "s1/s1_report.json"} <= names
     assert not (tiny.folder / "out").exists()
 

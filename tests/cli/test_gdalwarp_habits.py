@@ -11,7 +11,9 @@ import pytest
 from click.testing import CliRunner, Result
 from osgeo import gdal
 
-from ortho_pipeline.cli.program import cli
+from ortho_pipeline.cli.program import COMMANDS, cli
+from ortho_pipeline.commands import rectify
+from ortho_pipeline.options import SurfaceOptions
 
 #: Not on whole multiples of the resolution, and larger than the scene.
 EXTENT = (402003.0, 6679002.0, 404011.0, 6681004.0)
@@ -296,3 +298,77 @@ def test_several_images_are_for_run(tiny, tmp_path):
     done = run("rectify", tiny.image, tiny.image, "b.tif", "--height", "500", "-o", tmp_path / "out")
     assert done.exit_code == 2
     assert "ortho run" in done.stderr
+
+
+def test_like_takes_the_grid_of_another_raster(tiny, tmp_path):
+    given = ("-te", 402603, 6680103, 403603, 6681103, "-tr", 12.5, 8)
+    first = ortho(tiny.image, tmp_path / "first", *given)
+    again = ortho(tiny.image, tmp_path / "again", "--like", first.GetDescription())
+    same_grid(again, first)
+    assert again.GetSpatialRef().IsSame(first.GetSpatialRef())
+    assert np.array_equal(again.ReadAsArray(), first.ReadAsArray())
+    both = run("rectify", tiny.image, "--height", 500, "--like", first.GetDescription(), "-tr", 5, "-o", tmp_path / "x")
+    assert both.exit_code == 2
+    assert "--resolution" in both.stderr
+    document = json.loads((tmp_path / "again" / f"{tiny.image.stem}_report.json").read_text())
+    assert first.GetDescription() in {one["path"] for one in document["provenance"]["inputs"] if one["role"] == "grid"}
+
+
+@pytest.fixture
+def refused(tiny, tmp_path):
+    def words(*more: Any) -> str:
+        done = run("rectify", tiny.image, "--height", "500", *more)
+        assert done.exit_code == 2, done.output
+        assert not (tmp_path / "out").exists()
+        return done.stderr
+
+    return words
+
+
+def test_metres_given_as_degrees_are_refused_with_the_usual_size(refused, tmp_path):
+    said = refused("-t_srs", "EPSG:4326", "-tr", 30, 30, "-o", tmp_path / "out")
+    assert "smaller than one pixel of 30 degrees" in said
+    # 400 x 300 pixels cover 0.02 x 0.013 degrees.
+    assert "did you mean --resolution 0.000047?" in said
+
+
+def test_outputs_named_as_a_file_are_refused(refused, tmp_path):
+    assert f"did you mean '-o {tmp_path / 'out'}'?" in refused("-o", tmp_path / "out.tif")
+
+
+def test_a_misspelt_creation_option_names_the_one_most_like_it(refused, tmp_path):
+    for words in ((), ("--dry-run",)):
+        assert "did you mean COMPRESS?" in refused("-co", "COMPRES=ZSTD", "-o", tmp_path / "out", *words)
+
+
+def test_a_dry_run_says_what_would_be_made(tiny, tmp_path):
+    words = ("rectify", tiny.image, "--height", 500, "-tr", 10, "-o", tmp_path / "out")
+    done = run(*words, "--dry-run")
+    assert done.exit_code == 0, done.stderr
+    assert not (tmp_path / "out").exists()
+    made = json.loads(run(*words, "--json").stdout)["report"]["ortho"]
+    assert f"{made['size'][0]} x {made['size'][1]} px of 10 in {made['crs']}" in done.stdout
+
+
+def test_quiet_prints_nothing(tiny, tmp_path):
+    done = run("rectify", tiny.image, "--height", 500, "-q", "-o", tmp_path / "out")
+    assert (done.stdout, done.stderr, done.exit_code) == ("", "", 0)
+    shown = run("rectify", tiny.image, "--height", 500, "-q", "--json", "-o", tmp_path / "out")
+    assert json.loads(shown.stdout)["files"]
+
+
+def test_each_stage_of_a_job_has_its_own_progress(tiny, tmp_path):
+    told: list[tuple[str, float]] = []
+    rectify(tiny.image, tmp_path / "out", surface=SurfaceOptions(height=500.0), progress=lambda *one: told.append(one))
+    stages = list(dict.fromkeys(stage for stage, _ in told))
+    assert stages == ["Adjusting", "Warping", "Writing the COG", "Layers and report"]
+    for stage in stages[1:]:
+        shares = [share for one, share in told if one == stage]
+        assert shares == sorted(shares)
+        assert shares[-1] == 1.0
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_the_help_has_no_stray_blanks(command):
+    text = run(command, "--help").stdout.split("Options:")[0]
+    assert not [line for line in text.splitlines() if "  " in line.strip()]

@@ -22,6 +22,7 @@ from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.leases import PATIENCE, Lease, Leases, Lost
 from ortho_pipeline.errors import OrthoError, error_document
 from ortho_pipeline.files import json_text
+from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.files.storage.delivery import delivered
 from ortho_pipeline.files.storage.objects import Objects
 
@@ -116,7 +117,7 @@ def run_shared(
     where: SharedFolder,
     crew: Crew,
     make: Make,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> BatchResult:
     """Make the scenes of a plan together with other workers, beginning with one's own; end when all have a result.
 
@@ -143,7 +144,7 @@ def run_shared(
                 continue
             outcomes[order.job.name] = outcome
             if progress:
-                progress(len(outcomes) / len(planned.jobs))
+                progress(outcome.text(), len(outcomes) / len(planned.jobs))
 
     go(Order(job) for job in own)
     while True:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import click
 
 from ortho_pipeline.cli.options import (
+    dry_run_option,
     folder_option,
     image_argument,
     json_option,
@@ -18,7 +20,7 @@ from ortho_pipeline.cli.options import (
     surface_options,
 )
 from ortho_pipeline.cli.parsing import Command
-from ortho_pipeline.cli.printing import print_result, progress
+from ortho_pipeline.cli.printing import checked_text, print_json, print_result, progress
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 
 
@@ -35,6 +37,7 @@ from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, Sc
     help="Remove old models that would attach to the ortho, and what an unreported earlier run left. Outputs of the "
     "same name are replaced without it.",
 )
+@dry_run_option
 @point_options
 @match_options
 @scene_options
@@ -45,6 +48,7 @@ def rectify(
     image: str,
     folder: str,
     overwrite: bool,
+    dry_run: bool,
     points: PointOptions,
     match: MatchOptions,
     scene: SceneOptions,
@@ -55,7 +59,10 @@ def rectify(
     """Make the orthoimage of IMAGE, its adjusted model, and the accuracy report."""
     from ortho_pipeline import commands
 
-    with progress("Orthorectifying") as advance:
+    if dry_run:
+        checked = commands.check(image, scene=scene, points=points, surface=surface, match=match, output=output)
+        return print_json(checked) if as_json else click.echo(checked_text(Path(image).name, checked))
+    with progress() as advance:
         result = commands.rectify(
             image,
             folder,
@@ -68,7 +75,7 @@ def rectify(
             overwrite=overwrite,
             command=click.get_current_context().meta["command"],
         )
-    print_result(result, as_json)
+    return print_result(result, as_json)
 
 
 @click.command(cls=Command)

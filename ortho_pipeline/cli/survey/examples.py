@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 
 #: By the words of the command; each with what it is for.
@@ -81,7 +82,7 @@ EXAMPLES: Mapping[str, Sequence[tuple[str, str]]] = {
         ),
     ),
     "run": (
-        ("Open everything and make nothing:", "ortho run orbview3/pipeline.yaml --check"),
+        ("Open everything and make nothing:", "ortho run orbview3/pipeline.yaml --dry-run"),
         ("Make what is missing or has changed:", "ortho run orbview3/pipeline.yaml --executor sequential"),
         ("In what state is each scene?", "ortho run orbview3/pipeline.yaml --list"),
     ),
@@ -113,7 +114,7 @@ def with_examples(text: str | None, examples: Sequence[tuple[str, str]]) -> str 
     if not examples:
         return text
     lines = [f"    {line}" for about, command in examples for line in (f"# {about}", command)]
-    return "\n\n".join([(text or "").rstrip(), "\b\nExamples:", "\n".join(["\b", *lines])])
+    return "\n\n".join([inspect.cleandoc(text or ""), "\b\nExamples:", "\n".join(["\b", *lines])])
 
 
 def examples_of_study(group: str, name: str) -> Sequence[tuple[str, str]]:

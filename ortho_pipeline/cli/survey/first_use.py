@@ -23,7 +23,10 @@ _KINDS: tuple[Kind, ...] = ("dem", "points", "map image")
 STEPS = (
     ("See what is there, and what to do next", "ortho info FOLDER"),
     ("Make an orthoimage, with control points", "ortho rectify scene.tif --dem dem.tif --gcps points.csv -o out"),
-    ("The same without, from an ortho of the place", "ortho rectify scene.tif --dem auto --reference ortho.tif -o out"),
+    (
+        "The same without, from an ortho of the place",
+        "ortho rectify scene.tif --dem auto --allow-network --reference ortho.tif -o out",
+    ),
     ("Compare models on the same points", "ortho compare scene.tif --gcps points.csv -o out"),
     ("Make the orthos of many scenes", "ortho init FOLDER && ortho run FOLDER/pipeline.yaml"),
 )
@@ -96,24 +99,35 @@ def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:
 
 
 def next_steps(seen: Survey) -> list[str]:
-    """Return what to do next with what lies in a folder: sentences, and commands that can be typed there."""
+    """Return what to do next with what lies in a folder: sentences, and commands that work when they are pasted."""
+    from ortho_pipeline.commands.survey.folder import NO_DATUM
+
     scenes, images = seen.of("scene"), seen.of("image")
+
+    def at(name: str) -> str:
+        return os.path.join(seen.folder, name)
+
     if not scenes:
         if images and seen.of("points"):
-            line = shlex.join(["ortho", "compare", images[0], "--gcps", seen.of("points")[0]])
+            line = shlex.join(["ortho", "compare", at(images[0]), "--gcps", at(seen.of("points")[0])])
             return ["No image has a model of its own; one can be fitted to the points:", f"  {line}"]
         return ["No image with a model was found: put its metadata (RPC, DIMAP, .IMD ...) beside it."]
     dems, points, maps = (seen.beside(scenes[0], kind) for kind in _KINDS)
-    said, words = [], ["--dem", dems[0] if dems else "auto"]
+    said, words = [], ["--dem", at(dems[0])] if dems else ["--dem", "auto", "--allow-network"]
     if not dems:
         said.append(
-            "There is no DEM: '--dem FILE' gives one, '--dem auto' takes the Copernicus DEM under the scene, "
-            "'--height M' takes flat ground."
+            "There is no DEM: '--dem FILE' gives one, '--dem auto --allow-network' downloads the Copernicus DEM under "
+            "the scene, '--height M' takes flat ground."
+        )
+    elif any(one.path == dems[0] and one.said.endswith(NO_DATUM) for one in seen.found):
+        said.append(
+            f"{dems[0]} does not declare its height datum: add '--dem-vertical egm96', 'egm2008' or 'ellipsoid', "
+            "whichever its vendor states."
         )
     if points:
-        words += ["--gcps", points[0]]
+        words += ["--gcps", at(points[0])]
     elif maps:
-        words += ["--reference", maps[0]]
+        words += ["--reference", at(maps[0])]
         said.append(f"There are no control points: they can be matched with {maps[0]}.")
     else:
         said.append(
@@ -121,9 +135,16 @@ def next_steps(seen: Survey) -> list[str]:
             "measured ones, '--reference ORTHO' matches them with an ortho of the same place."
         )
     if len(scenes) == 1:
-        return [*said, "Make the ortho:", "  " + shlex.join(["ortho", "rectify", scenes[0], *words, "-o", "out"])]
-    file = "pipeline.yaml"
-    lines = ["ortho init .", f"ortho run {file} --check", f"ortho run {file}"]
+        return [*said, "Make the ortho:", "  " + shlex.join(["ortho", "rectify", at(scenes[0]), *words, "-o", "out"])]
+    file, network = at("pipeline.yaml"), [] if dems else ["--allow-network"]
+    lines = [
+        shlex.join(words)
+        for words in (
+            ["ortho", "init", str(seen.folder)],
+            ["ortho", "run", file, "--dry-run", *network],
+            ["ortho", "run", file, *network],
+        )
+    ]
     return [*said, f"Make the orthos of {counted(len(scenes), 'scene')}:", *(f"  {line}" for line in lines)]
 
 

@@ -130,7 +130,7 @@ def _in_options(value: Any, scene: SceneOptions) -> Any:
     if isinstance(value, MatchOptions):
         return replace(value, reference=tuple(map(raster, value.reference)))
     if isinstance(value, OutputOptions):
-        return replace(value, fill_from=raster(value.fill_from))
+        return replace(value, fill_from=raster(value.fill_from), like=raster(value.like))
     if isinstance(value, PointOptions) and is_item(value.gcps):
         return replace(value, gcps=_points(cast(str, value.gcps), scene))
     return value
@@ -159,5 +159,5 @@ def _far(given: dict[str, Any]) -> list[Any]:
         elif isinstance(value, MatchOptions):
             images += value.reference
         elif isinstance(value, OutputOptions):
-            images.append(value.fill_from)
+            images += value.files.values()
     return [path for path in images if isinstance(path, str | os.PathLike) and is_far(path)]

@@ -35,6 +35,10 @@ IMAGES = (
     ".xml",
     ".til",
 )
+#: Said of a DEM whose file does not say above what its heights are.
+NO_DATUM = "no height datum declared"
+#: Those of them that hold pixels and nothing else: such a file that does not open is damaged.
+_PIXELS = (".tif", ".tiff", ".ntf", ".nitf", ".jp2", ".img")
 POINTS = (".csv", ".geojson", ".points", ".pts", ".txt")
 #: Files that are looked at, and folders below the given one.
 _MOST, _DEPTH = 2000, 3
@@ -147,8 +151,8 @@ def _raster(path: Path, name: str, options: SceneOptions, refused: OrthoError) -
     """Say what an image is that no sensor opens; None for what is no image."""
     try:
         dataset = open_dataset(path, **options.access)
-    except OrthoError:
-        return None
+    except OrthoError as error:
+        return Found(name, "image", f"cannot be opened: {error.message}") if path.suffix.lower() in _PIXELS else None
     size = f"{dataset.RasterXSize} x {dataset.RasterYSize}"
     if dataset.GetGeoTransform(can_return_null=True) is None or not dataset.GetProjection():
         return Found(name, "image", f"{size}, no model: {refused.message}")
@@ -156,7 +160,9 @@ def _raster(path: Path, name: str, options: SceneOptions, refused: OrthoError) -
     if dataset.RasterCount == 1 and dataset.GetRasterBand(1).DataType in _HEIGHTS:
         kind = "dem"
     crs = dataset.GetSpatialRef()
-    return Found(name, kind, f"{size}, {crs.GetName() if crs is not None else 'a CRS'}")
+    said = f"{size}, {crs.GetName() if crs is not None else 'a CRS'}"
+    datum = crs is None or crs.IsCompound() or crs.GetAxesCount() == 3
+    return Found(name, kind, said if kind != "dem" or datum else f"{said}, {NO_DATUM}")
 
 
 def _points(path: Path, name: str) -> Found | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 from pathlib import Path
 
 from ortho_pipeline.commands.results import Result
@@ -51,9 +52,16 @@ def init(
             "the file of a run lies in the folder of its scenes or above it", file=target, remedy="give such a name"
         )  # fmt: skip
     write_text(target, text(seen, prefix))
-    count = counted(len(seen.of("scene")), "scene")
-    said = f"{count}. Look at the file, then:\n  ortho run {target} --check\n  ortho run {target}"
-    return Result({"pipeline": target}, {"scenes": seen.of("scene")}, said)
+    skipped = [one for one in seen.found if one.kind == "image"]
+    lines = [counted(len(seen.of("scene")), "scene")]
+    if skipped:
+        lines[0] += f", {counted(len(skipped), 'image')} skipped:"
+        lines += [f"  {one.path}: {one.said}" for one in skipped]
+    run = shlex.join(["ortho", "run", str(target)])
+    network = " --allow-network" if any(not seen.beside(name, "dem") for name in seen.of("scene")) else ""
+    lines += ["Look at the file, then:", f"  {run} --dry-run{network}", f"  {run}{network}"]
+    document = {"scenes": seen.of("scene"), "skipped": {one.path: one.said for one in skipped}}
+    return Result({"pipeline": target}, document, "\n".join(lines))
 
 
 def text(seen: Survey, prefix: str = ".") -> str:
@@ -65,7 +73,7 @@ def text(seen: Survey, prefix: str = ".") -> str:
 
     lines = [
         "# Scenes for 'ortho run'. Paths are relative to this file; every field: docs/run.md, 'ortho run --schema'.",
-        "# 'ortho run FILE --check' opens everything and makes nothing; 'ortho run FILE' makes what is missing.",
+        "# 'ortho run FILE --dry-run' opens everything and makes nothing; 'ortho run FILE' makes what is missing.",
         "output: out                     # a folder of each scene goes here",
         "defaults:                       # what holds for all scenes; a scene below may say otherwise",
         "  surface:",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import sha256
+from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.geodesy.crs import horizontal, parse_crs
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.matching import Reference, View, open_references
@@ -252,7 +253,7 @@ class BlockSession(Project):
             table = block_points(self.marks, self.images.labels, self._called)
         return compare_corrections(self.starts, CORRECTIONS, table, self._options.hold)
 
-    def ortho(self, progress: Callable[[float], None], number: int = 0) -> Result:
+    def ortho(self, progress: Progress, number: int = 0) -> Result:
         """Make what `ortho rectify` makes of an image with the model that `ortho adjust` has of the saved points."""
         from ortho_pipeline.commands.block import adjust
         from ortho_pipeline.commands.rectification import rectify

@@ -16,7 +16,7 @@ from ortho_pipeline.block.start import Start
 from ortho_pipeline.errors import OrthoError, counted
 from ortho_pipeline.files.documents import json_position, json_value
 from ortho_pipeline.measure.block.left_out import LeftOut
-from ortho_pipeline.measure.solution import SUSPICIOUS
+from ortho_pipeline.measure.solution import LEAST_CHECK_POINTS, SUSPICIOUS
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.report.block import KEPT_OUT
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS
@@ -110,8 +110,10 @@ def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:
         return {"px": None, "m": None, "what": "not tested: no fit"}
     to = ", relative to the reference" if relative else ""
     found = fit.object_rms()
-    if found is None:
-        return _left_out_in_turn(fit, solution.left_out, to)
+    if found is None or found["n"] < LEAST_CHECK_POINTS:
+        without = _left_out_in_turn(fit, solution.left_out, to, 0 if found is None else int(found["n"]))
+        if found is None or without["m"] is not None:
+            return without
     rays = [one for one in (fit.image_rms(image, "check") for image in fit.points.images) if one is not None]
     count = sum(int(one["n"]) for one in rays)
     total = float(np.sqrt(sum(one["n"] * one["total"] ** 2 for one in rays) / count)) if count else None
@@ -121,16 +123,17 @@ def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:
     return told
 
 
-def _left_out_in_turn(fit: BlockFit, without: LeftOut, to: str) -> dict[str, Any]:
+def _left_out_in_turn(fit: BlockFit, without: LeftOut, to: str, checks: int) -> dict[str, Any]:
     """Return the accuracy at control points whose ground was left out in turn, where others tell of all of it."""
     apart = without.ground[fit.used_ground]
     apart = apart[np.isfinite(apart).all(axis=1)]
     if not len(apart) or not fit.redundancy:
         return {"px": None, "m": None, "what": f"not tested: no check points; {fit.gauge}"}
+    few = f"{counted(checks, 'check point')}: too few to judge by" if checks else "no check points were kept apart"
     east, north, up = np.sqrt((apart**2).mean(axis=0)).tolist()
     text = (
         f"RMSE in plan, {up:.3f} m in height, at {counted(len(apart), 'control point')}, the ground of each left out "
-        f"in turn{to}; no check points were kept apart"
+        f"in turn{to}; {few}"
     )
     told: dict[str, Any] = json_value({"px": None, "m": math.hypot(east, north), "n": len(apart), "what": text})
     return told

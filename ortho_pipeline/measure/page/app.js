@@ -21,8 +21,8 @@ async function ask(what, given = {}) {
   const response = await fetch(`api/${what}`, { method: 'POST', headers: { 'content-type': 'application/json' }, body: JSON.stringify({ window: windowName, ...given }) });
   const answer = await response.json().catch(() => ({ error: { message: `the server answers ${response.status}` } }));
   if (response.ok) return answer;
-  const { message, remedy, field } = answer.error;
-  throw new Error(`${field ? `${field}: ` : ''}${message}${remedy ? ` (${remedy})` : ''}`);
+  const { message, remedy } = answer.error;
+  throw new Error(`${message}${remedy ? ` (${remedy})` : ''}`);
 }
 
 function say(text, bad = false) {
@@ -93,6 +93,7 @@ function show(next) {
   const figures = [headline.px === null ? '' : `${headline.px.toFixed(3)} px`, headline.m === null ? '' : `${headline.m.toFixed(3)} m`];
   $('figure').textContent = figures.filter(Boolean).join(', ') || 'Not tested';
   $('what').textContent = state.error ? `${headline.what}: ${state.error}` : headline.what;
+  $('headline').title = $('what').textContent;
   $('undo').disabled = !state.undo || !facts.writes;
   $('redo').disabled = !state.redo || !facts.writes;
   const counted = state.marks.filter((mark) => !mark.off);
@@ -216,7 +217,15 @@ async function tie(name, place, mine) {
   await locate(mine);
 }
 
+/** Whether a place of a view is within its image or map; a rendered reference has no edge of its own. */
+function within(name, place) {
+  const [kind, number] = name.split('-');
+  const size = { scene: facts.images, map: facts.maps }[kind]?.[number].size;
+  return !size || place.every((value, axis) => value >= 0 && value <= size[axis]);
+}
+
 const measure = safely(async (pane, place) => {
+  if (!within(views.shows[pane], place)) { say('You clicked outside the image.', true); return; }
   begin();
   const mine = (turn += 1);
   const name = views.shows[pane];
@@ -307,14 +316,20 @@ const accept = safely(async () => {
   draw();
 });
 
-function choose(id) {
+/** Begin to change a point that there is. */
+function edit(id) {
   const mark = markOf(id);
-  if (!mark) return;
   turn += 1;
   selected = id;
   const rays = Object.fromEntries(Object.entries(mark.rays ?? {}).map(([label, ray]) => [label, { ...ray }]));
   pending = { ...mark, rays, first: Object.keys(rays)[0] ?? null, was: id, by_hand: true, clicked: true };
-  say(`${id}: ${mark.role}${facts.labels ? '' : `, ${mark.how}`}${mark.off ? ', off' : ''}. Nudge it, click it anew, or change what stands here; Enter accepts.`);
+  say(`${id} (${mark.role}${facts.labels ? '' : `, ${mark.how}`}${mark.off ? ', off' : ''}). Move it with the arrow keys, click again, or edit the fields; press Enter to save.`);
+  return { mark, rays };
+}
+
+function choose(id) {
+  if (!markOf(id)) return;
+  const { mark, rays } = edit(id);
   views.goTo({ ...mark.places, ...(mark.image ? { 'scene-0': mark.image } : {}), ...Object.fromEntries(Object.entries(rays).map(([label, ray]) => [`scene-${facts.labels.indexOf(label)}`, ray.image])) }, 1);
   fill();
   draw();
@@ -357,6 +372,8 @@ const dragged = safely(async (pane, id, place) => {
     Object.assign(changed, { ground: there.ground, ground_from: 'reference' });
   }
   await act({ do: 'put', mark: plain(changed), was: id });
+  // What is being edited is the point where it lies now: Enter would put it back.
+  if (pending?.was === id) { edit(id); fill(); draw(); }
 });
 
 async function compare(change) {
@@ -413,7 +430,7 @@ const makeOrtho = safely(async () => {
     const of = facts.labels ? `${facts.images[told.number].name}: ` : '';
     while (told.state === 'running') {
       $('ortho-share').value = told.share;
-      $('ortho-said').textContent = of + (told.share ? `${Math.round(100 * told.share)} % of the pixels are made. You can close this and go on measuring.` : 'Reading, fitting …');
+      $('ortho-said').textContent = of + (told.stage ? `${told.stage}: ${Math.round(100 * told.share)} %. You can close this and go on measuring.` : 'Reading, fitting …');
       await wait(300);
       told = await ask('made');
     }

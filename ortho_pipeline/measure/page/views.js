@@ -77,7 +77,8 @@ export class Views {
       this.base[pane] = new ol.layer.Tile({});
       const layers = [this.base[pane], ...(pane === 'scene' ? [this.over] : []),
         new ol.layer.Vector({ source: this.marks[pane], updateWhileAnimating: true, updateWhileInteracting: true })];
-      const map = new ol.Map({ target: pane, controls: [], layers });
+      // The wheel and a drag work in whichever pane the pointer is, without a click before.
+      const map = new ol.Map({ target: pane, controls: [], layers, interactions: ol.interaction.defaults.defaults({ onFocusOnly: false }) });
       map.on('click', (event) => {
         const hit = map.forEachFeatureAtPixel(event.pixel, (feature) => feature.getId() ?? null, { hitTolerance: 4 });
         document.getElementById(pane).focus();

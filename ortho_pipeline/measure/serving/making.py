@@ -45,7 +45,7 @@ class Making:
             return self._told
 
     def told(self) -> dict[str, Any]:
-        """Say how far it is: `state` is none, running, done or failed, `share` the part of the pixels that is made.
+        """Say how far it is: `state` is none, running, done or failed, `share` the finished part of its `stage`.
 
         `number` is the image that it is of.
         """
@@ -90,8 +90,8 @@ class Making:
                 "files": [str(path) for path in made.files.values()],
             })  # fmt: skip
 
-    def _advance(self, share: float) -> None:
-        self._tell({"state": "running", "share": float(share)})
+    def _advance(self, stage: str, share: float) -> None:
+        self._tell({"state": "running", "stage": stage, "share": float(share)})
 
     def _tell(self, told: dict[str, Any]) -> None:
         with self._lock:

@@ -115,7 +115,7 @@ interface RayMatch {
   score?: number | null;
 }
 
-interface Making { state: 'none' | 'running' | 'done' | 'failed'; share: number; number: number; figure: string; what: string; files: string[]; error: string }
+interface Making { state: 'none' | 'running' | 'done' | 'failed'; stage?: string; share: number; number: number; figure: string; what: string; files: string[]; error: string }
 
 interface Compared { rows: any[]; recommendation: { model: string | null; reason: string } }
 

@@ -1,0 +1,36 @@
+"""A run without pixels: everything that it would be made from is opened, and what stands in its way is said."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+from ortho_pipeline import commands
+from ortho_pipeline.batch.plan import Plan, plan
+from ortho_pipeline.batch.runner import error_document
+from ortho_pipeline.errors import OrthoError
+
+
+def check_scenes(
+    config: str | os.PathLike[str] | Plan, only: Sequence[str] = (), shard: tuple[int, int] | None = None
+) -> list[dict[str, Any]]:
+    """Open what every scene is made from (images, points, DEM and its coverage) and read no pixel.
+
+    Returns
+    -------
+    list of dict
+        Name and image, and what `commands.check` says or ``error``.
+    """
+    planned = config if isinstance(config, Plan) else plan(config)
+    checked: list[dict[str, Any]] = []
+    for job in planned.chosen(only, shard):
+        one: dict[str, Any] = {"name": job.name, "image": str(job.image)}
+        try:
+            one |= commands.check(
+                job.image, scene=job.scene, points=job.points, surface=job.surface, match=job.match, output=job.ortho
+            )  # fmt: skip
+        except OrthoError as error:
+            one["error"] = error_document(error)
+        checked.append(one)
+    return checked
