@@ -42,8 +42,7 @@ from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile
-from ortho_pipeline.raster.output import checked_options
-from ortho_pipeline.raster.stored_blocks import require_whole
+from ortho_pipeline.raster.output import checked_options, require_whole
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.records import SceneReport
 from ortho_pipeline.surface import footprint

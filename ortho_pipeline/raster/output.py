@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import math
 import os
 import secrets
 from collections.abc import Iterator
@@ -22,8 +23,7 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.files.locations import VsiPath
-from ortho_pipeline.raster.source import first_line
-from ortho_pipeline.raster.stored_blocks import stored_blocks, stored_images
+from ortho_pipeline.raster.source import first_line, open_dataset
 
 #: Blocks of a file that are read again before it gets its name.
 _SAMPLES = 12
@@ -159,8 +159,8 @@ def check_written(
         if size is not None and (dataset.RasterXSize, dataset.RasterYSize) != size:
             raise InputError("the output was not written whole", **told)
         end = written.stat().st_size
-        for band in stored_images(dataset):
-            blocks = stored_blocks(band)
+        for band in _images(dataset):
+            blocks = _blocks(band)
             if any(offset + count > end or not (count or sparse) for offset, count, _, _ in blocks):
                 raise InputError("the output was not written whole", **told)
             # The last in the file, and some from everywhere.
@@ -172,6 +172,71 @@ def check_written(
                     band.ReadRaster(left, top, min(width, band.XSize - left), min(height, band.YSize - top))
     except RuntimeError as error:
         raise InputError(f"the output cannot be read again ({first_line(error)})", **told) from error
+
+
+# -- whole files ------------------------------------------------------------------------------------------------------
+
+
+def require_whole(path: str | os.PathLike[str], **access: Any) -> None:
+    """Refuse a raster on disk whose file ends before its pixels do; what is no raster is accepted.
+
+    A GeoTIFF is asked for the place of every block and no pixel is read. Of other formats the last block is read.
+
+    Parameters
+    ----------
+    access : dict
+        As of `raster.source.open_dataset`.
+
+    Raises
+    ------
+    InputError
+        If the file is truncated.
+    """
+    try:
+        dataset = open_dataset(path, **access)
+    except InputError:
+        return
+    told: dict[str, Any] = {"file": path, "remedy": "copy or download it again"}
+    if dataset.GetDriver().ShortName == "GTiff":
+        end = os.path.getsize(path)
+        for band in _images(dataset):
+            if any(offset + count > end for offset, count, _, _ in _blocks(band)):
+                raise InputError("the file is truncated: it ends before its pixels do", **told)
+        return
+    band = dataset.GetRasterBand(dataset.RasterCount)
+    width, height = band.GetBlockSize()
+    left, top = (band.XSize - 1) // width * width, (band.YSize - 1) // height * height
+    try:
+        band.ReadRaster(left, top, band.XSize - left, band.YSize - top)
+    except RuntimeError as error:
+        raise InputError(
+            f"the file is damaged: its last pixels cannot be read ({first_line(error)})", **told
+        ) from error
+
+
+def _images(dataset: gdal.Dataset) -> Iterator[gdal.Band]:
+    """Yield a band of every image in a file: bands that are stored apart, overviews, mask."""
+    apart = dataset.GetMetadataItem("INTERLEAVE", "IMAGE_STRUCTURE") == "BAND"
+    for index in range(dataset.RasterCount if apart else 1):
+        band = dataset.GetRasterBand(index + 1)
+        yield band
+        yield from (band.GetOverview(k) for k in range(band.GetOverviewCount()))
+    if dataset.GetRasterBand(1).GetMaskFlags() == gdal.GMF_PER_DATASET:
+        mask = dataset.GetRasterBand(1).GetMaskBand()
+        yield mask
+        yield from (mask.GetOverview(k) for k in range(mask.GetOverviewCount()))
+
+
+def _blocks(band: gdal.Band) -> list[tuple[int, int, int, int]]:
+    """Return offset and count of bytes, column and row of each block; an absent one has 0 bytes at 0."""
+    width, height = band.GetBlockSize()
+    found = []
+    for row in range(math.ceil(band.YSize / height)):
+        for column in range(math.ceil(band.XSize / width)):
+            place = f"{column}_{row}"
+            offset, count = (band.GetMetadataItem(f"BLOCK_{what}_{place}", "TIFF") for what in ("OFFSET", "SIZE"))
+            found.append((int(offset or 0), int(count or 0), column, row))
+    return found
 
 
 # -- creation options --------------------------------------------------------------------------------------------------

@@ -77,7 +77,8 @@ def test_clicks_tie_the_images_and_the_block_is_that_of_the_file(
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.1
     assert np.hypot(*off.T).max() < 0.2
     assert state["error"] == ""
-    assert state["headline"]["n"] == 1
+    assert state["headline"]["n"] == 3
+    assert "1 check point: too few to judge by" in state["headline"]["what"]
     assert "relative to the reference" in state["headline"]["what"]
     assert state["version"] >= 1, "the models moved by pixels: the reference is rendered anew"
     fit = session.solution.fit

@@ -57,9 +57,12 @@ def init(
     if skipped:
         lines[0] += f", {counted(len(skipped), 'image')} skipped:"
         lines += [f"  {one.path}: {one.said}" for one in skipped]
-    run = shlex.join(["ortho", "run", str(target)])
-    network = " --allow-network" if any(not seen.beside(name, "dem") for name in seen.of("scene")) else ""
-    lines += ["Look at the file, then:", f"  {run} --dry-run{network}", f"  {run}{network}"]
+    file = shlex.quote(str(target))
+    if all(seen.beside(name, "dem") for name in seen.of("scene")):
+        next_lines = f"  ortho run {file} --dry-run\n  ortho run {file}"
+    else:
+        next_lines = f"  ortho run {file} --allow-network --dry-run\n  ortho run {file} --allow-network"
+    lines += ["Look at the file, then:", next_lines]
     document = {"scenes": seen.of("scene"), "skipped": {one.path: one.said for one in skipped}}
     return Result({"pipeline": target}, document, "\n".join(lines))
 
