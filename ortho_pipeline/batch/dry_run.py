@@ -8,8 +8,7 @@ from typing import Any
 
 from ortho_pipeline import commands
 from ortho_pipeline.batch.plan import Plan, plan
-from ortho_pipeline.batch.runner import error_document
-from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.errors import OrthoError, error_document
 
 
 def check_scenes(

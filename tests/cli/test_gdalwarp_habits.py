@@ -303,11 +303,12 @@ def test_several_images_are_for_run(tiny, tmp_path):
 def test_like_takes_the_grid_of_another_raster(tiny, tmp_path):
     given = ("-te", 402603, 6680103, 403603, 6681103, "-tr", 12.5, 8)
     first = ortho(tiny.image, tmp_path / "first", *given)
-    again = ortho(tiny.image, tmp_path / "again", "--like", first.GetDescription())
+    words = ("rectify", tiny.image, "--height", 500, "-of", "GTiff", "--like", first.GetDescription())
+    again = gdal.Open(json.loads(run(*words, "-o", tmp_path / "again", "--json").stdout)["files"]["ortho"])
     same_grid(again, first)
     assert again.GetSpatialRef().IsSame(first.GetSpatialRef())
     assert np.array_equal(again.ReadAsArray(), first.ReadAsArray())
-    both = run("rectify", tiny.image, "--height", 500, "--like", first.GetDescription(), "-tr", 5, "-o", tmp_path / "x")
+    both = run(*words, "-tr", 5, "-o", tmp_path / "x")
     assert both.exit_code == 2
     assert "--resolution" in both.stderr
     document = json.loads((tmp_path / "again" / f"{tiny.image.stem}_report.json").read_text())
