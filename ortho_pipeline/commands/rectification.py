@@ -99,8 +99,7 @@ def rectify(
         written, an old side-car that would attach to the ortho.
     """
     stem, before, stage = Path(image).stem, bytes_read(), progress or _unwatched
-    files = outputs(folder, stem, output)
-    points = inputs.point_options(points)
+    files, points = outputs(folder, stem, output), inputs.point_options(points)
     inputs.check_paths(files, image, scene, points, surface, match, overwrite, output=output)
     require_heights(surface)
     begun = states(inputs.given_files(image, scene, points, surface, match, output))
@@ -126,8 +125,7 @@ def rectify(
         angles = write_angles(placed, sun, files, output)
         asked = {"scene": scene, "surface": surface, "output": output, **match_asked(match)}
         record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
-    whole = raster.open_dataset(image, **scene.access)
-    _write_models(model, exported, opened, whole, files, {**record, "adjustment": adjusted.record()})
+    _write_models(model, exported, opened, image, scene, files, {**record, "adjustment": adjusted.record()})
 
     def described() -> SceneReport:
         made = report.build_report(
@@ -147,7 +145,6 @@ def rectify(
     made = attempted(described, files, *OF_REPORT)
     inputs.refuse_changed(begun)
     retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
-    stage("Layers and report", 1.0)
     if isinstance(made, ReportError):
         return Result(files, {"report": None}, "Ortho and model are complete; there is no report.", made)
     return Result(files, {"report": json_value(made)}, report.summary_text(made))
@@ -320,16 +317,17 @@ def _warp(
 def _write_models(
     model: SensorModel,
     exported: rpc.RpcExport | None,
-    scene: Scene,
-    dataset: raster.gdal.Dataset,
+    opened: Scene,
+    image: str | os.PathLike[str],
+    scene: SceneOptions,
     files: dict[str, Path],
     provenance: Mapping[str, Any],
 ) -> None:
     """Write the model in every format; what cannot be written is taken out of `files`."""
-    size = scene.width, scene.height
-    write_model_file(SavedModel(model, scene.sensor, scene.model_source, size, provenance), files["model"])
+    size = opened.width, opened.height
+    write_model_file(SavedModel(model, opened.sensor, opened.model_source, size, provenance), files["model"])
     if exported is None:
         del files["rpc"], files["vrt"]
         return
     rpc.write_rpc_txt(exported.rpc, files["rpc"])
-    rpc.write_vrt(dataset, exported.rpc, files["vrt"])
+    rpc.write_vrt(raster.open_dataset(image, **scene.access), exported.rpc, files["vrt"])
