@@ -65,10 +65,12 @@ def signed(value: float | None) -> str:
 
 
 def short(value: float | None, sign: str = "") -> str:
-    """Return three significant digits."""
+    """Return three significant digits; from a thousand to ten millions in full, with commas."""
     if value is None:
         return "–"
-    return f"{value:{sign}.3g}".replace("-", "−") if value else "0"
+    # 999.6 is 1,000 in three digits, which `g` would write as 1e+03.
+    text = f"{value:{sign},.0f}" if 999.5 <= abs(value) < 1e7 else f"{value:{sign}.3g}"
+    return text.replace("-", "−") if value else "0"
 
 
 def share(value: float | None) -> str:

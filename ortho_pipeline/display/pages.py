@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.display.numbers import fixed, metres, plain_size, px, share, short, signed
+from ortho_pipeline.errors import counted
 
 
 def render(template: str, **values: Any) -> str:
@@ -73,5 +74,6 @@ def _environment() -> Any:
     environment.filters |= {
         "coded": _coded,
         "px": px, "m": metres, "signed": signed, "share": share, "fixed": fixed, "number": short, "plain": plain_size,
+        "counted": counted,
     }  # fmt: skip
     return environment

@@ -59,6 +59,8 @@ _DRAWN_RAYS, _LISTED = 400, 400
 #: What makes points of known ground a test.
 KEPT_OUT = "whose ground coordinates took no part"
 TIED = "their image measurements helped to tie the images"
+#: Ground that stays this close (m) to its given coordinates was held, not tested.
+_HELD = 0.0005
 #: A frame's side, the longest arrow in it, and the margin in which arrows of points at its edge end.
 _SIDE, _ARROW, _MARGIN = 420.0, 44.0, 48.0
 
@@ -195,6 +197,10 @@ def summary_text(report: BlockReport) -> str:
         lines.append(f"{label:<{wide}}  {found.rays:>6}{pairs}  {image.model} of {image.model_source}")
     for role, rms in (("control", adjustment.object_rms.control), ("check", adjustment.object_rms.check)):
         if rms:
+            if max(map(abs, (*rms.min, *rms.max))) < _HELD:
+                held = "held at the given coordinates, so no RMSE on the ground"
+                lines.append(f"{counted(rms.n, f'{role} point')}: {held}")
+                continue
             axes = zip("ENh", (rms.x, rms.y, rms.h), rms.min, rms.max, strict=True)
             text = ", ".join(f"{axis} {value:.3f} ({a:+.2f} to {b:+.2f})" for axis, value, a, b in axes)
             lines.append(f"{counted(rms.n, f'{role} point')}: RMSE {text} m")

@@ -21,8 +21,11 @@ from ortho_pipeline.commands.block_images import labels_of, points_of_images
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.exchange.rpc import export_rpc, read_rpc, rpc_metadata
+from ortho_pipeline.files.documents import record_of
 from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.models import RPC
+from ortho_pipeline.report.block import summary_text
+from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.wording import NO_SCALE
 from ortho_pipeline.simulation.scanner import LineScanner
 
@@ -578,3 +581,15 @@ def test_images_in_an_archive_are_adjusted_and_intersected_as_those_on_disk(ster
         one, other = (document["report"]["adjustment"]["images"] if command == "adjust" else document["points"]
                       for document in found)  # fmt: skip
         assert one == other
+
+
+def test_control_that_was_held_has_no_rmse_of_zero(stereo: Stereo, tmp_path: Path) -> None:
+    """Ground that a reference gives and that is held fits itself: its RMSE of 0.000 would read as a success."""
+    run("adjust", *stereo.images, "--points", stereo.write(), "-o", tmp_path / "out")
+    document = json.loads((tmp_path / "out" / "block_report.json").read_text())
+    known = document["adjustment"]["object_rms"]["control"] or document["adjustment"]["object_rms"]["check"]
+    zero = {name: [0.0] * 3 if isinstance(value, list) else 0.0 for name, value in known.items()} | {"n": 1504}
+    document["adjustment"]["object_rms"]["control"] = zero
+    said = summary_text(record_of(BlockReport, document))
+    assert "1504 control points: held at the given coordinates, so no RMSE on the ground" in said
+    assert "RMSE E 0.000" not in said

@@ -15,13 +15,14 @@ from scenes import Case, Setting, write_raster
 
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.commands.control.ties import names_of
+from ortho_pipeline.commands.control.ties import Tied, _points, names_of
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.imaging import matching
 from ortho_pipeline.imaging.matching.search import refuse_accident
-from ortho_pipeline.imaging.matching.weights import components
+from ortho_pipeline.imaging.matching.weights import Components, components
 from ortho_pipeline.imaging.ties import Pair, Ties, TieSettings, tie
+from ortho_pipeline.imaging.ties.pairs import PairSummary
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
@@ -304,3 +305,18 @@ def test_residuals_of_one_direction_leave_a_covariance_that_can_be_inverted():
     parts = components(along * random.normal(0, 2, (40, 1)), np.tile(1e-4 * np.eye(2), (40, 1, 1)), along)
     assert parts.height == pytest.approx(2.0, rel=0.4)
     assert np.linalg.eigvalsh(parts.covariance(np.tile(1e-4 * np.eye(2), (40, 1, 1)), along)).min() > 0
+
+
+def test_what_succeeded_between_two_images_is_never_more_than_was_tried() -> None:
+    """Ties that two images share through a third one are counted, and not as matches of these two."""
+    track, image = np.repeat(np.arange(4), 3), np.tile(np.arange(3), 4)
+    parts = Components(0.1, 1.0, 0.1)
+    pairs = tuple(
+        PairSummary(both, found, tried, (0.5, 0.5), parts)
+        for both, found, tried in (((0, 1), 4, 5), ((0, 2), 4, 4), ((1, 2), 1, 2))
+    )
+    ties = Ties(track, image, np.ones((12, 2)), np.tile(np.eye(2), (12, 1, 1)), pairs)
+    tied = Tied(_points(ties, ("a", "b", "c")), ties, 100.0, 10.0)
+    last = tied.to_json()["pairs"][-1]
+    assert (last["ties"], last["matched"], last["tried"]) == (4, 1, 2)
+    assert "b - c: 4 ties; 1 of 2 matches tried between these two images succeeded" in tied.summary()

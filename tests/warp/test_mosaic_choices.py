@@ -248,6 +248,20 @@ def test_along_the_seams_less_differs_than_before(tmp_path):
     assert sum(found["length_px"] for found in after.values()) == sum(int(one.sum()) for one in crossed)
 
 
+def test_a_step_at_one_place_of_a_seam_is_told_beside_the_mean(tmp_path):
+    """The right scene is 50 brighter in the upper sixth of the overlap, and the same below."""
+    bright = GROUND[:240, 180:400].copy()
+    bright[:40] += 50.0
+    orthos = [write(tmp_path, "left", GROUND[:240, :220], 0, 0), write(tmp_path, "right", bright, 180, 0)]
+    placed = lay_out(orthos, "first-on-top")
+    owners = owners_of(placed, None, seamlines=True)
+    (seam,) = along_seams(placed, owners.ordered, owners.cell, None).values()
+    assert seam["step"] == [pytest.approx(50.0, abs=0.5)]
+    assert seam["rms"][0] < 30.0
+    said = mosaic([one.path for one in orthos], tmp_path / "m.tif", MosaicOptions(format="COG", seamlines=True))
+    assert " at the worst place" in said.summary
+
+
 @pytest.mark.parametrize("shift", [(0, 0), (3, -2)])
 def test_content_beside_a_seam_is_measured_by_the_matcher(tmp_path, shift):
     """The second ortho shows the ground some columns and rows elsewhere, darker and with noise."""

@@ -80,6 +80,7 @@ class Tied:
                     "images": [names[one.images[0]], names[one.images[1]]],
                     "ties": len(self.ties.of_pair(*one.images)),
                     "tried": one.tried,
+                    "matched": one.ties,
                     "shift_px": [-one.shift[0], -one.shift[1]],
                     "height_m": None if one.components is None else one.components.height,
                     "reason": one.reason,
@@ -104,7 +105,8 @@ class Tied:
                 continue
             column, row = one["shift_px"]
             lines.append(
-                f"{pair}: {counted(one['ties'], 'tie')} of {one['tried']} tried here; models apart by column "
+                f"{pair}: {counted(one['ties'], 'tie')}; {one['matched']} of {one['tried']} matches tried "
+                f"between these two images succeeded; models apart by column "
                 f"{column:+.2f} px, row {row:+.2f} px; heights off by {metres(one['height_m'])}"
             )
         return "\n".join(lines)
