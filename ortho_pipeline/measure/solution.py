@@ -128,7 +128,7 @@ def normalised_residuals(fit: Fit) -> Array:
 def _headline(fit: Fit | None) -> dict[str, Any]:
     """Return the best evidence of accuracy that there is, and what it is: never the residuals of the fit itself."""
     if fit is None:
-        return {"px": None, "m": None, "what": "not tested: no fit"}
+        return {"px": None, "m": None, "what": "not tested: no points yet"}
     relative = bool((fit.points.groups[fit.used] >= 0).any())
     to = ", relative to the reference" if relative else ""
     check, loo = fit.rmse("check"), fit.rmse("loo") if fit.redundancy else None

@@ -107,7 +107,7 @@ def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:
     """Return the best evidence of accuracy that there is, and what it is: never the residuals of the fit itself."""
     fit = solution.fit
     if fit is None or solution.left_out is None:
-        return {"px": None, "m": None, "what": "not tested: no fit"}
+        return {"px": None, "m": None, "what": "not tested: no points yet"}
     to = ", relative to the reference" if relative else ""
     found = fit.object_rms()
     if found is None or found["n"] < LEAST_CHECK_POINTS:

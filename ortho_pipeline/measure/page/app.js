@@ -91,7 +91,7 @@ function show(next) {
   state = next;
   const { headline } = state;
   const figures = [headline.px === null ? '' : `${headline.px.toFixed(3)} px`, headline.m === null ? '' : `${headline.m.toFixed(3)} m`];
-  $('figure').textContent = figures.filter(Boolean).join(', ') || 'Not tested';
+  $('figure').textContent = figures.filter(Boolean).join(', ') || 'Accuracy unknown';
   $('what').textContent = state.error ? `${headline.what}: ${state.error}` : headline.what;
   $('headline').title = $('what').textContent;
   $('undo').disabled = !state.undo || !facts.writes;
