@@ -12,7 +12,7 @@ import numpy as np
 
 from ortho_pipeline.estimation.fit import Fit, root_mean_square
 from ortho_pipeline.geodesy.crs import parse_crs
-from ortho_pipeline.geodesy.ellipsoid import units_per_metre
+from ortho_pipeline.geodesy.distortion import map_from_enu
 from ortho_pipeline.models.base import Array, SensorModel, solve_2x2
 
 #: An image that moves less than this (pixels per metre of height) has no direction of view to speak of.
@@ -20,19 +20,18 @@ _NADIR = 1e-4
 
 
 def metre_partials(model: SensorModel, ground: Array) -> tuple[Array, Array]:
-    """Return d(image)/d(x, y in metres) ``(N, 2, 2)`` and d(image)/d(height) ``(N, 2)``."""
+    """Return d(image)/d(true east, north in metres) ``(N, 2, 2)`` and d(image)/d(height) ``(N, 2)``."""
     ground = with_reference_height(model, ground)
-    partials = model.ground_partials(ground)
-    units = units_per_metre(parse_crs(model.crs), ground)
-    return partials[:, :, :2] * units[:, None, :2], partials[:, :, 2]
+    partials = model.ground_partials(ground) @ map_from_enu(parse_crs(model.crs), ground)
+    return partials[:, :, :2], partials[:, :, 2]
 
 
 def viewing(model: SensorModel, width: int, height: int) -> dict[str, Any]:
     """Return how the middle of an image is seen: pixel size on the ground, and the direction of view.
 
     All are None where the middle has no ground. `view` has the angle at the ground between ray and vertical, the
-    azimuth (clockwise from the y axis of the model's CRS) in which the sensor stands, and the size of a pixel along and
-    across that direction: the length on level ground that one pixel of the image covers. For a square pixel of the size
+    azimuth (clockwise from true north) in which the sensor stands, and the size of a pixel along and across that
+    direction: the length on level ground that one pixel of the image covers. For a square pixel of the size
     p straight down, the paper's formula gives p / cos^2 along and p / cos across; the model gives what is so, also
     where lines follow each other at another distance.
 
@@ -41,7 +40,7 @@ def viewing(model: SensorModel, width: int, height: int) -> dict[str, Any]:
     dict
         `ground_pixel_m` [along the row, along the column], `lean_m_per_m` and `lean_azimuth_deg` (how far and whereto
         the ortho moves per metre of height), `view` {incidence_deg, sensor_azimuth_deg, pixel_m {along_view,
-        across_view}}; `sensor_azimuth_deg` is None straight down, where along is y and across is x.
+        across_view}}; `sensor_azimuth_deg` is None straight down, where along is north and across is east.
 
     Source: Bueyueksalih et al. (OrbView-3), formula 1.
     """
@@ -86,7 +85,7 @@ def with_reference_height(model: SensorModel, ground: Array) -> Array:
 
 
 def in_metres(fit: Fit, residuals: Array) -> Array:
-    """Return residuals ``(N, 2)`` px as shifts of the ortho, metres along x and y of the model's ground CRS."""
+    """Return residuals ``(N, 2)`` px as shifts of the ortho on the ground, metres true east and north."""
     if not len(residuals):
         return np.zeros((0, 2))
     plan, _ = metre_partials(fit.model, fit.points.ground)
@@ -94,7 +93,7 @@ def in_metres(fit: Fit, residuals: Array) -> Array:
 
 
 def rmse_metres(fit: Fit) -> dict[str, Any]:
-    """Return root mean squares in metres over control (used), check and left-out residuals; None for no points."""
+    """Return root mean squares (m; x is east, y north) of control (used), check and left-out residuals, or None."""
     shifts = in_metres(fit, fit.residuals)
     values = {
         "control": shifts[fit.used],

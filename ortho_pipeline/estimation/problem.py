@@ -29,7 +29,7 @@ import numpy as np
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints, counted
 from ortho_pipeline.estimation.least_squares import condition_of, minimise, solve_linear
-from ortho_pipeline.geodesy.ellipsoid import units_per_metre
+from ortho_pipeline.geodesy.distortion import map_from_enu
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.image_errors import says_more
@@ -85,8 +85,9 @@ class ImageErrors:
         known = (points.sigma_ground > 0).any(axis=1)
         if known.any():
             ground = points.ground[known]
-            spread = points.sigma_ground[known] * units_per_metre(points.crs, ground)
-            moved = model.ground_partials(ground) * spread[:, None, :]
+            # On the ellipsoid: at heights of people a metre of it is a thousandth longer at most.
+            per_metre = map_from_enu(points.crs, ground * (1.0, 1.0, 0.0))
+            moved = model.ground_partials(ground) @ (per_metre * points.sigma_ground[known][:, None, :])
             factor[known] = _summed(np.concatenate([factor[known], moved], axis=2))
         exact = (np.diagonal(factor, axis1=1, axis2=2) <= 0).any(axis=1)
         if exact.any():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -13,20 +12,6 @@ SEMI_MAJOR = 6378137.0
 ECCENTRICITY_SQUARED = 6.69437999014e-3
 #: Rotation of the Earth, radians per second.
 EARTH_RATE = 7.292115e-5
-
-
-def units_per_metre(crs: pyproj.CRS, ground: Array) -> Array:
-    """Return how many units of each ground coordinate one metre is, ``(N, 3)``.
-
-    For geographic coordinates from the radii of curvature of WGS84 at the points' latitude; for projected ones from
-    the unit of the axes. Heights are always metres.
-    """
-    scale = np.ones((len(ground), 3))
-    if crs.is_geographic:
-        scale[:, :2] = 1.0 / metres_per_degree(ground * (1.0, 1.0, 0.0))
-    else:
-        scale[:, :2] = 1.0 / crs.axis_info[0].unit_conversion_factor
-    return scale
 
 
 # -- the ellipsoid ---------------------------------------------------------------------------------------------------

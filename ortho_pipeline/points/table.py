@@ -82,7 +82,7 @@ class Points:
     sigma_image : ndarray (N,)
         Standard deviation of the image measurement, px: the root mean square of both axes.
     sigma_ground : ndarray (N, 3)
-        Standard deviation of the ground coordinates in metres; 0 is perfect.
+        Standard deviation of the ground in metres true east, north and up, whatever `crs`; 0 is perfect.
     crs : pyproj.CRS
         Horizontal CRS, x first.
     source : str

@@ -111,7 +111,7 @@ class Parameter:
 
 @record
 class CommonError:
-    """An error that points have in common, as matches that of their reference, per axis of the map in metres.
+    """An error that points have in common, as matches that of their reference: metres true east and north.
 
     `estimate_m` is what other points tell of it, and `estimate_sigma_m` what that leaves.
     """
@@ -161,7 +161,7 @@ class GroupedStatistics(Statistics):
 
 @record
 class Point:
-    """A point in the image: `residual_m` is where the ortho shows it minus where it belongs, metres along x and y.
+    """A point in the image: `residual_m` is where the ortho shows it minus where it belongs, metres east and north.
 
     `view_residual` is along and across the direction of view, `raw_residual` of the model as delivered. `lon_lat` is
     where it belongs and `shown_lon_lat` where the ortho shows it, degrees (WGS 84).

@@ -27,8 +27,8 @@ from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rm
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
 from ortho_pipeline.files.documents import DocumentError, json_position, json_value, made_of, record_of
-from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
-from ortho_pipeline.geodesy.ellipsoid import geocentric, units_per_metre
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform
+from ortho_pipeline.geodesy.distortion import east_north_from_map, map_from_enu
 from ortho_pipeline.geodesy.naming import crs_definition, crs_name
 from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
@@ -191,7 +191,7 @@ def _in_degrees(fit: Fit, shifts: Array) -> tuple[Array, Array]:
     if not len(points):
         return np.zeros((0, 2)), np.zeros((0, 2))
     to_degrees, moved = ground_transform(points.crs, "EPSG:4979"), points.ground.copy()
-    moved[:, :2] += shifts * units_per_metre(parse_crs(points.crs), points.ground)[:, :2]
+    moved[:, :2] += np.einsum("nij,nj->ni", map_from_enu(points.crs, points.ground)[:, :2, :2], shifts)
     return to_degrees(points.ground)[:, :2], to_degrees(moved)[:, :2]
 
 
@@ -209,10 +209,8 @@ def _map_scale(fit: Fit, seen: Mapping[str, Any], grid: Grid | None) -> MapScale
 def _pixel_on_ground(grid: Grid) -> list[float]:
     """Return width and height of the ortho's middle pixel in metres on the ellipsoid; nothing where it has no place."""
     left, bottom, right, top = grid.extent
-    middle = np.array([(left + right) / 2, (bottom + top) / 2, 0.0])
-    corners = middle + np.array([[0.0, 0.0, 0.0], [grid.dx, 0.0, 0.0], [0.0, grid.dy, 0.0]])
-    places = geocentric(ground_transform(grid.crs, "EPSG:4979")(corners))
-    sizes = np.linalg.norm(places[1:] - places[0], axis=1)
+    middle = np.array([[(left + right) / 2, (bottom + top) / 2, 0.0]])
+    sizes = np.linalg.norm(east_north_from_map(grid.crs, middle)[0] * [grid.dx, grid.dy], axis=0)
     return [float(size) for size in sizes if np.isfinite(size)]
 
 
@@ -303,7 +301,7 @@ def residuals_geojson(fit: Fit) -> dict[str, Any]:
     """Return the points as GeoJSON in lon, lat (WGS 84), one flat property per number, as GIS want them.
 
     ``res_*`` are residuals in pixels, ``raw_*`` those of the model as delivered, ``loo_*`` leave-one-out; ``east_m``
-    and ``north_m`` the shift of the ortho in metres along the axes of the ground, for a vector field symbol.
+    and ``north_m`` the shift of the ortho on the ground (m, true east and north), for a vector field symbol.
     """
     points = fit.points
     where = ground_transform(points.crs, "EPSG:4979")(points.ground) if len(points) else np.zeros((0, 3))

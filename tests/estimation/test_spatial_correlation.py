@@ -318,7 +318,10 @@ def test_report_of_few_points_says_so_and_draws_nothing():
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pinhole(SensorModel):
-    """A camera over a flat Earth in UTM: `aim` is the angle off the vertical, `azimuth` whereto it looks (degrees)."""
+    """A camera over a flat Earth: `aim` is the angle off the vertical, `azimuth` whereto it looks (degrees).
+
+    Ground is in UTM on its central meridian, where 0.9996 m on the map are a metre.
+    """
 
     kind = "pinhole"
     aim: float = 0.0
@@ -341,8 +344,7 @@ class Pinhole(SensorModel):
         forward = np.sin(tilt) * level - np.cos(tilt) * np.array([0.0, 0.0, 1.0])
         right = np.array([level[1], -level[0], 0.0])
         down = np.cross(forward, right)
-        eye = self.domain[0] - forward * self.altitude / np.cos(tilt)
-        way = np.asarray(ground) - eye
+        way = (np.asarray(ground) - self.domain[0]) / [0.9996, 0.9996, 1.0] + forward * self.altitude / np.cos(tilt)
         x, y = (self.focal * (way @ axis) / (way @ forward) for axis in (right, down))
         column = np.cos(turn) * x - np.sin(turn) * y
         return np.column_stack([column + 500, np.sin(turn) * x + np.cos(turn) * y + 500])

@@ -93,8 +93,9 @@ def test_points_left_out_of_a_real_scene_are_off_by_what_the_layer_says(real):
         covariance = predictive(rest.covariance, rest.degrees_of_freedom)
         parts = parts_at(Budget(covariance=covariance), sight, *at).total[0]
         seen = sight.seen(*at)
-        off = seen.ground_per_pixel[0] @ (points.image[k] - seen.image[0])
-        measured = seen.ground_per_pixel[0] * float(np.sqrt((rest.residuals[rest.used] ** 2).mean()))
+        per_pixel = sight.metres(*at)[0] @ seen.place_per_pixel[0]
+        off = per_pixel @ (points.image[k] - seen.image[0])
+        measured = per_pixel * float(np.sqrt((rest.residuals[rest.used] ** 2).mean()))
         normalised.append(off / np.sqrt(parts[:2] + np.diag(measured @ measured.T)))
     spread = np.sqrt((np.array(normalised) ** 2).mean())
     # Ten numbers, eight of them free: their spread is within this with 95 %.

@@ -95,7 +95,7 @@ def test_shadows_of_a_rendered_scene_are_where_the_mask_has_them(tmp_path):
     hiding = Hiding(tmp_path / "ortho.tif", heights, tmp_path / "mask.tif")
     engine.rectify(model, RasterSource(tmp_path / "image.tif"), surface, grid, hiding, resampling="nearest")
     # The map's north, not the true one, is the renderer's.
-    bearing = Sun(SUN.azimuth_deg - np.degrees(_convergence(grid)), SUN.elevation_deg)
+    bearing = Sun(SUN.azimuth_deg + _convergence(grid), SUN.elevation_deg)
     share = write_shadows(Sight(model, grid), surface, bearing, tmp_path / "shadow.tif", heights=heights)
     shadow, visible = read(tmp_path / "shadow.tif"), read(tmp_path / "mask.tif") == 1
     dark = read(tmp_path / "ortho.tif") == 40
@@ -105,9 +105,9 @@ def test_shadows_of_a_rendered_scene_are_where_the_mask_has_them(tmp_path):
 
 
 def _convergence(grid: Grid) -> float:
-    from ortho_pipeline.warp.layers.angles import true_north
-
-    return float(true_north(grid)(np.array([grid.width / 2]), np.array([grid.height / 2]))[0])
+    x, y = grid.xy(np.array([grid.width / 2]), np.array([grid.height / 2]))
+    place = pyproj.Transformer.from_crs(grid.crs, 4326, always_xy=True).transform(x[0], y[0])
+    return float(pyproj.Proj(grid.crs).get_factors(*place).meridian_convergence)
 
 
 def test_rectify_writes_angles_and_shadows_with_the_ortho(tiny, tmp_path):

@@ -1,7 +1,7 @@
 r"""An error that many points have in common, as matches have that of their reference, in an adjustment.
 
-The ground of such points is off by one unknown vector, in units of its standard deviation :math:`c \sim N(0, I)` (x and
-y of the map). Nothing within these points shows it: what it moves them by in the image is taken to be what the
+The ground of such points is off by one unknown vector, in units of its standard deviation :math:`c \sim N(0, I)`
+(true east and north). Nothing within these points shows it: what it moves them by in the image is taken to be what the
 parameters can follow, :math:`A \Pi c`, with :math:`\Pi` the least-squares fit of the parameters to a shift of one
 standard deviation. So it is one more pair of unknowns, which only points without it, and prior knowledge of the
 parameters, tell anything of. With whitened design :math:`A`, cofactors :math:`Q`, and :math:`U = A \Pi` for the
@@ -26,7 +26,7 @@ import numpy as np
 
 from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.geodesy.crs import parse_crs
-from ortho_pipeline.geodesy.ellipsoid import units_per_metre
+from ortho_pipeline.geodesy.distortion import map_from_enu
 from ortho_pipeline.models.base import Array, SensorModel, solve_2x2
 from ortho_pipeline.points import Points
 
@@ -51,8 +51,8 @@ class CommonError:
     per_sigma : (P, 2)
         What the parameters follow it by, per standard deviation along each axis.
     value : (2,)
-        Its estimate, in standard deviations: how far the ground of these points lies from the truth along x and y of
-        the map; 0 where nothing tells of it.
+        Its estimate, in standard deviations: how far true east and north of the truth the ground of these points lies;
+        0 where nothing tells of it.
     told : (2, 2)
         Information of other points and of priors on it; that of its own standard deviation is I.
     gain : (P, 2)
@@ -77,9 +77,9 @@ class CommonError:
         if not shares.any() or not count:
             return None
         problem = Problem.of(model, points, shares, {})
-        units = units_per_metre(parse_crs(model.crs), problem.ground) * problem.points.sigma_common[:, None]
+        per_metre = model.ground_partials(problem.ground) @ map_from_enu(parse_crs(model.crs), problem.ground)
         # Where ground is said to lie farther east than it does, it is seen farther west of where the model puts it.
-        moved = -problem.errors.whitened(model.ground_partials(problem.ground)[:, :, :2] * units[:, None, :2])
+        moved = -problem.errors.whitened(per_metre[:, :, :2] * problem.points.sigma_common[:, None, None])
         design = problem.errors.whitened(model.param_partials(problem.ground))
         scale = np.maximum(np.linalg.norm(design, axis=(0, 1)), 1e-300)
         found = np.linalg.lstsq((design / scale).reshape(-1, count), moved.reshape(-1, 2), rcond=1e-10)[0]

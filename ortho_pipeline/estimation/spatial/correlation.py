@@ -218,7 +218,7 @@ def analyse(
 
 
 def analyse_fit(fit: Fit, *, near: float | None = None) -> dict[str, CovarianceAnalysis | None]:
-    """Analyse the residuals of a fit on the ground (m, x and y of the model's CRS), control and check apart.
+    """Analyse the residuals of a fit on the ground (m, true east and north), control and check apart.
 
     Returns
     -------

@@ -21,7 +21,7 @@ from scipy import stats
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.geodesy.crs import parse_crs
-from ortho_pipeline.geodesy.ellipsoid import units_per_metre
+from ortho_pipeline.geodesy.distortion import map_from_enu
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
 from ortho_pipeline.imaging.matching.chip_search import (
     FEWEST,
@@ -310,13 +310,12 @@ def _sight(view: View, target: OtherScene, partials: Array, ground: Array) -> tu
     partials : (n, 2, 3)
         Of the first model.
     """
-    step = units_per_metre(parse_crs(view.model.crs), ground)
-    steps = np.stack([np.where(np.arange(3) == axis, step, 0.0) for axis in range(3)])
+    per_metre = map_from_enu(parse_crs(view.model.crs), ground)
     second = np.stack(
         [(target.project(ground + one, view.model.crs) - target.project(ground - one, view.model.crs)) / 2
-         for one in steps], axis=-1,
+         for one in np.moveaxis(per_metre, 2, 0)], axis=-1,
     )  # fmt: skip
-    first = partials * step[:, None, :]
+    first = partials @ per_metre
     # Along a ray of the second scene, plan follows height.
     with np.errstate(invalid="ignore"):
         plan = -_solve(second[:, :, :2], second[:, :, 2:])

@@ -1,8 +1,8 @@
 r"""How accurate each pixel of an ortho is: the covariance of where it shows the ground.
 
-A pixel at (e, n) takes its height h from the surface and its value from the image point that the model gives. With the
-derivatives of `sight`, :math:`A` (pixels per metre on the map, at constant height) and :math:`d` (metres that ground
-moves per metre of height), the covariance of the place that it really shows is
+A pixel takes its height h from the surface and its value from the image point that the model gives. With the
+derivatives of `sight` in metres true east and north on the ground, :math:`A` (pixels per metre, at constant height) and
+:math:`d` (metres that ground moves per metre of height), the covariance of the place that it really shows is
 
 .. math::
     C = A^{-1} (J C_p J^T + \tfrac{1}{3} \beta^2 I) A^{-T} + (\sigma_h^2 + \sigma_0^2)\, d d^T + \sigma_r^2 I
@@ -183,14 +183,15 @@ def parts_at(
 
 def _exact(budget: Budget, sight: Sight, columns: Array, rows: Array, heights: Array) -> Array:
     """Return the fields ``(n, 10)``: model (ee, nn, en), displacement (e, n), interpolation (ee, nn, en), image."""
-    seen = sight.seen(columns, rows, heights)
-    inverse = seen.ground_per_pixel
+    seen, metres = sight.seen(columns, rows, heights), sight.metres(columns, rows, heights)
+    inverse = metres @ seen.place_per_pixel
+    displacement = np.einsum("nij,nj->ni", metres, seen.displacement)
     model = np.zeros((len(columns), 3))
     if budget.covariance is not None and len(budget.covariance):
         partials = inverse @ sight.model.param_partials(seen.ground)
         model = _three(partials @ budget.covariance @ partials.transpose(0, 2, 1))
     interpolation = _three(inverse @ inverse.transpose(0, 2, 1)) * (budget.interpolation_px**2 / 3)
-    return np.concatenate([model, seen.displacement, interpolation, seen.image], axis=1)
+    return np.concatenate([model, displacement, interpolation, seen.image], axis=1)
 
 
 def _three(covariance: Array) -> Array:
@@ -221,8 +222,8 @@ def write_accuracy(
 ) -> AccuracyResult:
     """Write the accuracy of the ortho on the grid of `sight` as a COG, at one pixel for `step` squared of its own.
 
-    Bands: standard deviations east and north on the map (m), their correlation, and the radius that holds 90 % of the
-    errors (m); NaN where the ortho shows nothing, or something of the error is not known there.
+    Bands: standard deviations true east and north on the ground (m), their correlation, and the radius that holds 90 %
+    of the errors (m); NaN where the ortho shows nothing, or something of the error is not known there.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Angles of view and of the sun at each place of an ortho, and what lies in shadow.
 
-Azimuths are clockwise from true north, towards sensor and sun; zenith angles are from the ellipsoid's normal, and the
-sun's incidence is from the normal of the terrain over a pixel of the layer. The sun stands at one place for the whole
-scene. Refraction is left out.
+Azimuths are clockwise from true north, towards sensor and sun, whatever the map; zenith angles are from the ellipsoid's
+normal, and the sun's incidence is from the normal of the terrain over a pixel of the layer. The sun stands at one place
+for the whole scene. Refraction is left out.
 """
 
 from __future__ import annotations
@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.process_limits import Resources
-from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.distortion import inverse_2x2
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, classes_profile
-from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import levels, polynomials
 from ortho_pipeline.warp.layers.accuracy import layer_grid, overviews, tiles
@@ -35,8 +34,6 @@ LIT, SHADED, WITHOUT = 1, 2, 4
 #: Side of a tile, of the layer and of the mask, and pixels of the layer between nodes.
 _TILE, _MASK_TILE, _SPACING = 256, 1024, 16
 _LEVELS = 3
-#: Degrees of latitude over which north is looked for.
-_NORTH = 1e-4
 
 
 @dataclass(frozen=True)
@@ -59,15 +56,15 @@ class Sun:
                 "the horizon", field="output.sun", remedy="give degrees from north and over the horizon, above 0",
             )  # fmt: skip
 
-    def way(self, grid: Grid) -> Callable[[Array, Array, Array], Array]:
-        """Return the function from output positions to metres east, north on the map ``(n, 2)`` per metre upwards."""
-        tangent, north = 1.0 / math.tan(math.radians(self.elevation_deg)), true_north(grid)
+    @property
+    def way(self) -> Array:
+        """Metres true east and north ``(2,)`` that a line to the sun goes per metre upwards."""
+        bearing, tangent = math.radians(self.azimuth_deg), 1.0 / math.tan(math.radians(self.elevation_deg))
+        return tangent * np.array([math.sin(bearing), math.cos(bearing)])
 
-        def found(columns: Array, rows: Array, heights: Array) -> Array:
-            bearing = math.radians(self.azimuth_deg) + north(columns, rows)
-            return tangent * np.stack([np.sin(bearing), np.cos(bearing)], axis=1)
-
-        return found
+    def way_over(self, sight: Sight) -> Callable[[Array, Array, Array], Array]:
+        """Return the function from output positions and heights to output pixels ``(n, 2)`` per metre upwards."""
+        return lambda columns, rows, heights: inverse_2x2(sight.metres(columns, rows, heights)) @ self.way
 
 
 @dataclass(frozen=True)
@@ -75,23 +72,6 @@ class AnglesResult:
     """Least and greatest zenith angle of view (degrees) where the image reaches; NaN where it does not."""
 
     view_zenith_deg: tuple[float, float]
-
-
-def true_north(grid: Grid) -> Callable[[Array, Array], Array]:
-    """Return the function from output positions to the bearing (radians) of true north on the map ``(n,)``."""
-    there, back = ground_transform(grid.crs, "EPSG:4979"), ground_transform("EPSG:4979", grid.crs)
-
-    def found(columns: Array, rows: Array) -> Array:
-        x, y = grid.xy(columns, rows)
-        if grid.crs.is_geographic:
-            return np.zeros(len(x))
-        lonlat = there(np.stack([x, y, np.zeros(len(x))], axis=1))
-        step = np.array([0.0, _NORTH, 0.0])
-        ends = back(np.concatenate([lonlat - step, lonlat + step]))
-        way = ends[len(x) :] - ends[: len(x)]
-        return np.asarray(np.arctan2(way[:, 0], way[:, 1]))
-
-    return found
 
 
 # -- angles ----------------------------------------------------------------------------------------------------------
@@ -159,13 +139,12 @@ def _angles(
     t = ((ground - middle) / half).reshape(height, width, 1)
     image = (fields[..., 0, :2] + t * (fields[..., 1, :2] + t * fields[..., 2, :2])).reshape(-1, 2)
     lean = (fields[..., 0, 2:] + t * (fields[..., 1, 2:] + t * fields[..., 2, 2:])).reshape(-1, 2)
-    north = true_north(sight.grid)(*flat)
-    zenith = np.arctan(np.hypot(*lean.T))
+    metres = sight.metres(*flat, ground)
+    east, north = np.einsum("nij,nj->in", metres, lean)
     # A ray goes against the displacement; straight down it comes from nowhere in particular.
-    azimuth = np.degrees(np.arctan2(-lean[:, 0], -lean[:, 1]) - north) % 360.0
-    found = [np.degrees(zenith), azimuth]
+    found = [np.degrees(np.arctan(np.hypot(east, north))), np.degrees(np.arctan2(-east, -north)) % 360.0]
     if sun is not None:
-        found.append(_incidence(sight, surface, flat, sun.way(sight.grid)(*flat, ground)))
+        found.append(_incidence(sight, surface, flat, metres, sun.way))
     bands = np.stack(found)
     with np.errstate(invalid="ignore"):
         bands[:, ~((image >= 0) & (image <= size)).all(axis=1)] = math.nan
@@ -201,19 +180,16 @@ def _weights(count: int) -> Array:
     return np.maximum(0.0, 1.0 - np.abs(place[:, None] - nodes))
 
 
-def _incidence(sight: Sight, surface: Surface, flat: tuple[Array, Array], way: Array) -> Array:
+def _incidence(sight: Sight, surface: Surface, flat: tuple[Array, Array], metres: Array, way: Array) -> Array:
     """Return the angle (degrees) between the sun and the normal of the terrain over a pixel."""
     columns, rows = flat
-    metres = sight.metres(columns, rows)
 
     def at(column: float, row: float) -> Array:
         return surface.heights(np.stack(sight.grid.xy(columns + column, rows + row), axis=1), sight.grid.crs)
 
-    east = (at(0.5, 0.0) - at(-0.5, 0.0)) / metres[:, 0]
-    north = (at(0.0, -0.5) - at(0.0, 0.5)) / metres[:, 1]
-    cosine = (1.0 - east * way[:, 0] - north * way[:, 1]) / np.sqrt(
-        (1.0 + east**2 + north**2) * (1.0 + (way**2).sum(axis=1))
-    )
+    rise = np.stack([at(0.5, 0.0) - at(-0.5, 0.0), at(0.0, 0.5) - at(0.0, -0.5)], axis=1)
+    slope = np.einsum("ni,nij->nj", rise, inverse_2x2(metres))
+    cosine = (1.0 - slope @ way) / np.sqrt((1.0 + (slope**2).sum(axis=1)) * (1.0 + way @ way))
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
@@ -237,7 +213,7 @@ def write_shadows(
     """
     resources = resources or Resources()
     grid = sight.grid
-    looking = Visibility(sight, surface, heights, resources.memory // 4, way=sun.way(grid))
+    looking = Visibility(sight, surface, heights, resources.memory // 4, way=sun.way_over(sight))
     names = {LIT: ("in the sun", "#f7ecc9"), SHADED: ("in shadow", "#34506e"), WITHOUT: ("without a height", "#6b6b6b")}
     profile = classes_profile("shadow", names, _metadata(sun))
     counts = np.zeros(5, dtype=np.int64)

@@ -57,8 +57,8 @@ class Visibility:
     window_bytes : int
         Of heights that may be held at once.
     way : callable, optional
-        From output positions and heights to metres east and north on the map ``(n, 2)`` per metre upwards, where lines
-        do not go to the sensor.
+        From output positions and heights to output pixels ``(n, 2)`` per metre upwards, where lines do not go to the
+        sensor.
     """
 
     def __init__(
@@ -140,9 +140,9 @@ class Visibility:
     def _slopes(self, columns: Array, rows: Array, heights: Array) -> tuple[Array, Array]:
         """Return samples of the DEM per metre upwards ``(n, 2)``, and metres along the ground per metre upwards."""
         way = self._way(columns, rows, heights)
-        step = _RISE * way * [1.0, -1.0] / self._sight.metres(columns, rows)
-        there = self._samples(columns + step[:, 0], rows + step[:, 1])
-        return (there - self._samples(columns, rows)) / _RISE, np.hypot(*way.T)
+        there = self._samples(columns + _RISE * way[:, 0], rows + _RISE * way[:, 1])
+        metres = np.einsum("nij,nj->ni", self._sight.metres(columns, rows, heights), way)
+        return (there - self._samples(columns, rows)) / _RISE, np.hypot(*metres.T)
 
     def _to_sensor(self, columns: Array, rows: Array, heights: Array) -> Array:
         # A line goes against the displacement of what lies higher.
