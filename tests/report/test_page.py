@@ -334,3 +334,23 @@ def test_the_map_of_the_world_is_whole_at_the_antimeridian():
            (-120.0, -17.0), "Atlantic": (-20.0, -17.0), "Laptev Sea": (120.0, 76.0)}  # fmt: skip
     assert {name for name, place in dry.items() if not land.contains(shapely.Point(place))} == set()
     assert {name for name, place in wet.items() if land.contains(shapely.Point(place))} == set()
+
+
+@pytest.mark.parametrize("index", [0, 7])
+def test_the_north_arrow_covers_no_point_and_names_stay_on_the_map(index):
+    """The ortho is cut so that a point lies where the arrow stands first, and then at the upper edge."""
+    said = made(measured())
+    to = pyproj.Transformer.from_crs("EPSG:4326", said.ortho.crs, always_xy=True)
+    x, y = to.transform(*said.adjustment.points[index].lon_lat)
+    for down in (40.0, 2.0):
+        side = 4000.0
+        right, top = x + 26.0 * side / 720.0, y + down * side / 720.0
+        grid = dataclasses.replace(said.ortho, extent=(right - side, top - side, right, top))
+        drawing = plot_ortho(dataclasses.replace(said, ortho=grid))
+        (north,) = [item for kind, item in drawing.items if kind == "text" and item["text"] == "N"]
+        names = {point.id for point in said.adjustment.points}
+        for kind, item in drawing.items:
+            if kind == "circle" and item["kind"] == "halo" and 0 < item["x"] < 720 and 0 < item["y"] < 720:
+                assert math.hypot(item["x"] - north["x"], item["y"] - north["y"] - 26.0) > 30.0
+            if kind == "text" and item["text"] in names:
+                assert 10.0 < item["y"] < drawing.height

@@ -32,6 +32,8 @@ LONGEST_ARROW = _LONGEST * _SIDE
 _MAX_LABELS, _MAX_POINTS = 40, 600
 #: Distances between the lines of the graticule, degrees: such as have round minutes or seconds.
 _STEPS = [k / 3600 for k in (1, 2, 5, 10, 15, 20, 30)] + [k / 60 for k in (1, 2, 5, 10, 15, 20, 30)] + [1, 2, 5, 10, 20]
+#: The north arrow has this much room around it, px.
+_ROOM = 45.0
 #: Points on a line of the graticule.
 _SAMPLES = 33
 
@@ -90,7 +92,8 @@ def plot_ortho(report: SceneReport) -> Drawing | None:
         if one.point.id in wrong:
             drawing.circle("doubted", *one.at, 10.0)
         _draw(drawing, one, stretch, label=len(found) <= _MAX_LABELS or one.point.id in wrong)
-    _scale_and_north(drawing, paper, stretch, longest)
+    _scale(drawing, paper, stretch, longest)
+    _north(drawing, paper, found, stretch)
     return drawing
 
 
@@ -126,9 +129,9 @@ def _draw(drawing: Drawing, one: _Arrow, stretch: float, *, label: bool) -> None
         if label:
             beyond = x > drawing.width - 60
             side = -10 if (dx > 0 or beyond) and x > 60 else 10
-            drawing.text(
-                x + side, y + (4 if abs(dx) > abs(dy) else -5), one.point.id, anchor="end" if side < 0 else "start"
-            )
+            # Of a point at the upper or lower edge the name stays on the map.
+            line = min(max(y + (4 if abs(dx) > abs(dy) else -5), 14.0), drawing.height - 6.0)
+            drawing.text(x + side, line, one.point.id, anchor="end" if side < 0 else "start")
 
 
 def _said(point: Point) -> str:
@@ -192,7 +195,7 @@ def degrees(value: float, sides: str) -> str:
 # -- scale and north -------------------------------------------------------------------------------------------------
 
 
-def _scale_and_north(drawing: Drawing, paper: Paper, stretch: float, longest: float) -> None:
+def _scale(drawing: Drawing, paper: Paper, stretch: float, longest: float) -> None:
     _, per_metre = paper.middle()
     if not np.isfinite(per_metre).all():
         return
@@ -208,8 +211,20 @@ def _scale_and_north(drawing: Drawing, paper: Paper, stretch: float, longest: fl
         for kind in ("casing", "rule"):
             drawing.path(kind, [(right - size, y - 4), (right - size, y), (right, y), (right, y - 4)])
         drawing.text(right, y - 7, text, anchor="end")
+
+
+def _north(drawing: Drawing, paper: Paper, found: Sequence[_Arrow], stretch: float) -> None:
+    """Draw the north arrow in the first of some places near the edge that is free, else where most room is."""
+    _, per_metre = paper.middle()
+    if not np.isfinite(per_metre).all():
+        return
     ux, uy = per_metre[1] / np.hypot(*per_metre[1])
-    x, y = drawing.width - 26.0, 40.0
+    taken = [one.at for one in found]
+    taken += [(one.at[0] + one.shift[0] * stretch, one.at[1] + one.shift[1] * stretch) for one in found]
+    right, half = drawing.width - 26.0, drawing.height / 2
+    places = [(right, 40.0), (60.0, 40.0), (drawing.width / 2, 40.0), (right, half), (60.0, half)]
+    room = [min((math.dist(place, other) for other in taken), default=math.inf) for place in places]
+    x, y = places[next((k for k, free in enumerate(room) if free > _ROOM), int(np.argmax(room)))]
     drawing.line("casing", x - 16 * ux, y - 16 * uy, x + 16 * ux, y + 16 * uy)
     drawing.arrow("bar", x - 16 * ux, y - 16 * uy, 32 * ux, 32 * uy)
     drawing.text(x + 26 * ux, y + 26 * uy + 4, "N", anchor="middle")
