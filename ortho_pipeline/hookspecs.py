@@ -32,14 +32,23 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pluggy
 
+from ortho_pipeline.display.notebook import scene_html
 from ortho_pipeline.display.notices import FROM_SENSOR, Notice, with_code
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.problem import Prior
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.models.correction import ImageCorrection
+from ortho_pipeline.models.mosaicked import Pieces
+from ortho_pipeline.options import CORRECTIONS
+
+if TYPE_CHECKING:
+    from ortho_pipeline.estimation.fit import Fit
+    from ortho_pipeline.points import Points
 
 PROJECT_NAME = "ortho_pipeline"
 hookspec = pluggy.HookspecMarker(PROJECT_NAME)
@@ -140,6 +149,64 @@ class Scene:
     def model(self) -> SensorModel:
         """The first, best model."""
         return next(iter(self.models.values()))
+
+    @property
+    def shared_model(self) -> SensorModel:
+        """The first model, with those of the other pieces of the acquisition where they have their own."""
+        parts = {(0.0, 0.0): (self.model, (self.width, self.height))}
+        for piece in self.pieces:
+            if piece.model is not None and piece.size is not None and not piece.sees_apart:
+                # The bands of a component have the same geometry.
+                parts.setdefault(piece.offset, (piece.model, piece.size))
+        if len(parts) == 1:
+            return self.model
+        models, sizes = zip(*parts.values(), strict=True)
+        return Pieces(models, tuple(parts), sizes)
+
+    def fit(self, points: Points, correction: str = "shift") -> Fit:
+        """Adjust the model to control points, as `ortho fit` does.
+
+        Parameters
+        ----------
+        points : Points
+            In pixels of this image, with heights.
+        correction : {'none', 'shift', 'shift-drift', 'affine', 'model'}
+            What is adjusted: the image points, or the parameters of the model itself ('model').
+
+        Raises
+        ------
+        InputError
+            For an unknown correction, or if the points do not determine it.
+        """
+        from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
+        from ortho_pipeline.estimation.family_fit import OWN, fit_own
+        from ortho_pipeline.estimation.fit import fit
+
+        if correction not in CORRECTIONS:
+            raise InputError(
+                f"there is no correction {correction!r}", field="correction", remedy=f"one of {', '.join(CORRECTIONS)}"
+            )
+        if not self.models:
+            raise InputError("this image has no model", file=self.path, field="model", remedy="open it with a sensor")
+        if correction == OWN:
+            own = self.model if self.adjustable is None else self.models[self.adjustable]
+            return fit_own(own, points, self.priors)
+        refuse_swapped(self.shared_model, points, self.height)
+        start = ImageCorrection.identity(self.shared_model, correction, (self.width / 2, self.height / 2))
+        name = self.model.kind if correction == "none" else f"{self.model.kind}+{correction}"
+        return fit(start, points, robust=correction != "none", name=name)
+
+    def __repr__(self) -> str:
+        models = ", ".join(self.models) or "none"
+        return f"<scene {Path(self.path).name}: {self.width} x {self.height}, sensor {self.sensor}, models {models}>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ("size", f"{self.width} x {self.height} pixels"), ("sensor", self.sensor),
+            ("models", ", ".join(self.models)), ("read from", str(self.model_source)),
+            *((name, str(value)) for name, value in self.facts.items()),
+        ]  # fmt: skip
+        return scene_html(f"Scene {Path(self.path).name}", rows, self.warnings)
 
     @property
     def notices(self) -> tuple[Notice, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import json
 import re
 import subprocess
@@ -203,3 +204,53 @@ def test_modules_are_found_under_the_names_that_they_had_before_there_were_rooms
     assert done.stdout.splitlines() == [
         "ortho_pipeline.geometry is ortho_pipeline.geodesy.ellipsoid now", "True True True",
     ]  # fmt: skip
+
+
+# -- scenes that are adjusted, and what help() shows
+
+
+def test_a_scene_is_fitted_as_the_command_does() -> None:
+    scene, points = op.open_scene("sample_data/scene.tif"), op.read_points("sample_data/gcps.geojson")
+    found = scene.fit(points, "shift")
+    expected = commands.fit("sample_data/scene.tif", op.PointOptions(gcps="sample_data/gcps.geojson")).fit
+    np.testing.assert_array_equal(found.values, expected.values)
+    assert found.model_name == "rpc+shift"
+    assert scene.fit(points, "none").param_names == ()
+    with pytest.raises(InputError, match="no correction 'shfit'"):
+        scene.fit(points, "shfit")
+    with pytest.raises(InputError, match="no parameters of its own"):
+        scene.fit(points, "model")
+
+
+def test_a_fit_that_adjusts_nothing_says_so() -> None:
+    scene, points = op.open_scene("sample_data/scene.tif"), op.read_points("sample_data/gcps.geojson")
+    with pytest.raises(InputError, match="Scene is no sensor model") as error:
+        op.fit(scene, points)
+    assert 'scene.fit(points, "shift")' in str(error.value)
+    assert [notice.code for notice in op.fit(scene.model, points).warnings if notice.code == "nothing-adjusted"]
+    assert not [notice for notice in scene.fit(points, "none").warnings if notice.code == "nothing-adjusted"]
+
+
+def test_a_scene_shows_itself() -> None:
+    scene = op.open_scene("sample_data/scene.tif")
+    assert repr(scene) == "<scene scene.tif: 1000 x 1000, sensor rpc, models rpc>"
+    html = scene._repr_html_()
+    for text in ("scene.tif", "1000 x 1000 pixels", "scene_RPC.TXT"):
+        assert text in html
+
+
+@pytest.mark.parametrize("name", op.__all__)
+def test_signatures_are_read_by_people(name: str) -> None:
+    public = getattr(op, name)
+    if name == "Surface" or (isinstance(public, type) and issubclass(public, Exception)):
+        return
+    signature = str(inspect.signature(public))
+    for word in ("Annotated", "Option(", "typing.", "Options(sensor", "~"):
+        assert word not in signature, signature
+    for options in re.findall(r"(\w+Options)\(([^)]*)\)", signature):
+        assert options[1] == ""
+
+
+def test_options_are_shown_as_they_are_written() -> None:
+    assert repr(op.SceneOptions()) == "SceneOptions()"
+    assert repr(op.SceneOptions(rpc="tag", crop_offset=(1, 2))) == "SceneOptions(rpc='tag', crop_offset=(1, 2))"

@@ -305,7 +305,7 @@ def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:
     Of shift, shift-drift, affine, and the model's own parameters where it has some, the one with the fewest parameters
     whose error is expected to be within 2 % of the smallest over the scene.
     """
-    own = shared_model(scene)
+    own = scene.shared_model
     kinds = [name for name in comparing.CORRECTIONS if name != "none"] + ([OWN] if own.param_names else [])
     names = {comparing.own_name(own, kind): kind for kind in kinds}
     compared = comparing.compare(
@@ -328,7 +328,7 @@ def _corrected(
 ) -> Adjusted:
     if options.correction != OWN:
         # What adjusts its own parameters may start anywhere.
-        refuse_swapped(shared_model(scene), points, scene.height)
+        refuse_swapped(scene.shared_model, points, scene.height)
     points = with_heights(points, surface)
     correction = options.correction
     if correction is None:
@@ -342,7 +342,7 @@ def _corrected(
     if correction == OWN:
         scene = _by_own_parameters(scene)
         return Adjusted(scene, fit_own(restricted(scene.model, params_of(options)), points, scene.priors))
-    start = ImageCorrection.identity(shared_model(scene), correction, (scene.width / 2, scene.height / 2))
+    start = ImageCorrection.identity(scene.shared_model, correction, (scene.width / 2, scene.height / 2))
     start = restricted(start, params_of(options))
     name = scene.model.kind if correction == "none" else f"{scene.model.kind}+{correction}"
     return Adjusted(scene, fit(start, points, robust=correction != "none", name=name))
@@ -356,19 +356,6 @@ def _by_own_parameters(scene: Scene) -> Scene:
     rest = {name: model for name, model in scene.models.items() if name != chosen}
     source = f"metadata of {Path(scene.path).name}"
     return dataclasses.replace(scene, models={chosen: scene.models[chosen], **rest}, model_source=source)
-
-
-def shared_model(scene: Scene) -> SensorModel:
-    """Return the model of a scene, with those of the other pieces of its acquisition where they have their own."""
-    parts = {(0.0, 0.0): (scene.model, (scene.width, scene.height))}
-    for piece in scene.pieces:
-        if piece.model is not None and piece.size is not None and not piece.sees_apart:
-            # The bands of a component have the same geometry.
-            parts.setdefault(piece.offset, (piece.model, piece.size))
-    if len(parts) == 1:
-        return scene.model
-    models, sizes = zip(*parts.values(), strict=True)
-    return Pieces(models, tuple(parts), sizes)
 
 
 def _from_points(scene: Scene, options: PointOptions, points: Points, surface: Surface | None) -> Adjusted:

@@ -36,6 +36,11 @@ def fit_html(document: Mapping[str, Any]) -> str:
     return render("display/notebook.html.j2", tables=tables, notes=said)
 
 
+def scene_html(title: str, rows: Sequence[tuple[str, str]], notes: Sequence[str]) -> str:
+    """Return what is known of a scene as HTML: names and texts, and its warnings."""
+    return render("display/notebook.html.j2", tables=[_table(title, ("", ""), rows)], notes=notes)
+
+
 def block_html(document: Mapping[str, Any]) -> str:
     """Return the document of a block (`BlockFit.to_json`) as HTML: RMSE on the ground and in the images, warnings."""
     ground = [

@@ -10,6 +10,9 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints, counted
 from ortho_pipeline.estimation.problem import Solution
 from ortho_pipeline.estimation.statistics import correlation_of
+from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.models.correction import ImageCorrection
+from ortho_pipeline.points import Points
 
 #: Refuse where some corner of the image (of the model's domain without one) would be predicted so many times worse than
 #: a point is measured ...
@@ -82,3 +85,14 @@ def unstable(solution: Solution, strength: float | None) -> list[Notice]:
         return [Notice("inseparable-parameters", text, parameters=[names[first], names[second]])]
     text = f"unstable: the condition of the adjustment is {solution.condition:.0e}: a simpler model is safer"
     return [Notice("unstable", text, condition=solution.condition)]
+
+
+def nothing_adjusted(model: SensorModel, points: Points) -> list[Notice]:
+    """Return a notice if a model without parameters was given to be adjusted, without a correction over it."""
+    if model.param_names or isinstance(model, ImageCorrection) or not points.control.any():
+        return []
+    text = (
+        f"nothing was adjusted: a model {model.kind!r} has no parameters of its own; "
+        'scene.fit(points, "shift") adjusts a correction over it'
+    )
+    return [Notice("nothing-adjusted", text)]

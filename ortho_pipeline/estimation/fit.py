@@ -22,6 +22,7 @@ from ortho_pipeline.estimation.determinacy import (
     EXTRAPOLATION_WARNING,
     UNSTABLE,
     corner_ratio_of,
+    nothing_adjusted,
     uncertain_edge,
     unstable,
 )
@@ -291,6 +292,11 @@ def fit(
     InputError
         If no point at all has an image.
     """
+    if not isinstance(model, SensorModel):
+        raise InputError(
+            f"a {type(model).__name__} is no sensor model, and has nothing to adjust", field="model",
+            remedy='give a model; of a scene: scene.fit(points, "shift")',
+        )  # fmt: skip
     points = _placed(points, model)
     raw = points.image - model.ground_to_image(points.ground)
     known_bad = {points.ids.index(name): reason for name, reason in (exclude or {}).items() if name in points.ids}
@@ -305,7 +311,7 @@ def fit(
         measured = replace(problem, points=points.select(problem.rows))
         solution, common = common.settled(measured, keep, solution)
     ratio = corner_ratio_of(solution, points.source, strength)
-    warnings += uncertain_edge(ratio) + unstable(solution, strength)
+    warnings += nothing_adjusted(model, points) + uncertain_edge(ratio) + unstable(solution, strength)
     used = np.zeros(len(points), dtype=bool)
     used[problem.rows[keep]] = True
     seen = _without(common, model, points)

@@ -5,8 +5,8 @@ import inspect
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Literal, TypeVar, get_args
+from dataclasses import MISSING, dataclass, fields
+from typing import Any, Literal, TypeVar, get_args
 
 #: What a file of points calls the first pixel -> what is added to reach (0, 0) at its outer corner.
 PIXEL_ORIGINS = {
@@ -104,4 +104,15 @@ def documented(group: type[_T]) -> type[_T]:
         )
         lines.append(f"{one.name} : {kind}\n    {said}")
     group.__doc__ = f"{group.__doc__}\n\nParameters\n----------\n" + "\n".join(lines)
+    signature = inspect.signature(group)
+    plain = [one.replace(annotation=get_args(one.annotation)[0]) for one in signature.parameters.values()]
+    group.__signature__ = signature.replace(parameters=plain)  # type: ignore[attr-defined]
+    group.__repr__ = _as_called  # type: ignore[method-assign]
     return group
+
+
+def _as_called(self: Any) -> str:
+    """Return options as they are written: those alone that are not as by default."""
+    usual = {one.name: one.default if one.default_factory is MISSING else one.default_factory() for one in fields(self)}
+    said = ((name, getattr(self, name)) for name in usual)
+    return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in said if value != usual[name])})"

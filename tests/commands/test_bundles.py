@@ -10,7 +10,6 @@ import pytest
 from seeds import SIZE, rpc
 
 from ortho_pipeline.commands.control.points import read_control
-from ortho_pipeline.commands.scene_fit import shared_model
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.hookspecs import Piece, Scene
 from ortho_pipeline.options import PointOptions
@@ -52,9 +51,9 @@ def test_errors_are_taken_over_and_parallax_is_not(colours: Scene, tmp_path: Pat
     # What is added to the image plainly, as to a registered band, would be off by up to a pixel and a half.
     assert not heights or np.ptp((points.image - (colours.pieces[0].model.ground_to_image(ground) + OFF) / 4)[:, 1]) > 1
     # A correction is of this image alone, whatever its sister sees.
-    assert shared_model(colours) is colours.model
+    assert colours.shared_model is colours.model
     cropped = replace(colours, pieces=(replace(colours.pieces[0], offset=(-5.0, -5.0)),))
-    assert shared_model(cropped) is colours.model
+    assert cropped.shared_model is colours.model
 
 
 def test_the_file_of_points_is_read_once(colours: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

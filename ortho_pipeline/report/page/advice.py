@@ -77,6 +77,7 @@ _KNOW: dict[str, str] = {
     "crop-stated": "Nothing, if the offset is right.",
     "crop-noted": "Nothing.",
     "crop-kept": "Nothing.",
+    "nothing-adjusted": "Adjust a correction, such as a shift.",
     "rigorous-left-out": "Nothing, if the RPC is the model that you want.",
     "part-left-out": "Rectify the other parts as scenes of their own.",
     "radar-on-a-plane": "Give a DEM.",
