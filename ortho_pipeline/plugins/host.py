@@ -17,6 +17,7 @@ from ortho_pipeline.hookspecs import Scene, Sensor, Study
 from ortho_pipeline.models import KINDS
 from ortho_pipeline.plugins.contract import described, scene_faults
 from ortho_pipeline.plugins.registry import Broken, Provenance, Registry
+from ortho_pipeline.plugins.unread import unread
 from ortho_pipeline.raster.source import open_dataset
 
 _COPY_IT = "correct what the file says there, or copy it again from the delivery"
@@ -149,7 +150,7 @@ class Host:
         )
         if len(found) == 1:
             return found[0]
-        raise _not_one(found, self.sensors.values(), dataset.GetDescription())
+        raise _not_one(found, self.sensors.values(), dataset)
 
     def open_scene(
         self,
@@ -265,11 +266,16 @@ def _unknown_sensor(name: str, sensors: Iterable[str]) -> InputError:
     )
 
 
-def _not_one(found: list[Sensor], sensors: Iterable[Sensor], path: str) -> InputError:
+def _not_one(found: list[Sensor], sensors: Iterable[Sensor], dataset: Any) -> InputError:
+    path = dataset.GetDescription()
     if found:
         names = ", ".join(item.name for item in found)
         return InputError(
             f"several sensors recognise it: {names}", file=path, remedy="choose one with `scene.sensor=NAME`"
+        )
+    if beside := unread(dataset):
+        return InputError(
+            f"{beside.what}, which no sensor opens by itself", file=path, field="scene.sensor", remedy=beside.remedy
         )
     names = ", ".join(item.name for item in sensors) or "none"
     general = ", ".join(item.name for item in sensors if item.fallback)
