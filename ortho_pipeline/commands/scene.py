@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from importlib import metadata
 from pathlib import Path
@@ -11,9 +12,10 @@ import numpy as np
 
 from ortho_pipeline import plugins
 from ortho_pipeline.commands.heights.surfaces import open_dem
-from ortho_pipeline.commands.inputs import open_scene
+from ortho_pipeline.commands.inputs import open_image, open_scene
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION, Result, outputs_together
 from ortho_pipeline.commands.stac.given import heights_given, with_items
+from ortho_pipeline.commands.survey.map_raster import described, is_upright, kind_of
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError, completed, counted
 from ortho_pipeline.estimation.ground_residuals import viewing
@@ -24,9 +26,11 @@ from ortho_pipeline.files.storage import kept
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.geodesy.proj_grids import fetch_missing, grids, proj_info
+from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging import resolution
 from ortho_pipeline.models import families
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
+from ortho_pipeline.plugins.unread import unread
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.report import document as report
 from ortho_pipeline.surface import accuracy as dem_accuracy
@@ -52,7 +56,12 @@ def sensors() -> dict[str, Any]:
 
 @with_items
 def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> dict[str, Any]:
-    """Describe a scene: sensor, size, models and their source, facts, position and ground sample distance."""
+    """Describe a scene: sensor, size, models and their source, facts, position and ground sample distance.
+
+    Of a DEM or an ortho, which no sensor opens: what it seems to be, its place on the map, and which option takes it.
+    """
+    if (seen := _on_a_map(image, options)) is not None:
+        return seen
     scene = open_scene(image, options)
     model = scene.model
     size = scene.width, scene.height
@@ -79,6 +88,19 @@ def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) 
         "same_acquisition": [Path(piece.path).name for piece in scene.pieces],
         **to_document(scene.notices),
     }
+
+
+def _on_a_map(image: str | os.PathLike[str], options: SceneOptions) -> dict[str, Any] | None:
+    """Return the document of a DEM or an ortho; None of what is, or may be, a scene."""
+    if isinstance(image, Scene) or dataclasses.replace(options, allow_network=False, roots=()) != SceneOptions():
+        return None
+    if os.path.isdir(image):
+        return None
+    dataset = raster.open_dataset(image, **options.access)
+    if kind_of(dataset) is None or open_image(image, options, needs_model=False).models:
+        return None
+    # What stands askew on a map may be a frame that was laid there roughly.
+    return described(image, dataset) if is_upright(dataset) or unread(dataset) is None else None
 
 
 def models() -> list[dict[str, Any]]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import shlex
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from ortho_pipeline.cli.flags import FLAGS
 from ortho_pipeline.cli.options import json_option, scene_options
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_json, print_result, print_warnings, view_text
@@ -50,7 +52,8 @@ def print_steps() -> None:
 def info(image: str, scene: SceneOptions, as_json: bool) -> None:
     """Describe an image: sensor, model and where it was read from, position, ground sample distance.
 
-    Of a FOLDER: which scenes, DEMs and points lie there, and what to do next.
+    Of a DEM or an ortho: what it is, and which option takes it. Of a FOLDER: which scenes, DEMs and points lie there,
+    and what to do next.
     """
     from ortho_pipeline import commands
 
@@ -63,6 +66,8 @@ def info(image: str, scene: SceneOptions, as_json: bool) -> None:
         return _print_survey(image, scene, as_json)
     if as_json:
         return print_json(document)
+    if "kind" in document:
+        return _print_map_raster(document)
     lines = {
         "Image": f"{document['image']}  ({document['size'][0]} x {document['size'][1]})",
         "Sensor": document["sensor"],
@@ -81,6 +86,29 @@ def info(image: str, scene: SceneOptions, as_json: bool) -> None:
         click.echo(f"{name:<10} {value}")
     print_warnings(document["warnings"])
     return None
+
+
+def _print_map_raster(document: Mapping[str, Any]) -> None:
+    dem = document["kind"] == "dem"
+    option = FLAGS[document["option"]]
+    lines = {
+        "Raster": f"{document['image']}  ({document['size'][0]} x {document['size'][1]})",
+        "Looks like": "a DEM: one band of numbers with a sign, on a map" if dem
+        else "an orthoimage or another raster on a map; it has no sensor model",
+        "Bands": f"{document['bands']}, {document['type']}, nodata {document['nodata']}",
+        "CRS": document["crs"],
+        **({"Heights": _heights_text(document)} if dem else {}),
+        "Pixel": "{:.6g} x {:.6g} ".format(*document["pixel"]) + document["unit"],
+        "Extent": " ".join(f"{value:.10g}" for value in document["extent"]),
+        "Use it as": f"{option} {document['image']}" + (" --dem-vertical DATUM" * (dem and not document["vertical"])),
+    }  # fmt: skip
+    for name, value in lines.items():
+        click.echo(f"{name:<10} {value}")
+
+
+def _heights_text(document: Mapping[str, Any]) -> str:
+    low, high = document["heights"]
+    return f"about {low:.0f} to {high:.0f}, {document['vertical'] or 'vertical datum not declared'}"
 
 
 def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:

@@ -11,8 +11,10 @@ from typing import Any, Literal
 
 from ortho_pipeline import plugins
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION
+from ortho_pipeline.commands.survey.map_raster import is_upright, kind_of
 from ortho_pipeline.errors import InputError, OrthoError, counted
 from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.plugins.unread import unread
 from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import open_dataset
 
@@ -42,8 +44,6 @@ _PIXELS = (".tif", ".tiff", ".ntf", ".nitf", ".jp2", ".img")
 POINTS = (".csv", ".geojson", ".points", ".pts", ".txt")
 #: Files that are looked at, and folders below the given one.
 _MOST, _DEPTH = 2000, 3
-#: GDAL's numbers of the types that heights have: whole numbers with a sign, and floating point.
-_HEIGHTS = (3, 5, 6, 7)
 
 
 @dataclass(frozen=True)
@@ -154,11 +154,9 @@ def _raster(path: Path, name: str, options: SceneOptions, refused: OrthoError) -
     except OrthoError as error:
         return Found(name, "image", f"cannot be opened: {error.message}") if path.suffix.lower() in _PIXELS else None
     size = f"{dataset.RasterXSize} x {dataset.RasterYSize}"
-    if dataset.GetGeoTransform(can_return_null=True) is None or not dataset.GetProjection():
+    kind = kind_of(dataset)
+    if kind is None or not (is_upright(dataset) or unread(dataset) is None):
         return Found(name, "image", f"{size}, no model: {refused.message}")
-    kind: Kind = "map image"
-    if dataset.RasterCount == 1 and dataset.GetRasterBand(1).DataType in _HEIGHTS:
-        kind = "dem"
     crs = dataset.GetSpatialRef()
     said = f"{size}, {crs.GetName() if crs is not None else 'a CRS'}"
     datum = crs is None or crs.IsCompound() or crs.GetAxesCount() == 3

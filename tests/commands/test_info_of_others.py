@@ -1,0 +1,114 @@
+"""`ortho info` of what is no scene: DEMs and orthos say what they are, projects and photos what was recognised."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from osgeo import gdal
+
+from ortho_pipeline.cli.program import cli
+from tests.conftest import SAMPLE
+
+gdal.UseExceptions()
+
+
+def info(*words: Any) -> Result:
+    return CliRunner().invoke(cli, ["info", *map(str, words)])
+
+
+def picture(path: Path, tags: dict[str, str] | None = None) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    made = gdal.GetDriverByName("GTiff").Create(str(path), 30, 20, 3)
+    made.SetMetadata(tags or {})
+    return path
+
+
+def test_a_dem_says_what_it_is():
+    done = info(SAMPLE / "dem.tif")
+    assert done.exit_code == 0, done.output
+    for text in ("a DEM", "EPSG:32636", "20 x 20 metre", "EGM96 height", f"--dem {SAMPLE / 'dem.tif'}"):
+        assert text in done.output
+    document = json.loads(info(SAMPLE / "dem.tif", "--json").stdout)
+    heights = gdal.Open(str(SAMPLE / "dem.tif")).ReadAsArray()
+    heights = heights[heights != -32768]
+    assert document["kind"] == "dem"
+    assert document["option"] == "surface.dem"
+    np.testing.assert_allclose(document["heights"], [heights.min(), heights.max()], atol=1.0)
+    # Longitude comes first.
+    assert 33.3 < document["corners_lon_lat"][0][0] < 33.4
+    assert 37.2 < document["corners_lon_lat"][0][1] < 37.3
+
+
+def test_an_ortho_says_what_it_is():
+    done = info(SAMPLE / "reference.tif")
+    assert done.exit_code == 0, done.output
+    for text in ("an orthoimage", "no sensor model", "EPSG:32636", "5 x 5 metre", f"--reference {SAMPLE}"):
+        assert text in done.output
+    document = json.loads(info(SAMPLE / "reference.tif", "--json").stdout)
+    assert document["kind"] == "map image"
+    assert document["extent"] == [529305.0, 4121045.0, 532890.0, 4124260.0]
+    # A scene on a map stays a scene, and an option that opens one is not passed over.
+    assert json.loads(info(SAMPLE / "ikonos" / "po_39001_pan_0000000.tif", "--json").stdout)["sensor"] == "ikonos"
+    assert info(SAMPLE / "reference.tif", "--rpc", SAMPLE / "scene_RPC.TXT", "--json").exit_code == 0
+
+
+def test_a_dem_without_a_datum_asks_for_it(tmp_path):
+    dem = str(tmp_path / "dem.tif")
+    gdal.Translate(dem, str(SAMPLE / "dem.tif"), outputSRS="EPSG:32636")
+    assert "--dem-vertical DATUM" in info(dem).output
+
+
+@pytest.mark.parametrize("folder", ["images", "."])
+def test_an_opensfm_project_is_named(tmp_path, folder):
+    image = picture(tmp_path / folder / "a.tif")
+    (tmp_path / "opensfm").mkdir()
+    (tmp_path / "opensfm" / "reconstruction.json").write_text("[]")
+    done = info(image)
+    assert done.exit_code == 2
+    assert "OpenDroneMap or OpenSfM project" in done.output
+    assert f"--sensor-option exterior={tmp_path / 'opensfm' / 'reconstruction.json'}" in done.output
+    assert "OpenSfM project" in info(tmp_path).output
+
+
+def test_an_orthority_project_is_named(tmp_path):
+    image = picture(tmp_path / "a.tif")
+    (tmp_path / "int_param.yaml").write_text("camera: {}")
+    (tmp_path / "ext_param.geojson").write_text("{}")
+    done = info(image)
+    assert done.exit_code == 2
+    assert "orthority project (ext_param.geojson, int_param.yaml)" in done.output
+    assert "docs/formats/frame.md" in done.output
+
+
+def test_a_table_that_names_the_image_is_named(tmp_path):
+    image = picture(tmp_path / "a_b.tif")
+    (tmp_path / "positions.txt").write_text("x 1 2 3 4 5 6\na_b -5.5 -3.7e6 5258.3 -0.3 0.29 -179.0\n")
+    assert "positions.txt has six numbers for it" in info(image).output
+    other = picture(tmp_path / "c.tif")
+    assert "no sensor recognises it" in info(other).output
+
+
+def test_a_photo_with_a_position_is_named(tmp_path):
+    tags = {"EXIF_GPSLatitude": "(24) (41) (5.7)", "EXIF_Make": "DJI", "EXIF_Model": "FC6310R"}
+    done = info(picture(tmp_path / "a.tif", tags), "--json")
+    assert done.exit_code == 2
+    assert "a photo with its GPS position in EXIF (DJI FC6310R)" in json.loads(done.stdout)["error"]["message"]
+
+
+@pytest.mark.realdata
+def test_the_remedy_for_a_real_project_works(real):
+    image = real / "orthority" / "odm" / "images" / "100_0005_0018.tif"
+    done = info(image)
+    assert done.exit_code == 2
+    options = done.output.split("name the reconstruction: ")[1].split(", or ")[0]
+    assert info(image, *shlex.split(options)).exit_code == 0
+    # A frame that was laid on the map roughly is no ortho, and the DEM beside it is a DEM.
+    ngi = real / "orthority" / "ngi"
+    assert "camera_pos_ori.txt" in info(ngi / "3324c_2015_1004_05_0182_RGB.tif").output
+    assert json.loads(info(ngi / "dem.tif", "--json").stdout)["vertical"] == "EGM2008 height"
