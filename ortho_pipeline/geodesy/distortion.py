@@ -46,6 +46,11 @@ def east_north_from_map(crs: pyproj.CRS, ground: Array) -> Array:
     return np.stack([np.einsum("nij,nj->ni", axes, geocentric(end) - start) for end in there], axis=2) / step
 
 
+def metres_of_steps(crs: pyproj.CRS, ground: Array, steps: Array) -> Array:
+    """Return how long (m, on the ground) steps along x and y ``(2,)`` of `crs` are at places ``(N, 3)``, ``(N, 2)``."""
+    return np.asarray(np.linalg.norm(east_north_from_map(crs, ground) * steps, axis=1))
+
+
 def map_from_enu(crs: pyproj.CRS, ground: Array) -> Array:
     """Return how x, y (units of `crs`) and height (rows) change per metre true east, north and up (columns).
 

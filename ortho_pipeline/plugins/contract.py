@@ -15,12 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyproj
 
 from ortho_pipeline.errors import OrthoError, counted
 from ortho_pipeline.estimation.problem import Prior
 from ortho_pipeline.geodesy.crs import parse_crs
-from ortho_pipeline.geodesy.distortion import east_north_from_map
+from ortho_pipeline.geodesy.distortion import metres_of_steps
 from ortho_pipeline.hookspecs import Piece, Scene, Sensor
 from ortho_pipeline.models.base import Array, SensorModel
 
@@ -146,7 +145,7 @@ def _frame_faults(model: SensorModel) -> Iterator[str]:
     crs = parse_crs(model.crs)
     if crs.is_geographic and (abs(centre[1]) > 90 or abs(centre[0]) > 540 or half[0] > 360 or half[1] > 180):
         yield f"the domain {_row(centre)} ± {_row(half)} is not in degrees (lon, lat), the units of {model.crs}"
-    if min(_metres(crs, centre, half)) < NARROWEST / 2:
+    if metres_of_steps(crs, centre[None], half[:2]).min() < NARROWEST / 2:
         yield f"the domain {_row(centre)} ± {_row(half)} in {model.crs} is less than a metre wide: other units?"
     low, high = model.height_range
     if not (low < high and low <= model.reference_height <= high):
@@ -215,13 +214,8 @@ def _array_fault(what: str, image: object, count: int) -> str | None:
     return None if image.dtype == np.float64 else f"{what} returned {image.dtype}, must be float64"
 
 
-def _metres(crs: pyproj.CRS, place: Array, step: Array) -> Array:
-    """Return the lengths ``(2,)`` on the ground of steps along x and y."""
-    return np.asarray(np.linalg.norm(east_north_from_map(crs, place[None])[0], axis=0) * step[:2])
-
-
 def _scale_fault(model: SensorModel, image: Array, step: Array) -> Iterator[str]:
-    metres = _metres(parse_crs(model.crs), model.domain[0], step)
+    metres = metres_of_steps(parse_crs(model.crs), model.domain[0][None], step[:2])[0]
     with np.errstate(divide="ignore", invalid="ignore"):
         pixel = metres / np.linalg.norm(image[1:3] - image[0], axis=1)
     if (pixel < SMALLEST_PIXEL).all():

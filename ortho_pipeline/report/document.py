@@ -28,7 +28,7 @@ from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
 from ortho_pipeline.files.documents import DocumentError, json_position, json_value, made_of, record_of
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform
-from ortho_pipeline.geodesy.distortion import east_north_from_map, map_from_enu
+from ortho_pipeline.geodesy.distortion import map_from_enu, metres_of_steps
 from ortho_pipeline.geodesy.naming import crs_definition, crs_name
 from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
@@ -210,7 +210,7 @@ def _pixel_on_ground(grid: Grid) -> list[float]:
     """Return width and height of the ortho's middle pixel in metres on the ellipsoid; nothing where it has no place."""
     left, bottom, right, top = grid.extent
     middle = np.array([[(left + right) / 2, (bottom + top) / 2, 0.0]])
-    sizes = np.linalg.norm(east_north_from_map(grid.crs, middle)[0] * [grid.dx, grid.dy], axis=0)
+    sizes = metres_of_steps(grid.crs, middle, np.array([grid.dx, grid.dy]))[0]
     return [float(size) for size in sizes if np.isfinite(size)]
 
 

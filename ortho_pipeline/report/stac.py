@@ -18,6 +18,7 @@ import shapely
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import sha256, staged, whole_or_nothing, write_json
+from ortho_pipeline.geodesy.distortion import metres_of_steps
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import RasterSource
@@ -167,8 +168,11 @@ def _ortho_asset(path: Path, report: SceneReport, folder: Path) -> Any:
     content = staged(path)
     source = RasterSource(content)
     band: dict[str, Any] = {"data_type": source.dtype.name, "sampling": "area"}
-    if report.ortho is not None and report.ortho.unit == "m":
-        band["spatial_resolution"] = float(np.mean(report.ortho.resolution))
+    grid = grid_of(content)
+    x, y = grid.xy(np.array([grid.width / 2]), np.array([grid.height / 2]))
+    pixel = metres_of_steps(grid.crs, np.stack([x, y, np.zeros(1)], axis=1), np.array([grid.dx, grid.dy]))
+    if np.isfinite(pixel).all():
+        band["spatial_resolution"] = float(f"{pixel.mean():.3g}")
     bands = []
     for nodata in source.nodata:
         value = {} if nodata is None else {"nodata": "nan" if math.isnan(nodata) else nodata}

@@ -153,6 +153,18 @@ def test_accuracy_is_that_of_check_points_only(made, tiny, tmp_path):
     assert not [uri for uri in without["stac_extensions"] if "accuracy" in uri]
 
 
+@pytest.mark.parametrize(("crs", "step"), [("EPSG:3857", 10.0), ("EPSG:4326", 1e-4)])
+def test_the_resolution_is_metres_on_the_ground(tiny, tmp_path, crs, step):
+    output = OutputOptions(stac=True, acquired=TIME, crs=crs, resolution=step)
+    commands.rectify(tiny.image, tmp_path, surface=SurfaceOptions(dem=tiny.dem, vertical="ellipsoid"), output=output)
+    band = json.loads((tmp_path / "tiny_stac.json").read_text())["assets"]["ortho"]["raster:bands"][0]
+    left, dx, _, top, _, dy = (ortho := gdal.Open(str(tmp_path / "tiny_ortho.tif"))).GetGeoTransform()
+    x, y = left + ortho.RasterXSize / 2 * dx, top + ortho.RasterYSize / 2 * dy
+    lon, lat = pyproj.Transformer.from_crs(crs, 4326, always_xy=True).transform([x, x + dx, x], [y, y, y + dy])
+    sides = pyproj.Geod(ellps="WGS84").inv([lon[0]] * 2, [lat[0]] * 2, lon[1:], lat[1:])[2]
+    assert band["spatial_resolution"] == pytest.approx(np.mean(sides), rel=5e-3)
+
+
 def test_time_of_acquisition(tiny, tmp_path):
     assert acquisition_time({"acquired": "2010-01-02 03:04:05"}) == datetime(2010, 1, 2, 3, 4, 5, tzinfo=UTC)
     assert acquisition_time({"acquired": "x"}, "2010-01-02T03:04:05+02:00").hour == 1
