@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from ortho_pipeline.block.common_error import CommonError
-from ortho_pipeline.block.datum import HOLD, by_control, with_datum
+from ortho_pipeline.block.datum import HOLD, by_control, with_datum, with_start_errors
 from ortho_pipeline.block.determination import refuse_too_few, refuse_undetermined, uncertain_images
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
@@ -373,15 +373,17 @@ def _result(
 def _covariances(
     solved: Solved, found: Posterior, common: CommonError | None
 ) -> tuple[Cofactors, Array, Mapping[str, SharedErrors]]:
-    """Return covariances of parameters and ground without what all points share, and what neighbours share."""
+    """Return covariances of parameters and ground without what all known points share, and what neighbours share."""
     shared = SharedByImage.of(solved, common)
-    ground = solved.ground_covariance(found.covariance, found.image_square)
-    plain = ground.copy()
+    covariance = with_start_errors(solved.linear, found.covariance)
+    if shared is not None:
+        covariance = shared.added(covariance)
+    plain = solved.ground_covariance(found.covariance, found.image_square)
+    ground = plain.copy()
     ground[found.rows] = found.ground
-    if shared is None:
-        return found.covariance, ground, {}
-    covariance = shared.added(found.covariance)
-    return covariance, ground + solved.ground_covariance(covariance, found.image_square) - plain, shared.images
+    if covariance is not found.covariance:
+        ground += solved.ground_covariance(covariance, found.image_square) - plain
+    return covariance, ground, {} if shared is None else shared.images
 
 
 def _with_common(covariance: Cofactors, common: CommonError | None) -> tuple[Cofactors, Array]:

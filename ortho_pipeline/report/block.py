@@ -61,6 +61,8 @@ KEPT_OUT = "whose ground coordinates took no part"
 TIED = "their image measurements helped to tie the images"
 #: Ground that stays this close (m) to its given coordinates was held, not tested.
 _HELD = 0.0005
+#: What the headline says of a block that only ties hold together.
+_NO_CHECKS = "there are no check points"
 #: A frame's side, the longest arrow in it, and the margin in which arrows of points at its edge end.
 _SIDE, _ARROW, _MARGIN = 420.0, 44.0, 48.0
 
@@ -116,6 +118,7 @@ def build_report(
 def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHeadline:
     """Say how accurate the block is from the best evidence that there is: check points, else the fit of control.
 
+    How well ties agree is no evidence of it.
     What matches say is `relative` to their reference; they are seen in one image each, and measured check points in two
     or more come first.
     """
@@ -143,10 +146,10 @@ def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHea
         what = f"RMSE of {counted(control.n, 'measurement')} of control points in the images{to}: the fit, not a test"
         return said(px(control.total), what)
     sizes = [math.hypot(*ray.residual) for ray in adjustment.rays if ray.used and is_known(ray.residual)]
-    figure = px(float(np.median(sizes))) if sizes else NOT_TESTED
-    return said(
-        figure, f"median residual of {counted(len(sizes), 'ray')}: how well the images agree, not how right they are"
-    )
+    if sizes:
+        agree = f"The images agree to {px(float(np.median(sizes)))} (median residual of {counted(len(sizes), 'ray')})."
+        notes.insert(0, f"{agree} That tests neither positions nor heights.")
+    return said(UNKNOWN, _NO_CHECKS)
 
 
 def _corrected(head: BlockHeadline, notices: Sequence[Mapping[str, Any]]) -> BlockHeadline:
@@ -252,7 +255,11 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
     places = [place for image in report.images.values() for place in image.outline or ()]
     where = plot_locator((places[0][0], places[0][1])) if places else None
     provenance = {key: value for key, value in json_value(report.provenance).items() if key != "inputs"}
-    said = signals(report.warnings, report.notices, tested=report.headline.figure != NOT_TESTED)
+    said = signals(
+        report.warnings,
+        report.notices,
+        tested=report.headline.figure != NOT_TESTED and report.headline.what != _NO_CHECKS,
+    )
     return render(
         "report/block.html.j2",
         report=report,

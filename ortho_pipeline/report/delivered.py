@@ -56,13 +56,16 @@ def _of_block(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
     kinds = (
         (image.rms.back_projected.check, "of check points, whose ground coordinates took no part,"),
         (image.rms.back_projected.control, "of control points (the fit, not a test)"),
-        (image.rms.residuals.tie, "of tie points (how well the images agree, not how right they are)"),
     )
     for found, what in kinds:
         if found:
             said = f"RMSE of {counted(found.n, 'measurement')} {what} in this image, when it was adjusted in a block"
             return Headline(figure=px(found.total), metres=None, what=said, notes=notes)
-    return _untested(*notes, what="the model was adjusted in a block without points in this image")
+    what = "the model was adjusted in a block without check points in this image"
+    if tie := image.rms.residuals.tie:
+        agree = f"There the images agree to {px(tie.total)} (RMSE of {counted(tie.n, 'measurement')} of tie points)."
+        return _untested(f"{agree} That tests neither positions nor heights.", *notes, what=what)
+    return _untested(*notes, what=what)
 
 
 def _source(scene: Scene) -> str:

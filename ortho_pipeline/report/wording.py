@@ -128,7 +128,7 @@ def refuted(notices: Iterable[Mapping[str, Any]]) -> str | None:
 def instead(figure: str, what: str, notices: Iterable[Mapping[str, Any]]) -> tuple[str, str] | None:
     """Return what a headline says in place of a figure that an error makes untrue, and a note; None where none does."""
     against = refuted(notices)
-    if against is None or figure == NOT_TESTED:
+    if against is None or figure in (NOT_TESTED, UNKNOWN):
         return None
     return against, f"Do not rely on this figure: {figure}, {what}."
 

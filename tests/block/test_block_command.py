@@ -18,14 +18,17 @@ from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.block_images import labels_of, points_of_images
+from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.exchange.rpc import export_rpc, read_rpc, rpc_metadata
 from ortho_pipeline.files.documents import record_of
 from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.models import RPC
+from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.report.block import summary_text
 from ortho_pipeline.report.block_records import BlockReport
+from ortho_pipeline.report.delivered import accuracy_before
 from ortho_pipeline.report.wording import NO_SCALE
 from ortho_pipeline.simulation.scanner import LineScanner
 
@@ -331,8 +334,21 @@ def test_empty_parts_of_images_are_said(stereo: Stereo, tmp_path: Path) -> None:
 def test_ties_alone_hold_the_datum_and_say_so(stereo: Stereo, tmp_path: Path) -> None:
     points = points_without_ground(stereo.write())
     text = run("adjust", *stereo.images, "--points", points, "-o", tmp_path / "out")
-    assert "No control points: the orientation is held" in text
-    assert "how well the images agree, not how right they are" in text
+    lines = text.splitlines()
+    first = lines.index("Accuracy unknown: there are no check points")
+    assert lines[first + 1].startswith("The images agree to 0.")
+    assert "tests neither positions nor heights" in lines[first + 1]
+    assert lines[first + 2].startswith("No control points: heights and positions are as accurate as the start values")
+    head = json.loads((tmp_path / "out" / "block_report.json").read_text())["headline"]
+    assert (head["figure"], head["height"]) == ("Accuracy unknown", None)
+    page = (tmp_path / "out" / "block_report.html").read_text()
+    assert '<p class="figure">Accuracy unknown</p>' in page
+    assert "Nothing tests how accurate this is." in page
+    # Nor is it the figure of an ortho that is made with such a model.
+    saved = SceneOptions(model=tmp_path / "out" / "aft_BAND_model.json")
+    delivered = accuracy_before(open_scene(stereo.images[0], saved))
+    assert delivered.figure == "Not tested"
+    assert delivered.notes[0].startswith("There the images agree to 0.")
 
 
 @pytest.mark.parametrize("crs", ["geocentric", "utm"])

@@ -23,12 +23,16 @@ PERFECT_GROUND = 1e-5
 
 @dataclass(frozen=True)
 class Pseudo:
-    """An observation of one parameter (column) by itself; `held`: it defines the datum, and is not knowledge."""
+    """An observation of one parameter (column) by itself; `held`: it defines the datum, and is not knowledge.
+
+    `slow` (px) is an error that all measurements of the image share: see `BlockProblem.firmness`.
+    """
 
     column: int
     mean: float
     sigma: float
     held: bool = False
+    slow: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +154,8 @@ class BlockProblem:
     def with_sigmas(self, image: Array, assumed: tuple[float, float]) -> BlockProblem:
         """Return this problem with other sigmas of measurements ``(M,)``, and of known ground that states none."""
         found = copy.copy(self)
-        found.__dict__.pop("ground_sigmas", None)
+        for name in ("ground_sigmas", "firmness"):
+            found.__dict__.pop(name, None)
         object.__setattr__(found, "points", self.points.with_image_sigmas(image))
         object.__setattr__(found, "assumed", assumed)
         return found
@@ -192,6 +197,18 @@ class BlockProblem:
         """Known ground ``(N, 3)`` that states no sigma."""
         return np.asarray(np.isfinite(self.known) & (self.points.sigma_ground == 0))
 
+    @cached_property
+    def firmness(self) -> Array:
+        """By how much each pseudo-observation ``(k,)`` outweighs its sigma.
+
+        An error that measurements share does not average out. With it the variance of their mean is this many times as
+        large. A parameter against which the measurements weigh that much less is one that is held that much more.
+        """
+        images, _ = self.columns.image_and_place([one.column for one in self.pseudo])
+        weights = np.bincount(self.points.image, self.points.sigma_image**-2.0, minlength=len(self.models))
+        slow = np.array([one.slow for one in self.pseudo])
+        return np.asarray(1.0 + slow**2 * weights[images])
+
     # -- misfits -----------------------------------------------------------------------------------------------------
 
     def misfits(self, state: State, ordering: Ordering, weights: Selection) -> Misfits:
@@ -226,9 +243,10 @@ class BlockProblem:
         params = state.params
         images, places = self.columns.image_and_place([one.column for one in self.pseudo])
         rows = np.zeros((len(self.pseudo), self.columns.widest))
-        rows[np.arange(len(rows)), places] = [1.0 / one.sigma for one in self.pseudo]
+        roots = np.sqrt(self.firmness) / np.array([one.sigma for one in self.pseudo])
+        rows[np.arange(len(rows)), places] = roots
         parts, true = [rows], [np.array([not one.held for one in self.pseudo], dtype=bool)]
-        values = [np.array([(one.mean - params[one.column]) / one.sigma for one in self.pseudo], dtype=float)]
+        values = [roots * np.array([one.mean - params[one.column] for one in self.pseudo])]
         of = [images]
         for image, model in enumerate(state.models):
             known = model.constraints()
