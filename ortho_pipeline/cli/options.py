@@ -259,7 +259,7 @@ adjustment_options = click_options("points", BlockOptions, "ties", "correction",
 surface_options = _grouped("surface", SurfaceOptions)
 match_options = _grouped("match", MatchOptions)
 matching_options = _grouped(
-    "match", MatchOptions, "reference", "reference_bands", "search", "points", "reference_sigma"
+    "match", MatchOptions, "reference", "reference_bands", "search", "search_rotation", "points", "reference_sigma"
 )
 reference_options = _grouped("match", MatchOptions, "reference", "reference_bands", "search")
 tie_options = _grouped("match", MatchOptions, "search", "points")

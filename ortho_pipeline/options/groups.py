@@ -443,6 +443,14 @@ class MatchOptions:
             unset="three times the accuracy that the scene states, else 100",
         ),
     ] = None  # fmt: skip
+    search_rotation: Annotated[
+        float | None,
+        Option(
+            "--search-rotation", "How far the image's model may be turned (degrees, 180 for any angle).", "DEG",
+            kind="number", above=0, below=180.001, unset="5 where the model comes from metadata on orbit or attitude, "
+            "else none",
+        ),
+    ] = None  # fmt: skip
     points: Annotated[
         int,
         Option(

@@ -32,6 +32,7 @@ WRONG, SIGMAS = 0.5, 4.0
 def matches(
     scene: Path, model: SensorModel, surface: Surface, references: Sequence[Path], *,
     search: float, dem_sigma: float = 0.0, reference_sigma: float = 0.0, points: int = 500, threads: int = 1,
+    rotation_deg: float = 0.0,
 ) -> Points:  # fmt: skip
     """Call the matcher: the only place that knows how.
 
@@ -45,7 +46,7 @@ def matches(
     from ortho_pipeline.raster.source import RasterSource
 
     view = View(Intensity(RasterSource(scene)), model, surface)
-    settings = MatchSettings(search, points, dem_sigma, reference_sigma, threads)
+    settings = MatchSettings(search, points, dem_sigma, reference_sigma, threads, rotation_deg=rotation_deg)
     return match(view, open_references(references), settings).points
 
 

@@ -143,7 +143,7 @@ def _refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: 
                 field="surface.dem" if surface.dem is not None else "surface.height",
                 remedy="leave them out, or give `points.ties=auto`",
             )  # fmt: skip
-    for name in ("reference_bands", "reference_sigma"):
+    for name in ("reference_bands", "search_rotation", "reference_sigma"):
         if getattr(match, name) is not None and not match.reference:
             raise InputError(
                 "this is said of a reference, and there is none", field=f"match.{name}",

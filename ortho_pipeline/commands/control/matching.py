@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 DEFAULT_SEARCH, _PART = 100.0, 0.25
 #: Many times the sigma that a scene states are searched, and never less than so many pixels.
 _SIGMAS, _LEAST = 3.0, 8.0
+#: Degrees by which a pose that only metadata give may be turned.
+POSE_DEG = 5.0
 #: A reference is probably made of the scene itself where the chips are as alike as that in the median, and the matches
 #: agree to so many pixels: two images of one place have noise, heights and light of their own, and do not.
 _SAME, _EXACT = 0.97, 0.01
@@ -211,6 +213,7 @@ def match_scene(
     settings = MatchSettings(
         search=search.distance, points=options.points, dem_sigma=typical_sigma(view.surface) or 0.0,
         reference_sigma=options.reference_sigma or 0.0, threads=threads or os.cpu_count() or 1, memory=memory,
+        rotation_deg=rotation_of(scene, options),
     )  # fmt: skip
     with _of_references():
         matches = match(view, references, settings)
@@ -284,6 +287,16 @@ def search_of(scene: Scene, options: MatchOptions, pixel: float) -> Search:
     if part < DEFAULT_SEARCH:
         return Search(part, f"a default: the scene states no accuracy; {_PART:.0%} of its side", known=False)
     return Search(DEFAULT_SEARCH, "a default: the scene states no accuracy", known=False)
+
+
+def rotation_of(scene: Scene, options: MatchOptions) -> float:
+    """Return how far (degrees) the model may be turned: as the user says, or `POSE_DEG` where it is a pose.
+
+    An RPC is made of a pose that was adjusted: it is taken not to be turned.
+    """
+    if options.search_rotation is not None:
+        return options.search_rotation
+    return POSE_DEG if set(scene.model.param_names) & set(scene.priors) else 0.0
 
 
 def _stated(scene: Scene, pixel: float) -> tuple[float, str] | None:

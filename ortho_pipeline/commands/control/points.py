@@ -85,7 +85,7 @@ def refuse_idle(match: MatchOptions) -> None:
     InputError
         With the option.
     """
-    for name in ("reference_bands", "search", "points", "reference_sigma", "gcps_as"):
+    for name in ("reference_bands", "search", "search_rotation", "points", "reference_sigma", "gcps_as"):
         if getattr(match, name) != getattr(MatchOptions, name):
             raise InputError(
                 "this is said of matching, and there is no reference", field=f"match.{name}",

@@ -35,6 +35,7 @@ from ortho_pipeline.imaging.matching.targets import (
     shown_by,
     spread_over,
 )
+from ortho_pipeline.imaging.matching.turns import orientations
 from ortho_pipeline.imaging.matching.weights import Components, components
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
@@ -81,6 +82,8 @@ class MatchSettings:
     threads : int
     memory : int
         Bytes that are meant for all of the work, of which GDAL's cache has a part.
+    rotation_deg : float
+        How far the model may be turned.
     """
 
     search: float
@@ -89,6 +92,7 @@ class MatchSettings:
     reference_sigma: float = 0.0
     threads: int = 1
     memory: int = 512_000_000
+    rotation_deg: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +157,7 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     base = chip_factor(view, targets, shown)
     reach = max(reach, 2.0 * base)
     region = _region(view, shown)
-    correction, levels = place(view, targets, reach, base, region)
+    correction, levels = place(view, targets, reach, base, region, settings.rotation_deg)
     extent = region[2] - region[0], region[3] - region[1]
     # The targets may show a part of that rectangle only.
     share = len(shown) / SAMPLES**2 * view.size[0] * view.size[1] / (extent[0] * extent[1])
@@ -163,7 +167,7 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     tried = _Tried(view, targets, origins, cells, base, threads)
     tried.search(correction)
     for turn in range(_ROUNDS):
-        correction = tried.agreed(correction, None if turn else reach)
+        correction = tried.agreed(correction, None if turn else reach, orientations(settings.rotation_deg))
         tried.measure(correction)
         if tried.moved(correction) < _STANDS:
             break
@@ -259,13 +263,14 @@ class _Tried:
 
         in_batches(work, np.arange(len(self.origins)), self.threads)
 
-    def agreed(self, correction: ImageCorrection, searched: float | None) -> ImageCorrection:
+    def agreed(self, correction: ImageCorrection, searched: float | None, turns: int) -> ImageCorrection:
         """Return the correction that most offsets agree on; the others are of no use any more.
 
         Raises
         ------
         InputError
-            If as many could as well agree by chance, at any place of a search `searched` (px) wide.
+            If as many could as well agree by chance, at any place of a search `searched` (px) wide and any of so
+            many `turns` of it.
         """
         good = np.flatnonzero(self.reason == "")
         if len(good) < FEWEST:
@@ -274,7 +279,7 @@ class _Tried:
             correction, self.centres[good], self.offset[good], self.score[good], _NEAR * self.factor
         )  # fmt: skip
         if searched is not None:
-            places = (2 * searched / self.factor + 1) ** 2
+            places = turns * (2 * searched / self.factor + 1) ** 2
             refuse_accident(int(agreeing.sum()), len(good), _NEAR, places, self.targets, searched)
         self.reason[good[~agreeing]] = "contradicts"
         before = correction.ground_to_image(self._some(correction, good))

@@ -16,6 +16,7 @@ Source: Moisan and Stival 2004 (a-contrario consensus).
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,6 +29,7 @@ from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
 from ortho_pipeline.imaging.matching.targets import Target, View
+from ortho_pipeline.imaging.matching.turns import Turn, margin, renderings, votes
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
 
@@ -80,7 +82,7 @@ class Level:
 
 
 def place(
-    view: View, targets: Sequence[Target], reach: float, base: int, region: Region
+    view: View, targets: Sequence[Target], reach: float, base: int, region: Region, rotation_deg: float = 0.0
 ) -> tuple[ImageCorrection, list[Level]]:
     """Return the model of a view with the correction under which the targets agree with it, to a few chip px.
 
@@ -92,6 +94,8 @@ def place(
         Pixels of the scene in a chip pixel at the finest level.
     region : (left, top, right, bottom)
         The part of the scene (px) that the targets show.
+    rotation_deg : float
+        How far the model may be turned. Where no shift alone is found, rotations and scales are searched too.
 
     Raises
     ------
@@ -99,11 +103,71 @@ def place(
         If no place within reach stands out, with the reason.
     """
     middle = (region[0] + region[2]) / 2, (region[1] + region[3]) / 2
-    correction = ImageCorrection.identity(view.model, "affine", middle)
+    start = ImageCorrection.identity(view.model, "affine", middle)
     factor, radius = _coarsest(region, reach, base)
     side = _chip_side(region, factor, 3)
-    hypotheses = _hypotheses(_correlated(view, targets, region, side, factor, radius), targets)
-    corrections = [_shifted(correction, -shift * factor) for shift in hypotheses]
+    shifts = _hypotheses(_correlated(view, targets, region, side, factor, radius), targets)
+    alone = [_shifted(start, -shift * factor) for shift in shifts]
+    try:
+        return _refined(view, targets, reach, base, region, (factor, radius), alone)
+    except InputError as error:
+        if rotation_deg:
+            corrections = _turned(view, targets, region, start, (factor, radius), rotation_deg)
+            # What stands out has to do so among shifts alone too: of a pattern that repeats itself no turn is unique.
+            corrections += [
+                one for one in alone if all(_apart(one, other, region) > _APART * factor for other in corrections)
+            ]
+            with contextlib.suppress(InputError):
+                return _refined(view, targets, reach, base, region, (factor, radius), corrections)
+        raise error from None
+
+
+def _turned(
+    view: View, targets: Sequence[Target], region: Region, start: ImageCorrection, level: tuple[int, int],
+    rotation_deg: float,
+) -> list[ImageCorrection]:  # fmt: skip
+    """Return the corrections of the highest places over shifts, rotations and scales, the highest first."""
+    factor, radius = level
+    side = _chip_side(region, factor, 3)
+    origin = np.array(start.origin)
+    wide = radius + margin((_spread(region, side, factor) + side * factor / 2 - origin) / factor)
+    found: list[Turn] = []
+    for matrix in renderings(rotation_deg):
+        model = followed_by(start, _step(matrix, np.zeros(2)))
+        shown = _correlated(replace(view, model=model), targets, region, side, factor, wide)
+        if len(shown.centres) >= _FEWEST:
+            found += votes(shown.smooth(), (shown.centres - origin) / factor, radius, matrix, factor)
+    best: list[ImageCorrection] = []
+    for turn in sorted(found, key=lambda one: -one.value):
+        if len(best) == _HYPOTHESES or turn.value <= _WORTH * max(one.value for one in found):
+            break
+        correction = followed_by(start, _step(turn.matrix, turn.shift))
+        if all(_apart(correction, other, region) > _APART * factor for other in best):
+            best.append(correction)
+    return best
+
+
+def _apart(one: ImageCorrection, other: ImageCorrection, region: Region) -> float:
+    """Return the mean distance (px) of what two corrections of one model put over a region."""
+    across, down = (np.linspace(-extent / 2, extent / 2, 4) for extent in _extent(region))
+    places = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+    shift = (one.coefficients - other.coefficients)[[0, 3]]
+    return float(np.hypot(*(places @ (one.matrix - other.matrix).T + shift).T).mean())
+
+
+def _refined(
+    view: View, targets: Sequence[Target], reach: float, base: int, region: Region, level: tuple[int, int],
+    corrections: Sequence[ImageCorrection],
+) -> tuple[ImageCorrection, list[Level]]:  # fmt: skip
+    """Return the correction that stands out among hypotheses, refined level by level.
+
+    Raises
+    ------
+    InputError
+        If none does, or its chips agree no better than by accident.
+    """
+    factor, radius = level
+    side = _chip_side(region, factor, 3)
     compared = [_correlated(replace(view, model=one), targets, region, side, factor, _NEXT) for one in corrections]
     best = _standing_out(compared, targets, reach)
     correction, shown = corrections[best], compared[best]
@@ -241,7 +305,8 @@ def _standing_out(compared: Sequence[_Shown], targets: Sequence[Target], reach: 
             f"(correlation {means[best]:.2f} and {means[other]:.2f} in the mean of {counted(len(common), 'chip')})",
             file=targets[0].path, field=targets[0].field,
             remedy=f"check that {targets[0].called} shows this place, search farther (`match.search`) if the model "
-            "may be off by more, or measure points by hand where the ground is uniform or repeats itself",
+            "may be off by more, and for rotations (`match.search_rotation=5`) if it may be turned; measure points by "
+            "hand where the ground is uniform or repeats itself",
         )  # fmt: skip
     return best
 
@@ -282,11 +347,15 @@ def agreed(
     return followed_by(correction, step), agreeing
 
 
+def _step(matrix: Array, shift: Array) -> Array:
+    """Return the coefficients of an affine correction about an origin."""
+    slopes = matrix - np.eye(2)
+    return np.array([shift[0], *slopes[0], shift[1], *slopes[1]])
+
+
 def _shifted(correction: ImageCorrection, shift: Array) -> ImageCorrection:
     """Return a correction that is followed by a shift (px)."""
-    step = np.zeros(6)
-    step[[0, 3]] = shift
-    return followed_by(correction, step)
+    return followed_by(correction, _step(np.eye(2), shift))
 
 
 def followed_by(correction: ImageCorrection, step: Array) -> ImageCorrection:
@@ -323,7 +392,8 @@ def refuse_accident(
             f"within {reach:.0f} px of where the model puts them, which chance does as well",
             file=targets[0].path, field=targets[0].field,
             remedy=f"check that {targets[0].called} shows this place, search farther (`match.search`) if the model "
-            "may be off by more, or measure points by hand",
+            "may be off by more, for rotations (`match.search_rotation=5`) if it may be turned, or measure points "
+            "by hand",
         )  # fmt: skip
 
 
