@@ -37,6 +37,8 @@ DEFAULT_SEARCH, _PART = 100.0, 0.25
 _SIGMAS, _LEAST = 3.0, 8.0
 #: Degrees by which a pose that only metadata give may be turned.
 POSE_DEG = 5.0
+#: A reference that covers less than this of a scene is a notice.
+_COVERS = 0.5
 #: A reference is probably made of the scene itself where the chips are as alike as that in the median, and the matches
 #: agree to so many pixels: two images of one place have noise, heights and light of their own, and do not.
 _SAME, _EXACT = 0.97, 0.01
@@ -218,7 +220,7 @@ def match_scene(
     with _of_references():
         matches = match(view, references, settings)
     paths = tuple(one.path for one in references)
-    notices = [*_default_search(search), *_made_of_scene(scene, references, matches)]
+    notices = [*_default_search(search), *_made_of_scene(scene, references, matches), *_partial(matches)]
     return Matched(
         matches, paths, options, search, (scene.width, scene.height), pixel, tuple(notices), typical_sigma(view.surface)
     )
@@ -328,6 +330,14 @@ def _default_search(search: Search) -> list[Notice]:
         "(`match.search`)"
     )
     return [Notice("search-by-default", text, search_m=search.distance)]
+
+
+def _partial(matches: Matches) -> list[Notice]:
+    """Return a notice if the references cover little of the scene."""
+    if matches.coverage >= _COVERS:
+        return []
+    text = f"the reference covers {matches.coverage:.0%} of the scene; accuracy outside it is not tested"
+    return [Notice("reference-covers-part", text, coverage=matches.coverage)]
 
 
 # -- what a reference is not -----------------------------------------------------------------------------------------

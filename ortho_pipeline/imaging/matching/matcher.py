@@ -54,6 +54,8 @@ _ROUNDS, _STANDS = 3, 0.02
 _MOSTLY, _VAGUE = 0.5, 0.5
 #: Rounds of judging.
 _JUDGED = 6
+#: Of the `SAMPLES` x `SAMPLES` points of a scene so many have to be shown.
+_SAMPLES_SHOWN = 4
 #: Why a match was not kept, in words.
 REASONS = {
     "hidden": "the target shows too little of the chip",
@@ -124,6 +126,8 @@ class Matches:
         What the covariances are made of.
     points : Points
         The matches that were kept, with covariances and groups.
+    coverage : float
+        Share of the scene that the targets cover.
     """
 
     image: Array
@@ -138,6 +142,7 @@ class Matches:
     levels: tuple[Level, ...]
     components: Components
     points: Points
+    coverage: float = 1.0
 
 
 def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Matches:
@@ -172,7 +177,7 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
         if tried.moved(correction) < _STANDS:
             break
     tried.judge()
-    return tried.matches(settings, tuple(levels))
+    return replace(tried.matches(settings, tuple(levels)), coverage=len(shown) / SAMPLES**2)
 
 
 def _shown(view: View, targets: Sequence[Target]) -> Array:
@@ -185,11 +190,14 @@ def _shown(view: View, targets: Sequence[Target]) -> Array:
     """
     image = spread_over(view)
     inside = _inside(view, targets, image)
-    if inside.sum() < SAMPLES:
+    if inside.sum() < _SAMPLES_SHOWN:
+        said = "shows nothing of the scene"
+        remedy = "give images of the same place; if they are, the model of the scene leads elsewhere (`ortho info`)"
+        if inside.any():
+            said = f"covers {inside.mean():.1%} of the scene, which is too little to match"
+            remedy = "give images that cover more of the scene, or measure points by hand"
         raise InputError(
-            f"{targets[0].called} shows {'nothing' if not inside.any() else 'next to nothing'} of the scene",
-            file=targets[0].path, field=targets[0].field,
-            remedy="give images of the same place; if they are, the model of the scene leads elsewhere (`ortho info`)",
+            f"{targets[0].called} {said}", file=targets[0].path, field=targets[0].field, remedy=remedy
         )  # fmt: skip
     return image[inside]
 

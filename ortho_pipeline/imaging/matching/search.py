@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,7 +28,7 @@ from scipy import ndimage, stats
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
-from ortho_pipeline.imaging.matching.targets import Target, View
+from ortho_pipeline.imaging.matching.targets import Target, View, metres_per_pixel
 from ortho_pipeline.imaging.matching.turns import Turn, margin, renderings, votes
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
@@ -56,6 +56,9 @@ _UNIQUE, _ACCIDENT = 1e-3, 1e-6
 _CLEARLY = 0.8
 #: Chips agree within this (chip px).
 _AGREE = 1.5
+#: A chip fits one of two places alone if its correlation there is this, and at the other one less than half of it. If
+#: so many of all chips do, and so many of them each place, the target is inconsistent: parts of it are displaced.
+_FITS, _DIVIDED, _PART, _FEWEST_PART = 0.15, 0.75, 0.1, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +172,7 @@ def _refined(
     factor, radius = level
     side = _chip_side(region, factor, 3)
     compared = [_correlated(replace(view, model=one), targets, region, side, factor, _NEXT) for one in corrections]
-    best = _standing_out(compared, targets, reach)
+    best = _standing_out(compared, corrections, targets, reach, metres_per_pixel(view))
     correction, shown = corrections[best], compared[best]
     levels: list[Level] = []
     while True:
@@ -273,7 +276,10 @@ def _hypotheses(shown: _Shown, targets: Sequence[Target]) -> list[Array]:
     return found
 
 
-def _standing_out(compared: Sequence[_Shown], targets: Sequence[Target], reach: float) -> int:
+def _standing_out(
+    compared: Sequence[_Shown], corrections: Sequence[ImageCorrection], targets: Sequence[Target], reach: float,
+    pixel: float,
+) -> int:  # fmt: skip
     """Return the number of the hypothesis that is clearly better than the others.
 
     Raises
@@ -300,6 +306,14 @@ def _standing_out(compared: Sequence[_Shown], targets: Sequence[Target], reach: 
             chance = float(stats.ttest_1samp(difference, 0.0, alternative="greater").pvalue)
         if chance < _UNIQUE and means[other] < _CLEARLY * means[best]:
             continue
+        far = float(np.hypot(*(corrections[best].coefficients - corrections[other].coefficients)[[0, 3]])) * pixel
+        divided = _divided(values[best], values[other], far)
+        if divided:
+            raise InputError(
+                f"{targets[0].called} is inconsistent: {divided}", file=targets[0].path, field=targets[0].field,
+                remedy="give another reference, or only the part that is right: gdal_translate -projwin LEFT TOP RIGHT "
+                "BOTTOM IN.tif PART.tif",
+            )  # fmt: skip
         raise InputError(
             f"no place within {reach:.0f} px stands out: the best two of {len(compared)} are too much alike "
             f"(correlation {means[best]:.2f} and {means[other]:.2f} in the mean of {counted(len(common), 'chip')})",
@@ -309,6 +323,31 @@ def _standing_out(compared: Sequence[_Shown], targets: Sequence[Target], reach: 
             "hand where the ground is uniform or repeats itself",
         )  # fmt: skip
     return best
+
+
+def _divided(one: Mapping[tuple[float, ...], float], other: Mapping[tuple[float, ...], float], far: float) -> str:
+    """Return how chips are divided among two places `far` (m) from each other, by their correlations at both.
+
+    Returns
+    -------
+    str
+        Empty where they are not, as in ground that repeats itself, where chips fit both.
+    """
+    centres = np.array([centre for centre in one if centre in other]).reshape(-1, 2)
+    both = np.array([(one[tuple(c)], other[tuple(c)]) for c in centres.tolist()]).reshape(-1, 2)
+    fits = (both.max(axis=1) > _FITS) & (both.min(axis=1) < both.max(axis=1) / 2)
+    second = fits & (both[:, 1] > both[:, 0])
+    first = fits & ~second
+    least = max(_FEWEST_PART, _PART * len(both))
+    if fits.sum() < _DIVIDED * len(both) or min(first.sum(), second.sum()) < least:
+        return ""
+    apart = centres[second].mean(axis=0) - centres[first].mean(axis=0)
+    axis = int(np.abs(apart).argmax())
+    side = (("left", "right"), ("upper", "lower"))[axis][int(apart[axis] > 0)]
+    return (
+        f"{counted(int(first.sum()), 'chip')} fit it at one place, and {counted(int(second.sum()), 'chip')}, "
+        f"mostly in the {side} part of the scene, {far:.0f} m from there"
+    )
 
 
 def agreed(
@@ -398,7 +437,11 @@ def refuse_accident(
 
 
 def _no_overlap(targets: Sequence[Target], count: int) -> InputError:
+    why = f"it shares {counted(count, 'chip')} with the scene, and {_FEWEST} are needed"
+    if not count:
+        why = "where it covers the scene, it has no values or there are no heights"
     return InputError(
-        f"{targets[0].called} shows too little of the scene ({counted(count, 'chip')} in both)", file=targets[0].path,
-        field=targets[0].field, remedy="give images that overlap more, and heights that cover them",
+        f"{targets[0].called} shows too little of the scene: {why}", file=targets[0].path, field=targets[0].field,
+        remedy="give images that overlap more, bands that have values (`match.reference_bands`), and heights that "
+        "cover the overlap",
     )  # fmt: skip

@@ -25,6 +25,8 @@ _STOP: dict[str, str] = {
     "metadata-contradict": "Find out which of the two is right before the ortho is used; ask who delivered the scene.",
 }
 _LOOK: dict[str, str] = {
+    "reference-covers-part": "Add references or measured points in the rest of the scene, or do not use the "
+    "ortho there.",
     "left-out": "Look at it in the image and at its coordinates: measure it again, or delete it from the file of "
     "points.",
     "more-left-out": "So many gross errors mean that the points or the model do not suit the scene: see both.",
