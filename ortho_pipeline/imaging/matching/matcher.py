@@ -35,8 +35,8 @@ from ortho_pipeline.imaging.matching.targets import (
     shown_by,
     spread_over,
 )
-from ortho_pipeline.imaging.matching.turns import orientations
 from ortho_pipeline.imaging.matching.weights import Components, components
+from ortho_pipeline.imaging.turns import orientations
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points

@@ -29,7 +29,7 @@ from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
 from ortho_pipeline.imaging.matching.targets import Target, View, metres_per_pixel
-from ortho_pipeline.imaging.matching.turns import Turn, margin, renderings, votes
+from ortho_pipeline.imaging.turns import Turn, margin, renderings, votes
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
 
