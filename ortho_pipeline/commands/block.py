@@ -23,7 +23,13 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
-from ortho_pipeline.commands.control.block_points import gather, read_points, relative_to_reference, settled_scenes
+from ortho_pipeline.commands.control.block_points import (
+    gather,
+    read_points,
+    refuse_contradictions,
+    relative_to_reference,
+    settled_scenes,
+)
 from ortho_pipeline.commands.results import Result, attempted, to_store
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
@@ -91,6 +97,7 @@ def adjust(
     labels = labels_of(images)
     files = _files(labels, Path(folder))
     scenes = scenes_of(images, scene, models)
+    refuse_contradictions(points, match, surface)
     _check_paths(files, images, points, scenes, *models, match=match, surface=surface)
     scenes, placed = settled_scenes(images, labels, scenes, points, surface)
     gathered = gather(images, labels, scenes, points, match, surface)

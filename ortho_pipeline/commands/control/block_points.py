@@ -63,9 +63,8 @@ def gather(
     Raises
     ------
     InputError
-        If there are none, or options contradict each other; as `tie_scenes` and `match_scene`.
+        If there are none; as `tie_scenes` and `match_scene`.
     """
-    _refuse_contradictions(options, match, surface)
     matched = options.ties is not None or bool(match.reference)
     tables, notices, document, text = [], list[Notice](), dict[str, Any](), list[str]()
     heights: Surface | None = None
@@ -74,7 +73,6 @@ def gather(
         tables.append(table)
         notices += notes
     if matched:
-        require_heights(surface)
         alone = [inputs.open_scene(image, scene) for image, scene in zip(images, scenes, strict=True)]
         heights = open_surface(surface, scenes[0], under=alone)
         opened = {label: on_surface(scene, heights) for label, scene in zip(labels, alone, strict=True)}
@@ -117,7 +115,14 @@ def settled_scenes(
     return settled_options(images, scenes, surface, points_in)
 
 
-def _refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: SurfaceOptions) -> None:
+def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: SurfaceOptions) -> None:
+    """Refuse options that contradict each other, before any file is opened.
+
+    Raises
+    ------
+    InputError
+        If there is no source of points, heights that matching needs are missing, or an option has no effect.
+    """
     if options.points is None and options.ties is None:
         raise InputError(
             "the images have no points in common", field="points.points",
@@ -149,6 +154,8 @@ def _refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: 
                 "this is said of a reference, and there is none", field=f"match.{name}",
                 remedy="leave it out, or give `match.reference`",
             )  # fmt: skip
+    if options.ties is not None or match.reference:
+        require_heights(surface)
 
 
 def relative_to_reference(fit: BlockFit, options: BlockOptions, match: MatchOptions) -> list[Notice]:
