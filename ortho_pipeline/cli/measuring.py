@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -58,19 +59,31 @@ def measure(
     from ortho_pipeline.measure.serving.server import serve
 
     session = _session(images, output, scene, points, surface, match)
+    with contextlib.ExitStack() as until_end:
 
-    def ready(address: str) -> None:
-        if as_json:
-            print_json({"address": address, "points": str(session.output)})
-        else:
-            click.echo(f"Measuring at {address}")
-            click.echo(f"Points: {session.output}. Ctrl-C ends.")
-        if not no_browser:
-            import webbrowser
+        def ready(address: str) -> None:
+            if as_json:
+                print_json({"address": address, "points": str(session.output)})
+            else:
+                click.echo(f"Measuring at {address}")
+                click.echo(f"Points: {session.output}. The address works once. Ctrl-C ends.")
+            if not no_browser:
+                _open_browser(address, session.output, until_end)
 
-            webbrowser.open(address)
+        serve(session, _first(scene), ready, port)
 
-    serve(session, _first(scene), ready, port)
+
+def _open_browser(address: str, points: Path, until_end: contextlib.ExitStack) -> None:
+    """Open the address by way of a file: everybody on this machine can read the command line of a browser."""
+    import webbrowser
+
+    from ortho_pipeline.measure.serving.entry import private_file
+
+    path = until_end.enter_context(private_file(address, points))
+    if path is None:
+        click.echo("Note: no private file can be written beside the points. Open the address yourself.", err=True)
+    else:
+        webbrowser.open(path.as_uri())
 
 
 def _first(scene: SceneOptions | list[SceneOptions]) -> SceneOptions:

@@ -191,7 +191,7 @@ def test_the_ortho_of_an_image_has_the_model_of_the_block(
     block_client: Any, stereo: Any, truth: Any, features: np.ndarray
 ) -> None:
     def ask(what: str, **given: Any) -> Any:
-        return block_client.post(f"/token/api/{what}", json={"window": "window-one", **given}).json()
+        return block_client.post(f"/folder/api/{what}", json={"window": "window-one", **given}).json()
 
     grounds = truth.ground_at(features)
     there = stereo.truth.image_of(grounds)
@@ -212,27 +212,27 @@ def test_the_ortho_of_an_image_has_the_model_of_the_block(
     said = json.loads((ortho.parents[1] / "block/block_report.json").read_text())["adjustment"]["images"]["second"]
     for name, value in said["parameters"].items():
         assert state["parameters"]["second"][name]["value"] == pytest.approx(value["value"], rel=0, abs=1e-9)
-    assert block_client.get("/token/made/ortho").content[:4] == b"\x89PNG"
+    assert block_client.get("/folder/made/ortho").content[:4] == b"\x89PNG"
 
 
 def test_a_block_is_guarded_as_one_scene_is(block_client: Any) -> None:
     """Host, token, origin, long bodies, paths and images that there are not."""
-    url = "/token/api/tie"
+    url = "/folder/api/tie"
     given = {"window": "window-one", "number": 0, "image": [1.0, 2.0]}
     for headers, status in (({"host": "evil.example"}, 421), ({"origin": "http://evil.example"}, 403)):
         assert block_client.post(url, json=given, headers=headers).status_code == status
-    assert block_client.post("/tokem/api/tie", json=given).status_code == 404
+    assert block_client.post("/foldes/api/tie", json=given).status_code == 404
     assert block_client.post(url, content=b" " * (MAX_BODY + 1)).status_code == 413
     for path in ("tiles/scene-2/0/1/0/0?l=0,1", "tiles/..%2fscene/0/1/0/0?l=0,1", "tiles/reference-0/0/1/0/0?l=0,1",
                  "made/..%2f..%2fp.geojson", "made/nonsense", "../p.geojson", "scene.tif"):  # fmt: skip
-        answer = block_client.get(f"/token/{path}")
+        answer = block_client.get(f"/folder/{path}")
         assert answer.status_code in (400, 404)
         assert str(SAMPLE) not in answer.text
     for wrong in ({"rays": {"../scene": {"image": [1, 2]}}}, {"rays": {"scene": {"image": [1, 2], "path": "/etc"}}}):
         action = {"do": "put", "mark": {"id": "X", "role": "tie", **wrong}}
-        answer = block_client.post("/token/api/act", json={"window": "window-one", "action": action})
+        answer = block_client.post("/folder/api/act", json={"window": "window-one", "action": action})
         assert answer.status_code == 400
-    assert block_client.post("/token/api/make", json={"window": "another-window"}).status_code == 409
+    assert block_client.post("/folder/api/make", json={"window": "another-window"}).status_code == 409
 
 
 @pytest.mark.parametrize(
@@ -244,7 +244,7 @@ def test_a_block_is_guarded_as_one_scene_is(block_client: Any) -> None:
      ("predict", {"at": "scene-2", "place": [1, 2]})],
 )  # fmt: skip
 def test_what_several_images_have_not_is_refused_in_a_line(block_client: Any, what: str, given: dict[str, Any]) -> None:
-    answer = block_client.post(f"/token/api/{what}", json={"window": "window-one", **given})
+    answer = block_client.post(f"/folder/api/{what}", json={"window": "window-one", **given})
     assert answer.status_code == 400
     assert answer.json()["error"]["message"]
 
@@ -252,12 +252,15 @@ def test_what_several_images_have_not_is_refused_in_a_line(block_client: Any, wh
 @pytest.fixture(scope="module")
 def block_client(stereo: Any, tmp_path_factory: pytest.TempPathFactory):
     testclient = pytest.importorskip("starlette.testclient", reason="the extra 'measure' is not installed")
+    from ortho_pipeline.measure.serving.entry import Entry
     from ortho_pipeline.measure.serving.server import application
 
     output = tmp_path_factory.mktemp("block") / "p.geojson"
     session = open_block_session([SAMPLE / "scene.tif", stereo.path], output, surface=SURFACE)
-    with testclient.TestClient(application(session, "token", {"127.0.0.1:1"}), base_url="http://127.0.0.1:1") as client:
-        facts = client.post("/token/api/begin", json={"window": "window-one"}).json()
+    entry = Entry("folder")
+    with testclient.TestClient(application(session, entry, {"127.0.0.1:1"}), base_url="http://127.0.0.1:1") as client:
+        client.get(entry.path)
+        facts = client.post("/folder/api/begin", json={"window": "window-one"}).json()
         assert facts["labels"] == ["scene", "second"]
         yield client
     session.close()

@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ortho_pipeline.measure.serving.entry import leading_to
+
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytest.importorskip("uvicorn", reason="the extra 'measure' is not installed")
 
@@ -42,10 +44,15 @@ class Served:
         self.address = self.process.stdout.readline().split()[-1]
         self.page, self.hosts, self.faults = page, set(), []
         page.set_default_timeout(_SLOW_MACHINE)
-        page.on("request", lambda request: self.hosts.add(request.url.split("/")[2]))
+        page.on(
+            "request", lambda request: self.hosts.add(request.url.split("/")[2]) if "file:" not in request.url else None
+        )
         page.on("console", lambda told: self.faults.append(told.text) if told.type == "error" else None)
         page.on("pageerror", lambda error: self.faults.append(str(error)))
-        page.goto(self.address)
+        # As the command opens it: by a file, from where a strict cookie is not sent.
+        leading = folder / "open.html"
+        leading.write_text(leading_to(self.address))
+        page.goto(leading.as_uri())
         self.says("#what", "not tested")
 
     def says(self, where: str, text: str) -> None:
@@ -83,13 +90,13 @@ def serve(browser, tmp_path: Path):
     running = []
 
     def serving(reference: Path, *images: Path, **context: object) -> Served:
-        page = browser.new_page(**{"viewport": {"width": 1400, "height": 860}, **context})
-        running.append(Served(page, tmp_path, reference, *images))
+        own = browser.new_context(**{"viewport": {"width": 1400, "height": 860}, **context})
+        running.append(Served(own.new_page(), tmp_path, reference, *images))
         return running[-1]
 
     yield serving
     for served in running:
-        served.page.close()
+        served.page.context.close()
         served.process.kill()
         served.process.wait()
 
@@ -113,12 +120,19 @@ def test_a_person_clicks_two_points(serve, reference: Path, truth, features: np.
     playwright.expect(served.page.locator("#table tbody tr")).to_have_count(2)
     served.says("#said", "Click a feature")
     # A second window follows what the first one does.
-    second = served.page.context.browser.new_page()
+    second = served.page.context.new_page()
     second.goto(served.address)
     playwright.expect(second.locator("#banner-text")).to_have_text(re.compile("Read only"), timeout=_SLOW_MACHINE)
     served.page.keyboard.press("z")
     playwright.expect(second.locator("#table tbody tr")).to_have_count(1, timeout=_SLOW_MACHINE)
     second.close()
+    # Another browser does not get in: neither by the address that was used, nor by that of the page.
+    other = served.page.context.browser.new_page()
+    for address in (served.address, served.page.url):
+        answer = other.goto(address)
+        assert answer is not None
+        assert answer.status == 403
+    other.close()
     served.page.keyboard.press("Shift+Z")
     playwright.expect(served.page.locator("#table tbody tr")).to_have_count(2)
     points = served.end()

@@ -23,23 +23,25 @@ SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 WINDOW = "window-of-tests"
 
 
-def started(output: Path, reference: Path, *images: Path) -> tuple[subprocess.Popen[str], str]:
-    """Start the server, and return it with its address."""
+def started(output: Path, reference: Path, *images: Path) -> tuple[subprocess.Popen[str], Callable[..., dict]]:
+    """Start the server, and return it with what asks it as the page does."""
     process = subprocess.Popen(
         [sys.executable, "-m", "ortho_pipeline", "measure", str(SAMPLE / "scene.tif"), *map(str, images),
          "--reference", str(reference), "--dem", str(SAMPLE / "dem.tif"), "-o", str(output), "--no-browser"],
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert process.stdout is not None
-    return process, process.stdout.readline().split()[-1]
+    address = process.stdout.readline().split()[-1]
+    browser = request.build_opener(request.HTTPCookieProcessor())
+    browser.open(address, timeout=60).close()
 
+    def ask(what: str, **given: object) -> dict:
+        body = json.dumps({"window": WINDOW, **given}).encode()
+        asked = request.Request(f"{address.split('?')[0]}api/{what}", body, {"content-type": "application/json"})
+        with browser.open(asked, timeout=60) as answer:
+            return json.loads(answer.read())
 
-def ask(address: str, what: str, **given: object) -> dict:
-    """Ask the server as the page does."""
-    body = json.dumps({"window": WINDOW, **given}).encode()
-    asked = request.Request(f"{address}api/{what}", body, {"content-type": "application/json"})
-    with request.urlopen(asked, timeout=60) as answer:
-        return json.loads(answer.read())
+    return process, ask
 
 
 def put(number: int) -> dict:
@@ -61,9 +63,9 @@ def check_kills(
     chosen, output, least, most = random.Random(5), folder / "p.geojson", 0, 0
     of_each = 1 + len(images)
     for turn in range(count + 1):
-        process, address = started(output, reference, *images)
+        process, ask = started(output, reference, *images)
         try:
-            names = [mark["id"] for mark in ask(address, "begin")["state"]["marks"]]
+            names = [mark["id"] for mark in ask("begin")["state"]["marks"]]
             assert least <= len(names) <= most, "an action that was answered is lost, or one was made up"
             assert names == [f"P{number}" for number in range(len(names))]
             if output.exists():
@@ -75,7 +77,7 @@ def check_kills(
             try:
                 while True:
                     most += 1  # sent, and not yet answered
-                    ask(address, "act", action=action(most - 1))
+                    ask("act", action=action(most - 1))
                     least += 1
             except (error.URLError, OSError, HTTPException, ValueError):
                 pass

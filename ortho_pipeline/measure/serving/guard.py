@@ -1,19 +1,21 @@
-"""The guard before the page: this machine alone, the right host, the secret of the address, and bodies of a size.
+"""The guard before the page: this machine alone, the right host, the cookie, and bodies of a size.
 
-The address holds a random token as its first folder; nothing is answered without it. A page of another origin does not
-know the token, and a name that an attacker lets point at this machine fails at the Host header.
+Nothing is answered without the cookie, which the address of `Entry` gives once. A page of another origin cannot use it,
+and a name that an attacker lets point at this machine fails at the Host header.
 """
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any
+
+from ortho_pipeline.measure.serving.entry import REFUSED, Entry, leading_to
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
+Headers = dict[bytes, list[bytes]]
 
 #: A request has no longer body than this (bytes).
 MAX_BODY = 64_000
@@ -35,18 +37,18 @@ HEADERS = (
 
 
 class Guard:
-    """An ASGI application that lets through what may be asked, without the token in the path.
+    """An ASGI application that lets through what may be asked, without the folder of the entry in the path.
 
     Parameters
     ----------
     app : ASGI application
     hosts : set of str
         Host headers that are ours: name and port.
-    token : str
+    entry : Entry
     """
 
-    def __init__(self, app: App, hosts: set[str], token: str) -> None:
-        self._app, self._hosts, self._token = app, {host.encode() for host in hosts}, token
+    def __init__(self, app: App, hosts: set[str], entry: Entry) -> None:
+        self._app, self._hosts, self._entry = app, {host.encode() for host in hosts}, entry
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or refuse it."""
@@ -55,9 +57,20 @@ class Guard:
             return
         if scope["type"] != "http":
             raise RuntimeError("only HTTP is spoken here")
-        status, path = self._judged(scope)
+        headers = _headers(scope)
+        status = self._foreign(scope, headers)
         if status:
             await _refused(send, status)
+            return
+        query, known = scope["query_string"], self._entry.knows(headers.get(b"cookie", []))
+        path = scope["path"].removeprefix("/" + self._entry.folder)
+        if path == "/" and scope["method"] == "GET" and query:
+            cookie = None if known else self._entry.exchange(query)
+            if cookie or known:
+                await _entered(send, f"/{self._entry.folder}/", cookie)
+                return
+        if not known:
+            await _refused(send, 403, REFUSED)
             return
         body = await _body(receive)
         if body is None:
@@ -66,23 +79,25 @@ class Guard:
         inner = {**scope, "path": path, "raw_path": path.encode(), "root_path": ""}
         await self._app(inner, _replayed(body, receive), _with_headers(send))
 
-    def _judged(self, scope: Scope) -> tuple[int, str]:
-        """Return a status to refuse with, or 0 and the path without the token."""
-        headers: dict[bytes, list[bytes]] = {}
-        for name, value in scope["headers"]:
-            headers.setdefault(name.lower(), []).append(value)
+    def _foreign(self, scope: Scope, headers: Headers) -> int:
+        """Return a status to refuse what is of another host, origin or folder with, or 0."""
         hosts = headers.get(b"host", [])
         if len(hosts) != 1 or hosts[0].lower() not in self._hosts:
-            return 421, ""
+            return 421
         for origin in headers.get(b"origin", []):
             if origin.lower() not in {b"http://" + host for host in self._hosts}:
-                return 403, ""
-        if headers.get(b"sec-fetch-site", [b"none"])[0] == b"cross-site" and scope["method"] != "GET":
-            return 403, ""
-        parts = scope["path"].split("/", 2)
-        if len(parts) != 3 or not secrets.compare_digest(parts[1].encode(), self._token.encode()):
-            return 404, ""
-        return 0, "/" + parts[2]
+                return 403
+        # Another port of this machine is of the same site, and of another origin.
+        if scope["method"] != "GET" and headers.get(b"sec-fetch-site", [b"none"])[0] not in (b"same-origin", b"none"):
+            return 403
+        return 0 if scope["path"].startswith(f"/{self._entry.folder}/") else 404
+
+
+def _headers(scope: Scope) -> Headers:
+    headers: Headers = {}
+    for name, value in scope["headers"]:
+        headers.setdefault(name.lower(), []).append(value)
+    return headers
 
 
 async def _body(receive: Receive) -> bytes | None:
@@ -125,8 +140,17 @@ def _with_headers(send: Send) -> Send:
     return sending
 
 
-async def _refused(send: Send, status: int) -> None:
-    body = b"refused\n"
-    headers = [(b"content-type", b"text/plain"), (b"content-length", str(len(body)).encode()), *HEADERS]
+async def _refused(send: Send, status: int, text: bytes = b"refused\n") -> None:
+    await _answered(send, status, text, [(b"content-type", b"text/plain")])
+
+
+async def _entered(send: Send, folder: str, cookie: bytes | None) -> None:
+    given = [] if cookie is None else [(b"set-cookie", cookie)]
+    kind = [(b"content-type", b"text/html; charset=utf-8"), (b"cache-control", b"no-store")]
+    await _answered(send, 200, leading_to(folder).encode(), [*kind, *given])
+
+
+async def _answered(send: Send, status: int, body: bytes, given: list[tuple[bytes, bytes]]) -> None:
+    headers = [*given, (b"content-length", str(len(body)).encode()), *HEADERS]
     await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": body})

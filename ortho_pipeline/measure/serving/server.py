@@ -9,7 +9,6 @@ import asyncio
 import contextlib
 import math
 import os
-import secrets
 import socket
 import threading
 from collections.abc import Callable, Sequence
@@ -21,6 +20,7 @@ from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import parse_json
 from ortho_pipeline.measure.block.session import BlockSession
 from ortho_pipeline.measure.project import Project
+from ortho_pipeline.measure.serving.entry import Entry
 from ortho_pipeline.measure.serving.guard import REPORT_POLICY, App, Guard
 from ortho_pipeline.measure.serving.making import PICTURES, Making
 from ortho_pipeline.measure.serving.tiles import MOST, SIDE, Tiles
@@ -201,7 +201,7 @@ class _Answers:
         return band
 
 
-def application(session: Project, token: str, hosts: set[str], opened: SceneOptions = SceneOptions()) -> App:
+def application(session: Project, entry: Entry, hosts: set[str], opened: SceneOptions = SceneOptions()) -> App:
     """Return the ASGI application of a session."""
     from starlette.applications import Starlette
     from starlette.routing import Route
@@ -214,7 +214,7 @@ def application(session: Project, token: str, hosts: set[str], opened: SceneOpti
         Route("/tiles/{pane}/{version:int}/{factor:int}/{column:int}/{row:int}", given.tile),
         Route("/{name}", given.page),
     ]
-    return Guard(Starlette(routes=routes), hosts, token)
+    return Guard(Starlette(routes=routes), hosts, entry)
 
 
 class _Given:
@@ -299,24 +299,24 @@ def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], 
     Parameters
     ----------
     ready : callable
-        Gets the address once it is answered there.
+        Gets the address once it is answered there. The address works once.
     port : int
         0 is any that is free.
     """
     import uvicorn
 
-    token = secrets.token_urlsafe(24)
+    entry = Entry()
     listening = socket.create_server((_LOOPBACK, port))
     number = listening.getsockname()[1]
     hosts = {f"{_LOOPBACK}:{number}", f"localhost:{number}"}
     limit_cache(OutputOptions.memory, os.cpu_count() or 1)
-    app = application(session, token, hosts, opened)
+    app = application(session, entry, hosts, opened)
     config = uvicorn.Config(
         app, log_level="warning", access_log=False, server_header=False, date_header=False, ws="none", lifespan="off",
         timeout_graceful_shutdown=3,
     )  # fmt: skip
     try:
-        ready(f"http://{_LOOPBACK}:{number}/{token}/")
+        ready(f"http://{_LOOPBACK}:{number}{entry.path}")
         # Ctrl-C is how this command ends.
         with contextlib.suppress(KeyboardInterrupt):
             uvicorn.Server(config).run([listening])
