@@ -12,6 +12,7 @@ import fcntl
 import functools
 import hashlib
 import json
+import logging
 import os
 import socket
 import threading
@@ -28,18 +29,24 @@ from ortho_pipeline.files.folders import listing
 
 SCHEMA_VERSION = 1
 DOCUMENT = "ortho-pipeline scene record"
-_MAX_BYTES = 50_000_000
+_log = logging.getLogger(__name__)
+#: A larger file is not a record.
+MAX_BYTES = 50_000_000
 
 
 @dataclass(frozen=True)
 class FileState:
-    """A file at the time of its checksum; `role` says what it is to the scene."""
+    """A file at the time of its checksum; `role` says what it is to the scene.
+
+    Of an object in a store there is no date. Its `tag` is the one that the store gave this version.
+    """
 
     role: str
     path: str
     bytes: int
     mtime_ns: int
     sha256: str
+    tag: str = ""
 
     @classmethod
     def of(cls, role: str, path: Path, digest: Callable[..., str] = files.sha256, name: str | None = None) -> FileState:
@@ -49,6 +56,8 @@ class FileState:
 
     def untouched(self, folder: Path | None = None) -> bool:
         """Tell whether size and time of change are those recorded; `folder` is that of a relative path."""
+        if self.tag:
+            return False  # only its store can tell
         try:
             stat = os.stat(folder / self.path if folder else self.path)
         except (OSError, ValueError):
@@ -100,35 +109,97 @@ class Record:
     error: Mapping[str, Any] | None = None
     run: str = ""
 
-    def write(self, path: Path) -> None:
-        """Write the record, whole or not at all."""
+    def text(self) -> str:
+        """Return the record as one line of JSON."""
         document = {
             "document": DOCUMENT, "schema_version": SCHEMA_VERSION, **vars(self),
             "inputs": [vars(one) for one in self.inputs], "outputs": [vars(one) for one in self.outputs],
         }  # fmt: skip
         # On one line: the encoder of many is written in Python, and takes as long as the rest of the record.
-        files.write_text(path, json.dumps(document, allow_nan=False) + "\n")
+        return json.dumps(document, allow_nan=False) + "\n"
+
+    def write(self, path: Path) -> None:
+        """Write the record, whole or not at all."""
+        files.write_text(path, self.text())
 
     @classmethod
     def read(cls, path: Path) -> Record | None:
         """Return the record, or None where there is none of this version that can be understood."""
         if not path.is_file():
             return None
+        found = None
+        with contextlib.suppress(InputError):
+            found = cls.parse(files.read_bounded(path, MAX_BYTES, remedy="run again"))
+        if found is None:
+            _log.warning("%s: this record cannot be read; what it is of is made again", path)
+        return found
+
+    @classmethod
+    def parse(cls, data: bytes) -> Record | None:
+        """Return the record of a text that somebody else may have written, None if it cannot be understood."""
         try:
-            document = files.read_json(path, _MAX_BYTES, "run again")
+            document = files.parse_json(data, "record", "run again")
             if (document.pop("document"), document.pop("schema_version")) != (DOCUMENT, SCHEMA_VERSION):
                 return None
             record = _checked().validate_python(document)
-        except (InputError, ValueError, KeyError, TypeError, AttributeError):
+            if record.facts:
+                _facts().validate_python(record.facts)
+            if record.error is not None:
+                _error().validate_python(record.error)
+        except (InputError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return None
         # What is outside of the scene's folder is not ours to judge, or to remove.
-        return record if all(Path(one.path).name == one.path for one in record.outputs) else None
+        inside = all(Path(one.path).name == one.path and one.path for one in record.outputs)
+        whole = not record.facts or {one.role for one in record.outputs} >= _OUTPUTS
+        return record if inside and whole else None
 
-    def intact(self, folder: Path, verify: bool = False) -> bool:
-        """Tell whether all outputs are as they were written; with `verify` by content whatever their dates say."""
-        if verify:
+    def intact(self, folder: Path, checksums: bool = False) -> bool:
+        """Tell whether all outputs are as they were written; with `checksums` by content whatever their dates say."""
+        if checksums:
             return all(one.identical(folder) for one in self.outputs)
         return all(one.same(folder) for one in self.outputs)
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a summary says of a scene that is done."""
+
+    sensor: str
+    model: str
+    headline: Mapping[str, Any]
+    lean_m_per_m: float | None
+    rmse_px: Mapping[str, float | None]
+    rmse_m: Mapping[str, float | None]
+    rmse_points: Mapping[str, int | None]
+    ortho: Mapping[str, Any]
+    warnings: Sequence[str]
+    notices: Sequence[Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a summary says of a scene that failed."""
+
+    kind: str
+    message: str
+    file: str | None
+    field: str | None
+    remedy: str | None
+    trace: str = ""
+
+
+#: Roles of the outputs that every scene has which is done.
+_OUTPUTS = {"ortho", "report", "html"}
+
+
+@functools.cache
+def _facts() -> pydantic.TypeAdapter[Facts]:
+    return pydantic.TypeAdapter(Facts)
+
+
+@functools.cache
+def _error() -> pydantic.TypeAdapter[Problem]:
+    return pydantic.TypeAdapter(Problem)
 
 
 @functools.cache
@@ -140,7 +211,7 @@ def _checked() -> pydantic.TypeAdapter[Record]:
 def key_of(inputs: Sequence[FileState], configuration: Mapping[str, Any], versions: Mapping[str, Any]) -> str:
     """Return the SHA-256 of all that the outputs depend on."""
     content = {
-        "inputs": sorted((one.role, one.path, one.sha256) for one in inputs),
+        "inputs": sorted((one.role, one.path, one.sha256 or f"{one.bytes} {one.tag}") for one in inputs),
         "configuration": configuration,
         "versions": versions,
     }

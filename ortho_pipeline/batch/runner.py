@@ -19,62 +19,68 @@ from typing import Any
 
 from ortho_pipeline import commands
 from ortho_pipeline.batch.executors import Crew, Processes, Sequential, completed, crew_of
+from ortho_pipeline.batch.freshness import (
+    DIGESTS,
+    as_read,
+    far_states,
+    folders,
+    inputs_as_recorded,
+    is_scene,
+    reads_the_same,
+    untouched,
+)
 from ortho_pipeline.batch.plan import RUN_FILES, STATE, Job, Plan, for_run, plan, versions
-from ortho_pipeline.batch.records import Digests, FileState, Record, key_of, locked, siblings
+from ortho_pipeline.batch.records import FileState, Record, key_of, locked, siblings
 from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.run import SharedFolder, run_shared
 from ortho_pipeline.batch.summary import paths_of
-from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.mosaic.assembly import assemble
 from ortho_pipeline.errors import InputError, OrthoError, ReportError, error_document
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
-from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import is_far
 from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.report.page.run import write_run_page
 from ortho_pipeline.report.stac import write_catalog
 from ortho_pipeline.warp.mosaic import Ortho, Overlap, measure_seam
 
-#: Larger files beside an image are not metadata.
-_COMPANION_BYTES = 5_000_000
 #: A larger file is not a report on a mosaic.
 _REPORT_BYTES = 50_000_000
 #: Seams from which on they are measured by several processes.
 _MANY_SEAMS = 64
-#: Checksums that this process has taken.
-_digests = Digests()
 
 
 # -- one scene -------------------------------------------------------------------------------------------------------
 
 
-def make_scene(job: Job, verify: bool = False) -> Outcome:
+def make_scene(job: Job, checksums: bool = False) -> Outcome:
     """Make a scene unless it is there already; called in a worker, and never raises for what is wrong with a scene.
 
     The lock of the scene is held meanwhile: a scene that a scheduler hands out twice is made once.
 
     Parameters
     ----------
-    verify : bool
-        Judge outputs by their content, whatever their dates say.
+    checksums : bool
+        Judge files by their content, whatever their dates say.
     """
     begin = time.monotonic()
     try:
         with confined(job.output), locked(job.lock, wait=True):
-            return _make_locked(job, verify, begin)
+            return _make_locked(job, checksums, begin)
     except OrthoError as error:
         return Outcome(job.name, "failed", time.monotonic() - begin, error=error_document(error))
 
 
-def _make_locked(job: Job, verify: bool, begin: float) -> Outcome:
+def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
     clear_up(job.record)
     record = Record.read(job.record)
     # What an earlier run wrote, and this one may not write any more.
     before = record.outputs if record is not None else ()
     try:
         _check_versions(job)
-        listing = siblings(_folders(job))
-        good = _still_good(record, job, listing, verify)
+        listing = siblings(folders(job))
+        # Before the work, so that an object which changes meanwhile is noticed by the next run.
+        far = far_states(job)
+        good = _still_good(record, job, listing, checksums)
         if good is not None:
             # A worker of this run may have made it and died before it could say so.
             mine = bool(job.run) and good.run == job.run
@@ -84,7 +90,7 @@ def _make_locked(job: Job, verify: bool, begin: float) -> Outcome:
             Record(job.name, "", "started", outputs=before).write(job.record)
         result = commands.rectify(
             job.image, job.folder, scene=job.scene, points=job.points, surface=job.surface, match=job.match,
-            output=job.ortho, name=job.name, digest=_digests,
+            output=job.ortho, name=job.name, digest=DIGESTS,
         )  # fmt: skip
         made = tuple(FileState.of(role, path, name=path.name) for role, path in result.files.items())
         _remove(job.folder, {one.path for one in before} - {one.path for one in made})
@@ -92,7 +98,7 @@ def _make_locked(job: Job, verify: bool, begin: float) -> Outcome:
         if result.failure is not None:
             raise result.failure
         report = result.document["report"]
-        read = _as_read(job, report)
+        read = (*as_read(job, report), *far)
         done = Record(
             job.name, key_of(read, job.configuration, job.versions), "done", read, made, listing,
             time.monotonic() - begin, _facts(report), run=job.run,
@@ -121,61 +127,17 @@ def _check_versions(job: Job) -> None:
                          remedy="install the same versions everywhere")  # fmt: skip
 
 
-def _still_good(record: Record | None, job: Job, listing: str, verify: bool) -> Record | None:
+def _still_good(record: Record | None, job: Job, listing: str, checksums: bool) -> Record | None:
     """Return the record with the present dates if inputs, settings and outputs have the content recorded."""
-    if record is None or record.status != "done" or not isinstance(record.facts.get("lean_m_per_m"), int | float):
+    if record is None or not is_scene(record) or not record.intact(job.folder, checksums):
         return None
-    if not verify:
-        _digests.learn(record.inputs)
-    known = {one.path: one.role for one in record.inputs if os.path.isfile(one.path)}
-    found = inputs.hashed(
-        inputs.files_read(job.image, job.scene, job.points, job.surface, job.match, output=job.ortho),
-        _digests,
-    )
-    read = _states(job, {**{one["path"]: one["role"] for one in found}, **known})
-    if record.key != key_of(read, job.configuration, job.versions) or not record.intact(job.folder, verify):
+    read = inputs_as_recorded(record, job, checksums)
+    if read is None:
         return None
     fresh = replace(record, inputs=read, siblings=listing, outputs=_restated(record.outputs, job.folder))
     if fresh != record:
         fresh.write(job.record)
     return fresh
-
-
-def _as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
-    """Return the files that a report was made from; one that has changed in the meantime is an error."""
-    used = {one["path"]: one for one in report["provenance"]["inputs"]}
-    roles = {path: one["role"] for path, one in used.items()}
-    source = str(report["scene"]["model_source"])
-    if os.path.isfile(source):
-        roles.setdefault(os.path.abspath(source), "model source")
-    states = _states(job, roles)
-    for state in states:
-        if state.path in used and used[state.path]["sha256"] != state.sha256:
-            raise InputError("this file changed while the scene was made", file=state.path, remedy="run again")
-    return states
-
-
-def _folders(job: Job) -> list[str | os.PathLike[str]]:
-    """Return the files in whose folders a new name could change the scene."""
-    return [path for path in (job.image, inputs.point_file(job.points), job.surface.dem, *job.match.reference,
-                          *job.ortho.files.values(), *job.scene.files.values())
-            if path is not None and os.path.isabs(path) and not is_far(path)]  # fmt: skip
-
-
-def _states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:
-    """Return all files that a scene depends on: those of `roles`, and small companions of the image."""
-    known = _with_companions(job, roles)
-    return tuple(FileState.of(role, Path(path), _digests) for path, role in sorted(known.items()))
-
-
-def _with_companions(job: Job, roles: Mapping[str, str]) -> dict[str, str]:
-    known, stem = dict(roles), job.image.stem
-    for name in listing(job.image.parent).beginning(stem) if isinstance(job.image, Path) else ():
-        path, rest = job.image.parent / name, name.removeprefix(stem)
-        belongs = rest != name and rest[:1] in ("_", ".", "-") and str(path) not in known
-        if belongs and path.is_file() and path.stat().st_size <= _COMPANION_BYTES:
-            known[str(path)] = "companion"
-    return known
 
 
 def _restated(outputs: Sequence[FileState], folder: Path) -> tuple[FileState, ...]:
@@ -216,7 +178,7 @@ def run(
     scheduler: str | None = None,
     only: Sequence[str] = (),
     shard: tuple[int, int] | None = None,
-    verify: bool = False,
+    checksums: bool = False,
     progress: Progress | None = None,
     allow_network: bool = False,
     store: SharedFolder | None = None,
@@ -234,7 +196,7 @@ def run(
     only, shard : optional
         Names of scenes, or (k, n) for the k-th of n parts. The mosaic is made by a run of all scenes. In a shared
         `store` a worker that has finished its part goes on with what is left of the other parts of `only`.
-    verify : bool
+    checksums : bool
         Take all checksums again.
     allow_network : bool
         Let the scenes be read from URLs, and `surface.dem=auto` fetch cells.
@@ -267,7 +229,7 @@ def run(
         locked(lock, shared=part, owner=f"'ortho run {planned.path.name}'"),
         crew_of(executor, workers, threads, scheduler, len(jobs)) as (crew, budget),
     ):
-        return _Run(planned, part, verify, progress).make(
+        return _Run(planned, part, checksums, progress).make(
             crew, for_run(jobs, _run_id(), memory, budget, allow_network=allow_network)
         )
 
@@ -292,8 +254,8 @@ def list_scenes(config: str | os.PathLike[str] | Plan) -> list[dict[str, Any]]:
     for job in planned.jobs:
         record = Record.read(job.record)
         state = "new" if record is None else record.status
-        if state == "done" and record is not None and not _untouched(record, job, listings):
-            state = "done" if _reads_the_same(record, job) else "changed"
+        if state == "done" and record is not None and not untouched(record, job, listings):
+            state = "done" if reads_the_same(record, job) else "changed"
         listed.append({"name": job.name, "image": str(job.image), "state": state})
     return listed
 
@@ -302,9 +264,9 @@ class _Run:
     """One call of `run`: the log, the count, the end."""
 
     def __init__(
-        self, planned: Plan, part: bool, verify: bool, progress: Progress | None
+        self, planned: Plan, part: bool, checksums: bool, progress: Progress | None
     ) -> None:  # fmt: skip
-        self.planned, self.part, self.verify, self.progress = planned, part, verify, progress
+        self.planned, self.part, self.checksums, self.progress = planned, part, checksums, progress
         self.begin = time.monotonic()
         self.log_path = planned.output / RUN_FILES["log"]
         self.outcomes: dict[str, Outcome] = {}
@@ -313,7 +275,7 @@ class _Run:
         self.log("run started", scenes=len(jobs), file=str(self.planned.path), versions=versions())
         try:
             changed = list(self._without_unchanged(jobs))
-            work = _verify_scene if self.verify else make_scene
+            work = _with_checksums if self.checksums else make_scene
             for job, future in completed(crew, work, changed):
                 self._note(_outcome(job, future), len(jobs))
             made = None if self.part or self.planned.mosaic is None else self._mosaic(crew, jobs)
@@ -339,8 +301,8 @@ class _Run:
         left = any(name.endswith(".part") for name in os.listdir(self.planned.output / STATE))
         listings: dict[Path, Sequence[str]] = {}
         for job in jobs:
-            record = None if self.verify else Record.read(job.record)
-            if record is not None and _untouched(record, job, listings):
+            record = None if self.checksums else Record.read(job.record)
+            if record is not None and untouched(record, job, listings):
                 if left:
                     with contextlib.suppress(OrthoError):
                         clear_up(job.record)
@@ -440,37 +402,10 @@ class _Mosaic:
         return [found[id(pair)] for pair in pairs]
 
 
-def _verify_scene(job: Job) -> Outcome:
-    return make_scene(job, verify=True)
+def _with_checksums(job: Job) -> Outcome:
+    return make_scene(job, checksums=True)
 
 
 def _outcome(job: Job, future: Future[Outcome]) -> Outcome:
     error = future.exception()
     return future.result() if error is None else Outcome(job.name, "failed", error=error_document(error))
-
-
-def _untouched(record: Record, job: Job, listings: dict[Path, Sequence[str]]) -> bool:
-    """Tell whether nothing that a scene depends on has another size, date or neighbour than when it was made."""
-    return _files_untouched(record, job) and record.siblings == siblings(_folders(job), listings)
-
-
-def _files_untouched(record: Record, job: Job) -> bool:
-    return (
-        record.status == "done"
-        and all(one.untouched() for one in record.inputs)
-        and all(one.untouched(job.folder) for one in record.outputs)
-        and record.key == key_of(record.inputs, job.configuration, job.versions)
-    )
-
-
-def _reads_the_same(record: Record, job: Job) -> bool:
-    """Tell whether a scene among other neighbours than before would be made from the same files."""
-    if not _files_untouched(record, job):
-        return False
-    try:
-        with confined(job.output):
-            found = inputs.files_read(job.image, job.scene, job.points, job.surface, job.match, output=job.ortho)
-    except OrthoError:
-        return False
-    known = {one.path for one in record.inputs}
-    return set(_with_companions(job, {str(path): role for path, role in found.items()})) <= known

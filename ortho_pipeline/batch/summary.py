@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Sequence
+from pathlib import Path
 
+from ortho_pipeline.batch.freshness import as_recorded, untouched
 from ortho_pipeline.batch.plan import RUN_FILES, Job, Plan, plan
 from ortho_pipeline.batch.records import Record
 from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.run import SharedFolder, summary_of
+from ortho_pipeline.errors import InputError, error_document
 from ortho_pipeline.files import write_json
 from ortho_pipeline.report.page.run import write_run_page
 
@@ -22,12 +26,16 @@ def summarise(config: str | os.PathLike[str] | Plan, store: SharedFolder | None 
     if store is not None:
         return summary_of(planned, store)
     begin, found = time.monotonic(), []
+    listings: dict[Path, Sequence[str]] = {}
     for job in planned.jobs:
         record = Record.read(job.record)
         if record is None or record.status not in ("done", "failed"):
             found.append(Outcome(job.name, "missing"))
         elif record.status == "failed":
             found.append(Outcome(job.name, "failed", record.seconds, error=record.error))
+        elif not untouched(record, job, listings) and not as_recorded(record, job):
+            error = InputError("inputs or outputs have changed", file=job.folder, remedy="run it again")
+            found.append(Outcome(job.name, "missing", error=error_document(error)))
         else:
             found.append(Outcome(job.name, "done", record.seconds, paths_of(record, job), record.facts))
     files = {kind: planned.output / RUN_FILES[kind] for kind in ("summary", "index")}

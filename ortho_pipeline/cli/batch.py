@@ -75,7 +75,7 @@ class _Shard(click.ParamType):
     metavar="DIR",
     help="Folder that every path of the file has to lie in  [default: that of the file]",
 )
-@click.option("--verify", is_flag=True, help="Judge all files by their content, whatever their dates say.")
+@click.option("--checksums", is_flag=True, help="Compare files by checksum, ignoring timestamps.")
 @click.option("--list", "as_list", is_flag=True, help="List the scenes and their state, and do nothing.")
 @dry_run_option
 @click.option("--schema", "as_schema", is_flag=True, help="Print the JSON Schema of the file, and do nothing.")
@@ -122,7 +122,7 @@ def run(
         return None
     if dry_run:
         return _dry_run(planned, options["only"], options["shard"], as_json)
-    store = None if address is None else SharedFolder(address, options["allow_network"])
+    store = None if address is None else SharedFolder(address, options["allow_network"], checksums=options["checksums"])
     try:
         with progress(lines=True) as advance:
             result = (

@@ -211,7 +211,8 @@ def _to_store(
         address, _, file = address.rpartition("/")
     own = bound.arguments.get("allow_network", False)
     allowed = own or bound.arguments.get("scene", SceneOptions()).allow_network
-    with delivered(address, name, allow_network=allowed, keep=_goes_along) as folder:
+    with delivered(address, name, allow_network=allowed, keep=_goes_along) as delivery:
+        folder = delivery.folder
         bound.arguments[parameter] = folder / file
         result = command(*bound.args, **bound.kwargs)
         files: dict[str, Any] = {}

@@ -398,7 +398,7 @@ def test_everything_once(block):
     before = block.digests()
     times = {path: path.stat().st_mtime_ns for path in block.out.rglob("*ortho.tif")}
     assert block.run() == dict.fromkeys(("s0", "s1", "s2"), "unchanged")
-    assert block.run(verify=True) == dict.fromkeys(("s0", "s1", "s2"), "unchanged")
+    assert block.run(checksums=True) == dict.fromkeys(("s0", "s1", "s2"), "unchanged")
     assert block.digests() == before
     assert times == {path: path.stat().st_mtime_ns for path in block.out.rglob("*ortho.tif")}
     assert [scene["state"] for scene in batch.list_scenes(block.file)] == ["done"] * 3
@@ -488,14 +488,14 @@ def test_a_worker_with_other_software_refuses(block, monkeypatch):
     assert "gdal 1.0 in place of" in outcome.error["message"]
 
 
-def test_verify_sees_what_dates_hide(block):
+def test_checksums_see_what_dates_hide(block):
     block.run()
     path = block.out / "s1" / "s1_report.html"
     stat, text = path.stat(), path.read_bytes()
     path.write_bytes(b"x" + text[1:])
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     assert block.run()["s1"] == "unchanged"
-    assert block.run(verify=True) == {"s0": "unchanged", "s1": "done", "s2": "unchanged"}
+    assert block.run(checksums=True) == {"s0": "unchanged", "s1": "done", "s2": "unchanged"}
     assert path.read_bytes() == text
 
 

@@ -24,12 +24,13 @@ from servers import moto_server, on_a_faulty_way, serving
 from ortho_pipeline.batch import runner
 from ortho_pipeline.batch.executors import Sequential
 from ortho_pipeline.batch.plan import STATE, Job, Plan, plan
+from ortho_pipeline.batch.records import FileState, Record, key_of
 from ortho_pipeline.batch.results import Outcome
 from ortho_pipeline.batch.shared.arrays import part_of_array
 from ortho_pipeline.batch.shared.leases import Leases
 from ortho_pipeline.batch.shared.run import SharedFolder, run_shared, summary_of
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, error_document
 from ortho_pipeline.files.storage import objects
 from ortho_pipeline.files.storage.objects import Objects
 
@@ -104,6 +105,10 @@ def test_parts_of_all_workers_are_all_scenes_once() -> None:
     assert sorted(made) == sorted(job.name for job in jobs)
 
 
+#: What a worker says of a scene that failed.
+RESULT = Record("s", "", "failed", error=error_document(InputError("no heights")))
+
+
 # -- leases ------------------------------------------------------------------------------------------------------------
 
 
@@ -121,7 +126,20 @@ def make(made: list[str], seconds: float, dying: random.Random | None, job: Job)
     if dying is not None and dying.random() < 0.3:
         raise Dies
     made.append(job.name)
+    done_record(job).write(job.record)
     return Outcome(job.name, "done", seconds, {"ortho": str(job.folder / f"{job.name}_ortho.tif")})
+
+
+def done_record(job: Job) -> Record:
+    """Return what a run writes of a scene without inputs."""
+    job.record.parent.mkdir(exist_ok=True)
+    for role in ("report", "html"):
+        (job.folder / role).write_text(role)
+    names = {"ortho": f"{job.name}_ortho.tif", "report": "report", "html": "html"}
+    outputs = tuple(FileState.of(role, job.folder / name, name=name) for role, name in names.items())
+    facts = {"sensor": "rpc", "model": "rpc", "headline": {}, "lean_m_per_m": 0.1, "rmse_px": {}, "rmse_m": {},
+             "rmse_points": {}, "ortho": {}, "warnings": [], "notices": []}  # fmt: skip
+    return Record(job.name, key_of((), job.configuration, job.versions), "done", outputs=outputs, facts=facts)
 
 
 def work_together(address: str, count: int, scenes: int, patience: float, dying: int | None = None) -> Counter[str]:
@@ -179,10 +197,10 @@ def test_a_lease_that_was_taken_over_ends_nothing(store: str) -> None:
     taken = second.take("s", seen)
     assert not isinstance(taken, str)
     with pytest.raises(Exception, match="taken over"):
-        lease.finish({"status": "done"})
+        lease.finish(RESULT)
     assert first.result("s") is None
-    taken.finish({"status": "done"})
-    assert first.result("s") == {"status": "done"}
+    taken.finish(RESULT)
+    assert first.result("s") == RESULT
     assert first.finished() == {"s"}
 
 
@@ -195,7 +213,7 @@ def test_leases_hold_on_a_faulty_way(store: str, moto: tuple[str, int], monkeypa
         assert not [one for one in taken if isinstance(one, str)]
         for one in taken:
             one.renew()
-            one.finish({"status": "done"})
+            one.finish(RESULT)
         assert way.met["answer lost"] > 0
         assert len(Leases(store, allow_network=True).finished()) == 12
 
@@ -239,6 +257,87 @@ def test_the_command_delivers_to_a_store_and_collects(store: str, tiny: Any, mon
     assert not [name for name, _ in Objects(f"{store}/only", allow_network=True).names() if "s0" in name]
     assert {"run.json", f"{STATE}/s0.result.json", "s1/s1_report.json"} <= names
     assert not (tiny.folder / "out").exists()
+
+
+@pytest.fixture
+def bucket_run(store: str, tiny: Any) -> Any:
+    """Return what runs one scene into a store and says how it ended."""
+    raw = tiny.folder / "raw"
+    raw.mkdir()
+    gdal.Translate(str(raw / "s0.tif"), str(tiny.image))
+    file = tiny.folder / "p.yaml"
+    file.write_text(FILE + f"    points: {{gcps: {tiny.gcps.name}, crs: 'EPSG:4979', vertical: ellipsoid}}\n")
+
+    def run(*more: str) -> tuple[str, int]:
+        done = CliRunner().invoke(
+            cli, ["run", str(file), "-o", store, "--executor", "sequential", "--json", "--allow-network", *more]
+        )
+        assert done.stdout, done.stderr
+        (scene,) = json.loads(done.stdout)["scenes"]
+        return scene["status"], done.exit_code
+
+    assert run() == ("done", 0)
+    assert run() == ("unchanged", 0)
+    return run
+
+
+def test_a_run_in_a_store_notices_what_changed(bucket_run: Any, store: str, tiny: Any) -> None:
+    """Twelve kinds of change, each to one output, one input, the settings or the record."""
+    objects = Objects(store, allow_network=True)
+    result = f"{STATE}/s0.result.json"
+    whole = objects.read(result, 10**6)[0]
+    ortho = objects.read("s0/s0_ortho.tif", 10**8)[0]
+    file, image = tiny.folder / "p.yaml", tiny.folder / "raw" / "s0.tif"
+
+    def raised() -> None:
+        dem = gdal.Open(str(tiny.folder / "dem.tif"), gdal.GA_Update)
+        dem.GetRasterBand(1).WriteArray(dem.ReadAsArray() + 3)
+
+    def tampered(**fields: Any) -> None:
+        objects.put(result, json.dumps({**json.loads(whole), **fields}).encode())
+
+    changes: dict[str, Any] = {
+        "output deleted": lambda: objects.delete("s0/s0_ortho.tif"),
+        "output replaced by as many bytes": lambda: objects.put("s0/s0_ortho.tif", bytes(len(ortho))),
+        "report deleted": lambda: objects.delete("s0/s0_report.json"),
+        "DEM raised": raised,
+        "image changed": lambda: gdal.Open(str(image), gdal.GA_Update).WriteRaster(0, 0, 1, 1, b"\0\0"),
+        "points changed": lambda: tiny.write(tiny.gcps, tiny.points(11)),
+        "a model beside the image": lambda: (image.parent / "s0_notes.txt").write_text("new"),
+        "settings changed": lambda: file.write_text(file.read_text().replace("GTiff}", "GTiff, resolution: 20}")),
+        "empty record": lambda: objects.put(result, b"{}"),
+        "record that is no JSON": lambda: objects.put(result, b"\xff{"),
+        "record without outputs": lambda: tampered(outputs=[]),
+        "record of another scene": lambda: tampered(name="s1"),
+    }
+    assert len(changes) == 12
+    for what, change in changes.items():
+        change()
+        if "record" not in what:
+            assert bucket_run("--summary")[0] == "missing", what
+        assert bucket_run() == ("done", 0), what
+    assert bucket_run("--checksums") == ("unchanged", 0)
+    assert bucket_run("--summary") == ("unchanged", 0)
+
+
+HOSTILE = [
+    b"", b"null", b"[]", b"{", b'{"document": 1}', b"[" * 100_000, b'{"a":' * 20_000 + b"1" + b"}" * 20_000,
+    *(json.dumps({"document": "ortho-pipeline scene record", "schema_version": 1, "name": "s0", "key": "", **one}).encode()
+      for one in ({"status": 7}, {"status": "done", "facts": {"lean_m_per_m": "x"}},
+                  {"status": "failed", "error": {}}, {"status": "failed", "error": {"message": ["\u001b"]}},
+                  {"status": "done", "outputs": [{"role": "ortho", "path": "../x", "bytes": 1, "mtime_ns": 1, "sha256": ""}]},
+                  {"status": "done", "inputs": [{"path": None}]})),
+    b'{"document": "ortho-pipeline scene record", "schema_version": 1, "name": "s0", "key": "", "status": "done", '
+    b'"seconds": 1e999}',
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("data", HOSTILE, ids=range(len(HOSTILE)))
+def test_a_record_that_cannot_be_read_is_none(data: bytes, tmp_path: Path, caplog: Any) -> None:
+    assert Record.parse(data) is None
+    (tmp_path / "record.json").write_bytes(data)
+    assert Record.read(tmp_path / "record.json") is None
+    assert caplog.text.count("cannot be read") == 1
 
 
 @pytest.mark.slow

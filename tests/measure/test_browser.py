@@ -180,7 +180,7 @@ def test_a_point_is_measured_in_the_map_which_follows_the_scene(serve, whole_ref
     page.wait_for_timeout(800)
     page.focus("#scene")
     page.keyboard.press("m")
-    served.says("#said", "Matched|No match")
+    served.says("#said", "Matched|No match|outside the image")
     page.keyboard.press("Escape")
     points = served.end()
     assert len(points) == 3

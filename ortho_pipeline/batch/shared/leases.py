@@ -7,15 +7,14 @@ compared: a worker takes over a lease that it has seen unchanged for as long as 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import secrets
 import socket
 import threading
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
-from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.batch.records import MAX_BYTES, Record
+from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import json_text
 from ortho_pipeline.files.storage.objects import Conflict, Objects
 
@@ -23,7 +22,8 @@ from ortho_pipeline.files.storage.objects import Conflict, Objects
 PATIENCE = 120.0
 _RENEWALS = 4
 _LEASE, _RESULT = ".lease.json", ".result.json"
-_MAX_BYTES = 20_000_000
+#: A larger object is not a lease.
+_LEASE_BYTES = 10_000
 
 
 class Lost(OrthoError):
@@ -74,8 +74,8 @@ class Lease:
                 self._lost = True
                 raise Lost(f"another worker has taken over {self.name!r}") from error
 
-    def finish(self, result: Mapping[str, Any]) -> None:
-        """Write the result of the scene, in place of an older one.
+    def finish(self, result: Record) -> None:
+        """Write the result of the scene, its record, in place of an older one.
 
         Raises
         ------
@@ -83,7 +83,7 @@ class Lease:
             If another one has the lease.
         """
         self.renew()
-        self._store.put(self.name + _RESULT, json_text(result).encode())
+        self._store.put(self.name + _RESULT, result.text().encode())
 
 
 class Leases:
@@ -106,16 +106,17 @@ class Leases:
             made = self._store.put(name + _LEASE, data, new=seen is None, replacing=seen)
         except Conflict:
             with contextlib.suppress(FileNotFoundError):
-                return self._store.read(name + _LEASE, _MAX_BYTES)[1].version or ""
+                return self._store.read(name + _LEASE, _LEASE_BYTES)[1].version or ""
             return ""
         return Lease(self._store, name, made.version, self._holder)
 
-    def result(self, name: str) -> dict[str, Any] | None:
-        """Return the result of a scene, None where there is none that can be understood."""
-        with contextlib.suppress(FileNotFoundError, ValueError):
-            found = json.loads(self._store.read(name + _RESULT, _MAX_BYTES)[0])
-            return found if isinstance(found, dict) else None
-        return None
+    def result(self, name: str) -> Record | None:
+        """Return the result of a scene, None where there is none of its name that can be understood."""
+        try:
+            found = Record.parse(self._store.read(name + _RESULT, MAX_BYTES)[0])
+        except (FileNotFoundError, InputError):
+            return None
+        return found if found is not None and found.name == name else None
 
     def finished(self) -> frozenset[str]:
         """Return the names of the scenes that have a result."""

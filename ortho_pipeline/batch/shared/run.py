@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.batch.executors import Crew, completed
+from ortho_pipeline.batch.freshness import inputs_as_recorded, is_scene
 from ortho_pipeline.batch.plan import STATE, Job, Plan
-from ortho_pipeline.batch.records import key_of
+from ortho_pipeline.batch.records import Record
 from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.leases import PATIENCE, Lease, Leases, Lost
-from ortho_pipeline.errors import OrthoError, error_document
+from ortho_pipeline.errors import InputError, OrthoError, error_document
 from ortho_pipeline.files import json_text
 from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.files.storage.delivery import delivered
@@ -34,11 +35,16 @@ Make = Callable[[Job], Outcome]
 
 @dataclasses.dataclass(frozen=True)
 class SharedFolder:
-    """Where the outputs of a run go, and how long a worker may be silent."""
+    """Where the outputs of a run go, how long a worker may be silent, and whether contents are compared."""
 
     address: str
     allow_network: bool
     patience: float = PATIENCE
+    checksums: bool = False
+
+    def address_of(self, name: str) -> str:
+        """Return the address of a scene's folder."""
+        return f"{self.address.rstrip('/')}/{name}"
 
     def leases(self) -> Leases:
         """Open the leases."""
@@ -69,8 +75,8 @@ def make_shared(where: SharedFolder, make: Make, order: Order) -> Outcome:
         if isinstance(lease, str):
             return Outcome(name, "busy", facts={"lease": lease})
         there = leases.result(name)
-        if there is not None and there.get("key") == key_of_shared(order.job) and there.get("status") != "failed":
-            return outcome_of(name, there)
+        if there is not None and there.status == "done" and not why_stale(where, order.job, there):
+            return outcome_of(where, there)
         with lease.held(where.patience):
             return _made(where, make, order.job, lease)
     except Lost:
@@ -80,17 +86,27 @@ def make_shared(where: SharedFolder, make: Make, order: Order) -> Outcome:
 
 
 def _made(where: SharedFolder, make: Make, job: Job, lease: Lease) -> Outcome:
-    address = f"{where.address.rstrip('/')}/{job.name}"
+    address = where.address_of(job.name)
     with tempfile.TemporaryDirectory(prefix="ortho_run_") as scratch:
-        outcome = make(dataclasses.replace(job, output=Path(scratch)))
-        if outcome.files:
+        local = dataclasses.replace(job, output=Path(scratch))
+        outcome = make(local)
+        record = Record.read(local.record)
+        if record is None:
+            record = Record(job.name, "", "failed", seconds=outcome.seconds, error=outcome.error)
+        if outcome.status != "failed":
             lease.renew()
-            with delivered(address, job.name, allow_network=where.allow_network, keep=_goes_along) as folder:
-                for path in (Path(scratch) / job.name).iterdir():
-                    path.replace(folder / path.name)
-            files = {role: f"{address}/{Path(path).name}" for role, path in outcome.files.items()}
-            outcome = dataclasses.replace(outcome, files=files)
-    lease.finish({**vars(outcome), "key": key_of_shared(job)})
+            with delivered(address, job.name, allow_network=where.allow_network, keep=_goes_along) as delivery:
+                for path in local.folder.iterdir():
+                    path.replace(delivery.folder / path.name)
+            stored = delivery.stored
+            outputs = tuple(
+                dataclasses.replace(one, mtime_ns=0, tag=stored[one.path].tag)
+                for one in record.outputs
+                if one.path in stored
+            )
+            record = dataclasses.replace(record, outputs=outputs)
+            outcome = dataclasses.replace(outcome, files=_files(where, record))
+    lease.finish(record)
     return outcome
 
 
@@ -98,17 +114,37 @@ def _goes_along(path: Path) -> bool:
     return path.suffix != ".vrt"
 
 
-def key_of_shared(job: Job) -> str:
-    """Return the digest of what a scene is asked to be: settings, software, and the size of the image."""
-    size = job.image.stat().st_size if isinstance(job.image, Path) and job.image.is_file() else 0
-    return key_of((), {"image_bytes": size, **job.configuration}, job.versions)
+def _files(where: SharedFolder, record: Record) -> dict[str, str]:
+    return {one.role: f"{where.address_of(record.name)}/{one.path}" for one in record.outputs}
 
 
-def outcome_of(name: str, result: Mapping[str, Any]) -> Outcome:
-    """Return the outcome that a result tells: what another worker, or an earlier run, has made is unchanged."""
-    status = "failed" if result.get("status") == "failed" else "unchanged"
-    given = {field: result.get(field) or {} for field in ("files", "facts")}
-    return Outcome(name, status, float(result.get("seconds") or 0.0), **given, error=result.get("error"))
+def why_stale(where: SharedFolder, job: Job, record: Record) -> str:
+    """Return in what a scene is not as its record says; empty if it is.
+
+    Outputs are asked of the store: size and tag, or with `where.checksums` the content.
+    """
+    if not is_scene(record):
+        return "its record is that of no finished scene"
+    store = Objects(where.address_of(job.name), allow_network=where.allow_network)
+    for one in record.outputs:
+        try:
+            if where.checksums:
+                same = store.read(one.path, one.bytes)[1].sha256 == one.sha256
+            else:
+                same = store.stated(one.path) == (one.bytes, one.tag)
+        except (FileNotFoundError, InputError):
+            return f"{one.path} is gone, or larger than it was"
+        if not same:
+            return f"{one.path} is not as it was written"
+    if inputs_as_recorded(record, job, where.checksums) is None:
+        return "its inputs, settings or software have changed"
+    return ""
+
+
+def outcome_of(where: SharedFolder, record: Record) -> Outcome:
+    """Return the outcome that a record tells: what another worker, or an earlier run, has made is unchanged."""
+    status = "failed" if record.status == "failed" else "unchanged"
+    return Outcome(record.name, status, record.seconds, _files(where, record), record.facts, record.error)
 
 
 def run_shared(
@@ -130,7 +166,10 @@ def run_shared(
     leases, work = where.leases(), functools.partial(make_shared, where, make)
     outcomes: dict[str, Outcome] = {}
     for job in own:
-        _again(leases, job)
+        there = leases.result(job.name)
+        if there is None or there.status == "failed" or _unfit(where, leases, job):
+            leases.forget(job.name)
+    looked: set[str] = set()
     watched: dict[str, tuple[str, float]] = {}
 
     def go(orders: Iterable[Order]) -> None:
@@ -149,6 +188,13 @@ def run_shared(
     go(Order(job) for job in own)
     while True:
         finished = leases.finished()
+        for job in planned.jobs:
+            # What others were to make, and an earlier run made otherwise.
+            if job.name in finished - outcomes.keys() - looked:
+                looked.add(job.name)
+                if _unfit(where, leases, job):
+                    leases.forget(job.name)
+                    finished -= {job.name}
         left = [job for job in planned.jobs if job.name not in finished and job.name not in outcomes]
         if not left:
             break
@@ -159,29 +205,40 @@ def run_shared(
         go(Order(job, dead.get(job.name)) for job in left)
         if any(job.name not in outcomes for job in left):
             time.sleep(min(where.patience / 4, _LONGEST_NAP))
-    return BatchResult(tuple(_collected(leases, planned, outcomes)), {}, time.monotonic() - begin)
+    return BatchResult(tuple(_collected(where, leases, planned, outcomes)), {}, time.monotonic() - begin)
 
 
-def _again(leases: Leases, job: Job) -> None:
-    """Let a scene of one's own part be made again that failed, or was asked for otherwise, in an earlier run."""
+def _unfit(where: SharedFolder, leases: Leases, job: Job) -> bool:
+    """Tell whether a result says nothing, or is that of another scene than the one that is asked for now."""
     there = leases.result(job.name)
-    if there is not None and (there.get("status") == "failed" or there.get("key") != key_of_shared(job)):
-        leases.forget(job.name)
+    if there is None or there.status not in ("done", "failed"):
+        return True
+    return there.status == "done" and bool(why_stale(where, job, there))
 
 
-def _collected(leases: Leases, planned: Plan, outcomes: Mapping[str, Outcome]) -> Iterable[Outcome]:
+def _collected(
+    where: SharedFolder, leases: Leases, planned: Plan, outcomes: Mapping[str, Outcome]
+) -> Iterable[Outcome]:
     for job in planned.jobs:
         if job.name in outcomes:
             yield outcomes[job.name]
             continue
         there = leases.result(job.name)
-        yield Outcome(job.name, "missing") if there is None else outcome_of(job.name, there)
+        unfinished = there is None or there.status not in ("done", "failed")
+        why = "nobody has finished it" if unfinished else ""
+        if there is not None and there.status == "done":
+            why = why_stale(where, job, there)
+        if there is None or why:
+            error = error_document(InputError(why, file=where.address_of(job.name), remedy="run it again"))
+            yield Outcome(job.name, "missing", error=error)
+        else:
+            yield outcome_of(where, there)
 
 
 def summary_of(planned: Plan, where: SharedFolder) -> BatchResult:
     """Collect the results of all workers, and write them beside the scenes as ``run.json``; make nothing."""
     begin = time.monotonic()
-    found = tuple(_collected(where.leases(), planned, {}))
+    found = tuple(_collected(where, where.leases(), planned, {}))
     store = Objects(where.address, allow_network=where.allow_network)
     files: dict[str, Any] = {"summary": store.of(_SUMMARY)}
     result = BatchResult(found, files, time.monotonic() - begin)

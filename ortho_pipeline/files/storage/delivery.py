@@ -12,6 +12,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,16 @@ _AT_ONCE = 4
 _WRITABLE = ("s3", "gs", "az")
 
 
+@dataclass(frozen=True)
+class Delivery:
+    """The folder of a delivery, and, when it has ended well, what each of its files is in the store."""
+
+    folder: Path
+    stored: dict[str, Content] = field(default_factory=dict)
+
+
 @contextlib.contextmanager
-def delivered(address: str, name: str, *, allow_network: bool, keep: Callable[[Path], bool]) -> Iterator[Path]:
+def delivered(address: str, name: str, *, allow_network: bool, keep: Callable[[Path], bool]) -> Iterator[Delivery]:
     """Yield a folder on this machine, whose files are in the folder of objects when the block has ended well.
 
     Parameters
@@ -53,11 +62,13 @@ def delivered(address: str, name: str, *, allow_network: bool, keep: Callable[[P
         )  # fmt: skip
     store = Objects(address, allow_network=allow_network)
     with tempfile.TemporaryDirectory(prefix="ortho_") as folder:
-        yield Path(folder)
-        _upload(store, Path(folder), f"{name}{_RECORD}", keep)
+        delivery = Delivery(Path(folder))
+        yield delivery
+        delivery.stored.update(_upload(store, Path(folder), f"{name}{_RECORD}", keep))
 
 
-def _upload(store: Objects, folder: Path, record: str, keep: Callable[[Path], bool]) -> None:
+def _upload(store: Objects, folder: Path, record: str, keep: Callable[[Path], bool]) -> dict[str, Content]:
+    """Upload the files and their record; return what each is in the store."""
     paths = sorted(path for path in folder.rglob("*") if path.is_file() and keep(path))
     names = [path.relative_to(folder).as_posix() for path in paths]
     store.delete(record)
@@ -65,6 +76,7 @@ def _upload(store: Objects, folder: Path, record: str, keep: Callable[[Path], bo
     with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="upload") as pool:
         contents = list(pool.map(store.put, names, paths))
     store.put(record, _record_of(names, contents))
+    return dict(zip(names, contents, strict=True))
 
 
 def _record_of(names: list[str], contents: list[Content]) -> bytes:

@@ -58,13 +58,14 @@ class Content:
 
     That name is its ETag, and in Google's store the number of its generation.
     `tags` are the ETags that stores give such a content: the MD5 of what is stored at once, and for what is stored in
-    parts the MD5 of theirs, with their number.
+    parts the MD5 of theirs, with their number. `tag` is the ETag that the store gave it when it was written.
     """
 
     size: int
     sha256: str
     tags: tuple[str, ...]
     version: str | None
+    tag: str = ""
 
 
 class Objects:
@@ -160,6 +161,18 @@ class Objects:
                 for one in chunk:
                     yield one["path"], one["size"]
 
+    def stated(self, name: str) -> tuple[int, str]:
+        """Return the size of an object and the tag that its store gives this version (empty if it gives none).
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is none.
+        """
+        with self._errors(name):
+            found = self._store.head(name)
+        return found["size"], found["e_tag"] or ""
+
     def exists(self, name: str) -> bool:
         """Tell whether there is such an object."""
         try:
@@ -195,7 +208,7 @@ class Objects:
             with self._errors(name):
                 made = self._store.put(name, data, attributes=self._note(content), chunk_size=PART, max_concurrency=4)
                 if self._encrypted or (made["e_tag"] or "").strip('"') in content.tags:
-                    return replace(content, version=made[self._version])
+                    return replace(content, version=made[self._version], tag=made["e_tag"] or "")
                 stored = self._store.head(name)
             wrong = _difference(content, stored, ours=True)
             if not wrong and _TAG.fullmatch(stored["e_tag"] or "") is None:
@@ -203,7 +216,7 @@ class Objects:
                 there = self._attempts(name, content.size, collections.deque(maxlen=0).extend)[1]
                 wrong = "" if there.sha256 == content.sha256 else "it is another content"
             if not wrong:
-                return replace(content, version=stored[self._version])
+                return replace(content, version=stored[self._version], tag=stored["e_tag"] or "")
         with contextlib.suppress(OrthoError):
             self.delete(name)
         gone = "could not be removed" if self.exists(name) else "was removed"

@@ -217,11 +217,10 @@ async function tie(name, place, mine) {
   await locate(mine);
 }
 
-/** Whether a place of a view is within its image or map; a rendered reference has no edge of its own. */
+/** Whether a place of a view is within its image, or half a pixel beside it; a reference says itself what it shows. */
 function within(name, place) {
   const [kind, number] = name.split('-');
-  const size = { scene: facts.images, map: facts.maps }[kind]?.[number].size;
-  return !size || place.every((value, axis) => value >= 0 && value <= size[axis]);
+  return kind !== 'scene' || place.every((value, axis) => value >= -0.5 && value <= facts.images[number].size[axis] + 0.5);
 }
 
 const measure = safely(async (pane, place) => {

@@ -1,0 +1,150 @@
+"""Whether a scene is as its record says: one rule for outputs on disk and in a store.
+
+A record states of every input and output its place, its size and its checksum, or the tag that a store gives it. A
+scene is fresh while all of them are so, and settings and software too.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ortho_pipeline.batch.plan import Job
+from ortho_pipeline.batch.records import Digests, FileState, Record, key_of, siblings
+from ortho_pipeline.commands import inputs
+from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.files import confined
+from ortho_pipeline.files.folders import listing
+from ortho_pipeline.files.locations import is_far, url_of
+from ortho_pipeline.files.storage.objects import Objects, is_address
+
+#: Larger files beside an image are not metadata.
+_COMPANION_BYTES = 5_000_000
+#: Checksums that this process has taken.
+DIGESTS = Digests()
+
+
+def is_scene(record: Record) -> bool:
+    """Tell whether a record is that of a finished scene, with all that a summary says of one."""
+    return record.status == "done" and bool(record.facts)
+
+
+def inputs_as_recorded(record: Record, job: Job, checksums: bool = False) -> tuple[FileState, ...] | None:
+    """Return the inputs of a scene with their present dates; None if they, settings or software are not as recorded.
+
+    Parameters
+    ----------
+    checksums : bool
+        Take the checksums again of files whose size and date are those recorded, too.
+    """
+    if not checksums:
+        DIGESTS.learn(record.inputs)
+    known = {one.path: one.role for one in record.inputs if os.path.isfile(one.path)}
+    found = inputs.files_read(job.image, job.scene, job.points, job.surface, job.match, output=job.ortho)
+    read = (*_local_states(job, {**{str(path): role for path, role in found.items()}, **known}), *far_states(job))
+    return read if record.key == key_of(read, job.configuration, job.versions) else None
+
+
+def as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
+    """Return the files that a report was made from; one that has changed in the meantime is an error."""
+    used = {one["path"]: one for one in report["provenance"]["inputs"]}
+    roles = {path: one["role"] for path, one in used.items()}
+    source = str(report["scene"]["model_source"])
+    if os.path.isfile(source):
+        roles.setdefault(os.path.abspath(source), "model source")
+    states = _local_states(job, roles)
+    for state in states:
+        if state.path in used and used[state.path]["sha256"] != state.sha256:
+            raise InputError("this file changed while the scene was made", file=state.path, remedy="run again")
+    return states
+
+
+def as_recorded(record: Record, job: Job) -> bool:
+    """Tell whether inputs and outputs have the content that the record states, whatever their dates say."""
+    with confined(job.output):
+        try:
+            return record.intact(job.folder) and inputs_as_recorded(record, job) is not None
+        except OrthoError:
+            return False
+
+
+def far_states(job: Job) -> tuple[FileState, ...]:
+    """Return size and tag of the inputs that lie in a store, or behind a server that gives tags.
+
+    Raises
+    ------
+    InputError
+        If one is not there, or the network is not allowed.
+    StorageError
+        If the store does not answer.
+    """
+    given = inputs.given_files(job.image, job.scene, job.points, job.surface, job.match, job.ortho)
+    found = []
+    for address in sorted({url_of(path) for path in given if is_far(path)}):
+        if not is_address(address):
+            continue
+        folder, _, name = address.rpartition("/")
+        try:
+            size, tag = Objects(folder, allow_network=job.scene.allow_network).stated(name)
+        except FileNotFoundError as error:
+            raise InputError("there is no such object", file=address, remedy="check the address") from error
+        found.append(FileState("far input", address, size, 0, "", tag))
+    return tuple(found)
+
+
+def folders(job: Job) -> list[str | os.PathLike[str]]:
+    """Return the files in whose folders a new name could change the scene."""
+    return [path for path in (job.image, inputs.point_file(job.points), job.surface.dem, *job.match.reference,
+                          *job.ortho.files.values(), *job.scene.files.values())
+            if path is not None and os.path.isabs(path) and not is_far(path)]  # fmt: skip
+
+
+def _local_states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:
+    """Return all files that a scene depends on: those of `roles`, and small companions of the image."""
+    known = _with_companions(job, roles)
+    return tuple(FileState.of(role, Path(path), DIGESTS) for path, role in sorted(known.items()))
+
+
+def _with_companions(job: Job, roles: Mapping[str, str]) -> dict[str, str]:
+    known, stem = dict(roles), job.image.stem
+    for name in listing(job.image.parent).beginning(stem) if isinstance(job.image, Path) else ():
+        path, rest = job.image.parent / name, name.removeprefix(stem)
+        belongs = rest != name and rest[:1] in ("_", ".", "-") and str(path) not in known
+        if belongs and path.is_file() and path.stat().st_size <= _COMPANION_BYTES:
+            known[str(path)] = "companion"
+    return known
+
+
+def untouched(record: Record, job: Job, listings: dict[Path, Sequence[str]]) -> bool:
+    """Tell whether nothing that a scene depends on has another size, date or neighbour than when it was made.
+
+    Of a scene with inputs in a store this is not known here.
+    """
+    return _files_untouched(record, job, record.inputs) and record.siblings == siblings(folders(job), listings)
+
+
+def _files_untouched(record: Record, job: Job, recorded: Sequence[FileState]) -> bool:
+    return (
+        is_scene(record)
+        and all(one.untouched() for one in record.inputs)
+        and all(one.untouched(job.folder) for one in record.outputs)
+        and record.key == key_of(recorded, job.configuration, job.versions)
+    )
+
+
+def reads_the_same(record: Record, job: Job) -> bool:
+    """Tell whether a scene among other neighbours than before would be made from the same files."""
+    try:
+        far = tuple(one for one in record.inputs if one.tag)
+        near = replace(record, inputs=tuple(one for one in record.inputs if not one.tag))
+        if not _files_untouched(near, job, record.inputs) or (far and far != far_states(job)):
+            return False
+        with confined(job.output):
+            found = inputs.files_read(job.image, job.scene, job.points, job.surface, job.match, output=job.ortho)
+    except OrthoError:
+        return False
+    known = {one.path for one in record.inputs}
+    return set(_with_companions(job, {str(path): role for path, role in found.items()})) <= known
