@@ -320,15 +320,17 @@ def test_a_run_in_a_store_notices_what_changed(bucket_run: Any, store: str, tiny
     assert bucket_run("--summary") == ("unchanged", 0)
 
 
+def _scene(**fields: Any) -> bytes:
+    given = {"document": "ortho-pipeline scene record", "schema_version": 1, "name": "s0", "key": "", "status": "done"}
+    return json.dumps({**given, **fields}).encode()
+
+
+_OUTSIDE = {"role": "ortho", "path": "../x", "bytes": 1, "mtime_ns": 1, "sha256": ""}
 HOSTILE = [
     b"", b"null", b"[]", b"{", b'{"document": 1}', b"[" * 100_000, b'{"a":' * 20_000 + b"1" + b"}" * 20_000,
-    *(json.dumps({"document": "ortho-pipeline scene record", "schema_version": 1, "name": "s0", "key": "", **one}).encode()
-      for one in ({"status": 7}, {"status": "done", "facts": {"lean_m_per_m": "x"}},
-                  {"status": "failed", "error": {}}, {"status": "failed", "error": {"message": ["\u001b"]}},
-                  {"status": "done", "outputs": [{"role": "ortho", "path": "../x", "bytes": 1, "mtime_ns": 1, "sha256": ""}]},
-                  {"status": "done", "inputs": [{"path": None}]})),
-    b'{"document": "ortho-pipeline scene record", "schema_version": 1, "name": "s0", "key": "", "status": "done", '
-    b'"seconds": 1e999}',
+    _scene(status=7), _scene(facts={"lean_m_per_m": "x"}), _scene(status="failed", error={}),
+    _scene(status="failed", error={"message": ["\u001b"]}), _scene(outputs=[_OUTSIDE]), _scene(inputs=[{"path": None}]),
+    _scene().replace(b'"key"', b'"seconds": 1e999, "key"'), _scene(seconds="1"), _scene(inputs={}),
 ]  # fmt: skip
 
 
