@@ -268,7 +268,7 @@ def locked(path: Path, *, shared: bool = False, wait: bool = False, owner: str =
     InputError
         If the lock is held, or the folder cannot be written or locked.
     """
-    files.allowed(path.parent)
+    path = files.allowed(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)

@@ -12,7 +12,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
-from ortho_pipeline.files import states, together, whole_or_nothing, write_json
+from ortho_pipeline.files import allowed, states, together, whole_or_nothing, write_json
 from ortho_pipeline.files.locations import archive_of, located, place
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.band_stack import stack_bands
@@ -69,7 +69,7 @@ def register(
         files["metadata"] = beside
     elif opened.models:
         files["model"] = Path(folder) / f"{chosen.stem}_bands_model.json"
-    for path in files.values():
+    for path in map(allowed, files.values()):
         if path.resolve() in {one.resolve() for one in (*paths, place(opened.model_source))}:
             raise InputError(
                 "this path would be read and written", file=path, field="folder", remedy="choose another folder"

@@ -20,7 +20,7 @@ from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange import crop
 from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.exchange.rpc import files_of
-from ortho_pipeline.files import sha256, states
+from ortho_pipeline.files import allowed, sha256, states
 from ortho_pipeline.files.documents import software_version
 from ortho_pipeline.files.locations import archive_of, is_far, located
 from ortho_pipeline.files.process_limits import startable_threads
@@ -158,7 +158,7 @@ def check_paths(
     *,
     output: OutputOptions = OutputOptions(),
 ) -> None:
-    """Refuse to write what is read, and outputs that change the model of the source or of the ortho.
+    """Refuse to write what is read or through a link, and what changes the model of the source or of the ortho.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def check_paths(
     """
     inputs = {Path(path).resolve() for path in given_files(image, scene, points, surface, match, output)}
     removed = old_side_cars(files["ortho"]) if overwrite and "ortho" in files else []
-    for path in (*files.values(), *removed):
+    for path in (*map(allowed, files.values()), *removed):
         if path.resolve() in inputs:
             raise InputError(
                 "this path would be read and written", file=path, field="folder", remedy="choose another output folder"

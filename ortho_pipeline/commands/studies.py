@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import together, write_json, write_text
+from ortho_pipeline.files import allowed, together, write_json, write_text
 from ortho_pipeline.hookspecs import Study
 from ortho_pipeline.plugins import Host
 
@@ -75,10 +75,12 @@ def reproduce(
     """
     study = _study(name, "reproduce")
     assert study.reproduce
+    files = (
+        {} if folder is None else {ending: allowed(Path(folder) / f"{name}.{ending}") for ending in ("json", "html")}
+    )
     found = study.reproduce(realisations or study.realisations, progress=progress)
     if folder is None:
         return Result({}, dict(found.document), found.text)
-    files = {ending: Path(folder) / f"{name}.{ending}" for ending in ("json", "html")}
     with together(folder, name):
         write_json(files["json"], found.document)
         write_text(files["html"], found.page())

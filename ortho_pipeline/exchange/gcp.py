@@ -151,7 +151,7 @@ def write_geolocation(
             field="model" if surface is None else "surface.dem",
             remedy="give the metadata of this very image, and a DEM that covers the whole scene, or `surface.height`",
         )  # fmt: skip
-    arrays = path.resolve().with_suffix(".tif")
+    arrays = path.parent.resolve() / f"{path.stem}.tif"
     with raster_output(arrays) as temporary:
         made = gdal.GetDriverByName("GTiff").Create(
             os.fspath(temporary), len(across), len(down), 2, gdal.GDT_Float64, options=["COMPRESS=DEFLATE"]

@@ -129,7 +129,7 @@ class Outputs:
             sound = False
         if sound:
             for name, final in renames:
-                if (self.folder / name).is_file():
+                if (self.folder / name).is_file() and not (self.folder / name).is_symlink():
                     os.replace(self.folder / name, self.folder / final)
             for name in obsolete:
                 (self.folder / name).unlink(missing_ok=True)
@@ -151,7 +151,7 @@ class Outputs:
     def temporary(self, final: Path) -> Path:
         """Return a new temporary path for `final`; drivers go by its suffix."""
         suffix = final.suffix if len(final.suffix) < 40 else ""
-        if final.is_dir() or not final.name:
+        if os.path.isdir(final) or not final.name:
             raise InputError("a folder lies where this file would be written", file=final, remedy="remove or rename it")
         try:
             if len(os.fsencode(final.name)) > os.pathconf(final.parent, "PC_NAME_MAX"):
@@ -211,38 +211,39 @@ class Outputs:
 _under_way: ContextVar[Outputs | None] = ContextVar("_under_way", default=None)
 
 
-#: The folder that all outputs have to lie in, in this context.
-_confined: ContextVar[Path | None] = ContextVar("_confined", default=None)
+#: The folder that all outputs have to lie in, in this context: as it was named, and where that leads.
+_confined: ContextVar[tuple[Path, Path] | None] = ContextVar("_confined", default=None)
 
 
 @contextlib.contextmanager
 def confined(folder: str | os.PathLike[str]) -> Iterator[None]:
-    """Let nothing be written outside of `folder` within the block, wherever symbolic links in it lead."""
-    token = _confined.set(Path(folder).resolve())
+    """Let nothing be written outside of `folder` within the block, nor through a symbolic link in it."""
+    token = _confined.set((Path(os.path.abspath(folder)), Path(folder).resolve()))
     try:
         yield
     finally:
         _confined.reset(token)
 
 
-def allowed(path: Path) -> Path:
-    """Return a path that may be written.
+def allowed(path: str | os.PathLike[str]) -> Path:
+    """Return the absolute path of a file that may be written.
+
+    Links on the way to the folder that a user named are followed: they are the user's. No link is followed in place of
+    the file, nor below the folder that outputs are `confined` to. One that appears later is replaced, not followed.
 
     Raises
     ------
     InputError
-        If it lies outside of the folder that outputs are `confined` to, or its links lead nowhere.
+        If such a link is in the way, or the path is outside of the folder.
     """
-    folder = _confined.get()
-    try:
-        if folder is None or path.resolve().is_relative_to(folder):
-            return path
-    except (OSError, RuntimeError) as error:
-        raise InputError("this path leads nowhere", file=path, remedy="check its links") from error
-    raise InputError(
-        f"a symbolic link leads outside of the output folder {folder}", file=path,
-        remedy="remove the link, or choose an output folder without links",
-    )  # fmt: skip
+    place = _place(path)
+    for link in (place, *place.parents):
+        if os.path.islink(link):
+            raise InputError(
+                "a symbolic link is in the way: outputs are not written through links", file=link,
+                remedy="remove the link, or choose the folder or file that it leads to as the output",
+            )  # fmt: skip
+    return place
 
 
 @contextlib.contextmanager
@@ -262,12 +263,13 @@ def together(folder: str | os.PathLike[str], name: str) -> Iterator[Outputs]:
     InputError
         If the folder cannot be written, or another command is writing outputs of this name there.
     """
-    place = Path(folder).resolve()
+    place = _place(Path(folder) / _PART).parent
     outer = _under_way.get()
     if outer is not None and outer.folder == place:
         yield outer
         return
-    outputs = Outputs(allowed(place), name)
+    outputs = Outputs(place, name)
+    allowed(outputs.lock_path)
     outputs.begin()
     token, failed = _under_way.set(outputs), True
     try:
@@ -295,9 +297,9 @@ def whole_or_nothing(path: str | os.PathLike[str], *, side_cars: bool = True) ->
     Raises
     ------
     InputError
-        If the folder cannot be written, or the disk is full.
+        If the folder cannot be written, the disk is full, or a link is in the way (see `allowed`).
     """
-    final = _place(path)
+    final = allowed(path)
     outer = _under_way.get()
     with contextlib.ExitStack() as stack:
         if outer is not None and outer.holds(final):
@@ -349,11 +351,11 @@ def staged(path: str | os.PathLike[str]) -> Path:
 
 
 def _place(path: str | os.PathLike[str]) -> Path:
-    """Return the absolute path that a file is written to."""
-    final = Path(path)
+    """Return the absolute path of an output, in which only the links on the way to the user's folder are followed."""
+    confined_to = _confined.get()
     try:
-        # A rename onto a symbolic link would replace the link, not what it points to.
-        return allowed(final.resolve() if final.is_symlink() else final.parent.resolve() / final.name)
+        if confined_to is None:
+            return Path(path).parent.resolve() / Path(path).name
     except (OSError, RuntimeError) as error:
         # Links that point at each other are a RuntimeError before Python 3.13.
         raise InputError(
@@ -361,6 +363,14 @@ def _place(path: str | os.PathLike[str]) -> Path:
             file=path,
             remedy="check its links",
         ) from error
+    named, folder = confined_to
+    absolute = Path(os.path.abspath(path))
+    for root in (named, folder):
+        if absolute.is_relative_to(root):
+            return folder / absolute.relative_to(root)
+    raise InputError(
+        f"this path is outside of the output folder {folder}", file=path, remedy="choose a path in that folder"
+    )
 
 
 def _unwritable(path: Path, error: OSError) -> InputError:
@@ -405,7 +415,7 @@ def append_line(path: str | os.PathLike[str], line: str) -> None:
     InputError
         If it cannot be written.
     """
-    allowed(Path(path))
+    path = allowed(path)
     data = (line + "\n").encode("utf-8", errors="backslashreplace")
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
@@ -421,7 +431,7 @@ def append_line(path: str | os.PathLike[str], line: str) -> None:
         finally:
             os.close(descriptor)
     except OSError as error:
-        raise _unwritable(Path(path), error) from error
+        raise _unwritable(path, error) from error
 
 
 def clear_up(path: str | os.PathLike[str]) -> None:

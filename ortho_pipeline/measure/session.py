@@ -20,7 +20,7 @@ from ortho_pipeline.commands.heights.surfaces import open_surface, require_heigh
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import sha256
+from ortho_pipeline.files import confined, sha256
 from ortho_pipeline.files.documents import json_position
 from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.hookspecs import Scene
@@ -181,10 +181,11 @@ class Session(Project):
             self._options, gcps=self.output, crs=None, vertical=None, pixel_origin="corner", check=None, select=None,
             correction=correction,
         )  # fmt: skip
-        return rectify(
-            self.scene.path, self.output.with_name(f"{self.output.stem}_ortho"), scene=self._opened, points=points,
-            surface=self._surface, progress=progress,
-        )  # fmt: skip
+        with confined(self.output.parent):
+            return rectify(
+                self.scene.path, self.output.with_name(f"{self.output.stem}_ortho"), scene=self._opened, points=points,
+                surface=self._surface, progress=progress,
+            )  # fmt: skip
 
     def _radius(self, click: Array | None) -> float:
         """Return within how many px of the prediction a click is looked for."""

@@ -49,15 +49,6 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["a.tif"]
 
 
-def test_a_link_is_written_through(tmp_path):
-    target, link = tmp_path / "target.txt", tmp_path / "link.txt"
-    target.write_text("old")
-    link.symlink_to(target)
-    write_text(link, "new")
-    assert link.is_symlink()
-    assert target.read_text() == "new"
-
-
 def test_a_folder_that_is_a_file_is_said(tmp_path):
     (tmp_path / "f").write_text("")
     with pytest.raises(InputError, match="cannot write"):

@@ -10,7 +10,7 @@ from typing import Any
 from ortho_pipeline.commands.inputs import refuse_changed
 from ortho_pipeline.commands.results import ENDINGS, Result, attempted, to_store
 from ortho_pipeline.errors import InputError, ReportError
-from ortho_pipeline.files import states, together, write_json
+from ortho_pipeline.files import allowed, states, together, write_json
 from ortho_pipeline.files.locations import is_far, located, place
 from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.options import MosaicOptions
@@ -86,7 +86,7 @@ def _check_paths(orthos: Sequence[Path], files: Mapping[str, Path]) -> None:
         raise InputError("record and page lie beside the mosaic under its name", file=files["mosaic"], field="output",
                          remedy="let the name end in .tif or .vrt")  # fmt: skip
     known = [ortho.resolve() for ortho in orthos]
-    for path in files.values():
+    for path in map(allowed, files.values()):
         if path.resolve() in known:
             raise InputError("this path would be read and written", file=path, field="output", remedy="choose another")
     for ortho in orthos:

@@ -10,7 +10,7 @@ from pathlib import Path
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.survey.folder import Kind, Survey, survey
 from ortho_pipeline.errors import InputError, counted
-from ortho_pipeline.files import write_text
+from ortho_pipeline.files import allowed, write_text
 from ortho_pipeline.options import SceneOptions
 
 NAME = "pipeline.yaml"
@@ -40,6 +40,7 @@ def init(
     """
     seen = survey(folder, options)
     target = Path(folder) / NAME if path is None else Path(path)
+    allowed(target)
     if target.exists() and not overwrite:
         raise InputError("this file is there already", file=target, remedy="give another name, or allow `overwrite`")
     if not seen.of("scene"):

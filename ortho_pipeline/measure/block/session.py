@@ -20,7 +20,7 @@ from ortho_pipeline.commands.heights.surfaces import open_surface, require_heigh
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import sha256
+from ortho_pipeline.files import confined, sha256
 from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.geodesy.crs import horizontal, parse_crs
 from ortho_pipeline.hookspecs import Scene
@@ -262,10 +262,11 @@ class BlockSession(Project):
             self.save()
             asked = self._asked()
         label, folder = self.images.labels[number], self.output.with_name(f"{self.output.stem}_ortho")
-        block = adjust(self.images.paths, folder / "block", asked, self._opened)
         path, own = self.images.paths[number], self._opened[number]
-        opened = SceneOptions(model=block.files[f"{label} model"], allow_network=own.allow_network, roots=own.roots)
-        return rectify(path, folder / label, scene=opened, surface=self._heights, progress=progress)
+        with confined(self.output.parent):
+            block = adjust(self.images.paths, folder / "block", asked, self._opened)
+            opened = SceneOptions(model=block.files[f"{label} model"], allow_network=own.allow_network, roots=own.roots)
+            return rectify(path, folder / label, scene=opened, surface=self._heights, progress=progress)
 
 
 def _nothing() -> Points:
