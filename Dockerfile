@@ -8,16 +8,17 @@ COPY plugins plugins
 RUN python -m venv /opt/ortho && /opt/ortho/bin/pip install --no-cache-dir '.[wheel,dask]'
 
 FROM python:3.13-slim
-RUN useradd --create-home --uid 10001 ortho && mkdir /cache /work /opt/numba && chown ortho:ortho /cache /work /opt/numba
+RUN useradd --create-home --uid 10001 ortho && mkdir -p /cache /work /opt/numba/kernels-10001 \
+ && chown ortho:ortho /cache /work /opt/numba/kernels-10001 && chmod 700 /opt/numba/kernels-10001
 COPY --from=build /opt/ortho /opt/ortho
 ENV PATH=/opt/ortho/bin:$PATH ORTHO_CACHE=/cache/ortho NUMBA_CACHE_DIR=/opt/numba PYTHONUNBUFFERED=1
-USER 10001
-WORKDIR /work
 # Compiled code of the usual job is in the image, for all processors of this kind: a new container does not compile, also
-# where it runs as another user or cannot write. On ARM: --build-arg CPU=generic.
+# where it runs as another user or cannot write. Root compiles it, so that all users may trust it. On ARM: --build-arg CPU=generic.
 ARG CPU=x86-64-v3
 ENV NUMBA_CPU_NAME=$CPU NUMBA_CPU_FEATURES=""
-COPY --chown=ortho:ortho sample_data/scene.tif sample_data/scene_RPC.TXT sample_data/dem.tif /tmp/sample/
+COPY sample_data/scene.tif sample_data/scene_RPC.TXT sample_data/dem.tif /tmp/sample/
 RUN ortho rectify /tmp/sample/scene.tif --dem /tmp/sample/dem.tif --dem-vertical ellipsoid --override-dem-vertical \
-        -o /tmp/warm && rm -r /tmp/warm && chmod -R a+rX /opt/numba
+        -o /tmp/warm && rm -r /tmp/warm /tmp/sample && chmod -R a+rX /opt/numba/kernels-0
+USER 10001
+WORKDIR /work
 ENTRYPOINT ["ortho"]

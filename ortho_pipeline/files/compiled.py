@@ -1,20 +1,21 @@
 """Functions that are compiled: kernels, made with the two decorators of this module.
 
-A kernel is compiled once per machine where a cache can be written, in the memory of each process elsewhere; see
-`kernels.compiler`. Where it was compiled before, it is called without numba, which is not even loaded; see
-`kernels.machine_code`.
+A kernel is compiled once per machine where a cache may be kept, in the memory of each process elsewhere; see
+`kernels.compiler`. numba is loaded when a kernel is first called.
 """
 
 from __future__ import annotations
 
 import functools
-import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.files.kernels import machine_code
+from ortho_pipeline.errors import InputError
 
+#: numba takes settings from a file of this name in the working folder, which may be somebody else's delivery.
+_SETTINGS = ".numba_config.yaml"
 _lock = threading.Lock()
 
 
@@ -45,45 +46,37 @@ class Kernel:
     def __init__(self, function: Callable[..., Any], inline: bool = False) -> None:
         functools.update_wrapper(self, function)
         self.py_func, self.inline = function, inline
-        self._calls: dict[Any, Callable[..., Any]] = {}
+        self._made: Any = None
 
     def __call__(self, *given: Any, **named: Any) -> Any:
-        if named:
-            return self.dispatcher(*given, **named)
-        kinds = machine_code.kind(given)
-        call = self._calls.get(kinds)
-        if call is None:
-            call = self._found(kinds)
-        return call(*given)
+        return (self._made or self.dispatcher)(*given, **named)
 
-    @functools.cached_property
+    @property
     def dispatcher(self) -> Any:
-        """What numba makes of the function."""
-        from ortho_pipeline.files.kernels import compiler
+        """What numba makes of the function.
 
-        return compiler.dispatcher(self)
+        Raises
+        ------
+        InputError
+            If a file in the working folder would change numba's settings.
+        """
+        if self._made is None:
+            with _lock:
+                _refuse_settings()
+                from ortho_pipeline.files.kernels import compiler
+
+                self._made = self._made or compiler.dispatcher(self)
+        return self._made
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):  # asked of any object, and no reason to load numba
             raise AttributeError(name)
         return getattr(self.dispatcher, name)
 
-    def _found(self, kinds: tuple[Any, ...] | None) -> Callable[..., Any]:
-        """Return what is called with arguments of such kinds: machine code that was kept, or numba."""
-        with _lock:
-            call = self._calls.get(kinds)
-            # Where numba is loaded already, its own cache tells what it did.
-            if call is None and kinds is not None and not self.inline and "numba" not in sys.modules:
-                call = machine_code.find(self.py_func, kinds)
-            if call is None:
-                call = self.dispatcher if kinds is None or self.inline else functools.partial(self._first, kinds)
-            self._calls[kinds] = call
-        return call
 
-    def _first(self, kinds: tuple[Any, ...], *given: Any) -> Any:
-        from ortho_pipeline.files.kernels import compiler
-
-        result = self.dispatcher(*given)
-        self._calls[kinds] = self.dispatcher
-        compiler.keep(self, kinds, given)
-        return result
+def _refuse_settings() -> None:
+    if Path(_SETTINGS).exists():
+        raise InputError(
+            "numba would take its settings from this file in the working folder, and could run code that they name",
+            file=Path(_SETTINGS).absolute(), remedy="remove the file, or start from another folder",
+        )  # fmt: skip

@@ -12,6 +12,7 @@ import re
 import time
 from collections.abc import Iterable
 from functools import cached_property
+from pathlib import Path
 
 from ortho_pipeline.files.locations import AnyPath, VsiPath
 
@@ -21,6 +22,17 @@ _SETTLED = 2.0
 _MOST = 16
 _State = tuple[int, int, int, int]
 _kept: dict[str, tuple[_State, Listing]] = {}
+
+
+def cache_folder() -> Path | None:
+    """Return the folder for all that this package keeps for a user; None where the user has no home.
+
+    A relative one, in the environment or for want of a home, would be a folder in the working folder.
+    """
+    above = os.environ.get("XDG_CACHE_HOME", "")
+    if not os.path.isabs(above):
+        above = os.path.expanduser("~/.cache")
+    return Path(above) / "ortho-pipeline" if os.path.isabs(above) else None
 
 
 class Listing:

@@ -2,12 +2,19 @@
 
 import ast
 import os
+import pickle
 import platform
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.folders import cache_folder
+from ortho_pipeline.files.kernels import places
+from ortho_pipeline.files.storage import kept
 
 KERNELS = [
     path
@@ -15,20 +22,36 @@ KERNELS = [
     if "@compiled" in path.read_text(encoding="utf-8")
 ]
 SCENE = Path(__file__).parents[2] / "sample_data/ikonos/po_39001_pan_0000000.tif"
-#: What numba does where neither the package's folder nor the home can be written: it finds no place for a cache.
-READ_ONLY = "import sys; from numba.core import caching; caching.CacheImpl._locator_classes = []\n"
-#: And nobody has compiled before.
-NOWHERE = READ_ONLY + "from ortho_pipeline.files import compiled; from ortho_pipeline.files.kernels import compiler\n"
-NOWHERE += "compiler._SharedPlace._locator_classes = ()\n"
+#: Nothing can be kept below a file.
+NOWHERE = {"NUMBA_CACHE_DIR": os.fspath(Path(__file__))}
+ONE = """
+from ortho_pipeline.files.compiled import compiled
+@compiled
+def double(x):
+    return 2 * x
+"""
+#: Hits of the cache are told by numba.
+TOLD = "import numba; from one import double; print(double(21), sum(double.stats.cache_hits.values()))"
 
 
-def run(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", NOWHERE + code], capture_output=True, text=True, check=False)
+def run(code: str, folder: Path | None = None, **surroundings: str) -> subprocess.CompletedProcess[str]:
+    """Run Python, which finds modules in a folder; where nothing else is said, no kernel can be kept."""
+    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", **(surroundings or NOWHERE)}
+    code = f"import sys; sys.path.insert(0, {str(folder)!r})\n{code}"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+
+
+def cached(folder: Path, code: str = TOLD, **surroundings: str) -> str:
+    """Return what Python prints that keeps kernels in ``cache`` below a folder of its modules."""
+    done = run(code, folder, NUMBA_CACHE_DIR=str(folder / "cache"), **surroundings)
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
 
 
 def test_a_command_runs_where_no_cache_can_be_written() -> None:
     done = run(
         f"sys.argv = ['ortho', 'info', {str(SCENE)!r}]\n"
+        "from ortho_pipeline.files import compiled\n"
         "from ortho_pipeline.models import rpc_kernel\n"
         "from ortho_pipeline.models.pushbroom import kernel as pushbroom_kernel\n"
         "compiled.compiled(lambda number: number + 1)(1)\n"
@@ -37,8 +60,9 @@ def test_a_command_runs_where_no_cache_can_be_written() -> None:
         "main()"
     )
     assert done.returncode == 0, done.stderr
-    (notice,) = [line for line in done.stderr.splitlines() if "compiled" in line]
+    (notice,) = [line for line in done.stderr.splitlines() if "compiled" in line.lower()]
     assert "NUMBA_CACHE_DIR" in notice
+    assert "nobody else can write" in notice
 
 
 def test_every_kernel_is_made_without_a_cache_and_computes_the_same() -> None:
@@ -106,13 +130,11 @@ def test_kept_code_is_made_again_when_a_function_of_another_module_changes(tmp_p
     above = made + "from between import twice\n@compiled\ndef run(x):\n    return twice(x)\n"
     (tmp_path / "between.py").write_text(between)
     (tmp_path / "above.py").write_text(above)
-    surroundings = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
     found = []
     for added in (1, 1, 20):
         (tmp_path / "below.py").write_text(below.format(added))
         code = "import numba; from above import run; print(run(0), sum(run.stats.cache_hits.values()))"
-        command = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(tmp_path)!r}); {code}"]
-        found.append(subprocess.run(command, env=surroundings, capture_output=True, text=True, check=True).stdout)
+        found.append(cached(tmp_path, code))
     assert found == ["2 0\n", "2 1\n", "40 0\n"]
 
 
@@ -123,19 +145,13 @@ def test_kept_code_is_loaded_without_what_only_compiling_needs(tmp_path: Path) -
         "@compiled\ndef total(x):\n    sum = 0.0\n    for k in range(x.size):\n        sum += x[k]\n    return sum\n"
     )
     code = (
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import numba, numpy as np; from one import total\n"
+        "import numba, numpy as np; from one import total\n"
         "def say(x): print(total(x), sum(total.stats.cache_hits.values()), 'scipy.linalg' in sys.modules)\n"
         "say(np.ones(3))\n"
-        "if len(sys.argv) > 1: say(np.ones(4, 'f4'))\n"  # the same process can still compile
     )
-    surroundings = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
-    found = [
-        subprocess.run(
-            [sys.executable, "-c", code, *more], env=surroundings, capture_output=True, text=True, check=True
-        )
-        for more in ((), ("compile",))
-    ]
-    assert [one.stdout for one in found] == ["3.0 0 True\n", "3.0 1 False\n4.0 1 True\n"]
+    assert cached(tmp_path, code) == "3.0 0 True\n"
+    # The same process can still compile.
+    assert cached(tmp_path, code + "say(np.ones(4, 'f4'))\n") == "3.0 1 False\n4.0 1 True\n"
 
 
 @pytest.mark.parametrize("path", KERNELS, ids=lambda path: path.name)
@@ -149,41 +165,166 @@ def test_kernels_use_nothing_that_is_missing_when_they_are_loaded(path: Path) ->
             assert ast.unparse(node.func) not in ("hash", "dict", "set", "frozenset"), path
 
 
-def test_what_was_compiled_before_is_taken_from_where_nothing_can_be_written(tmp_path: Path) -> None:
-    """As in an image of a container that is run by another user, or whose files are read-only: no need to compile."""
-    (tmp_path / "one.py").write_text(
-        "import two\nfrom ortho_pipeline.files.compiled import compiled\n@compiled\ndef double(x):\n    return 2 * x\n"
-    )
-    # A module of which nothing was compiled, as most are that a job does not need: nothing is said of it.
-    (tmp_path / "two.py").write_text(
-        "from ortho_pipeline.files.compiled import compiled\n@compiled\ndef half(x):\n    return x / 2\n"
-    )
+def test_every_kernel_keeps_its_own_code_whatever_its_module_is_called(tmp_path: Path) -> None:
+    """Files lie beside each other, and kernels of two rooms have the same module and name."""
+    for room, factor in (("near", 2), ("far", 3)):
+        (tmp_path / room).mkdir()
+        (tmp_path / room / "one.py").write_text(ONE.replace("2 * x", f"{factor} * x"))
+    code = "from near.one import double as first; from far.one import double as second; print(first(1), second(1))"
+    assert cached(tmp_path, code) == "2 3\n"
+    assert len(list((tmp_path / "cache").glob("*/*.nbi"))) == 2
+
+
+def test_threads_that_call_a_kernel_first_compile_it_once(tmp_path: Path) -> None:
+    (tmp_path / "one.py").write_text(ONE)
     code = (
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import numba; from one import double\n"
-        "print(double(21), sum(double.stats.cache_hits.values()), double(0.5), sum(double.stats.cache_hits.values()))"
+        "from concurrent.futures import ThreadPoolExecutor; from one import double\n"
+        "with ThreadPoolExecutor(8) as pool: print(sum(pool.map(double, range(1000))), len(double.signatures))"
     )
-    surroundings = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
-    elsewhere = (
-        "from numba.core import caching\n"
-        "class Home(caching.UserWideCacheLocator):\n"
-        f"    def get_cache_path(self): return {str(tmp_path / 'home')!r}\n"
-        "caching.CacheImpl._locator_classes = [Home]\n"
-    )
+    assert cached(tmp_path, code) == "999000 1\n"
 
-    def output(before: str) -> str:
-        command = [sys.executable, "-c", before + code.replace(", double(0.5)", "" if before else ", 1.0")]
-        done = subprocess.run(command, env=surroundings, capture_output=True, text=True, check=True)
-        return done.stdout + done.stderr
 
-    assert output("") == "42 0 1.0 0\n"
-    kept = {path.name: path.read_bytes() for path in (tmp_path / "cache").rglob("*.nb*")}
-    for before in (READ_ONLY, elsewhere):
-        assert output(before) == "42 1 1\n"
-    assert {path.name: path.read_bytes() for path in (tmp_path / "cache").rglob("*.nb*")} == kept
-    # Code that is not there is compiled, and kept where that is possible.
-    code = code.replace("double(21)", "double(0.25)")
-    told = output(READ_ONLY)
-    assert told.startswith("0.5 0 0\n")
-    assert "cannot be kept" in told
-    assert output(elsewhere) == "0.5 0 0\n"
-    assert output(elsewhere) == "0.5 1 1\n"
+# -- whose code is taken -----------------------------------------------------------------------------------------------
+
+
+class Planted:
+    """Runs a program when it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (str(self.mark),)
+
+
+def plant(folder: Path, mark: Path) -> None:
+    """Replace what is kept in a folder by what makes a folder `mark` when it is loaded."""
+    for path in folder.iterdir():
+        path.write_bytes(pickle.dumps(Planted(mark)))
+
+
+def test_settings_of_numba_in_the_working_folder_end_with_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They could name a folder of kernels, or modules that are imported."""
+    (tmp_path / "one.py").write_text(ONE)
+    (tmp_path / ".numba_config.yaml").write_text("cache_dir: cache\nopt: 0\n")
+    monkeypatch.chdir(tmp_path)
+    done = run("from one import double; double(1)", tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    assert "InputError" in done.stderr
+    assert f"{tmp_path}/.numba_config.yaml" in done.stderr
+    assert not (tmp_path / "cache").exists()
+    assert run("from one import double; print('numba' in sys.modules)", tmp_path).stdout == "False\n"
+
+
+@pytest.mark.parametrize(
+    "surroundings",
+    [
+        {"XDG_CACHE_HOME": "caches", "HOME": "~"},
+        {"XDG_CACHE_HOME": "", "HOME": "~"},  # as without a home and an entry in passwd
+        {"XDG_CACHE_HOME": "", "HOME": "."},
+        {"NUMBA_CACHE_DIR": "kernels", "HOME": "~"},
+    ],
+)
+def test_no_folder_of_caches_is_in_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, surroundings: dict[str, str]
+) -> None:
+    for name in ("NUMBA_CACHE_DIR", "ORTHO_CACHE"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in surroundings.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.chdir(tmp_path)
+    places.own.cache_clear()
+    assert cache_folder() is None
+    assert places.own()[0] is None
+    assert "NUMBA_CACHE_DIR" in places.own()[1]
+    with pytest.raises(InputError, match="ORTHO_CACHE"):
+        kept.folder()
+    assert list(tmp_path.iterdir()) == []
+    places.own.cache_clear()
+
+
+def others(how: str, folder: Path) -> None:
+    """Let others write to a folder, in one of the ways in which that happens."""
+    match how:
+        case "folder":
+            folder.chmod(0o777)
+        case "sticky folder":
+            folder.chmod(0o1777)
+        case "group":
+            folder.chmod(0o770)
+        case "file":
+            folder.chmod(0o755)
+            for path in folder.iterdir():
+                path.chmod(0o666)
+        case "folder above":
+            folder.parent.chmod(0o777)
+        case "link":
+            for path in folder.iterdir():
+                path.rename(path.with_suffix(".moved"))
+                path.symlink_to(path.with_suffix(".moved"))
+        case "owner of files":
+            for path in folder.iterdir():
+                os.chown(path, 4321, -1)
+        case "owner of the folder":
+            os.chown(folder, 4321, -1)
+
+
+@pytest.mark.parametrize(
+    "how",
+    ["folder", "sticky folder", "group", "file", "folder above", "link", "owner of files", "owner of the folder"],
+)
+def test_folders_to_which_others_can_write_are_known(tmp_path: Path, how: str) -> None:
+    if how.startswith("owner") and os.geteuid():
+        pytest.skip("only root can give files to somebody else")
+    folder = tmp_path / "cache" / "kernels"
+    folder.mkdir(parents=True, mode=0o700)
+    (folder / "one.nbi").write_bytes(b"")
+    assert places.fault_of(folder, os.geteuid()) == ""
+    others(how, folder)
+    assert "others can write to" in places.fault_of(folder, os.geteuid())
+
+
+def test_kernels_to_which_others_can_write_are_not_loaded(tmp_path: Path) -> None:
+    (tmp_path / "one.py").write_text(ONE)
+    assert cached(tmp_path) == "42 0\n"
+    (folder,) = (tmp_path / "cache").iterdir()
+    plant(folder, tmp_path / "loaded")
+    others("file", folder)
+    before = sorted(folder.iterdir())
+    told = cached(tmp_path)
+    assert told.startswith("42 0\n")
+    assert "others can write to" in told
+    assert not (tmp_path / "loaded").exists()
+    assert sorted(folder.iterdir()) == before
+
+
+def test_a_folder_for_all_has_one_folder_for_each_user(tmp_path: Path) -> None:
+    """As /tmp: nobody can rename or remove what is another's."""
+    (tmp_path / "one.py").write_text(ONE)
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "cache").chmod(0o1777)
+    assert cached(tmp_path) == "42 0\n"
+    (folder,) = (tmp_path / "cache").iterdir()
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert places.fault_of(folder, os.geteuid()) == ""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can compile for others")
+def test_what_root_has_compiled_is_read_by_others_and_what_they_compile_is_not_kept_there(tmp_path: Path) -> None:
+    """As in an image of a container that is run by another user, or whose files are read-only: no need to compile."""
+    for above in (tmp_path, *tmp_path.parents[:2]):
+        above.chmod(0o755)
+    (tmp_path / "one.py").write_text(ONE)
+    assert cached(tmp_path) == "42 0\n"
+    (folder,) = (tmp_path / "cache").iterdir()
+    folder.chmod(0o755)
+    # Modules are loaded, and numba is ready to compile, while Python's files can be read.
+    another = f"import os, numba; numba.njit(lambda x: x)(1); from one import double; os.setuid(4321)\n{TOLD}"
+    told = cached(tmp_path, another + "; print(double(0.5), sum(double.stats.cache_hits.values()))")
+    assert told.startswith("42 1\n1.0 1\n")
+    assert "not kept" in told
+    assert len(list(folder.iterdir())) == 2
+    folder.chmod(0o777)  # open to others, it is left alone
+    assert cached(tmp_path, another).startswith("42 0\n")

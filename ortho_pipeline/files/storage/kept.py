@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.folders import cache_folder
 from ortho_pipeline.files.reading import read_bounded, sha256
 from ortho_pipeline.files.storage.objects import Content
 
@@ -54,12 +55,22 @@ class Record:
 
 
 def folder() -> Path:
-    """Return the folder of what is kept: ``$ORTHO_CACHE``, or one of the user's folder of caches."""
+    """Return the folder of what is kept: ``$ORTHO_CACHE``, or one of the user's folder of caches.
+
+    Raises
+    ------
+    InputError
+        If there is none, or its path is relative: it would be a folder in the working folder.
+    """
     given = os.environ.get(FOLDER)
-    if given:
-        return Path(given).absolute()
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "ortho-pipeline"
+    found = Path(given) if given else cache_folder()
+    if found is None or not found.is_absolute():
+        wrong = f"{FOLDER} has a relative path" if given else "there is no home folder"
+        raise InputError(
+            f"files of the network cannot be kept ({wrong})", field=FOLDER,
+            remedy=f"set the environment variable {FOLDER} to the absolute path of a folder that you may write to",
+        )  # fmt: skip
+    return found
 
 
 def kept(
