@@ -44,13 +44,14 @@ def dispatcher(kernel: Kernel) -> Any:
 
 def _cache(kind: Callable[..., Any], place: type[_Own], function: Callable[..., Any]) -> Any:
     """Return a cache in a place of ours, whatever places numba's settings name."""
+    settings: Any = numba.config
     with _lock:
-        before = numba.config.CACHE_LOCATOR_CLASSES
-        numba.config.CACHE_LOCATOR_CLASSES = f"{place.__module__}.{place.__name__}"
+        before = settings.CACHE_LOCATOR_CLASSES
+        settings.CACHE_LOCATOR_CLASSES = f"{place.__module__}.{place.__name__}"
         try:
             return kind(function)
         finally:
-            numba.config.CACHE_LOCATOR_CLASSES = before
+            settings.CACHE_LOCATOR_CLASSES = before
 
 
 class _Own:

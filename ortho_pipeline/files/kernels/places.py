@@ -1,8 +1,8 @@
 """Folders in which compiled kernels are kept, and who may have written there.
 
 Kept kernels are machine code and pickles: whoever writes them runs code as whoever loads them. So a folder is used if
-it belongs to this user, and nobody else can write to it, to a file in it or to a folder above it. What root has compiled
-is read as well, under the same conditions.
+it belongs to this user, and nobody else can write to it, to a file in it or to a folder above it. What root has
+compiled is read as well, under the same conditions.
 """
 
 from __future__ import annotations
