@@ -11,7 +11,7 @@ import pytest
 from scipy import ndimage
 
 from ortho_pipeline.estimation.fit import Fit, fit
-from ortho_pipeline.estimation.spatial.shared_errors import MOST_POINTS
+from ortho_pipeline.estimation.spatial.shared_errors import MATCHED_ALIKE, MOST_POINTS
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.points import Points
 
@@ -224,7 +224,7 @@ def test_groups_too_few_to_estimate_count_as_one_point_each(rpc: RPC) -> None:
     assert found.shared_errors is not None
     assert found.shared_errors.range_px is None
     assert found.effective_points == 4
-    np.testing.assert_allclose(found.sigmas, np.sqrt(3) * alone.sigmas, rtol=1e-12)
+    np.testing.assert_allclose(found.sigmas, np.hypot(np.sqrt(3) * alone.sigmas, MATCHED_ALIKE), rtol=1e-12)
 
 
 def test_surveyed_points_among_matched_ones_count_as_they_are(rpc: RPC) -> None:

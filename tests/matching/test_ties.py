@@ -251,7 +251,7 @@ def test_an_adjustment_finds_ties_and_control_by_itself(tmp_path):
         "assets": {"dem": {"href": dem.name}},
     }
     (dem.parent / "dem.json").write_text(json.dumps({"type": "FeatureCollection", "features": [cell]}))
-    heights = "--dem", dem.parent / "dem.json", "--dem-vertical", "ellipsoid", "--dem-sigma", 2
+    heights = "--dem", dem.parent / "dem.json", "--dem-vertical", "ellipsoid", "--dem-sigma", 1
     run("adjust", *images, "--ties", "auto", "--reference", scenes[0].reference_file, *heights, "--search", 25,
         "--reference-sigma", 2, "--match-points", 60, "--correction", "affine", "-o", tmp_path / "out")  # fmt: skip
     before, after = [], []

@@ -17,7 +17,8 @@ known; but residuals show a part of the variance :math:`\sigma_n^2 + \sigma_s^2`
 likely as any other: else smooth functions of enormous variance, of which a fit leaves hardly anything, dominate.
 No single function is taken: :math:`\Sigma` is the mean over all of them, weighted by their likelihood. So the variance
 is right in the mean over scenes of all these kinds; it is not right for each kind alone (docs/accuracy.md). A constant
-part cannot be told from the shift: it is not seen at all.
+part cannot be told from the shift: residuals do not show it at all. What matching itself adds of that kind is known
+(`MATCHED_ALIKE`), and the covariance has it.
 
 Source: Patterson and Thompson 1971 (restricted likelihood); Liang and Zeger 1986 (sandwich); Cressie 1993, section 2.6;
 Stein 1999, section 2.10 (Matern); Handcock and Stein 1993 (mean over what is likely).
@@ -53,6 +54,9 @@ _FAMILIES: tuple[Callable[[Array], Array], ...] = (
 _RANGES, _RATIOS, _LARGEST = 16, 20, 1e4
 #: Cells whose means are looked at.
 _CELLS = 144
+#: What all matches of an image err alike (px per axis), however many they are. Pixels of scene and reference meet at
+#: one phase all over an image, and neither interpolation nor sampling is exact: 0.001 to 0.003 px with real images.
+MATCHED_ALIKE = 0.002
 
 
 @dataclass(frozen=True)
@@ -97,15 +101,16 @@ def shared_errors(
     design = solution.errors.whitened(solution.jacobian)[rows]
     residuals = solution.errors.whitened(solution.residuals)[rows]
     shift = solution.errors.whitened(np.broadcast_to(np.eye(2), (len(solution.groups), 2, 2)))
-    groups = len(np.unique(solution.groups[rows]))
     own, usual = design @ solution.cofactors, variance * solution.cofactors
     if common is not None:
         own, usual = common.influence(solution)[rows], variance * common.cofactors(solution)
+    groups = len(np.unique(solution.groups[rows]))
+    alike = MATCHED_ALIKE * np.einsum("nip,nik->pk", own, shift[rows])
     scene = Neighbours.of(image[rows], residuals, np.concatenate([design, own, shift[rows]], axis=2))
     if scene is None:
         # All that is known is who shares: a group is one point.
         effective = float(len(solution.groups) - len(rows) + groups)
-        return SharedErrors(len(rows), groups, effective), usual * max(len(rows) / groups, 1.0)
+        return SharedErrors(len(rows), groups, effective), usual * max(len(rows) / groups, 1.0) + alike @ alike.T
     middle, likely = scene.middle(variance)
     count = design.shape[2]
     covariance = usual + positive_part(middle[count : 2 * count, count : 2 * count], usual)
@@ -115,7 +120,7 @@ def shared_errors(
     total = variance * inverse
     grown = total + positive_part(inverse @ middle[2 * count :, 2 * count :] @ inverse, total)
     effective = len(solution.groups) * float(np.trace(total) / np.trace(grown))
-    return SharedErrors(len(rows), groups, effective, *likely), covariance
+    return SharedErrors(len(rows), groups, effective, *likely), covariance + alike @ alike.T
 
 
 def positive_part(matrix: Array, unit: Array) -> Array:

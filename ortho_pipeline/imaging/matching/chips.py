@@ -101,8 +101,10 @@ def _read(target: Target, places: Array, out: Pixels) -> None:
         return
     # Pixels of the target in one of the chip: more than one are averaged, or detail would appear as false structure.
     factor = max(1, round(math.sqrt(extent[4] * extent[5])))
-    left, top = (int(value) - 3 * factor for value in low)
-    columns, rows = (math.ceil((last - first) / factor) + 7 for first, last in zip(low, high, strict=True))
+    left, top = (int(value) - chip_kernel.TAPS // 2 * factor for value in low)
+    columns, rows = (
+        math.ceil((last - first) / factor) + chip_kernel.TAPS + 1 for first, last in zip(low, high, strict=True)
+    )
     if columns * rows * min(factor, EXACT) ** 2 > _LARGEST:
         return
     pixels = target.intensity.read(left, top, columns, rows, factor)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ortho_pipeline.files.compiled import compiled
+from ortho_pipeline.imaging.matching.chip_kernel import BEFORE, TAPS, weights_at
 
 
 @compiled
@@ -21,7 +22,8 @@ def shifts(scene, target, start, offset, rim, limits, shift, covariance, correla
     chip, moved = np.empty((layers, inner, inner)), np.empty((layers, inner, inner))
     own, slopes = np.empty((2, layers, inner, inner)), np.empty((2, layers, inner, inner))
     seen, whole = np.empty((inner, inner), dtype=np.bool_), np.empty((inner, inner), dtype=np.bool_)
-    weights, derived, found = np.empty((2, 4)), np.empty((2, 4)), np.empty(6)
+    weights, derived, found = np.empty((2, TAPS)), np.empty((2, TAPS)), np.empty(6)
+    lines = np.empty((2, inner + TAPS - 1, inner))
     for k in range(count):
         shift[k, :] = np.nan
         covariance[k, :, :] = np.nan
@@ -34,10 +36,10 @@ def shifts(scene, target, start, offset, rim, limits, shift, covariance, correla
             if abs(x - start[k, 0]) > limits[2] or abs(y - start[k, 1]) > limits[2]:
                 break
             left, top = int(np.floor(x)), int(np.floor(y))
-            _weights(x - left, weights[0], derived[0])
-            _weights(y - top, weights[1], derived[1])
+            weights_at(x - left, weights[0], derived[0])
+            weights_at(y - top, weights[1], derived[1])
             first = reach + rim
-            used = _moved(target[k], first + left, first + top, weights, derived, whole, moved, slopes, seen)
+            used = _moved(target[k], first + left, first + top, weights, derived, whole, lines, moved, slopes, seen)
             if 2 * used < inner * inner or not _step(chip, own, moved, slopes, seen, offset, found):
                 break
             x += found[0]
@@ -118,42 +120,30 @@ def _inner(scene, rim, chip, own, whole):
 
 
 @compiled
-def _moved(target, left, top, weights, derived, whole, moved, slopes, seen):
-    """Fill values and derivatives (columns, rows) of a target at a shift, and where they are valid; return how many."""
+def _moved(target, left, top, weights, derived, whole, lines, moved, slopes, seen):
+    """Fill values and derivatives (columns, rows) of a target at a shift, and where they are valid; return how many.
+
+    `lines` ``(2, inner + TAPS - 1, inner)`` is room for what is interpolated along rows alone.
+    """
     layers, inner = moved.shape[0], moved.shape[1]
-    used = 0
-    for i in range(inner):
-        for j in range(inner):
-            seen[i, j] = whole[i, j]
-            if not seen[i, j]:
-                continue
-            for m in range(layers):
+    seen[:, :] = whole
+    for m in range(layers):
+        for i in range(inner + TAPS - 1):
+            for j in range(inner):
+                value, slope = 0.0, 0.0
+                for k in range(TAPS):
+                    pixel = target[m, top + i - BEFORE, left + j - BEFORE + k]
+                    value += weights[0, k] * pixel
+                    slope += derived[0, k] * pixel
+                lines[0, i, j], lines[1, i, j] = value, slope
+        for i in range(inner):
+            for j in range(inner):
                 value, across, down = 0.0, 0.0, 0.0
-                for n in range(4):
-                    line, slope = 0.0, 0.0
-                    for k in range(4):
-                        pixel = target[m, top + i - 1 + n, left + j - 1 + k]
-                        line += weights[0, k] * pixel
-                        slope += derived[0, k] * pixel
-                    value += weights[1, n] * line
-                    across += weights[1, n] * slope
-                    down += derived[1, n] * line
+                for n in range(TAPS):
+                    value += weights[1, n] * lines[0, i + n, j]
+                    across += weights[1, n] * lines[1, i + n, j]
+                    down += derived[1, n] * lines[0, i + n, j]
                 moved[m, i, j], slopes[0, m, i, j], slopes[1, m, i, j] = value, across, down
                 if np.isnan(value):
                     seen[i, j] = False
-            if seen[i, j]:
-                used += 1
-    return used
-
-
-@compiled
-def _weights(f, weights, derived):
-    """Fill the weights of cubic convolution (Keys 1981, a = -1/2) and of its derivative at the fraction `f`."""
-    weights[0] = ((-0.5 * f + 1.0) * f - 0.5) * f
-    weights[1] = (1.5 * f - 2.5) * f * f + 1.0
-    weights[2] = ((-1.5 * f + 2.0) * f + 0.5) * f
-    weights[3] = (0.5 * f - 0.5) * f * f
-    derived[0] = (-1.5 * f + 2.0) * f - 0.5
-    derived[1] = (4.5 * f - 5.0) * f
-    derived[2] = (-4.5 * f + 4.0) * f + 0.5
-    derived[3] = (1.5 * f - 1.0) * f
+    return seen.sum()
