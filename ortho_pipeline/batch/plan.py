@@ -303,9 +303,9 @@ class _Planner:
         looks = os.sep in text and not text.startswith("+")
         if self.places.far:
             return self.places.name(text, field) if looks or _SUFFIX.search(text) else text
-        if looks or _is_file(self.places.base / text):
+        if looks or _exists(self.places.base / text):
             return self.places.name(text, field)
-        if _is_file(Path(text)):
+        if _exists(Path(text)):
             raise InputError(
                 f"{text!r} is a file of the current folder, but paths are relative to the pipeline file",
                 file=self.path, field=field, remedy=f"give its path relative to {self.places.base}",
@@ -373,10 +373,10 @@ def for_run(
     ]  # fmt: skip
 
 
-def _is_file(path: Path) -> bool:
-    """Tell whether there is a file of this name; a text that can be no name is none."""
+def _exists(path: Path) -> bool:
+    """Tell whether something has this name, a pipe too; a text that can be no name names nothing."""
     try:
-        return path.is_file()
+        return path.exists()
     except (OSError, ValueError):
         return False
 

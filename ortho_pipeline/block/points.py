@@ -18,7 +18,7 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError, counted
-from ortho_pipeline.geodesy.crs import ground_transform, horizontal, same_crs
+from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs, same_crs
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import is_usable
 from ortho_pipeline.points import Points
@@ -276,7 +276,7 @@ class BlockPoints:
 
     def known_in(self, crs: str | pyproj.CRS) -> Array:
         """Return the known ground ``(N, 3)`` in another CRS; an unknown height makes the whole row NaN."""
-        target = pyproj.CRS.from_user_input(crs)
+        target = parse_crs(crs)
         return ground_transform(self.crs, target if target.is_geocentric else horizontal(target))(self.ground)
 
 

@@ -11,6 +11,7 @@ no error, where a geoid grid is not installed. PROJ's network access stays off, 
 from __future__ import annotations
 
 import functools
+import json
 import logging
 import os
 import re
@@ -27,6 +28,7 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import AreaOfInterest, Transformer, TransformerGroup
 
 from ortho_pipeline.errors import CrsError, DatumError, OrthoError
+from ortho_pipeline.geodesy.crs_gate import refuse_files
 from ortho_pipeline.geodesy.geoid_grid import header_fault, refuse_absurd, refuse_unread
 
 Array = NDArray[np.float64]
@@ -38,6 +40,7 @@ SYSTEM_FOLDERS = ("/usr/share/proj", "/usr/local/share/proj", "/opt/homebrew/sha
 VERTICAL_NAMES = {"ellipsoid": "ellipsoid", "egm96": "EPSG:5773", "egm2008": "EPSG:3855", "egm84": "EPSG:5798"}
 VERTICAL_FORMS = "ellipsoid, egm96, egm2008, EPSG:n of a vertical CRS, or a geoid grid file (.gtx, .tif)"
 _GRID_SUFFIXES = {".gtx", ".tif", ".tiff", ".byn", ".isg", ".gri"}
+_BARE_NAME = re.compile(r"\w[\w.-]*")
 _WGS84_SEMI_MAJOR = 6378137.0
 #: How WKT, PROJJSON and PROJ strings begin. PROJ seeks anything else by its name, for a quarter of a second.
 _STATED = re.compile(
@@ -75,10 +78,11 @@ def parse_crs(text: str | pyproj.CRS) -> pyproj.CRS:
     Raises
     ------
     CrsError
-        If it is not a coordinate system.
+        If it is not a coordinate system, or names a file by its path.
     """
     if isinstance(text, pyproj.CRS):
         return text
+    refuse_files(text if isinstance(text, str) else json.dumps(text))
     try:
         if isinstance(text, str) and not _STATED.match(text) and not _NAME.fullmatch(text):
             raise ValueError("neither a name nor a form of a coordinate system")
@@ -177,10 +181,24 @@ class Vertical:
             return _vertical_of_code(plain.upper())
         if Path(plain).suffix.lower() in _GRID_SUFFIXES:
             path = Path(plain)
-            found = cls(str(path.resolve()) if path.is_file() else plain)
+            found = cls(str(path.resolve()) if path.exists() else plain)
             vertical_transformer(found.name)
             return found
         raise DatumError(f"{plain!r} is not a height datum", field="vertical", remedy=f"give {VERTICAL_FORMS}")
+
+    @classmethod
+    def stated(cls, text: str) -> Vertical:
+        """Return the height datum that a file of strangers names: as `parse`, but no grid by its path."""
+        name = text.strip()
+        if Path(name).suffix.lower() not in _GRID_SUFFIXES:
+            return cls.parse(name)
+        if not _BARE_NAME.fullmatch(name):
+            raise DatumError(
+                f"{name[:80]!r} is the path of a grid, which is not opened because a file names it", field="vertical",
+                remedy="give the grid as `points.vertical=FILE`",
+            )  # fmt: skip
+        vertical_transformer(name)
+        return cls(name)
 
     @property
     def is_ellipsoid(self) -> bool:
@@ -265,7 +283,8 @@ def vertical_transformer(name: str) -> Transformer:
             return Transformer.from_crs(
                 _compound(name), "EPSG:4979", always_xy=True, only_best=True, allow_ballpark=False
             )
-        if fault := header_fault(Path(name)):
+        # PROJ looks for bare names in its own folders only.
+        if Path(name).is_absolute() and (fault := header_fault(Path(name))):
             raise _grid_error(Vertical(name), fault)
         if set(name) & {",", '"'}:
             raise DatumError(
@@ -292,10 +311,9 @@ def _grid_error(vertical: Vertical, message: str) -> DatumError:
     grid = _grid_of_message(message)
     if grid is None:
         return DatumError(
-            f"there is no transformation from {vertical.label} to the ellipsoid",
-            field="vertical",
+            f"there is no transformation from {vertical.label} to the ellipsoid", field="vertical",
             remedy="give the geoid grid file of this datum instead",
-        )
+        )  # fmt: skip
     return DatumError(
         f"heights in {vertical.label} need the geoid grid {grid}, which is not installed",
         field="vertical",
@@ -440,10 +458,9 @@ def _transformer(source: pyproj.CRS, target: pyproj.CRS) -> Transformer:
 def _way_error(source: pyproj.CRS, target: pyproj.CRS, grid: str | None) -> OrthoError:
     if grid is None:
         return CrsError(
-            f"there is no transformation from {source.name!r} to {target.name!r}",
-            field="CRS",
+            f"there is no transformation from {source.name!r} to {target.name!r}", field="CRS",
             remedy="choose systems of known datum, such as UTM on WGS84",
-        )
+        )  # fmt: skip
     return CrsError(
         f"the transformation from {source.name!r} to {target.name!r} needs the grid {grid}, which is not installed",
         field="CRS",
@@ -468,12 +485,8 @@ def _warn_of_better(used: Transformer, source: pyproj.CRS, target: pyproj.CRS, s
         grid = ", ".join(grid.short_name for grid in better.grids if not grid.available)
         log.warning(
             "%s -> %s: used %.1f m, a transformation of %.1f m needs the grid %s, which is not installed",
-            source.name,
-            target.name,
-            used.get_last_used_operation().accuracy,
-            better.accuracy,
-            grid,
-        )
+            source.name, target.name, used.get_last_used_operation().accuracy, better.accuracy, grid,
+        )  # fmt: skip
 
 
 #: By the texts that systems are made of: a CRS writes its WKT to be hashed.

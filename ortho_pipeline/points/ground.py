@@ -82,8 +82,10 @@ def _from_geocentric(
 ) -> tuple[Array, pyproj.CRS]:  # fmt: skip
     """Return longitude, latitude and ellipsoidal height of points in Earth-centred X, Y, Z (metres)."""
     _check_kind(path, table, crs)
-    for said in (Vertical.parse(text) for text in (option, table.vertical) if text is not None):
-        if not said.is_ellipsoid:
+    given = None if option is None else Vertical.parse(option)
+    stated = None if table.vertical is None else Vertical.stated(table.vertical)
+    for said in (given, stated):
+        if said is not None and not said.is_ellipsoid:
             raise DatumError(
                 f"{crs.name!r} has X, Y, Z from the centre of the Earth and no heights above {said.label}",
                 file=path, field="points.vertical", remedy="leave the height datum out",
@@ -110,7 +112,7 @@ def _vertical_of(
         # The CRS is what the format prescribes, not what anybody said of these heights.
         declared = None
     given = None if option is None else Vertical.parse(option)
-    stated = None if table.vertical is None else Vertical.parse(table.vertical)
+    stated = None if table.vertical is None else Vertical.stated(table.vertical)
     unit = declared.metres_per_unit if declared else 1.0
     said = _certain(declared)
     if stated is not None and said is not None and stated != said:

@@ -15,18 +15,19 @@ import functools
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from osgeo import gdal
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.files.beside import ask_beside
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, VsiPath, in_local_archive, network_is_closed, place, within
-from ortho_pipeline.raster.references import NAMES_OF, PLAIN_VRT, Named, products_of_volume
+from ortho_pipeline.geodesy.crs_gate import refuse_files
+from ortho_pipeline.raster.references import NAMES_OF, PLAIN_VRT, Named, crs_texts, products_of_volume
 
 gdal.UseExceptions()
 
@@ -45,6 +46,8 @@ _FETCHING = (
 )  # fmt: skip
 #: Side-cars that GDAL opens as rasters, by their ending after the whole name of an image or after its stem.
 _RASTER_SIDE_CAR = re.compile(r"\.(ovr|msk|aux|rrd|r[0-9])$")
+#: Side-cars that say in which coordinate system a raster is.
+_CRS_SIDE_CARS = (".aux.xml", ".prj", ".hdr")
 #: Formats that a GDAL may have been built without, by the beginning of a file: wheels have fewer drivers.
 _BEGINNINGS = {
     b"NITF": "NITF", b"EHFA_HEADER_TAG": "HFA", b"\x00\x00\x00\x0cjP": "JP2OpenJPEG", b"UHL1": "DTED",
@@ -138,6 +141,7 @@ class _Gate:
                 name = os.fspath(product)
                 self._see_named(product, "DIMAP", frozenset())
         else:
+            self._see_crs_beside(there)
             kind = _identified(name, drivers)
             if kind is None and not isinstance(there, VsiPath) and (format := _format_of(there)) is not None:
                 _require_driver(format, there)
@@ -166,6 +170,7 @@ class _Gate:
         if len(self._seen) > _MANY:
             raise InputError(f"this leads to more than {_MANY} files", file=by, remedy=PLAIN_VRT)
         name = str(path)
+        self._see_crs_beside(path)
         kind = _identified(name, DRIVERS)
         first = None if kind is None else _identified(name, None)
         if kind is None or first not in DRIVERS or (kind == "VRT" and isinstance(path, VsiPath)):
@@ -227,6 +232,18 @@ class _Gate:
             )  # fmt: skip
         return places[0] if places else None
 
+    def _see_crs_beside(self, path: Any) -> None:
+        """See to the coordinate systems in side-cars: some drivers ask PROJ for them to identify a file."""
+        for other in self._beside(path):
+            rest = other.lower()
+            for start in (path.name.lower(), path.stem.lower()):
+                rest = rest.removeprefix(start)
+            if rest in _CRS_SIDE_CARS:
+                side_car = path.parent / other
+                self._must_be_inside(side_car, path, other)
+                if side_car.is_file():
+                    _see_crs(crs_texts(side_car, rest), side_car)
+
     def _see_side_cars(self, path: Any) -> None:
         """See to what GDAL takes up as overviews and masks because of its name."""
         name, stem = path.name.lower(), path.stem.lower()
@@ -235,9 +252,7 @@ class _Gate:
             if lower == name:
                 continue
             rest = lower.removeprefix(name) if lower.startswith(name) else lower.removeprefix(stem)
-            if rest == ".aux.xml":
-                self._must_be_inside(path.parent / other, path, other)
-            elif _RASTER_SIDE_CAR.fullmatch(rest):
+            if _RASTER_SIDE_CAR.fullmatch(rest):
                 side_car = path.parent / other
                 self._must_be_inside(side_car, path, other)
                 if _identified(str(side_car), None) not in _PLAIN:
@@ -252,6 +267,7 @@ class _Gate:
     def _see_named(self, path: Any, kind: str, chain: frozenset[str]) -> None:
         """See to the files that a header names."""
         chain = chain | {str(path.resolve())}
+        _see_crs(crs_texts(path, kind), path)
         for named in NAMES_OF[kind](path):
             for target in self._targets(named, path):
                 if kind == "DIMAP" and target.is_file() and named.field == "COMPONENT_PATH":
@@ -325,6 +341,7 @@ class _Gate:
                 for target in self._targets(named, path):
                     if target.exists():
                         self._see(target, path, named.field, frozenset())
+        _see_crs((dataset.GetProjection(), dataset.GetGCPProjection()), path)
         kind = dataset.GetDriver().ShortName
         for name in _listed(dataset):
             file = place(name)
@@ -332,6 +349,13 @@ class _Gate:
                 continue
             self._must_be_inside(file, path, kind, name)
         self.block = max(self.block, DecodedUnit(_decoded_at_once(dataset), str(path)), key=lambda block: block.size)
+
+
+def _see_crs(texts: Iterable[str], path: Any) -> None:
+    """Refuse coordinate systems that lead PROJ to files, before GDAL or anybody else asks PROJ for them."""
+    with completed(path):
+        for text in texts:
+            refuse_files(text)
 
 
 def _decoded_at_once(dataset: gdal.Dataset) -> int:

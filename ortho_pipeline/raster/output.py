@@ -11,6 +11,7 @@ import contextlib
 import difflib
 import math
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
@@ -241,6 +242,21 @@ def _blocks(band: gdal.Band) -> list[tuple[int, int, int, int]]:
 
 # -- creation options --------------------------------------------------------------------------------------------------
 
+#: Those that say how the file is laid out. Others name files and addresses, or give the ortho another grid or CRS.
+_LAYOUT = frozenset(
+    re.findall(
+        r"\S+",
+        """
+        COMPRESS OVERVIEW_COMPRESS PREDICTOR OVERVIEW_PREDICTOR LEVEL QUALITY OVERVIEW_QUALITY ZLEVEL ZSTD_LEVEL
+        LZMA_PRESET DISCARD_LSB JPEG_QUALITY JPEGTABLESMODE WEBP_LEVEL WEBP_LOSSLESS MAX_Z_ERROR MAX_Z_ERROR_OVERVIEW
+        JXL_LOSSLESS JXL_LOSSLESS_COPY JXL_EFFORT JXL_DISTANCE JXL_ALPHA_DISTANCE NBITS INTERLEAVE PIXELTYPE ENDIANNESS
+        TILED BLOCKXSIZE BLOCKYSIZE BLOCKSIZE BIGTIFF SPARSE_OK NUM_THREADS PHOTOMETRIC ALPHA PROFILE TFW
+        GEOTIFF_KEYS_FLAVOR GEOTIFF_VERSION RESAMPLING OVERVIEW_RESAMPLING OVERVIEWS OVERVIEW_COUNT STATISTICS
+        """,
+    )
+)
+_PLAIN_VALUE = re.compile(r"[\w.,+-]{1,80}")
+
 
 def checked_options(driver: str, given: dict[str, str], threads: int, side: int = 512) -> dict[str, str]:
     """Return lossless defaults, a `side` of blocks, under what the user gave; what no driver knows is an error."""
@@ -253,7 +269,12 @@ def checked_options(driver: str, given: dict[str, str], threads: int, side: int 
                 f"the {driver} driver has no creation option {key}", field="creation option",
                 remedy=f"did you mean {meant[0]}?" if meant else f"see the {driver} driver in GDAL's documentation",
             )  # fmt: skip
-        if not _fits(known[key], value):
+        if key not in _LAYOUT:
+            raise InputError(
+                f"the creation option {key} is not taken: it does more than lay out the file", field="creation option",
+                remedy="grid and CRS of an ortho are options of their own (`output.crs`, `output.resolution`)",
+            )  # fmt: skip
+        if not _PLAIN_VALUE.fullmatch(value) or not _fits(known[key], value):
             values = ", ".join(choice.text or "" for choice in known[key].findall("Value")) or known[key].get("type")
             raise InputError(
                 f"{value[:60]!r} is not a value of the creation option {key}", field="creation option",

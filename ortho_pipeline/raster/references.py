@@ -38,6 +38,8 @@ _VRT_TEXTS = frozenset(
     {"srs", "metadata", "gcplist", "histograms", "gdalrasterattributetable", "colortable", "categorynames",
      "description"}
 )  # fmt: skip
+#: What holds the text of a coordinate system in VRTs, side-cars of GDAL and of Esri, and DIMAP, in lower case.
+_CRS_NAMES = frozenset({"srs", "projection", "wkt", "horizontal_cs_code", "horizontal_cs_name"})
 _VRT_CLASSES = frozenset({"vrtdataset", "vrtrasterband", "vrtsourcedrasterband", "vrtrawrasterband"})
 PLAIN_VRT = "make a file of it first (gdal_translate in.vrt out.tif)"
 
@@ -120,6 +122,28 @@ def _source(node: Any, path: Any, band: str) -> Named:
     if len(texts) != 1 or len(relative) > 1 or not set(relative) <= {"0", "1"}:
         raise InputError("a source of this VRT has no plain name", file=path, field="SourceFilename", remedy=PLAIN_VRT)
     return Named(texts[0], "SourceFilename", relative=relative == ["1"], raw=band == "raw")
+
+
+def crs_texts(path: Any, kind: str) -> Iterator[str]:
+    """Yield the texts in a header or side-car that GDAL makes a coordinate system of while it opens the raster.
+
+    Parameters
+    ----------
+    kind : str
+        A driver, or the ending of a side-car: those of XML, ``.prj`` and ``.hdr``; others yield nothing.
+    """
+    if kind == ".prj":
+        yield _header(path)
+    elif kind == ".hdr":
+        yield from re.findall(r"coordinate system string\s*=\s*\{([^}]*)", _header(path), re.IGNORECASE)
+    elif kind in ("VRT", "DIMAP", ".aux.xml"):
+        pending = [[_ELEMENT, "", _xml(path)]]
+        while pending:
+            for name, child in _parts(pending.pop()):
+                pending.append(child)
+                keys = [text.lower() for part, one in _parts(child) if part == "key" for text in _value(one)]
+                if name in _CRS_NAMES or "srs" in keys:
+                    yield from _value(child)
 
 
 def _names_of_dimap(path: Any) -> Iterator[Named]:

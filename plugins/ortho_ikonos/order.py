@@ -13,10 +13,10 @@ from osgeo import gdal
 
 from ortho_ikonos.metadata import Component, Delivery, Placement, read_header
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import CrsError, InputError
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import place
-from ortho_pipeline.geodesy.crs import same_crs
+from ortho_pipeline.geodesy.crs import parse_crs, same_crs
 
 _NAME = re.compile(
     r"(?P<order>po_[^/\\]+)_(?P<band>[a-z]{2,4})_(?P<component>\d{7})\.(?:tiff?|ntf|nitf)", re.IGNORECASE | re.ASCII
@@ -155,7 +155,7 @@ def position_of(dataset: gdal.Dataset, delivery: Delivery, component: Component)
     if own is not None:
         own_crs, own_corner, own_pixel = own
         crs = crs or own_crs.to_string()
-        if not same_crs(pyproj.CRS(crs), own_crs):
+        if not same_crs(parse_crs(crs), own_crs):
             text = f"the image says it is in {own_crs.name}, the metadata {delivery.projection}"
             warnings.append(Notice("metadata-contradict", text))
         elif corner is not None and pixel is not None:
@@ -212,8 +212,8 @@ def _georeferencing(dataset: gdal.Dataset) -> tuple[pyproj.CRS, tuple[float, flo
     if skew_x or skew_y or dx <= 0 or dy >= 0:
         return None
     try:
-        crs = pyproj.CRS.from_wkt(reference.ExportToWkt())
-    except pyproj.exceptions.CRSError:
+        crs = parse_crs(reference.ExportToWkt())
+    except CrsError:
         return None
     code = crs.to_epsg()
     return pyproj.CRS.from_epsg(code) if code else crs, (left, top), (dx, -dy)

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.errors import CrsError, InputError, OrthoError
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.files.locations import place
-from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.points import Points
@@ -115,8 +115,8 @@ def _layout_of(dataset: gdal.Dataset) -> Layout:
         return value
 
     try:
-        crs = pyproj.CRS.from_user_input(fields.get("SRS") or "EPSG:4326")
-    except pyproj.exceptions.CRSError as error:
+        crs = parse_crs(fields.get("SRS") or "EPSG:4326")
+    except CrsError as error:
         raise InputError("the SRS of the arrays is not known", file=name, field="SRS", remedy=_REMEDY) from error
     return Layout(
         files=(files[0], files[1]),

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
 from osgeo import gdal
 
@@ -25,6 +24,7 @@ from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.exchange.rpc import has_rpc
 from ortho_pipeline.files import read_bounded, read_json
 from ortho_pipeline.files.locations import place
+from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geodetic
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models.map_plane import MapPlane
@@ -176,7 +176,7 @@ def _map_of(dataset: gdal.Dataset) -> tuple[str, tuple[float, float], tuple[floa
     text = dataset.GetProjection()
     if steps is None or not text:
         raise InputError("this image has no map geometry: it is in slant or ground range", file=name, remedy=_PLANE)
-    crs = pyproj.CRS(text)
+    crs = parse_crs(text)
     if not crs.is_projected or steps[2] or steps[4] or not (steps[1] > 0 > steps[5]):
         raise InputError(
             f"an image in {crs.name} is not read, only in a map projection with north on top", file=name,
