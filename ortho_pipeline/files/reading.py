@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import stat
 import threading
 from collections.abc import Iterable
@@ -18,6 +19,8 @@ from ortho_pipeline.files.locations import VsiPath, check_path
 
 #: Bytes that are read at once for a checksum.
 _CHUNK = 1 << 20
+#: The escape of half a character.
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 #: Digits that a whole number in a JSON document may have.
 _DIGITS = 40
 
@@ -72,10 +75,14 @@ def parse_json(data: str | bytes, file: object, remedy: str, *, unique: bool = F
     """
     try:
         text = data.decode("utf-8-sig") if isinstance(data, bytes) else data
-        return json.loads(
+        found = json.loads(
             text, parse_constant=_finite, parse_float=_finite, parse_int=_whole,
             object_pairs_hook=_unique if unique else None,
         )  # fmt: skip
+        if _SURROGATE.search(text):
+            # Half of a character is in no name of a file, and cannot be written to a report.
+            json.dumps(found, ensure_ascii=False).encode()
+        return found
     except (ValueError, RecursionError) as error:
         line = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else None
         reason = str(error)[:120]

@@ -342,6 +342,12 @@ class _Gate:
                     if target.exists():
                         self._see(target, path, named.field, frozenset())
         _see_crs((dataset.GetProjection(), dataset.GetGCPProjection()), path)
+        transform = dataset.GetGeoTransform(can_return_null=True)
+        if transform is not None and not all(map(math.isfinite, transform)):
+            raise InputError(
+                "the geotransform of this raster is not finite", file=path, field="geotransform",
+                remedy="set the true one with gdal_edit.py -a_ullr",
+            )  # fmt: skip
         kind = dataset.GetDriver().ShortName
         for name in _listed(dataset):
             file = place(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -17,7 +18,11 @@ from ortho_pipeline.batch import plan as batch_plan
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
+from ortho_pipeline.files import read_json
+from ortho_pipeline.files.stac.item import read_item
+from ortho_pipeline.imaging.matching import open_references
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
+from ortho_pipeline.raster.source import open_dataset
 from ortho_pipeline.simulation.scanner import LineScanner
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
@@ -197,3 +202,41 @@ def test_a_format_that_this_gdal_was_built_without_is_named(tmp_path):
         assert name in line
         assert f"GDAL's driver {driver}, and this GDAL" in line
         assert "Remedy: take a GDAL that has it" in line
+
+
+# -- texts that are no text, places that are no place ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("where", ["href", "id", "key", "far"])
+def test_a_lone_surrogate_in_a_document_is_refused(where: str, tmp_path: Path) -> None:
+    href = {"href": "a\ud800.tif", "far": "http://host/\ud800.tif"}.get(where, "a.tif")
+    document = {"type": "Feature", "stac_version": "1.0.0", "id": "one\udfff" if where == "id" else "one", "links": []}
+    key = "image\ud800" if where == "key" else "image"
+    assets = {key: {"href": href, "roles": ["data"], "type": "image/tiff"}}
+    (tmp_path / "item.json").write_text(json.dumps({**document, "properties": {}, "assets": assets}))
+    with pytest.raises(InputError, match=r"item\.json"):
+        read_item(tmp_path / "item.json")
+
+
+def test_a_pair_of_surrogates_is_a_character(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(json.dumps({"name": "scene \U0001f6f0"}))
+    assert "\\ud83d" in (tmp_path / "a.json").read_text()
+    assert read_json(tmp_path / "a.json", 1000, "")["name"] == "scene \U0001f6f0"
+
+
+@pytest.mark.parametrize(
+    "place", ["inf,1,0,50,0,-1", "0,1,0,nan,0,-1", "0,1,0,-inf,0,-1", "0,1e999,0,0,0,-1", "0,1,0,0,0,-1e-320",
+              "1e308,1e-5,0,0,0,-1e-5"]
+)  # fmt: skip
+def test_a_reference_that_lies_nowhere_is_refused(place: str, tmp_path: Path) -> None:
+    path = tmp_path / "r.vrt"
+    path.write_text(
+        f'<VRTDataset rasterXSize="9" rasterYSize="9"><SRS>EPSG:32636</SRS><GeoTransform>{place}</GeoTransform>'
+        '<VRTRasterBand dataType="Float32" band="1"/></VRTDataset>'
+    )
+    with pytest.raises(InputError, match=r"r\.vrt"):
+        open_references([path])
+    if "n" in place or "999" in place:
+        # Whatever it is opened for: an image, a DEM, a template of a grid, a source of heights.
+        with pytest.raises(InputError, match=r"r\.vrt"):
+            open_dataset(path)

@@ -148,13 +148,17 @@ class Reference:
                 remedy="give an orthoimage (GeoTIFF with its CRS), or set it with gdal_edit.py -a_srs and -a_ullr",
             )  # fmt: skip
         forward = np.array([[transform[1], transform[2]], [transform[4], transform[5]]])
-        if not (np.isfinite(transform).all() and abs(np.linalg.det(forward)) > 0):
+        with np.errstate(all="ignore"):
+            sound = abs(np.linalg.det(forward)) > 0
+            inverse = np.linalg.inv(forward) if sound else np.full((2, 2), np.nan)
+            offset = -inverse @ np.array([transform[0], transform[3]])
+            # Beyond that many pixels from the origin a number does not tell one pixel from the next.
+            sound = bool(np.isfinite(inverse).all() and np.abs(offset).max() < 2**52)
+        if not sound:
             raise CrsError(
                 "the reference has a georeference that cannot be inverted", file=source.path, field="reference",
                 remedy="give an orthoimage",
             )  # fmt: skip
-        inverse = np.linalg.inv(forward)
-        offset = -inverse @ np.array([transform[0], transform[3]])
         with completed(source.path):
             crs = horizontal(parse_crs(text))
             # A system of no known datum is refused here, by the name of its file.
