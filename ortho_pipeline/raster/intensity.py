@@ -25,6 +25,11 @@ _WINDOWS, _WINDOW, _TRIED = 9, 64, 150
 _FULL = 0.9
 #: Values are told apart in so many steps between the percentiles 1 and 99 of a band.
 _STEPS = 256
+#: From the first frequency on (cycles per pixel) a raster that was enlarged by two shows at most this part of what it
+#: shows between the other two; noise and edges of a raster that was not show more. Of some 20 real and simulated
+#: images, enlarged by bilinear, cubic, spline and Lanczos kernels, none shows more than 0.0014; as delivered, all but
+#: one (0.0011) show 0.0018 and more.
+_TOP, _MIDDLE, _EMPTY = 0.375, (0.0625, 0.25), 0.0016
 #: Up to this factor pixels are averaged here; beyond, GDAL does it, from overviews where there are some. Overviews may
 #: have been made by any rule, so they serve to find a place and never to measure it.
 EXACT = 8
@@ -67,6 +72,14 @@ class Intensity:
             return tuple((known[np.round(spread).astype(int)] + 1).tolist())
         best = np.argsort(-found, kind="stable")[:_BANDS]
         return tuple(sorted((known[best[found[best] >= _WORTH * found.max()]] + 1).tolist()))
+
+    @cached_property
+    def enlarged(self) -> bool:
+        """Whether it was enlarged by two or more: several of its pixels make one that is resolved."""
+        bands = np.array(self.averaged) - 1
+        windows = [sample[bands].mean(axis=0) for sample in itertools.islice(self._samples(), _WINDOWS)]
+        windows = [window for window in windows if np.isfinite(window).all()]
+        return bool(windows) and enlarged(np.stack(windows))
 
     def _samples(self) -> Iterator[NDArray[np.float32]]:
         """Yield windows ``(bands, h, w)`` spread over the raster in which some band has values; NaN is not valid."""
@@ -171,6 +184,20 @@ def contents(bands: NDArray[np.float32]) -> NDArray[np.float64]:
             alike = 1.0 - float((step**2).mean()) / (2 * variance) if len(step) and variance > 0 else 0.0
             found[number] += max(alike, 0.0) * float(-(counts * np.log2(counts)).sum()) / len(steps)
     return found
+
+
+def enlarged(windows: NDArray[np.float32]) -> bool:
+    """Tell whether a raster was enlarged by two or more: windows ``(n, h, w)`` show nothing as fine as their pixels."""
+    height, width = windows.shape[1:]
+    down, across = (np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2 for count in (height, width))
+    level = windows - windows.mean(axis=(1, 2), keepdims=True)
+    power = (np.abs(np.fft.fft2(level * down[:, None] * across)) ** 2).sum(axis=0)
+    for axis, count in ((1, height), (0, width)):
+        frequency, along = np.abs(np.fft.fftfreq(count)), power.sum(axis=axis)
+        middle = along[(frequency >= _MIDDLE[0]) & (frequency < _MIDDLE[1])].sum()
+        if not along[frequency >= _TOP].sum() < _EMPTY * middle:
+            return False
+    return True
 
 
 def _part(number: int, base: int) -> float:

@@ -268,7 +268,8 @@ def chip_factor(view: View, targets: Sequence[Target], shown: Array) -> int:
             remedy=f"match images whose resolutions differ by at most {_RATIO:.0f} times",
         )  # fmt: skip
     # Averaged to the pixels of a target half as fine, a real scene was found half a pixel off; in its own, a twentieth.
-    return max(1, round(1 / ratio / _FINER))
+    # Of a scene that was enlarged, two by two are its own: single ones show its noise as if it were structure.
+    return max(2 if view.intensity.enlarged else 1, round(1 / ratio / _FINER))
 
 
 def _resolution_ratio(view: View, target: Target, image: Array) -> Array:
