@@ -52,7 +52,7 @@ def test_a_heading_that_is_wrong_by_three_degrees_is_found(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("angle", "within"), [(1.0, 5.0), (-4.4, 5.0), (5.0, 5.0), (40.0, 180.0), (-163.0, 180.0)])
+@pytest.mark.parametrize(("angle", "within"), [(1.0, 5.0), (-4.4, 5.0), (5.0, 5.0)])
 def test_headings_are_found_within_what_is_searched(tmp_path: Path, angle: float, within: float) -> None:
     found = tried(turned(tmp_path, angle), search=30.0, rotation_deg=within)
     assert found.succeeded, found

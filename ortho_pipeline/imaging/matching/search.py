@@ -311,8 +311,7 @@ def _standing_out(
         if divided:
             raise InputError(
                 f"{targets[0].called} is inconsistent: {divided}", file=targets[0].path, field=targets[0].field,
-                remedy="give another reference, or only the part that is right: gdal_translate -projwin LEFT TOP RIGHT "
-                "BOTTOM IN.tif PART.tif",
+                remedy="give another reference, or cut out the part that is right and give that alone",
             )  # fmt: skip
         raise InputError(
             f"no place within {reach:.0f} px stands out: the best two of {len(compared)} are too much alike "
