@@ -112,7 +112,7 @@ def _together(seams: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {
         "length_px": sum(seam["length_px"] for seam in seams),
         "rms": None if rms is None else float(rms),
-        "step": max((max(seam["step"]) for seam in seen), default=None),
+        "largest_rms": max((max(seam["largest_rms"]) for seam in seen), default=None),
         "matched": matched,
         "rmse_px": math.sqrt(apart / matched) if matched else None,
     }
@@ -122,7 +122,7 @@ def along_text(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
     """Return how scenes differ along the seams, before and after."""
     said = []
     if before["rms"] is not None and after["rms"] is not None:
-        worst = f"{short(after['step'])} at the worst place"
+        worst = f"{short(after['largest_rms'])} at the worst place"
         said.append(f"{short(after['rms'])} in brightness (RMS; {worst}; before {short(before['rms'])})")
     if before["rmse_px"] is not None and after["rmse_px"] is not None:
         said.append(f"{after['rmse_px']:.2f} px in place (before {before['rmse_px']:.2f} px)")

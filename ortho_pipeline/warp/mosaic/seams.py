@@ -45,7 +45,7 @@ def along_seams(
     -------
     dict
         `length_px`, `places`; `difference` and `rms` of each band (first minus second; None without a place), and
-        `step`, the largest mean difference at one place;
+        `largest_rms`, that of the worst place;
         `matched`, and of these `median_px` [column, row] of the second against the first, `rmse_px` and `largest_px`.
     """
     opened = open_layers(placed, memory)
@@ -77,7 +77,7 @@ def _measured(
 ) -> dict[str, Any]:
     chosen = places[np.unique(np.linspace(0, len(places) - 1, _PLACES).astype(int))] * cell
     bands = opened[pair[0]].source.count
-    chips, sums, seen, step = [], np.zeros((2, bands)), 0, np.zeros(bands)
+    chips, sums, seen, largest = [], np.zeros((2, bands)), 0, np.zeros(bands)
     for column, row in np.rint(chosen).astype(int).tolist():
         box = column - _WIDE, row - _WIDE, column + _WIDE, row + _WIDE
         (one, valid), (other, also) = (opened[number].read_around(box) for number in pair)
@@ -89,7 +89,7 @@ def _measured(
         sums += np.stack([difference.sum(axis=1), (difference**2).sum(axis=1)])
         seen += int(both.sum())
         if both.any():
-            step = np.maximum(step, np.abs(difference.mean(axis=1)))
+            largest = np.maximum(largest, np.sqrt((difference**2).mean(axis=1)))
         part = _best_part(valid & also)
         chips.append([np.where(valid & also, values.mean(axis=0), np.nan)[part] for values in (one, other)])
     shifts = _shifts(np.array(chips, dtype=np.float32))
@@ -99,7 +99,7 @@ def _measured(
         "places": len(chosen),
         "difference": (sums[0] / seen).tolist() if seen else None,
         "rms": np.sqrt(sums[1] / seen).tolist() if seen else None,
-        "step": step.tolist() if seen else None,
+        "largest_rms": largest.tolist() if seen else None,
         "matched": len(shifts),
         "median_px": np.median(shifts, axis=0).tolist() if some else None,
         "rmse_px": float(np.sqrt(np.mean(lengths**2))) if some else None,
