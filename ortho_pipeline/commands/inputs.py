@@ -37,6 +37,8 @@ SIDE_CARS = ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", "_metadata.txt", ".IMD")
 ATTACHED = (".aux.xml", ".ovr", ".msk")
 #: In place of a file of points: the ground control points that the image itself holds.
 OWN_POINTS = "own"
+#: Options that stand in a record only where they were given: without them, files of the same job keep their bytes.
+_IF_GIVEN = ("like", "reference_bands", "search_rotation")
 #: Name of the "sensor" of an image that has no model of its own.
 POINTS_ONLY = "points only"
 
@@ -372,7 +374,8 @@ def read_since(before: int) -> dict[str, Any]:
 def _as_asked(options: Any) -> dict[str, Any]:
     """Return options as JSON values, without the budget of the machine, on which no result depends."""
     given = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
-    return {key: _text_of(value) for key, value in given.items() if key not in ("memory", "threads")}
+    left_out = {"memory", "threads", *(key for key in _IF_GIVEN if given.get(key) is None)}
+    return {key: _text_of(value) for key, value in given.items() if key not in left_out}
 
 
 def _text_of(value: Any) -> Any:

@@ -313,6 +313,7 @@ def test_like_takes_the_grid_of_another_raster(tiny, tmp_path):
     assert "--resolution" in both.stderr
     document = json.loads((tmp_path / "again" / f"{tiny.image.stem}_report.json").read_text())
     assert first.GetDescription() in {one["path"] for one in document["provenance"]["inputs"] if one["role"] == "grid"}
+    assert document["provenance"]["options"]["output"]["like"] == first.GetDescription()
 
 
 @pytest.fixture

@@ -482,6 +482,9 @@ def test_provenance_has_the_checksum_of_every_input_and_the_command(tiny, tmp_pa
         assert found[path]["bytes"] == path.stat().st_size
         assert found[path]["sha256"] in result.files["html"].read_text()
     assert given["options"]["surface"]["vertical"] == "ellipsoid"
+    # An option of later versions changes nothing in the files of a job that does not use it.
+    assert "like" not in given["options"]["output"]
+    assert given["options"]["output"]["extent"] is None
 
 
 def test_model_files_may_name_model_families_of_plugins(tiny, tmp_path, monkeypatch):
