@@ -437,7 +437,7 @@ def _result(
     loo = np.full((len(points), 2), np.nan)
     loo[used] = solution.leave_one_out()
     sigma0 = solution.sigma0
-    shared = shared_errors(solution, points.image[used], common)
+    shared = shared_errors(solution, points.image[used], common, points.sigma_alike[used])
     usual = common.cofactors(solution) if common is not None else solution.cofactors
     covariance = usual * (1.0 if sigma0 is None else sigma0**2) if shared is None else shared[1]
     return Fit(

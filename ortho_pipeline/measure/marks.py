@@ -64,6 +64,7 @@ class Mark:
     sigma_xy: float = 0.0
     sigma_h: float = 0.0
     sigma_common: float = 0.0
+    sigma_alike: float = 0.0
     group: int | None = None
     how: Literal["manual", "matched", "file"] = "manual"
     ground_from: Literal["reference", "typed", "file"] | None = None
@@ -140,9 +141,10 @@ def checked(mark: Mark) -> Mark:
         lon, lat, height = mark.ground
         if not (abs(lon) <= 360 and abs(lat) <= 90 and abs(height) <= 20_000):
             raise InputError("this is no place on Earth", field="ground", remedy="check the coordinates and their CRS")
-    for key in ("sigma_xy", "sigma_h", "sigma_common"):
+    for key in ("sigma_xy", "sigma_h", "sigma_common", "sigma_alike"):
         if not 0 <= getattr(mark, key) <= 1e6:
-            raise InputError("a standard deviation is not negative", field=key, remedy="give metres")
+            raise InputError("a standard deviation is not negative", field=key,
+                             remedy="give 0 or more")  # fmt: skip
     if mark.group is not None and mark.group < 0:
         raise InputError("groups are numbered from 0 on", field="group")
     return mark
@@ -198,6 +200,7 @@ class Marks:
             sigma_ground=np.array([[mark.sigma_xy] * 2 + [mark.sigma_h] for mark in used], dtype=float).reshape(-1, 3),
             crs=horizontal(parse_crs(GROUND_CRS)), source=source, covariance_image=covariance, groups=groups,
             sigma_common=np.array([mark.sigma_common for mark in used], dtype=float),
+            sigma_alike=np.array([mark.sigma_alike for mark in used], dtype=float),
         )  # fmt: skip
 
     def document(self, source: str) -> dict[str, Any]:
@@ -247,7 +250,8 @@ def marks_of(points: Points, at: str) -> list[Mark]:
             role=point.role,  # type: ignore[arg-type]
             sigma_image=None if more[k] else point.sigma_image, covariance=(column, row, both) if more[k] else None,
             sigma_xy=max(point.sigma_ground[:2]), sigma_h=point.sigma_ground[2], sigma_common=point.sigma_common,
-            group=point.group if point.group >= 0 else None, how="file", ground_from="file", at=at,
+            sigma_alike=point.sigma_alike, group=point.group if point.group >= 0 else None,
+            how="file", ground_from="file", at=at,
         )))  # fmt: skip
     return found
 

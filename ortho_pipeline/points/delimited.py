@@ -50,6 +50,7 @@ _ALIASES = {
         "var_row": "varrow",
         "cov_col_row": "covcolrow",
         "sigma_common": "sigmacommon",
+        "sigma_alike": "sigmaalike",
     }.items()
     for alias in aliases.split()
 }
@@ -245,7 +246,7 @@ def _row(
             return None
         role = role_of(found, path, of.column("status"))
     sigma = of.sigma("sigma_image", False)
-    covariance, group, common = read_image_errors(
+    covariance, group, common, alike = read_image_errors(
         [of.plain(name) for name in CSV_ERRORS], path, [of.column(name) for name in CSV_ERRORS], sigma
     )
     return Row(
@@ -261,6 +262,7 @@ def _row(
         covariance=covariance,
         group=group,
         sigma_common=common,
+        sigma_alike=alike,
     )
 
 

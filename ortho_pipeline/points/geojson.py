@@ -79,7 +79,7 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: C
         raise InputError(f"{short(name)} is not an id", file=path, field=f"{where}.properties.id")
     role = properties.get("role") or expected.role
     sigma_image = sigma("sigma_image", False)
-    covariance, group, common = read_image_errors(
+    covariance, group, common, alike = read_image_errors(
         [properties.get(one) for one in CSV_ERRORS], path, [f"{where}.properties.{one}" for one in CSV_ERRORS],
         sigma_image,
     )  # fmt: skip
@@ -95,6 +95,7 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: C
         covariance=covariance,
         group=group,
         sigma_common=common,
+        sigma_alike=alike,
     )
     if "col" not in expected.needed:
         return [row]
@@ -160,4 +161,6 @@ def _error_properties(point: Point) -> dict[str, float]:
         found[CSV_ERRORS[3]] = point.group
     if point.sigma_common:
         found[CSV_ERRORS[4]] = point.sigma_common
+    if point.sigma_alike:
+        found[CSV_ERRORS[5]] = point.sigma_alike
     return found

@@ -114,8 +114,8 @@ def checked_groups(groups: ArrayLike | None, count: int) -> Index:
     return found.astype(np.int64)
 
 
-def checked_common(sigma: ArrayLike | None, count: int) -> Array:
-    """Return standard deviations ``(N,)`` m, 0 for points that have no error in common with others.
+def checked_common(sigma: ArrayLike | None, count: int, name: str = "sigma_common") -> Array:
+    """Return standard deviations ``(N,)``, 0 for points that have no error in common with others.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def checked_common(sigma: ArrayLike | None, count: int) -> Array:
     """
     found = np.zeros(count) if sigma is None else np.asarray(sigma, dtype=float)
     if found.shape != (count,) or not ((found >= 0) & np.isfinite(found)).all():
-        raise InputError(f"sigma_common is {count} numbers (m), none negative", field="sigma_common")
+        raise InputError(f"{name} is {count} numbers, none negative", field=name)
     return found
 
 
@@ -152,14 +152,14 @@ def _is_positive_definite(covariance: Array) -> NDArray[np.bool_]:
 
 def read_image_errors(
     values: Sequence[Any], path: str | os.PathLike[str], where: Sequence[str], sigma: float | None
-) -> tuple[tuple[float, float, float] | None, int | None, float | None]:
-    """Return variances and covariance of a measurement, group and sigma_common of its point; None is not given.
+) -> tuple[tuple[float, float, float] | None, int | None, float | None, float | None]:
+    """Return variances and covariance of a measurement, group, sigma_common and sigma_alike; None is not given.
 
     Parameters
     ----------
-    values : sequence of five
+    values : sequence of six
         Of `CSV_ERRORS`, as a file has them; None and empty text are not given.
-    where : sequence of five str
+    where : sequence of six str
         Where in the file each stands.
     sigma : float or None
         The standard deviation beside them, which has to agree.
@@ -171,9 +171,9 @@ def read_image_errors(
     """
     there = [value is not None and value != "" for value in values]
     group = _group(values[3], path, where[3]) if there[3] else None
-    common = sigma_of(values[4], path, where[4], zero=True) if there[4] else None
+    common, alike = (sigma_of(values[k], path, where[k], zero=True) if there[k] else None for k in (4, 5))
     if not any(there[:3]):
-        return None, group, common
+        return None, group, common, alike
     if not all(there[:3]):
         missing = CSV_ERRORS[there[:3].index(False)]
         raise InputError(
@@ -194,7 +194,7 @@ def read_image_errors(
             f"sigma_image is {sigma:g}, and the covariance beside it has {derived:g}", file=path, field=where[0],
             remedy="leave sigma_image empty where a covariance is given",
         )  # fmt: skip
-    return (column, row, both), group, common
+    return (column, row, both), group, common, alike
 
 
 def _group(value: Any, path: str | os.PathLike[str], where: str) -> int:
@@ -222,9 +222,12 @@ def groups_of(rows: Sequence[Row]) -> Index:
     return np.array([-1 if row.group is None else row.group for row in rows], dtype=np.int64)
 
 
-def common_of(rows: Sequence[Row]) -> Array:
-    """Return the standard deviations ``(N,)`` m of what points have in common, of the rows of a file."""
-    return np.array([row.sigma_common or 0.0 for row in rows], dtype=np.float64)
+def common_of(rows: Sequence[Row]) -> dict[str, Array]:
+    """Return the standard deviations ``(N,)`` of what points have in common, by name, of the rows of a file."""
+    return {
+        name: np.array([getattr(row, name) or 0.0 for row in rows], dtype=np.float64)
+        for name in ("sigma_common", "sigma_alike")
+    }
 
 
 def sigmas_of(rows: Sequence[Row], default: float) -> Array:

@@ -34,7 +34,7 @@ CSV_COLUMNS = ("id", "col", "row", "x", "y", "h", "role", "sigma_image", "sigma_
 #: Column of a CSV of several images: the file that a point was measured in.
 CSV_IMAGE = "image"
 #: Columns of points whose errors differ with the direction, or are shared with those of neighbours, or with all.
-CSV_ERRORS = ("var_col", "var_row", "cov_col_row", "group", "sigma_common")
+CSV_ERRORS = ("var_col", "var_row", "cov_col_row", "group", "sigma_common", "sigma_alike")
 
 
 class Columns(NamedTuple):
@@ -61,7 +61,8 @@ OWN_IMAGE: Placement = (0.0, 0.0, 1.0)
 class Point(NamedTuple):
     """One of the points of a table, in its units; `image` and `sigma_image` in px, sigmas of the ground in metres.
 
-    `covariance_image` (px^2) and `group` are those of its measurement, as in `Points`, and so is `sigma_common`.
+    `covariance_image` (px^2) and `group` are those of its measurement, as in `Points`; so are `sigma_common` (m) and
+    `sigma_alike` (px).
     """
 
     id: str
@@ -73,6 +74,7 @@ class Point(NamedTuple):
     covariance_image: tuple[tuple[float, float], tuple[float, float]]
     group: int
     sigma_common: float
+    sigma_alike: float
 
 
 @dataclass(slots=True)
@@ -95,6 +97,7 @@ class Row:
     covariance: tuple[float, float, float] | None = None
     group: int | None = None
     sigma_common: float | None = None
+    sigma_alike: float | None = None
 
     def __post_init__(self) -> None:
         if self.id is not None:

@@ -96,6 +96,9 @@ class Points:
     sigma_common : ndarray (N,), optional
         Standard deviation in metres, per axis in plan, of an error of the ground that all points with one have in
         common, as matches have that of their reference; 0 without. No number of points makes it less.
+    sigma_alike : ndarray (N,), optional
+        Standard deviation in px, per axis, of an error of the measurement that all points with one have in common, as
+        matches have where bands of the reference disagree; 0 without.
     """
 
     ids: tuple[str, ...]
@@ -109,6 +112,7 @@ class Points:
     covariance_image: Array = None  # type: ignore[assignment]  # filled below, as `groups` is
     groups: NDArray[np.int64] = None  # type: ignore[assignment]
     sigma_common: Array = None  # type: ignore[assignment]
+    sigma_alike: Array = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         count = len(self.ids)
@@ -126,7 +130,8 @@ class Points:
         object.__setattr__(self, "sigma_image", sigma)
         object.__setattr__(self, "covariance_image", covariance)
         object.__setattr__(self, "groups", checked_groups(self.groups, count))
-        object.__setattr__(self, "sigma_common", checked_common(self.sigma_common, count))
+        for name in CSV_ERRORS[4:]:
+            object.__setattr__(self, name, checked_common(getattr(self, name), count, name))
         roles = np.asarray(self.roles, dtype="<U7")
         if roles.shape != (count,) or not set(roles.tolist()) <= set(ROLES):
             raise InputError(f"each point has one role of {', '.join(ROLES)}", field="roles")
@@ -176,12 +181,12 @@ class Points:
     def __iter__(self) -> Iterator[Point]:
         columns = self.image.tolist(), self.ground.tolist(), self.roles.tolist()
         sigmas = self.sigma_image.tolist(), self.sigma_ground.tolist()
-        errors = self.covariance_image.tolist(), self.groups.tolist(), self.sigma_common.tolist()
-        for name, image, ground, role, sigma, sigma_ground, both, group, common in zip(
-            self.ids, *columns, *sigmas, *errors, strict=True
+        shared = self.groups.tolist(), self.sigma_common.tolist(), self.sigma_alike.tolist()
+        for name, image, ground, role, sigma, sigma_ground, both, *others in zip(
+            self.ids, *columns, *sigmas, self.covariance_image.tolist(), *shared, strict=True
         ):
             covariance = tuple(both[0]), tuple(both[1])
-            yield Point(name, tuple(image), tuple(ground), role, sigma, tuple(sigma_ground), covariance, group, common)
+            yield Point(name, tuple(image), tuple(ground), role, sigma, tuple(sigma_ground), covariance, *others)
 
     @property
     def __geo_interface__(self) -> dict[str, Any]:
@@ -252,6 +257,7 @@ class Points:
             covariance_image=self.covariance_image[index],
             groups=self.groups[index],
             sigma_common=self.sigma_common[index],
+            sigma_alike=self.sigma_alike[index],
         )
 
     def with_covariance_image(self, covariance: ArrayLike, groups: ArrayLike | None = None) -> Points:
@@ -357,7 +363,7 @@ def _points_of(
         source=os.fspath(path),
         covariance_image=covariance_of(rows, sigma_image),
         groups=groups_of(rows),
-        sigma_common=common_of(rows),
+        **common_of(rows),
     )
 
 
@@ -477,8 +483,9 @@ def _error_columns(points: Points) -> dict[str, list[str]]:
             found[name] = [repr(value) if there else "" for value, there in zip(values, more, strict=True)]
     if (points.groups >= 0).any():
         found[CSV_ERRORS[3]] = [str(group) if group >= 0 else "" for group in points.groups.tolist()]
-    if points.sigma_common.any():
-        found[CSV_ERRORS[4]] = [repr(sigma) if sigma else "" for sigma in points.sigma_common.tolist()]
+    for name in CSV_ERRORS[4:]:
+        if getattr(points, name).any():
+            found[name] = [repr(sigma) if sigma else "" for sigma in getattr(points, name).tolist()]
     return found
 
 

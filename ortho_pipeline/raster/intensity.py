@@ -56,10 +56,10 @@ class Intensity:
     @cached_property
     def averaged(self) -> tuple[int, ...]:
         """Numbers of the bands that are averaged; they are chosen when pixels are first asked for."""
-        return self.bands or self._best()
+        return self.bands or self.best()
 
-    def _best(self) -> tuple[int, ...]:
-        """Return the numbers of the bands with the most content; alpha is none."""
+    def best(self, most: int = _BANDS) -> tuple[int, ...]:
+        """Return the numbers of at most so many bands, those with the most content; alpha is none."""
         colours = [band.GetColorInterpretation() for band in self.source.bands]
         known = np.flatnonzero([colour != gdal.GCI_AlphaBand for colour in colours])
         if len(known) < 2:
@@ -68,9 +68,9 @@ class Intensity:
         found = contents(np.stack(samples, axis=1)[known]) if samples else np.zeros(len(known))
         if not found.any():
             # A raster of one value, or none where it was looked at: bands from its whole spectrum.
-            spread = np.linspace(0, len(known) - 1, min(_BANDS, len(known)))
+            spread = np.linspace(0, len(known) - 1, min(most, len(known)))
             return tuple((known[np.round(spread).astype(int)] + 1).tolist())
-        best = np.argsort(-found, kind="stable")[:_BANDS]
+        best = np.argsort(-found, kind="stable")[:most]
         return tuple(sorted((known[best[found[best] >= _WORTH * found.max()]] + 1).tolist()))
 
     @cached_property

@@ -36,7 +36,9 @@ def made(count: int = 6, seed: int = 0) -> Points:
     half = random.normal(0, 1, (count, 2, 2))
     covariance[some] = (half @ half.transpose(0, 2, 1) + 1e-3 * np.eye(2))[some]
     groups = np.where(random.random(count) < 0.5, -1, random.integers(0, 9, count))
-    return replace(plain.with_covariance_image(covariance, groups), sigma_common=np.where(groups >= 0, 1.7, 0.0))
+    matched = groups >= 0
+    common = {"sigma_common": np.where(matched, 1.7, 0.0), "sigma_alike": np.where(matched, 0.3, 0.0)}
+    return replace(plain.with_covariance_image(covariance, groups), **common)
 
 
 def assert_same(one: Points, other: Points) -> None:
@@ -44,6 +46,7 @@ def assert_same(one: Points, other: Points) -> None:
     np.testing.assert_array_equal(one.sigma_image, other.sigma_image)
     np.testing.assert_array_equal(one.groups, other.groups)
     np.testing.assert_array_equal(one.sigma_common, other.sigma_common)
+    np.testing.assert_array_equal(one.sigma_alike, other.sigma_alike)
 
 
 def test_a_point_without_a_covariance_errs_alike_in_all_directions_and_on_its_own() -> None:
@@ -124,7 +127,7 @@ def test_covariances_and_groups_are_read_as_they_were_written(
 def test_files_say_no_more_than_there_is_to_say(tmp_path: Path) -> None:
     points = made()
     plain = replace(points, covariance_image=points.sigma_image[:, None, None] ** 2 * np.eye(2), groups=None)
-    plain = replace(plain, sigma_common=None)
+    plain = replace(plain, sigma_common=None, sigma_alike=None)
     write_points(plain, tmp_path / "plain.csv")
     write_points(plain, tmp_path / "plain.geojson")
     assert "sigma_h\n" in (tmp_path / "plain.csv").read_text()
@@ -134,7 +137,7 @@ def test_files_say_no_more_than_there_is_to_say(tmp_path: Path) -> None:
     assert "sigma_h,group,image\n" in (tmp_path / "groups.csv").read_text()
     assert read_points(tmp_path / "groups.csv").groups.tolist() == [3, -1, -1, -1, -1, -1]
     write_points(points, tmp_path / "all.csv")
-    assert "sigma_h,var_col,var_row,cov_col_row,group,sigma_common\n" in (tmp_path / "all.csv").read_text()
+    assert "sigma_h,var_col,var_row,cov_col_row,group,sigma_common,sigma_alike\n" in (tmp_path / "all.csv").read_text()
     kept = {field.name for field in dataclasses.fields(points)}
     assert {"covariance_image", "groups"} <= kept
 

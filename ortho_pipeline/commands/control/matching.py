@@ -220,7 +220,10 @@ def match_scene(
     with _of_references():
         matches = match(view, references, settings)
     paths = tuple(one.path for one in references)
-    notices = [*_default_search(search), *_made_of_scene(scene, references, matches), *_partial(matches)]
+    notices = [
+        *_default_search(search), *_made_of_scene(scene, references, matches), *_partial(matches),
+        *_bands_apart(matches),
+    ]  # fmt: skip
     return Matched(
         matches, paths, options, search, (scene.width, scene.height), pixel, tuple(notices), typical_sigma(view.surface)
     )
@@ -338,6 +341,28 @@ def _partial(matches: Matches) -> list[Notice]:
         return []
     text = f"the reference covers {matches.coverage:.0%} of the scene; accuracy outside it is not tested"
     return [Notice("reference-covers-part", text, coverage=matches.coverage)]
+
+
+def _bands_apart(matches: Matches) -> list[Notice]:
+    """Return a notice if single bands of the references put the scene in different places."""
+    from ortho_pipeline.imaging.band_shifts import agreeing, disagreeing, spread
+
+    bands = matches.bands
+    if not disagreeing(bands):
+        return []
+    agree = agreeing(bands)
+    said = ", ".join(
+        f"band {one.band} by {one.shift[0]:+.2f} ± {one.sigma[0]:.2f}, {one.shift[1]:+.2f} ± {one.sigma[1]:.2f}"
+        for one in bands
+    )
+    text = (
+        "bands of the reference disagree about the place of the scene. Compared with the result, single bands move it "
+        f"(column, row, px): {said}. The result is not known better than {spread(bands):.1f} px. "
+        "Choose bands that agree and look like the scene: "
+        f"`match.reference_bands={','.join(str(number) for number in agree)}`"
+    )
+    found = [{"band": one.band, "shift_px": list(one.shift), "sigma_px": list(one.sigma)} for one in bands]
+    return [Notice("bands-disagree", text, bands=found, agreeing=list(agree), spread_px=spread(bands))]
 
 
 # -- what a reference is not -----------------------------------------------------------------------------------------

@@ -109,6 +109,7 @@ def _joined(surveyed: Points, matches: Points) -> Points:
         roles=both("roles"), sigma_image=both("sigma_image"), sigma_ground=both("sigma_ground"), crs=matches.crs,
         source=f"{surveyed.source}, {matches.source}", covariance_image=both("covariance_image"),
         groups=np.concatenate([surveyed.groups, groups]), sigma_common=both("sigma_common"),
+        sigma_alike=both("sigma_alike"),
     )  # fmt: skip
 
 

@@ -81,7 +81,7 @@ class SharedErrors:
 
 
 def shared_errors(
-    solution: Solution, image: Array, common: CommonError | None = None
+    solution: Solution, image: Array, common: CommonError | None = None, sigma_alike: Array | None = None
 ) -> tuple[SharedErrors, Array] | None:
     """Return what neighbours share and the covariance ``(P, P)`` of the parameters; None where no point has a group.
 
@@ -93,6 +93,8 @@ def shared_errors(
         Its points, px.
     common : CommonError, optional
         What the points have in common; its own part of the covariance is not in what is returned.
+    sigma_alike : (n,), optional
+        What the matches among them err alike, px per axis, where it is known to be more than `MATCHED_ALIKE`.
     """
     rows = np.flatnonzero(solution.groups >= 0)
     if not len(rows) or solution.sigma0 is None or not len(solution.cofactors):
@@ -105,7 +107,8 @@ def shared_errors(
     if common is not None:
         own, usual = common.influence(solution)[rows], variance * common.cofactors(solution)
     groups = len(np.unique(solution.groups[rows]))
-    alike = MATCHED_ALIKE * np.einsum("nip,nik->pk", own, shift[rows])
+    sigma = np.full(len(rows), MATCHED_ALIKE) if sigma_alike is None else np.maximum(sigma_alike[rows], MATCHED_ALIKE)
+    alike = np.einsum("n,nip,nik->pk", sigma, own, shift[rows])
     scene = Neighbours.of(image[rows], residuals, np.concatenate([design, own, shift[rows]], axis=2))
     if scene is None:
         # All that is known is who shares: a group is one point.

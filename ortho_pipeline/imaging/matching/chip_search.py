@@ -1,16 +1,22 @@
-"""Where chips are found again in larger ones, and whether that place can be believed: alike, unique, and back again."""
+"""Where chips are found again in larger ones, and whether to believe it: alike, unique, back again, in all bands."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ortho_pipeline.imaging.band_shifts import BandShift
+from ortho_pipeline.imaging.matching.chips import Renderer
 from ortho_pipeline.imaging.matching.correlation import Peaks, orientation, peaks, surfaces
+from ortho_pipeline.imaging.matching.least_squares import measure
+from ortho_pipeline.imaging.matching.targets import Reference, Target, View
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.raster.intensity import Intensity
 
 #: Side of a chip (chip px); it is even, so that a chip of any factor has its centre between the same pixels.
 SIDE = 40
@@ -28,6 +34,8 @@ _UNIQUE = 0.85
 _BACK = 0.7
 #: Part of a chip that the target shows at least.
 _SEEN = 0.8
+#: At most so many chips are measured in single bands, at most so many of these, within so many chip px.
+_CHIPS, _BANDS, _AROUND = 48, 6, 6
 #: Chips that are worked on together: as many for any number of threads, so that results do not depend on them.
 _BATCH = 32
 
@@ -78,6 +86,67 @@ def in_batches(work: Callable[[NDArray[np.int_]], None], index: NDArray[np.int_]
         return
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, batches))
+
+
+def in_each_band(
+    view: View, targets: Sequence[Target], origins: NDArray[np.int_], scene: Chips, start: Array, factor: int,
+    threads: int,
+) -> tuple[BandShift, ...]:  # fmt: skip
+    """Return where single bands of references put chips; none where fewer than two bands can be compared.
+
+    Parameters
+    ----------
+    view : View
+        With the model as the matches corrected it.
+    origins : (n, 2)
+        First pixels of chips that were matched.
+    scene : (n, s, s)
+    start : (n, 2)
+        Where they were found in the targets, chip px.
+    """
+    references = [target for target in targets if isinstance(target, Reference)]
+    numbers = _compared_bands(references)
+    if len(numbers) < 2 or len(origins) < FEWEST:
+        return ()
+    some = np.unique(np.linspace(0, len(origins) - 1, _CHIPS).round().astype(int))
+    side = SIDE + 2 * _AROUND
+    renderer = Renderer(view, references, origins[some] - _AROUND * factor, side, factor)
+    fields, bands = orientation(scene[some]), []
+    for number in numbers:
+        single = [replace(one, intensity=Intensity(one.intensity.source, (number,))) for one in references]
+        wide = _rendered(renderer.of(single), len(some), side, threads)
+        # Least squares finds what is near: the band as a whole may be some pixels away.
+        coarse = peaks(surfaces(fields, orientation(wide)))
+        moved = (coarse.shift - start[some])[coarse.inside]
+        whole = np.round(np.median(moved, axis=0)) if len(moved) else np.zeros(2)
+        found = measure(scene[some], wide, start[some] + whole).shift
+        # Where a band shows the scene farther on, the model moves back.
+        moves = (start[some] - found)[np.isfinite(found).all(axis=1)] * factor
+        if len(moves) >= FEWEST:
+            bands.append(BandShift.of(number, moves))
+    return tuple(bands) if len(bands) > 1 else ()
+
+
+def _compared_bands(references: Sequence[Reference]) -> tuple[int, ...]:
+    """Return the numbers of the bands that are compared: several that a user chose, else all with content."""
+    if not references:
+        return ()
+    first = references[0].intensity
+    numbers = first.averaged
+    if len(first.bands) < 2:
+        numbers = (*numbers, *(one for one in first.best(_BANDS) if one not in numbers))
+    fewest = min(one.intensity.source.count for one in references)
+    return tuple(sorted(one for one in numbers[:_BANDS] if one <= fewest))
+
+
+def _rendered(renderer: Renderer, count: int, side: int, threads: int) -> Chips:
+    wide = np.empty((count, side, side), dtype=np.float32)
+
+    def render(index: NDArray[np.int_]) -> None:
+        wide[index] = renderer.render(index)
+
+    in_batches(render, np.arange(count), threads)
+    return wide
 
 
 def _inner(wide: NDArray[_T], radius: int) -> NDArray[_T]:

@@ -8,6 +8,7 @@ does not depend on the sensor model.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 
@@ -68,6 +69,12 @@ class Renderer:
         self._targets, self._size = targets, size
         self._surface = view.surface
         self._nodes = [_Nodes(view, target, np.asarray(origins, dtype=float), size * factor) for target in targets]
+
+    def of(self, targets: Sequence[Target]) -> Renderer:
+        """Return a renderer of the same chips for other bands of the same targets."""
+        found = copy.copy(self)
+        found._targets = targets
+        return found
 
     def render(self, index: NDArray[np.int_]) -> Pixels:
         """Return the chips of these numbers ``(n, size, size)``; NaN where nothing is shown."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ortho_pipeline.errors import InputError, TooFewPoints, counted
 from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.imaging.band_shifts import BandShift, spread
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
 from ortho_pipeline.imaging.matching.chip_search import (
     FEWEST,
@@ -21,6 +22,7 @@ from ortho_pipeline.imaging.matching.chip_search import (
     doubts,
     found_again,
     in_batches,
+    in_each_band,
 )
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.least_squares import measure
@@ -128,6 +130,8 @@ class Matches:
         The matches that were kept, with covariances and groups.
     coverage : float
         Share of the scene that the targets cover.
+    bands : tuple of BandShift
+        What single bands of the references say, where there are several.
     """
 
     image: Array
@@ -143,6 +147,7 @@ class Matches:
     components: Components
     points: Points
     coverage: float = 1.0
+    bands: tuple[BandShift, ...] = ()
 
 
 def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Matches:
@@ -177,7 +182,9 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
         if tried.moved(correction) < _STANDS:
             break
     tried.judge()
-    return replace(tried.matches(settings, tuple(levels)), coverage=len(shown) / SAMPLES**2)
+    found, bands = tried.matches(settings, tuple(levels)), tried.bands(correction)
+    points = replace(found.points, sigma_alike=np.full(len(found.points), spread(bands)))
+    return replace(found, coverage=len(shown) / SAMPLES**2, bands=bands, points=points)
 
 
 def _shown(view: View, targets: Sequence[Target]) -> Array:
@@ -249,6 +256,14 @@ class _Tried:
         self.found = np.full((count, 2), np.nan)  # chip px, in the target's chip
         self.covariance = np.full((count, 2, 2), np.nan)
         self.ground = np.full((count, 3), np.nan)
+
+    def bands(self, correction: SensorModel) -> tuple[BandShift, ...]:
+        """Return what single bands say of the matches that are kept, measured with the last correction."""
+        good = np.flatnonzero(self.reason == "")
+        return in_each_band(
+            View(self.view.intensity, correction, self.view.surface), self.targets, self.origins[good],
+            self.scene[good], self.offset[good] / self.factor, self.factor, self.threads,
+        )  # fmt: skip
 
     def _renderer(self, correction: SensorModel, index: NDArray[np.int_], radius: int) -> Renderer:
         seen = View(self.view.intensity, correction, self.view.surface)

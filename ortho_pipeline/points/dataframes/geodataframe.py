@@ -66,8 +66,9 @@ def _error_columns(points: Points) -> dict[str, Any]:
             found[name] = np.where(more, points.covariance_image[:, i, j], np.nan)
     if (points.groups >= 0).any():
         found[CSV_ERRORS[3]] = np.where(points.groups >= 0, points.groups, np.nan)
-    if points.sigma_common.any():
-        found[CSV_ERRORS[4]] = points.sigma_common
+    for name in CSV_ERRORS[4:]:
+        if getattr(points, name).any():
+            found[name] = getattr(points, name)
     return found
 
 
@@ -118,7 +119,7 @@ def _row(source: str, where: str, record: dict[str, Any], place: Any) -> Row:
     else:
         height = place.z if place is not None and place.has_z and "h" not in record else math.nan
     sigma_image = _sigma(source, where, record, "sigma_image", zero=False)
-    covariance, group, common = read_image_errors(
+    covariance, group, common, alike = read_image_errors(
         [_plain(record.get(name)) for name in CSV_ERRORS], source, [f"{where}, {name}" for name in CSV_ERRORS],
         sigma_image,
     )  # fmt: skip
@@ -133,6 +134,7 @@ def _row(source: str, where: str, record: dict[str, Any], place: Any) -> Row:
         covariance=covariance,
         group=group,
         sigma_common=common,
+        sigma_alike=alike,
     )
 
 

@@ -27,6 +27,8 @@ _STOP: dict[str, str] = {
 _LOOK: dict[str, str] = {
     "reference-covers-part": "Add references or measured points in the rest of the scene, or do not use the "
     "ortho there.",
+    "bands-disagree": "Match again with bands that agree and look like the scene (`match.reference_bands`): visible "
+    "bands for a panchromatic scene.",
     "left-out": "Look at it in the image and at its coordinates: measure it again, or delete it from the file of "
     "points.",
     "more-left-out": "So many gross errors mean that the points or the model do not suit the scene: see both.",

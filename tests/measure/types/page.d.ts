@@ -27,6 +27,7 @@ interface Mark {
   sigma_xy: number;
   sigma_h: number;
   sigma_common?: number;
+  sigma_alike?: number;
   group?: number | null;
   how: 'manual' | 'matched' | 'file';
   ground_from: 'reference' | 'typed' | 'file' | null;
