@@ -128,6 +128,29 @@ def startable_threads(wanted: int) -> int:
     return count
 
 
+class _Pool:
+    """The process in which GDAL's pool of threads was begun."""
+
+    process: int | None = None
+
+
+def claim_gdal_threads() -> None:
+    """Refuse GDAL's pool of threads where the process that this one was forked from has begun it.
+
+    Its threads do not exist here, and GDAL would wait for them without end.
+
+    Raises
+    ------
+    OrthoError
+    """
+    _Pool.process = _Pool.process or os.getpid()
+    if _Pool.process != os.getpid():
+        raise OrthoError(
+            "this process was forked from one in which GDAL's threads were running, and they do not run here",
+            remedy="start processes with multiprocessing.get_context('spawn'), or give `output.threads=1`",
+        )
+
+
 def share_freed_memory() -> bool:
     """Let the threads of this process and of its children share one heap; tell whether the C library does (glibc).
 

@@ -17,7 +17,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import whole_or_nothing
-from ortho_pipeline.files.process_limits import Progress
+from ortho_pipeline.files.process_limits import Progress, claim_gdal_threads
 from ortho_pipeline.raster.output import abandon, check_written, checked_options, close, gdal_errors
 from ortho_pipeline.raster.source import Grid, RasterSource, holds, pixel_type
 
@@ -210,6 +210,8 @@ class RasterWriter:
         # The bands of a block lie together in the file, and GDAL holds several such blocks.
         self._side = square_side(profile, 512)
         self.options = checked_options(driver, dict(creation_options or {}), threads, self._side)
+        if threads > 1 or self.options.get("NUM_THREADS", "1") != "1":
+            claim_gdal_threads()
         self._lock = threading.Lock()
         self._written, self._progress = 0, progress
         self._open = contextlib.ExitStack()
