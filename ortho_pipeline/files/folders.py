@@ -35,6 +35,21 @@ def cache_folder() -> Path | None:
     return Path(above) / "ortho-pipeline" if os.path.isabs(above) else None
 
 
+def ignore_working_folder() -> None:
+    """Keep libraries and child processes from taking code or settings from the working folder.
+
+    For a process of the command line: the environment is that of its host, which a library leaves alone.
+    """
+    # Python puts the working folder first where a child process looks for modules.
+    os.environ["PYTHONSAFEPATH"] = "1"
+    # Without a home, or with a relative one, libraries look for their settings below the working folder.
+    if not os.path.isabs(os.path.expanduser("~")):
+        os.environ["HOME"] = "/nonexistent"
+    for name in ("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
+        if not os.path.isabs(os.environ.get(name, "/")):
+            del os.environ[name]
+
+
 class Listing:
     """The names in a folder.
 
