@@ -26,12 +26,14 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import ridge_of
+from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models import families
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.report import document as report
 
 
 @with_items
+@one_blas_thread()
 def fit(
     image: str | os.PathLike[str],
     points: PointOptions,
@@ -58,6 +60,7 @@ def fit(
 
 @with_items
 @outputs_together
+@one_blas_thread()
 def compare(
     image: str | os.PathLike[str],
     points: PointOptions,

@@ -33,7 +33,7 @@ from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import retire, sha256, states
 from ortho_pipeline.files.documents import json_value
-from ortho_pipeline.files.process_limits import Progress, Resources
+from ortho_pipeline.files.process_limits import Progress, Resources, one_blas_thread
 from ortho_pipeline.files.traffic import bytes_read
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
@@ -62,6 +62,7 @@ _RASTERS = ("image", "DEM", "DEM accuracy", "reference", "other ortho")
 
 @with_items
 @outputs_together
+@one_blas_thread()
 def rectify(
     image: str | os.PathLike[str] | Scene,
     folder: str | os.PathLike[str],
@@ -188,6 +189,7 @@ def check(
 
 @with_items
 @outputs_together
+@one_blas_thread()
 def export(
     image: str | os.PathLike[str],
     folder: str | os.PathLike[str],

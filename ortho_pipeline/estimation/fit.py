@@ -32,6 +32,7 @@ from ortho_pipeline.estimation.spatial.common_error import CommonError
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors, shared_errors
 from ortho_pipeline.estimation.statistics import correlation_of, student_of, total_correlation_of
 from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points
 
@@ -258,6 +259,7 @@ def root_mean_square(residuals: Array) -> dict[str, float | int] | None:
     return {"col": math.sqrt(col), "row": math.sqrt(row), "total": math.sqrt(col + row), "n": len(residuals)}
 
 
+@one_blas_thread()
 def fit(
     model: SensorModel,
     points: Points,

@@ -17,6 +17,7 @@ from ortho_pipeline.commands.placement import Placement, place_scene, source_of
 from ortho_pipeline.commands.scene_fit import open_adjustable
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
@@ -35,6 +36,7 @@ _IDLE = ("accuracy_raster", "visibility", "angles", "stac", "fill_from")
 
 
 @with_items
+@one_blas_thread()
 def ortho_array(
     image: str | os.PathLike[str] | Scene,
     dem: str | os.PathLike[str] | SurfaceOptions,

@@ -17,6 +17,7 @@ from ortho_pipeline.commands.scene_fit import Adjusted, adjust, on_surface
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import write_points
 from ortho_pipeline.report import document as reports
@@ -28,6 +29,7 @@ _SUFFIXES = (".geojson", ".csv", ".tsv")
 
 @with_items
 @to_store(output=None, report=None)
+@one_blas_thread()
 def match(
     image: str | os.PathLike[str],
     output: str | os.PathLike[str],

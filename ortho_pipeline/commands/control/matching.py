@@ -16,6 +16,7 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
 from ortho_pipeline.models.base import Array
@@ -180,6 +181,7 @@ class Matched:
         ]  # fmt: skip
 
 
+@one_blas_thread()
 def match_scene(
     scene: Scene,
     options: MatchOptions,

@@ -27,6 +27,7 @@ from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.files import write_text
 from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points.image_errors import sigma_of_covariance
@@ -185,6 +186,7 @@ def _few(ties: Ties, names: tuple[str, ...]) -> list[Notice]:
 
 @with_items
 @to_store(output=None)
+@one_blas_thread()
 def ties(
     images: Sequence[str | os.PathLike[str]],
     output: str | os.PathLike[str],
