@@ -40,7 +40,7 @@ from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
-from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.raster.block_cache import cache_restored, limit_cache
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.output import checked_options, require_whole
 from ortho_pipeline.report import document as report
@@ -63,6 +63,7 @@ _RASTERS = ("image", "DEM", "DEM accuracy", "reference", "other ortho")
 @with_items
 @outputs_together
 @one_blas_thread()
+@cache_restored()
 def rectify(
     image: str | os.PathLike[str] | Scene,
     folder: str | os.PathLike[str],

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from osgeo import gdal
 
 #: What GDAL's cache has to hold beside large blocks of an image (bytes).
@@ -29,3 +33,25 @@ def keep_blocks(size: int) -> None:
     """Raise GDAL's block cache to what holds blocks of `size` bytes beside those of the output."""
     if size > gdal.GetCacheMax() // 2:
         gdal.SetCacheMax(max(gdal.GetCacheMax(), size + _OTHER_BLOCKS))
+
+
+class _Jobs:
+    """How many jobs are under way, and the size of the cache before the first of them."""
+
+    lock, count, before = threading.Lock(), 0, 0
+
+
+@contextmanager
+def cache_restored() -> Iterator[None]:
+    """Give the process the size of its cache back when the last job that is under way has ended."""
+    with _Jobs.lock:
+        if not _Jobs.count:
+            _Jobs.before = gdal.GetCacheMax()
+        _Jobs.count += 1
+    try:
+        yield
+    finally:
+        with _Jobs.lock:
+            _Jobs.count -= 1
+            if not _Jobs.count:
+                gdal.SetCacheMax(_Jobs.before)

@@ -21,6 +21,7 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
+from ortho_pipeline.raster.block_cache import cache_restored
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report.document import read_report
@@ -182,6 +183,7 @@ class Matched:
 
 
 @one_blas_thread()
+@cache_restored()
 def match_scene(
     scene: Scene,
     options: MatchOptions,

@@ -31,6 +31,7 @@ from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points.image_errors import sigma_of_covariance
+from ortho_pipeline.raster.block_cache import cache_restored
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.surface.accuracy import typical_sigma
@@ -113,6 +114,7 @@ class Tied:
         return "\n".join(lines)
 
 
+@cache_restored()
 def tie_scenes(
     scenes: Mapping[str, Scene],
     options: MatchOptions,

@@ -14,6 +14,7 @@ from ortho_pipeline.files import allowed, states, together, write_json
 from ortho_pipeline.files.locations import is_far, located, place
 from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.options import MosaicOptions
+from ortho_pipeline.raster.block_cache import cache_restored
 from ortho_pipeline.report.document import read_report
 from ortho_pipeline.report.mosaic.document import mosaic_document, summary_text
 from ortho_pipeline.report.mosaic.page import write_page
@@ -34,6 +35,7 @@ Measure = Callable[[Sequence[Overlap]], list[dict[str, Any]]]
 
 
 @to_store(path=None)
+@cache_restored()
 def mosaic(
     orthos: Sequence[str | os.PathLike[str]],
     path: str | os.PathLike[str],

@@ -1,8 +1,12 @@
-"""Processes that are forked after an ortho was made, as multiprocessing does by default before Python 3.14."""
+"""What a call leaves behind in its process, and in those that are forked from it."""
 
 import subprocess
 import sys
 from pathlib import Path
+
+from osgeo import gdal
+
+from ortho_pipeline import OutputOptions, SurfaceOptions, rectify
 
 CODE = """
 import os, signal, sys
@@ -37,3 +41,16 @@ def test_a_forked_child_is_refused_gdal_threads_at_once_and_works_with_one(tiny,
     assert made == "made"
     assert not list((tmp_path / "child").glob("*.tif"))
     assert list((tmp_path / "alone").glob("*.tif"))
+
+
+def test_a_job_leaves_gdals_cache_as_large_as_it_was(tiny, tmp_path: Path) -> None:
+    before, seen = gdal.GetCacheMax(), set[int]()
+    try:
+        gdal.SetCacheMax(987_654_321)
+        output = OutputOptions(resolution=(40.0, 40.0))
+        progress = lambda stage, share: seen.add(gdal.GetCacheMax())  # noqa: E731
+        rectify(str(tiny.image), str(tmp_path), surface=SurfaceOptions(height=500), output=output, progress=progress)
+        assert gdal.GetCacheMax() == 987_654_321
+        assert min(seen) < 200_000_000
+    finally:
+        gdal.SetCacheMax(before)
