@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ortho_pipeline.cli.flags import as_typed
+from ortho_pipeline.cli.machine.terminal import printable, say
 from ortho_pipeline.cli.options import dry_run_option, json_option, mosaic_options, network_option
 from ortho_pipeline.cli.parsing import Command, Megabytes
 from ortho_pipeline.cli.printing import PARTLY_DONE, checked_text, print_json, print_result, progress
@@ -118,7 +119,7 @@ def run(
         if as_json:
             return print_json({"schema_version": SCHEMA_VERSION, "scenes": listed})
         for scene in listed:
-            click.echo(f"{scene['name']}\t{scene['state']}\t{scene['image']}")
+            say(f"{scene['name']}\t{scene['state']}\t{scene['image']}")
         return None
     if dry_run:
         return _dry_run(planned, options["only"], options["shard"], as_json)
@@ -131,7 +132,7 @@ def run(
                 else batch.run(planned, memory=memory, progress=advance, store=store, **options)
             )
     except KeyboardInterrupt:
-        click.echo("What is done is kept: run it again to go on.", err=True)
+        say("What is done is kept: run it again to go on.", err=True)
         raise
     if as_json:
         print_json(result.to_json())
@@ -175,14 +176,14 @@ def _dry_run(planned: Plan, only: Sequence[str], shard: tuple[int, int] | None, 
         said = Counter(text for one in checked for text in one.get("warnings", ()))
         for one in checked:
             if "error" in one:
-                click.echo(f"{one['name']}: {_error_text(one['error'])}")
+                say(f"{one['name']}: {_error_text(one['error'])}")
             else:
                 own = [text for text in one["warnings"] if said[text] == 1]
-                click.echo(checked_text(one["name"], {**one, "warnings": own}))
+                say(checked_text(one["name"], {**one, "warnings": own}))
         for text, count in said.items():
             if count > 1:
-                click.echo(f"Warning: {as_typed(text)} ({counted(count, 'scene')})")
-        click.echo(f"{counted(len(checked), 'scene')}: {len(checked) - len(failed)} ready, {len(failed)} not")
+                say(f"Warning: {as_typed(text)} ({counted(count, 'scene')})")
+        say(f"{counted(len(checked), 'scene')}: {len(checked) - len(failed)} ready, {len(failed)} not")
     if failed:
         click.get_current_context().exit(FAILED if len(failed) == len(checked) else PARTLY_DONE)
 
@@ -202,14 +203,14 @@ def _print_summary(result: BatchResult) -> None:
     for title in ("scene", "state", "model", "check px", "left out px", "control px", "seconds"):
         table.add_column(title, justify="left" if title in ("scene", "state", "model") else "right", no_wrap=True)
     for scene in scenes:
-        table.add_row(*_row(scene))
+        table.add_row(*map(printable, _row(scene)))
     if scenes:
         console.print(table)
     for scene in scenes:
         if scene.error:
-            console.print(f"\n{scene.name}: {_error_text(scene.error)}", markup=False)
+            console.print(printable(f"\n{scene.name}: {_error_text(scene.error)}"), markup=False)
         elif against := refuted(scene.facts.get("notices", ())):
-            console.print(f"\n{scene.name}: Error: accuracy unknown: {against}", markup=False)
+            console.print(printable(f"\n{scene.name}: Error: accuracy unknown: {against}"), markup=False)
     counts = ", ".join(
         f"{result.count(status)} {status}"
         for status in ("done", "unchanged", "failed", "missing")
@@ -217,9 +218,9 @@ def _print_summary(result: BatchResult) -> None:
     )
     console.print(f"\n{counted(len(result.scenes), 'scene')}: {counts}  ({result.seconds:.1f} s)")
     if result.mosaic:
-        console.print(_mosaic_text(result.mosaic), markup=False)
+        console.print(printable(_mosaic_text(result.mosaic)), markup=False)
     for name, path in result.files.items():
-        console.print(f"  {name:<10} {path}", markup=False)
+        console.print(printable(f"  {name:<10} {path}"), markup=False)
 
 
 def _row(scene: Outcome) -> list[str]:

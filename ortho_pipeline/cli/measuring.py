@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ortho_pipeline.cli.machine.terminal import say
 from ortho_pipeline.cli.options import (
     images_argument,
     json_option,
@@ -65,8 +66,8 @@ def measure(
             if as_json:
                 print_json({"address": address, "points": str(session.output)})
             else:
-                click.echo(f"Measuring at {address}")
-                click.echo(f"Points: {session.output}. The address works once. Ctrl-C ends.")
+                say(f"Measuring at {address}")
+                say(f"Points: {session.output}. The address works once. Ctrl-C ends.")
             if not no_browser:
                 _open_browser(address, session.output, until_end)
 
@@ -81,7 +82,7 @@ def _open_browser(address: str, points: Path, until_end: contextlib.ExitStack) -
 
     path = until_end.enter_context(private_file(address, points))
     if path is None:
-        click.echo("Note: no private file can be written beside the points. Open the address yourself.", err=True)
+        say("Note: no private file can be written beside the points. Open the address yourself.", err=True)
     else:
         webbrowser.open(path.as_uri())
 

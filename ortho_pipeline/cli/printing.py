@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ortho_pipeline.cli.flags import as_typed
+from ortho_pipeline.cli.machine.terminal import printable_json, say
 from ortho_pipeline.errors import counted
 
 if TYPE_CHECKING:
@@ -28,13 +29,13 @@ _PRINTED, _WORST = 60, 20
 
 def print_json(document: Any) -> None:
     """Print a document for programs."""
-    click.echo(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False))
+    click.echo(printable_json(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)))
 
 
 def print_warnings(warnings: Any) -> None:
     """Print warnings on stderr."""
     for warning in warnings:
-        click.echo(f"Warning: {as_typed(str(warning))}", err=True)
+        say(f"Warning: {as_typed(str(warning))}", err=True)
 
 
 def print_result(result: Result, as_json: bool) -> None:
@@ -42,14 +43,14 @@ def print_result(result: Result, as_json: bool) -> None:
     if as_json:
         print_json(result.to_json())
     else:
-        click.echo(as_typed(result.summary))
+        say(as_typed(result.summary))
         for name, path in result.files.items():
-            click.echo(f"  {name:<10} {path}")
+            say(f"  {name:<10} {path}")
     if result.failure is not None:
         context = click.get_current_context()
         if context.meta.get("debug"):
-            click.echo("".join(traceback.format_exception(result.failure)), err=True)
-        click.echo(f"Error: {as_typed(str(result.failure))}", err=True)
+            say("".join(traceback.format_exception(result.failure)), err=True)
+        say(f"Error: {as_typed(str(result.failure))}", err=True)
         context.exit(PARTLY_DONE)
 
 
@@ -71,46 +72,44 @@ def print_fit(result: FitResult) -> None:
     from ortho_pipeline.report.wording import NO_SCALE, refuted
 
     document = result.to_json()
-    click.echo(f"Sensor {document['sensor']}, model {document['model']} of {document['model_source']}")
+    say(f"Sensor {document['sensor']}, model {document['model']} of {document['model_source']}")
     _print_parameters(document)
     wide = max([len(point["id"]) for point in document["points"]] + [5])
-    click.echo(f"\n{'point':<{wide}}  role     used    column       row   left out: col.    row")
+    say(f"\n{'point':<{wide}}  role     used    column       row   left out: col.    row")
     points, rest = _worst(document["points"])
     for point in points:
         numbers = [*point["residual"], *point["loo_residual"]]
         shown = "".join(f"{'-' if value is None else f'{value:+.3f}':>10}" for value in numbers)
-        click.echo(f"{point['id']:<{wide}}  {point['role']:<8} {'yes' if point['used'] else 'no':<4}{shown}")
+        say(f"{point['id']:<{wide}}  {point['role']:<8} {'yes' if point['used'] else 'no':<4}{shown}")
     if rest:
-        click.echo(f"and {counted(rest, 'point')} with smaller residuals (--json has all)")
-    click.echo("\nResiduals are measured minus predicted, in pixels; 'left out': had the point taken no part.")
+        say(f"and {counted(rest, 'point')} with smaller residuals (--json has all)")
+    say("\nResiduals are measured minus predicted, in pixels; 'left out': had the point taken no part.")
     against = refuted(document["notices"])
     if against:
-        click.echo(f"Accuracy unknown: {against}. {NO_SCALE}")
+        say(f"Accuracy unknown: {against}. {NO_SCALE}")
     if document["raw_bias"] and document["parameters"]:
         bias = document["raw_bias"]
-        click.echo(f"Model as delivered: column {bias['col']:+.3f}, row {bias['row']:+.3f} on average")
+        say(f"Model as delivered: column {bias['col']:+.3f}, row {bias['row']:+.3f} on average")
     labels = {"control": "control", "check": "check", "loo": "leave-one-out", "matched": "matched"}
     for which, rmse in document["rmse"].items():
         text = "no points" if rmse is None else (
             f"column {rmse['col']:.3f}, row {rmse['row']:.3f}, both {rmse['total']:.3f}  "
             f"({counted(rmse['n'], 'point')})"
         )  # fmt: skip
-        click.echo(f"RMSE {labels[which]:<14} {text}")
+        say(f"RMSE {labels[which]:<14} {text}")
     if document["outlying"] and (rest := document["rmse_of_agreeing_checks"]):
-        click.echo(
-            f"RMSE of the check points that are not outlying: {rest['total']:.3f}  ({counted(rest['n'], 'point')})"
-        )
+        say(f"RMSE of the check points that are not outlying: {rest['total']:.3f}  ({counted(rest['n'], 'point')})")
     if result.matching:
-        click.echo(f"Matching: {result.matching.text()}. {result.matching.floor()}")
+        say(f"Matching: {result.matching.text()}. {result.matching.floor()}")
         if absolute := result.matching.absolute_text():
-            click.echo(absolute)
+            say(absolute)
     if document["map_scale"] and not against:
-        click.echo(f"Map scale: {document['map_scale']['statement']}")
+        say(f"Map scale: {document['map_scale']['statement']}")
     for role, found in document["covariance"].items():
         if found:
-            click.echo(f"Residuals of {role} points: {found['statement']}")
+            say(f"Residuals of {role} points: {found['statement']}")
     sigma0 = "unknown" if document["sigma0"] is None else f"{document['sigma0']:.3g}"
-    click.echo(f"Redundancy {document['redundancy']}, sigma0 {sigma0}")
+    say(f"Redundancy {document['redundancy']}, sigma0 {sigma0}")
     print_warnings(document["warnings"])
 
 
@@ -131,15 +130,15 @@ def _print_parameters(document: Mapping[str, Any]) -> None:
         return
     statistics = document["statistics"]
     wide = max(len(name) for name in (*document["parameters"], "parameter"))
-    click.echo(f"  {'parameter':<{wide}} {'value':>14} {'sigma':>9} {'t':>8} {'p':>7}  total correlation")
+    say(f"  {'parameter':<{wide}} {'value':>14} {'sigma':>9} {'t':>8} {'p':>7}  total correlation")
     for name, parameter in document["parameters"].items():
         t, p, total = (statistics[key][name] for key in ("t", "p", "total_correlation"))
         chance = "-" if p is None else ("< 0.001" if p < 0.001 else f"{p:.3f}")
         numbers = f"{parameter['value']:>+14.6g} {parameter['sigma']:>9.2g} {'-' if t is None else f'{t:.1f}':>8}"
         weak = "  not justified" if name in statistics["not_justified"] else ""
-        click.echo(f"  {name:<{wide}} {numbers} {chance:>7}  {'-' if total is None else f'{total:.3f}':>17}{weak}")
+        say(f"  {name:<{wide}} {numbers} {chance:>7}  {'-' if total is None else f'{total:.3f}':>17}{weak}")
     if statistics["not_justified"]:
-        click.echo(f"  not justified: p above {statistics['significance']:g}; --prune takes such parameters out")
+        say(f"  not justified: p above {statistics['significance']:g}; --prune takes such parameters out")
 
 
 def view_text(view: Mapping[str, Any] | None) -> str:
@@ -179,15 +178,15 @@ def progress(*, lines: bool = False) -> Iterator[Progress | None]:
 
 
 def _print_stage(stage: str, share: float) -> None:
-    click.echo(f"{share:4.0%}  {stage}", err=True)
+    say(f"{share:4.0%}  {stage}", err=True)
 
 
 def print_models(models: list[dict[str, Any]]) -> None:
     """Print the model families, one a line."""
-    click.echo(f"{'model':<13} {'parameters':>10} {'points':>7} {'ground':>7}  suits")
+    say(f"{'model':<13} {'parameters':>10} {'points':>7} {'ground':>7}  suits")
     for model in models:
         numbers = f"{model['parameters']:>10} {model['minimum_points']:>7} {str(model['dimensions']) + 'D':>7}"
-        click.echo(f"{model['name']:<13} {numbers}  {model['suits']}")
+        say(f"{model['name']:<13} {numbers}  {model['suits']}")
 
 
 def print_comparison(result: CompareResult, units: str) -> None:
@@ -196,10 +195,8 @@ def print_comparison(result: CompareResult, units: str) -> None:
     rows, points = document["rows"], document["points"]
     wide = max([len(row["model"]) for row in rows] + [5])
     axes = ("column", "row") if units == "px" else ("x", "y")
-    click.echo(
-        f"{counted(points['control'], 'control point')}, {counted(points['check'], 'check point')}; RMSE in {units}"
-    )
-    click.echo(
+    say(f"{counted(points['control'], 'control point')}, {counted(points['check'], 'check point')}; RMSE in {units}")
+    say(
         f"\n{'':<{wide}}  {'':>6} {'control (the fit)':^28}  {'check':^28}  {'left out':>8} {'condi-':>8}\n"
         f"{'model':<{wide}}  {'param.':>6} "
         + 2 * f"{'n':>4}{axes[0]:>8}{axes[1]:>8}{'total':>8}  "
@@ -209,9 +206,7 @@ def print_comparison(result: CompareResult, units: str) -> None:
     for row in rows:
         mark = "*" if row["model"] == document["recommendation"]["model"] else " "
         if row["error"]:
-            click.echo(
-                f"{row['model']:<{wide}}{mark} {row['parameters']:>6}    not fitted: {as_typed(str(row['error']))}"
-            )
+            say(f"{row['model']:<{wide}}{mark} {row['parameters']:>6}    not fitted: {as_typed(str(row['error']))}")
             continue
         rmse = row["rmse" if units == "px" else "rmse_m"]
         loo = _error(rmse["loo"]["total"] if rmse["loo"] else None)
@@ -221,18 +216,18 @@ def print_comparison(result: CompareResult, units: str) -> None:
         if row["warnings"]:
             notes += [text for text in row["warnings"] if text not in notes]
             line += "  " + ",".join(f"[{notes.index(text) + 1}]" for text in row["warnings"])
-        click.echo(line)
+        say(line)
     for number, text in enumerate(map(as_typed, notes), 1):
-        click.echo(f"\n[{number}] {text}" if number == 1 else f"[{number}] {text}")
+        say(f"\n[{number}] {text}" if number == 1 else f"[{number}] {text}")
     for point in document["left_out"]:
-        click.echo(f"\nleft out of all models: {point['id']} ({point['reason']})")
-    click.echo(
+        say(f"\nleft out of all models: {point['id']} ({point['reason']})")
+    say(
         f"\n* Recommended: {document['recommendation']['reason']}."
         if document["recommendation"]["model"]
         else f"\nNo recommendation: {document['recommendation']['reason']}."
     )
     for name, path in document["files"].items():
-        click.echo(f"  {name:<10} {path}")
+        say(f"  {name:<10} {path}")
     print_warnings(document["warnings"])
 
 

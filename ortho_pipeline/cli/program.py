@@ -13,6 +13,7 @@ from typing import Any
 
 import click
 
+from ortho_pipeline.cli.machine.terminal import PrintableLog, say
 from ortho_pipeline.cli.signals import ended_by_signals
 from ortho_pipeline.errors import InputError, OrthoError, Terminated, error_document
 
@@ -109,7 +110,7 @@ class _Commands(click.Group):
         except OrthoError as error:
             return self._fail(ctx, error, CORRECTABLE if isinstance(error, InputError) else FAILED)
         except KeyboardInterrupt:
-            click.echo("Interrupted.", err=True)
+            say("Interrupted.", err=True)
             return ctx.exit(INTERRUPTED)
         except ImportError as error:
             # Every command loads GDAL when it begins its work.
@@ -133,8 +134,8 @@ class _Commands(click.Group):
         if ctx.meta.get("debug"):
             import traceback
 
-            click.echo("".join(traceback.format_exception(error)), err=True)
-        click.echo(f"Error: {error}", err=True)
+            say("".join(traceback.format_exception(error)), err=True)
+        say(f"Error: {error}", err=True)
         if ctx.meta.get("json"):
             from ortho_pipeline.cli.printing import print_json
 
@@ -185,7 +186,7 @@ def main() -> None:
             cli(prog_name="ortho", obj=_begin)
         except KeyboardInterrupt:
             # Before a command has begun; later `_Commands` says so.
-            click.echo("Interrupted.", err=True)
+            say("Interrupted.", err=True)
             raise SystemExit(INTERRUPTED) from None
 
 
@@ -201,7 +202,9 @@ def _begin() -> None:
     # Before GDAL is loaded, which reads the environment; worker processes inherit it.
     ignore_working_folder()
     close_network()
-    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING, stream=sys.stderr)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(PrintableLog("%(levelname)s: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
 
 
 @click.group(

@@ -29,13 +29,16 @@ _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
 #: What opens a door and stands in an address itself: a name with a password, or what a query calls so.
 _NAMED = re.compile(r"(?<=://)[^/?#@]*@")
 _SIGNED = re.compile(
-    r"[?&;](?:x-(?:amz|goog|ms)-[\w-]*|awsaccesskeyid|googleaccessid|sig|signature|password|secret|(?:api|access|auth|"
-    r"subscription)?[_-]?key|(?:access|auth|sas|session|security|id)?[_-]?token|header\.[\w-]*|\w*userpwd)=",
+    r"[?&;#](?:x-(?:amz|goog|ms|auth)-?[\w-]*|awsaccesskeyid|googleaccessid|h?mac|sig|signature|pass(?:word|wd|phrase)|"
+    r"pwd|auth|authorization|bearer|jwt|assertion|code|otp|ticket|credentials?|(?:client)?[_-]?secret|"
+    r"(?:api|access|auth|subscription)?[_-]?key|(?:access|auth|sas|session|security|id|refresh)?[_-]?token|"
+    r"header\.[\w-]*|\w*userpwd)=",
     re.IGNORECASE,
 )
 #: The token of a page of answers opens none.
 _PAGE = re.compile(r"(?<=[?&])token=[^&]*", re.IGNORECASE)
 _SHOWN = 5
+_MOST_ENCODED = 5
 #: No more is read at once of a file in an archive or behind a URL: a zip of 1 kB may hold billions of zeros.
 MAX_READ = 5_000_000
 #: No delivery has more files in a folder; a store behind a URL may.
@@ -319,11 +322,11 @@ def require_network(address: str, allowed: bool, *, paged: bool = False) -> None
     InputError
         If it is not allowed, or the address, which is what would be read or written there, holds credentials.
     """
-    plain = unquote(address)
+    plain = _decoded(address)
     if _NAMED.search(plain) or _SIGNED.search(_PAGE.sub("", plain) if paged else plain):
         raise InputError(
             "an address with credentials in it (a password, a signature) is not read, for what is read is named in all "
-            "outputs", file=_NAMED.sub("", plain).partition("?")[0],
+            "outputs", file=re.split("[?#;&]", _NAMED.sub("", plain))[0],
             remedy="give it without them, as s3://, gs:// or az:// with the credentials in the environment",
         )  # fmt: skip
     if not allowed:
@@ -332,6 +335,15 @@ def require_network(address: str, allowed: bool, *, paged: bool = False) -> None
             remedy="allow them with `scene.allow_network`",
         )  # fmt: skip
     _open_network()
+
+
+def _decoded(address: str) -> str:
+    """Return an address without percent signs: what is encoded twice is decoded twice by some servers."""
+    for _ in range(_MOST_ENCODED):
+        address, before = unquote(address), address
+        if address == before:
+            break
+    return address
 
 
 def in_local_archive(name: str) -> bool:

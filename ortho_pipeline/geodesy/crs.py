@@ -82,8 +82,8 @@ def parse_crs(text: str | pyproj.CRS) -> pyproj.CRS:
     """
     if isinstance(text, pyproj.CRS):
         return text
-    refuse_files(text if isinstance(text, str) else json.dumps(text))
     try:
+        refuse_files(text if isinstance(text, str) else json.dumps(text))
         if isinstance(text, str) and not _STATED.match(text) and not _NAME.fullmatch(text):
             raise ValueError("neither a name nor a form of a coordinate system")
         return pyproj.CRS.from_user_input(text)

@@ -26,6 +26,8 @@ _LEADS = re.compile(
 )
 #: The rest of a value or name, up to what ends it.
 _VALUE = re.compile(_START + r"""([^=,@"'“”\[\]()]+)""")
+#: The longest WKT in PROJ's database has some 20,000 characters.
+_LONGEST = 100_000
 _REMEDY = "give EPSG:n, WKT or a PROJ string without files; a grid in PROJ's own folder is found by its name"
 
 
@@ -42,6 +44,8 @@ def refuse_files(text: str) -> None:
     CrsError
         If it names a path, an address, or what the working folder has and PROJ's folders have not.
     """
+    if len(text) > _LONGEST:
+        raise CrsError(f"a coordinate system of {len(text)} characters is not read", field="CRS", remedy=_REMEDY)
     if text.lstrip().startswith("{"):
         text = _unescaped(text)
     if any(match["path"] is not None for match in _LEADS.finditer(text)):

@@ -367,11 +367,11 @@ def _stac_collection(path: Path) -> Any:
 
 def _stac_heights(path: Path) -> Any:
     items, _ = Collection(path).under([(0.5, 0.5, 1.5, 0.6)])
-    systems = [_system(text) for item in items for text in item.heights().systems]
+    systems = [_name_of_system(text) for item in items for text in item.heights().systems]
     return [[(item.id, item.date, item.boxes, item.heights().name) for item in items], systems]
 
 
-def _system(text: str) -> str:
+def _name_of_system(text: str) -> str:
     try:
         return parse_crs(text).name
     except CrsError:
@@ -440,6 +440,7 @@ _WKT = 'PROJCS["a",GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,29
     'PARAMETER["central_meridian",33],PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],' \
     'PARAMETER["false_northing",0],UNIT["metre",1]]'  # fmt: skip
 _PO = "po_39001_metadata.txt"
+_GRIDS = "+proj=longlat +ellps=bessel +nadgrids=@missing.gsb,null +geoidgrids=egm96_15.gtx +vunits=m +type=crs"
 _UTM = "+proj=utm +zone=36 +datum=WGS84 +units=m +no_defs"
 _ORB = f"{seeds.ORBVIEW3}.pvl"
 
@@ -504,6 +505,7 @@ READERS = (
     Reader("acquired", "text", "time.txt", _text("2005-08-03T08:12:31Z"), _time, of_files=False),
     Reader("crs-wkt", "text", "crs.txt", _text(_WKT), _system, of_files=False),
     Reader("crs-proj", "text", "crs.txt", _text(_UTM), _system, of_files=False),
+    Reader("crs-grids", "text", "crs.txt", _text(_GRIDS), _system, of_files=False),
     Reader("dem", "tiff", "dem.tif", _tiff(seeds.dem), _dem),
     Reader("reference", "tiff", "ortho.tif", _tiff(seeds.dem), _reference),
     Reader("image", "tiff", "one.tif", _tiff(seeds.image), _image),

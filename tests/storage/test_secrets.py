@@ -36,6 +36,11 @@ def public(tiny: Any) -> Iterator[PublicFolder]:
         "http://{1}?Key-Pair-Id=a&Signature={0}", "http://{1}?api_key={0}", "http://{1}?token={0}",
         "/vsicurl/http://{1}?x-goog-signature={0}", "/vsicurl?header.Authorization={0}&url=http://{1}",
         "/vsicurl?url=http%3A%2F%2Fuser%3A{0}%40{1}", "http://{1}?X%2DAmz%2DSignature={0}",
+        *(f"http://{{1}}?{name}={{0}}" for name in (
+            "jwt", "auth", "pwd", "code", "credential", "Credentials", "hmac", "ticket", "authorization", "passwd",
+            "client_secret", "X-Auth", "bearer", "assertion", "otp")),
+        "http://{1}#token={0}", "http://{1}#access_token={0}&x=1", "http://{1}?si%2567={0}", "http://{1}?%25%37%33ig={0}",
+        "http://{1}?a=1&amp;sig={0}", "http://{1}?a=b%26sig%3D{0}",
     ],
 )  # fmt: skip
 def test_addresses_with_credentials_are_refused_without_naming_them(form: str, public: PublicFolder) -> None:
@@ -48,7 +53,17 @@ def test_addresses_with_credentials_are_refused_without_naming_them(form: str, p
     assert not public.asked
 
 
-@pytest.mark.parametrize("address", ["http://h/a.tif?k=v", "http://h/a.tif?monkey=1", "s3://box/a@b.tif"])
+@pytest.mark.parametrize(
+    "address",
+    [
+        "http://h/a.tif?k=v",
+        "http://h/a.tif?monkey=1",
+        "http://h/a.tif?zipcode=3",
+        "http://h/i.json#image",
+        "http://h/a%25.tif",
+        "s3://box/a@b.tif",
+    ],
+)
 def test_addresses_without_credentials_are_read(address: str) -> None:
     located(address, allow_network=True)
 

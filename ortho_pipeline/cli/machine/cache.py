@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from ortho_pipeline.cli.machine.terminal import say
 from ortho_pipeline.cli.options import json_option
 from ortho_pipeline.cli.parsing import Group
 from ortho_pipeline.cli.printing import print_json
@@ -50,9 +51,7 @@ def clear(as_json: bool) -> None:
     document = commands.forget_kept_files()
     if as_json:
         return print_json(document)
-    click.echo(
-        f"Removed {counted(document['files'], 'file')} of {document['bytes'] / 1e6:.1f} MB from {document['folder']}"
-    )
+    say(f"Removed {counted(document['files'], 'file')} of {document['bytes'] / 1e6:.1f} MB from {document['folder']}")
     return None
 
 
@@ -60,7 +59,7 @@ def _print(document: dict[str, Any], as_json: bool) -> None:
     if as_json:
         return print_json(document)
     for one in document["files"]:
-        click.echo(f"{one.get('state', ''):<8} {one['bytes'] / 1e6:9.1f} MB  {one['address']}".lstrip())
+        say(f"{one.get('state', ''):<8} {one['bytes'] / 1e6:9.1f} MB  {one['address']}".lstrip())
     total = sum(one["bytes"] for one in document["files"])
-    click.echo(f"{counted(len(document['files']), 'file')}, {total / 1e6:.1f} MB, in {document['folder']}")
+    say(f"{counted(len(document['files']), 'file')}, {total / 1e6:.1f} MB, in {document['folder']}")
     return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from ortho_pipeline.cli.machine.terminal import say
 from ortho_pipeline.cli.options import json_option
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_json
@@ -20,17 +21,17 @@ def doctor(fetch_grids: bool, as_json: bool) -> None:
     if as_json:
         return print_json(document)
     gdal, proj = document["gdal"], document["proj"]
-    click.echo("Packages   " + ", ".join(f"{name} {version}" for name, version in document["packages"].items()))
-    click.echo(f"GDAL       {gdal['version']} (bindings {gdal['bindings']}), reads {', '.join(gdal['drivers'])}")
+    say("Packages   " + ", ".join(f"{name} {version}" for name, version in document["packages"].items()))
+    say(f"GDAL       {gdal['version']} (bindings {gdal['bindings']}), reads {', '.join(gdal['drivers'])}")
     if gdal["missing_drivers"]:
-        click.echo(f"{'':<10} built without {', '.join(gdal['missing_drivers'])}")
-    click.echo(f"PROJ       {proj['proj']}, looks in {', '.join(proj['search_path'])}")
+        say(f"{'':<10} built without {', '.join(gdal['missing_drivers'])}")
+    say(f"PROJ       {proj['proj']}, looks in {', '.join(proj['search_path'])}")
     for grid in document["grids"]:
-        click.echo(f"{grid['datum']:<10} " + (f"{grid['path']}" if grid["found"] else f"missing: {grid.get('remedy')}"))
+        say(f"{grid['datum']:<10} " + (f"{grid['path']}" if grid["found"] else f"missing: {grid.get('remedy')}"))
     for fetched in document["fetched"]:
-        click.echo(f"fetched    {fetched['grid']} to {fetched['path']}")
+        say(f"fetched    {fetched['grid']} to {fetched['path']}")
     for plugin in document["plugins"]:
-        click.echo(f"plugin     {plugin['plugin']} ({plugin['distribution']} {plugin['version']})")
+        say(f"plugin     {plugin['plugin']} ({plugin['distribution']} {plugin['version']})")
     for broken in document["broken"]:
-        click.echo(f"broken     {broken['plugin']}: {broken['error']}")
+        say(f"broken     {broken['plugin']}: {broken['error']}")
     return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from ortho_pipeline.cli.machine.terminal import say
 from ortho_pipeline.cli.options import json_option
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_json, print_models
@@ -19,11 +20,11 @@ def sensors(as_json: bool) -> None:
     if as_json:
         return print_json(document)
     for sensor in document["sensors"]:
-        click.echo(f"{sensor['name']:<14} {sensor['description']}   [{sensor['distribution']} {sensor['version']}]")
+        say(f"{sensor['name']:<14} {sensor['description']}   [{sensor['distribution']} {sensor['version']}]")
         for option, text in sensor["options"].items():
-            click.echo(f"{'':<14}   {option}: {text}")
+            say(f"{'':<14}   {option}: {text}")
     for broken in document["broken"]:
-        click.echo(f"left out: {broken['plugin']} ({broken['error']})", err=True)
+        say(f"left out: {broken['plugin']} ({broken['error']})", err=True)
     return None
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from ortho_pipeline.cli.machine.terminal import say
 from ortho_pipeline.cli.options import (
     dry_run_option,
     folder_option,
@@ -61,7 +62,7 @@ def rectify(
 
     if dry_run:
         checked = commands.check(image, scene=scene, points=points, surface=surface, match=match, output=output)
-        return print_json(checked) if as_json else click.echo(checked_text(Path(image).name, checked))
+        return print_json(checked) if as_json else say(checked_text(Path(image).name, checked))
     with progress() as advance:
         result = commands.rectify(
             image,

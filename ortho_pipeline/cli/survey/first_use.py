@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ortho_pipeline.cli.flags import FLAGS
+from ortho_pipeline.cli.machine.terminal import say
 from ortho_pipeline.cli.options import json_option, scene_options
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_json, print_result, print_warnings, view_text
@@ -37,10 +38,10 @@ STEPS = (
 def print_steps() -> None:
     """Print the five things that one does."""
     wide = max(len(what) for what, _ in STEPS)
-    click.echo("Orthorectify satellite scenes, and say honestly how good the result is.\n")
+    say("Orthorectify satellite scenes, and say honestly how good the result is.\n")
     for what, line in STEPS:
-        click.echo(f"  {what:<{wide}}   {line}")
-    click.echo(
+        say(f"  {what:<{wide}}   {line}")
+    say(
         "\n'ortho --help' lists all commands, 'ortho COMMAND --help' says all of one, 'ortho doctor' what is installed."
     )
 
@@ -83,7 +84,7 @@ def info(image: str, scene: SceneOptions, as_json: bool) -> None:
         **{name: str(value) for name, value in document["facts"].items()},
     }  # fmt: skip
     for name, value in lines.items():
-        click.echo(f"{name:<10} {value}")
+        say(f"{name:<10} {value}")
     print_warnings(document["warnings"])
     return None
 
@@ -103,7 +104,7 @@ def _print_map_raster(document: Mapping[str, Any]) -> None:
         "Use it as": f"{option} {document['image']}" + (" --dem-vertical DATUM" * (dem and not document["vertical"])),
     }  # fmt: skip
     for name, value in lines.items():
-        click.echo(f"{name:<10} {value}")
+        say(f"{name:<10} {value}")
 
 
 def _heights_text(document: Mapping[str, Any]) -> str:
@@ -119,10 +120,10 @@ def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:
         return print_json({**seen.to_json(), "next": next_steps(seen)})
     wide = max([0, *(len(one.path) for one in seen.found)])
     for one in seen.found:
-        click.echo(f"{one.kind:<10} {one.path:<{wide}}   {one.said}")
-    click.echo("\nNext:" if seen.found else "Next:")
+        say(f"{one.kind:<10} {one.path:<{wide}}   {one.said}")
+    say("\nNext:" if seen.found else "Next:")
     for line in next_steps(seen):
-        click.echo(f"  {line}")
+        say(f"  {line}")
     return None
 
 

@@ -1,0 +1,53 @@
+"""What data hold reaches the terminal as printable text of a bounded length."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from ortho_pipeline.cli.machine.terminal import LONGEST, printable
+from ortho_pipeline.cli.program import cli
+
+ESCAPES = "\x1b]0;title\x07\x1b[2J\x9b31m\u202e\r"
+
+
+@pytest.mark.parametrize(
+    "text", ["\x1b[31m", "a\rb", "\x07", "\x9b2J", "\x7f", "\u202eabc", "\ud800", "\u2028", "\x00"]
+)
+def test_control_characters_are_shown_as_escapes(text: str) -> None:
+    shown = printable(text)
+    assert all(one.isprintable() for one in shown)
+    shown.encode()
+
+
+def test_text_of_people_is_shown_as_it_is() -> None:
+    for text in (
+        "a\nb\tc",
+        "größe 28.2 m ± 3 °",
+        "場所",
+        "Remedy: x\n  y",
+        "'quoted' \\ `surface.dem`",
+        "scene \U0001f6f0",
+    ):
+        assert printable(text) == text
+
+
+def test_long_text_is_cut_and_says_so() -> None:
+    shown = printable("x" * 40_000)
+    assert len(shown) < LONGEST + 100
+    assert "40000" in shown
+
+
+@pytest.mark.parametrize("json", [False, True])
+def test_a_message_about_data_has_no_control_characters_and_an_end(json: bool, tmp_path: Path) -> None:
+    table = tmp_path / f"p{ESCAPES[1:8]}\x1b[2J.csv"
+    table.write_text(f"id,col,row,{ESCAPES.strip()},{'y' * 40_000},h\n" + "a,1,2,10,50,0\n", encoding="utf-8")
+    image = Path(__file__).resolve().parents[2] / "sample_data" / "scene.tif"
+    typed = ["fit", str(image), "--gcps", str(table), *(["--json"] if json else [])]
+    done = CliRunner().invoke(cli, typed)
+    assert done.exit_code == 2
+    for shown in (done.stderr, done.stdout):
+        assert not set(shown) & set("\x1b\x07\x9b\u202e\r\x00")
+    assert len(done.stderr) < 10_000
