@@ -13,12 +13,13 @@ import functools
 import itertools
 import os
 import resource
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from ortho_pipeline.errors import OrthoError
 
@@ -205,7 +206,7 @@ class _Blas:
     """How many are computing with one thread, and what they took from the others."""
 
     lock, users = threading.Lock(), 0
-    limit: Any = None
+    limits: ClassVar[dict[bool, Any]] = {}
 
 
 @contextmanager
@@ -216,8 +217,10 @@ def one_blas_thread() -> Iterator[None]:
     of a few hundred rows their threads wait for each other more than they save.
     """
     with _Blas.lock:
-        if not _Blas.users:
-            _Blas.limit = _blas_libraries().limit(limits=1, user_api="blas")
+        # SciPy's own library may have been loaded since the first asked; to load it here would cost each job its time.
+        loaded = "scipy.linalg" in sys.modules
+        if not _Blas.users or loaded not in _Blas.limits:
+            _Blas.limits[loaded] = _blas_libraries(loaded).limit(limits=1, user_api="blas")
         _Blas.users += 1
     try:
         yield
@@ -225,13 +228,13 @@ def one_blas_thread() -> Iterator[None]:
         with _Blas.lock:
             _Blas.users -= 1
             if not _Blas.users:
-                _Blas.limit.restore_original_limits()
+                for loaded in reversed(list(_Blas.limits)):
+                    _Blas.limits.pop(loaded).restore_original_limits()
 
 
 @functools.cache
-def _blas_libraries() -> Any:
-    """Return the libraries of NumPy and SciPy, which have one each."""
-    import scipy.linalg.lapack  # noqa: F401  (loads its library)
+def _blas_libraries(scipy: bool) -> Any:
+    """Return the libraries of BLAS that are loaded: NumPy's, and with `scipy` that of SciPy too."""
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
