@@ -26,7 +26,7 @@ _LEADS = re.compile(
 )
 #: The rest of a value or name, up to what ends it.
 _VALUE = re.compile(_START + r"""([^=,@"'“”\[\]()]+)""")
-#: The longest WKT in PROJ's database has some 20,000 characters.
+#: Of every eighth system in the databases of EPSG and Esri the longest text has 7,000 characters.
 _LONGEST = 100_000
 _REMEDY = "give EPSG:n, WKT or a PROJ string without files; a grid in PROJ's own folder is found by its name"
 
