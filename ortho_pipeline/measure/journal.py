@@ -20,6 +20,8 @@ from ortho_pipeline.files import allowed, parse_json, sync_folder
 
 #: Beyond this many bytes it is no journal of hands.
 MAX_BYTES = 256_000_000
+#: What is appended to the name of a journal for what follows an impossible action.
+REST = ".rest"
 _REMEDY = "move it away to begin anew, or restore it from a copy"
 
 
@@ -103,6 +105,28 @@ class Journal:
         new = _lines(data, self.path)[1][len(self.actions) :]
         self.actions += new
         return new
+
+    def set_aside(self, count: int) -> None:
+        """Keep so many actions; what follows them is moved to the end of a file beside the journal.
+
+        A journal that another process writes stays as it is.
+        """
+        kept, rest = (b"".join(map(_line, part)) for part in (self.actions[:count], self.actions[count:]))
+        self.actions = self.actions[:count]
+        if self.read_only:
+            return
+        path = self.path.with_name(self.path.name + REST)
+        try:
+            aside = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+            with os.fdopen(aside, "wb") as file:
+                file.write(rest)
+                file.flush()
+                os.fsync(file.fileno())
+            sync_folder(path.parent)
+            os.ftruncate(self._file, len(kept))
+            os.fsync(self._file)
+        except OSError as error:
+            raise _unwritable(path, error) from error
 
     def close(self) -> None:
         """Let go of the file and of its lock."""

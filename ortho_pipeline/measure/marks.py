@@ -26,6 +26,8 @@ from ortho_pipeline.points.rows import is_writable, plain_id
 GROUND_CRS = "EPSG:4979"
 #: More marks than this are no work of hands, and longer words no names.
 MOST_MARKS, LONGEST_ID, LONGEST_NOTE = 20_000, 64, 500
+#: Standard deviations of an image (px) are within these, and groups have numbers below this.
+_SIGMAS, _GROUPS = (1e-6, 1e6), 1 << 31
 
 
 @record
@@ -145,19 +147,20 @@ def checked(mark: Mark) -> Mark:
         if not 0 <= getattr(mark, key) <= 1e6:
             raise InputError("a standard deviation is not negative", field=key,
                              remedy="give 0 or more")  # fmt: skip
-    if mark.group is not None and mark.group < 0:
-        raise InputError("groups are numbered from 0 on", field="group")
+    if mark.group is not None and not 0 <= mark.group < _GROUPS:
+        raise InputError("this is no number of a group", field="group", remedy=f"give 0 to {_GROUPS - 1}")
     return mark
 
 
 def _check_measurement(one: Mark | Ray, where: str) -> None:
     if one.image is not None and max(map(abs, one.image)) > 1e8:
         raise InputError("this is no place in an image", field=f"{where}image")
-    if one.sigma_image is not None and not 1e-6 <= one.sigma_image <= 1e6:
+    least, most = _SIGMAS
+    if one.sigma_image is not None and not least <= one.sigma_image <= most:
         raise InputError("a standard deviation is positive", field=f"{where}sigma_image", remedy="give pixels")
     if one.covariance is not None:
         column, row, both = one.covariance
-        if not (column > 0 and row > 0 and both**2 < column * row * (1 - 1e-9)):
+        if not (least**2 <= min(column, row) and max(column, row) <= most**2 and both**2 < column * row * (1 - 1e-9)):
             raise InputError("this is no covariance", field=f"{where}covariance")
 
 
@@ -290,6 +293,7 @@ class History:
             If it cannot be done.
         """
         if action.get("do") in ("undo", "redo"):
+            _require_members(action, set())
             if not (self.can_undo if action["do"] == "undo" else self.can_redo):
                 raise InputError(f"there is nothing to {action['do']}", field="do")
             return -1 if action["do"] == "undo" else 1
@@ -307,8 +311,9 @@ class History:
 def _changed(marks: Marks, action: Mapping[str, Any]) -> Marks:
     kind = action.get("do")
     members = {"begin": {"marks"}, "put": {"mark", "was"}, "remove": {"id"}, "correct": {"correction"}}
-    if kind not in members or not set(action) <= members[kind] | {"do"}:
+    if not isinstance(kind, str) or kind not in members:
         raise InputError("this is no action", field="do", remedy=f"one of {', '.join(members)}, undo, redo")
+    _require_members(action, members[kind])
     if kind == "begin":
         if marks.by_id or not isinstance(action.get("marks"), list):
             raise InputError("only an empty table is begun with marks", field="marks")
@@ -324,6 +329,12 @@ def _changed(marks: Marks, action: Mapping[str, Any]) -> Marks:
     if chosen is not None and chosen not in CORRECTIONS:
         raise InputError("there is no such correction", field="correction", remedy=f"one of {', '.join(CORRECTIONS)}")
     return replace(marks, correction=chosen)
+
+
+def _require_members(action: Mapping[str, Any], members: set[str]) -> None:
+    if not set(action) <= members | {"do"}:
+        raise InputError("this action has members that it cannot have", field="action",
+                         remedy=f"leave out all but {', '.join(sorted(members | {'do'}))}")  # fmt: skip
 
 
 def _begun(marks: Sequence[Mark]) -> Marks:

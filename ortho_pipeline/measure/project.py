@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import abc
+import copy
 import datetime
 import os
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,12 +48,21 @@ class Project(abc.ABC):
         The images.
     sheets : sequence of Sheet
         The references as maps.
+
+    Attributes
+    ----------
+    stopped : str
+        Which action of the journal was impossible, if one was: the points are those before it.
     """
+
+    _solution: Any
+    rendered: list[Any]
 
     def __init__(self, output: Path, surface: Surface, views: Sequence[View], sheets: Sequence[Sheet]) -> None:
         self.output, self.surface, self.views, self.sheets = output, surface, tuple(views), tuple(sheets)
         self._lock = threading.RLock()
         self._saved = -1
+        self.stopped = ""
         self.journal = Journal(output.with_name(output.name + JOURNAL))
         self._history, self._written = History(), Written()
 
@@ -69,6 +79,15 @@ class Project(abc.ABC):
     @abc.abstractmethod
     def _given(self) -> list[Mark] | None:
         """Return the points that it begins with; None if none were given."""
+
+    @abc.abstractmethod
+    def _require_possible(self, marks: Iterable[Mark], correction: str | None) -> None:
+        """Refuse marks, and a correction, that images such as these cannot have.
+
+        Raises
+        ------
+        InputError
+        """
 
     @abc.abstractmethod
     def _solve(self) -> None:
@@ -117,12 +136,34 @@ class Project(abc.ABC):
                     "there is a journal of these points, which began with others", file=self.journal.path,
                     field="points.gcps", remedy="leave out `points.gcps` to go on, or choose another output",
                 )  # fmt: skip
-            for action in self.journal.actions:
-                self._history.take(self._history.after(_plain(action)))
+            count = self._take(self.journal.actions)
+            if self.stopped:
+                self.journal.set_aside(count)
         except BaseException:
             self.journal.close()
             raise
         self._solve()
+
+    def _take(self, actions: Sequence[Mapping[str, Any]]) -> int:
+        """Do actions of the journal up to one that is impossible; return how many were done."""
+        for number, action in enumerate(actions):
+            try:
+                self._history.take(self._step(_plain(action)))
+            except InputError as error:
+                if action.get("do") == "begin":
+                    raise
+                line = len(self.journal.actions) - len(actions) + number + 1
+                self.stopped = f"action {line} of the journal is impossible ({error.message})"
+                return number
+        return len(actions)
+
+    def _step(self, action: Mapping[str, Any]) -> Marks | int:
+        """Return what an action leads to, as `History.after`, if images such as these can have it."""
+        step, known = self._history.after(action), self.marks.by_id
+        if isinstance(step, Marks):
+            changed = (mark for name, mark in step.by_id.items() if known.get(name) is not mark)
+            self._require_possible(changed, step.correction)
+        return step
 
     def _first(self) -> dict[str, Any]:
         """Return the action that a journal begins with."""
@@ -163,11 +204,19 @@ class Project(abc.ABC):
             done = (
                 {**action, "mark": {**action["mark"], "at": now()}} if isinstance(action.get("mark"), dict) else action
             )
-            step = self._history.after(done)
-            self.journal.append({**done, "at": now()})
-            self._history.take(step)
-            self._solve()
-            return self.state()
+            step = self._step(done)
+            before = self._history, self._solution, self.rendered
+            self._history = copy.copy(self._history)
+            try:
+                # What is in the journal has to open again: it was solved, and all that is shown of it was made.
+                self._history.take(step)
+                self._solve()
+                shown = self._shown()
+                self.journal.append({**done, "at": now()})
+            except BaseException:
+                self._history, self._solution, self.rendered = before
+                raise
+            return {**shown, "actions": len(self.journal.actions)}
 
     @property
     def marks(self) -> Marks:
@@ -197,34 +246,36 @@ class Project(abc.ABC):
 
     def _follow(self) -> None:
         """Do what another process has done since, if that one writes."""
-        new = self.journal.more()
-        for action in new:
-            self._history.take(self._history.after(_plain(action)))
+        new = [] if self.stopped else self.journal.more()
         if new:
+            self._take(new)
             self._solve()
 
     def state(self) -> dict[str, Any]:
         """Return all that changes with the points, as JSON values."""
         with self._lock:
             self._follow()
-            marks, history, version = list(self.marks.by_id.values()), self._history, self.version
-            shown, ahead = self._places(version, self._grounds(marks)), self._ahead()
-            there = np.full((len(ahead), 3), np.nan)
-            for number in {one.number for one in ahead}:
-                rows = [k for k, one in enumerate(ahead) if one.number == number]
-                there[rows] = self.places_of(number).ground_about(
-                    [ahead[k].image for k in rows], [ahead[k].height for k in rows]
-                )
-            told = [self._written.of(mark) for mark in marks]
-            return {
-                "marks": [{**mark, "places": places} for mark, places in zip(told, shown, strict=True)],
-                "version": version, "undo": history.can_undo, "redo": history.can_redo,
-                "actions": len(self.journal.actions), **self._figures(),
-                "next": [
-                    {**json_value(one), "places": places}
-                    for one, places in zip(ahead, self._places(version, there), strict=True)
-                ],
-            }  # fmt: skip
+            return {**self._shown(), "actions": len(self.journal.actions)}
+
+    def _shown(self) -> dict[str, Any]:
+        """Return what `state` does, but for the number of actions."""
+        marks, history, version = list(self.marks.by_id.values()), self._history, self.version
+        shown, ahead = self._places(version, self._grounds(marks)), self._ahead()
+        there = np.full((len(ahead), 3), np.nan)
+        for number in {one.number for one in ahead}:
+            rows = [k for k, one in enumerate(ahead) if one.number == number]
+            there[rows] = self.places_of(number).ground_about(
+                [ahead[k].image for k in rows], [ahead[k].height for k in rows]
+            )
+        told = [self._written.of(mark) for mark in marks]
+        return {
+            "marks": [{**mark, "places": places} for mark, places in zip(told, shown, strict=True)],
+            "version": version, "undo": history.can_undo, "redo": history.can_redo, **self._figures(),
+            "next": [
+                {**json_value(one), "places": places}
+                for one, places in zip(ahead, self._places(version, there), strict=True)
+            ],
+        }  # fmt: skip
 
     # -- places ------------------------------------------------------------------------------------------------------
 

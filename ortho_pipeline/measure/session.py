@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,6 +59,9 @@ class Session(Project):
         The heights, as `ortho` opens them.
     """
 
+    _solution: Solution
+    rendered: list[SensorModel]
+
     def __init__(
         self, scene: Scene, places: Places, output: Path, options: PointOptions,
         opened: SceneOptions = SceneOptions(), match: MatchOptions = MatchOptions(),
@@ -70,7 +73,7 @@ class Session(Project):
         self._options, self._opened, self._surface = options, opened, surface
         self.search = search_of(scene, match, metres_per_pixel(places.view))
         self.grid = Grid.over(places)
-        self.rendered: list[SensorModel] = [places.model]
+        self.rendered = [places.model]
         self._solution = Solution(scene.model, None)
         self._begin()
 
@@ -96,13 +99,19 @@ class Session(Project):
     def _document(self) -> dict[str, Any]:
         return self.marks.document(self._called)
 
+    def _require_possible(self, marks: Iterable[Mark], correction: str | None) -> None:
+        for mark in marks:
+            if mark.rays or mark.role == "tie":
+                raise InputError("there is one image, and this is a point of several", field="rays",
+                                 remedy="load the page anew")  # fmt: skip
+
     def _solve(self) -> None:
         marks = self._history.marks
         self._solution = solve(
             self.scene, marks.points(self._called), self._options, self._opened, self.places.surface, marks.correction
         )  # fmt: skip
         if moved(self.rendered[-1], self._solution.model, self.grid.everywhere):
-            self.rendered.append(self._solution.model)
+            self.rendered = [*self.rendered, self._solution.model]
 
     @property
     def _called(self) -> str:

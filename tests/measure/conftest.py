@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,10 @@ from osgeo import gdal, osr
 from ortho_pipeline.exchange.rpc import write_rpc_txt
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.measure.block.session import open_block_session
+from ortho_pipeline.measure.project import Project
+from ortho_pipeline.measure.session import open_session
+from ortho_pipeline.options import MatchOptions, SurfaceOptions
 from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.simulation.terrain import Landscape, Terrain
 
@@ -166,3 +172,25 @@ def write_second(
         replace(rpc, col_off=rpc.col_off - column, row_off=rpc.row_off - row), path.with_name(f"{path.stem}_RPC.TXT")
     )
     return Stereo(path, second)
+
+
+def opened_projects(
+    folder: Path, reference: Path | None = None, second: Path | None = None
+) -> list[Callable[[], Project]]:
+    """Return what opens, and opens again, a project of one image and one of two."""
+    truth = truth_of_sample()
+    if reference is None or second is None:
+        reference, second = folder / "reference.tif", folder / "second.tif"
+        write_reference(truth, reference, FEATURES)
+        write_second(truth, second, FEATURES)
+    given = {"surface": SurfaceOptions(dem=SAMPLE / "dem.tif"), "match": MatchOptions(reference=(str(reference),))}
+    scene = SAMPLE / "scene.tif"
+    return [
+        partial(open_session, scene, folder / "one.geojson", **given),
+        partial(open_block_session, [scene, second], folder / "two.geojson", **given),
+    ]
+
+
+@pytest.fixture
+def projects(reference: Path, stereo: Stereo, tmp_path: Path) -> list[Callable[[], Project]]:
+    return opened_projects(tmp_path, reference, stereo.path)

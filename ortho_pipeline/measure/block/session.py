@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -71,6 +71,9 @@ class BlockSession(Project):
         What is adjusted, as for `ortho adjust`; `points` is what it begins with.
     """
 
+    _solution: BlockSolution
+    rendered: list[tuple[SensorModel, ...]]
+
     def __init__(
         self, images: BlockImages, references: tuple[Reference, ...], output: Path, options: BlockOptions,
         opened: Sequence[SceneOptions] = (), match: MatchOptions = MatchOptions(),
@@ -91,7 +94,7 @@ class BlockSession(Project):
         self._sigma_height = usual if stated is None else stated
         self.grid = BlockGrid.over(images.places, references)
         self._everywhere = [self._spread(one) for one in images.places]
-        self.rendered: list[tuple[SensorModel, ...]] = [tuple(one.model for one in images.places)]
+        self.rendered = [tuple(one.model for one in images.places)]
         self._solution = BlockSolution(dict(zip(images.labels, self.rendered[0], strict=True)))
         self._begin()
 
@@ -144,15 +147,11 @@ class BlockSession(Project):
             }
         return self._starts[correction]
 
-    def act(self, action: Mapping[str, Any]) -> dict[str, Any]:
-        mark = action.get("mark")
-        rays = mark.get("rays") if isinstance(mark, dict) else None
-        strangers = sorted(set(rays) - set(self.images.labels)) if isinstance(rays, dict) else []
-        if strangers or (isinstance(mark, dict) and mark.get("image") is not None):
-            raise InputError("there is no such image", field="rays", remedy="load the page anew")
-        if action.get("do") == "correct":
-            self.starts(action.get("correction") if isinstance(action.get("correction"), str) else None)
-        return super().act(action)
+    def _require_possible(self, marks: Iterable[Mark], correction: str | None) -> None:
+        for mark in marks:
+            if mark.image is not None or not set(mark.rays) <= set(self.images.labels):
+                raise InputError("there is no such image", field="rays", remedy="load the page anew")
+        self.starts(correction)
 
     def _solve(self) -> None:
         table = block_points(self.marks, self.images.labels, self._called)
@@ -163,7 +162,7 @@ class BlockSession(Project):
             self._solution = replace(self._solution, models=delivered)
         models = tuple(self._solution.models[label] for label in self.images.labels)
         if any(moved(*three) for three in zip(self.rendered[-1], models, self._everywhere, strict=True)):
-            self.rendered.append(models)
+            self.rendered = [*self.rendered, models]
 
     @property
     def solution(self) -> BlockSolution:

@@ -532,6 +532,7 @@ function bandChoices(pane) {
 
 function banner() {
   const text = facts.locked ? 'Read only: another process measures these points. This one shows what that one does.'
+    : facts.stopped ? `Warning: ${facts.stopped}. The points are those before it; the rest was kept in a file beside the journal.`
     : facts.writes ? (facts.healed ? 'The last action had not been written as a whole, and was left out.' : '') : 'Read only: another window measures these points.';
   $('banner-text').textContent = text;
   $('banner').hidden = !text;

@@ -19,6 +19,8 @@ Headers = dict[bytes, list[bytes]]
 
 #: A request has no longer body than this (bytes).
 MAX_BODY = 64_000
+#: Nor a longer path or query (bytes).
+MAX_ADDRESS = 1_000
 #: Nothing but what this server gives is loaded, run or asked; no other page shows this one.
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
@@ -90,6 +92,8 @@ class Guard:
         # Another port of this machine is of the same site, and of another origin.
         if scope["method"] != "GET" and headers.get(b"sec-fetch-site", [b"none"])[0] not in (b"same-origin", b"none"):
             return 403
+        if max(len(scope["path"]), len(scope["query_string"])) > MAX_ADDRESS:
+            return 414
         return 0 if scope["path"].startswith(f"/{self._entry.folder}/") else 404
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import math
 import os
 import socket
@@ -98,7 +99,7 @@ class _Answers:
             "labels": list(session.images.labels) if isinstance(session, BlockSession) else None,
             "output": os.path.basename(session.output), "tile": SIDE, "bands": self._tiles.bands,
             "corrections": list(CORRECTIONS), "writes": writes, "locked": session.journal.read_only,
-            "healed": session.journal.healed, "state": session.state(),
+            "healed": session.journal.healed, "stopped": session.stopped, "state": session.state(),
         }  # fmt: skip
 
     def leave(self, given: dict[str, Any]) -> dict[str, Any]:
@@ -275,9 +276,7 @@ class _Given:
         if work is None:
             return Response("refused\n", 404)
         try:
-            given = parse_json(await request.body() or b"{}", "request", _REMEDY)
-            if not isinstance(given, dict):
-                raise InputError("a request is a JSON object", remedy=_REMEDY)
+            given = _asked(await request.body())
             done = await self._run(work, given)
         except OrthoError as error:
             return JSONResponse(_told(error), 409 if error.field == "window" else 400)
@@ -328,10 +327,25 @@ def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], 
 # -- what requests say -----------------------------------------------------------------------------------------------
 
 
+def _asked(body: bytes) -> dict[str, Any]:
+    given = parse_json(body or b"{}", "request", _REMEDY)
+    if not isinstance(given, dict):
+        raise InputError("a request is a JSON object", remedy=_REMEDY)
+    try:
+        json.dumps(given, ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        # JSON can name halves of a character. They are in no file and in no answer.
+        raise InputError("a text of this request is not Unicode", field="request", remedy=_REMEDY) from error
+    return given
+
+
 def _tile(request: Request) -> tuple[Any, ...]:
     given = request.path_params
     query = request.query_params
-    bands = _bands([int(text) if text.isascii() and text.isdigit() else -1 for text in query.get("b", "0").split(",")])
+    numbered = [text.isascii() and text.isdigit() and len(text) < 10 for text in query.get("b", "0").split(",")]
+    if not all(numbered):
+        raise InputError("there is no such band", field="bands")
+    bands = _bands([int(text) for text in query.get("b", "0").split(",")])
     values = query.get("l", "").split(",")
     if len(values) != 2 * len(bands):
         raise InputError("there is no such tile", field="tile")

@@ -94,6 +94,7 @@ interface Facts {
   writes: boolean;
   locked: boolean;
   healed: boolean;
+  stopped: string;
   state: State;
 }
 
