@@ -26,6 +26,7 @@ import pydantic
 from ortho_pipeline import files
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.folders import listing
+from ortho_pipeline.report.wording import refuted
 
 SCHEMA_VERSION = 1
 DOCUMENT = "ortho-pipeline scene record"
@@ -144,6 +145,7 @@ class Record:
             record = _checked().validate_python(document)
             if record.facts:
                 _facts().validate_python(record.facts)
+                refuted(record.facts["notices"])  # what a page says of them needs their members
             if record.error is not None:
                 _error().validate_python(record.error)
         except (InputError, ValueError, KeyError, TypeError, AttributeError, RecursionError):

@@ -162,13 +162,13 @@ def test_a_damaged_record_is_none_and_stops_nothing(tmp_path: Path, place: tuple
     path = tmp_path / "one.json"
     path.write_text(json.dumps(document))
     record = Record.read(path)
-    assert record is None or not record.intact(tmp_path, verify=True)
+    assert record is None or not record.intact(tmp_path, checksums=True)
 
 
 def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
     (tmp_path / "a").write_text("1")
     state = FileState.of("ortho", tmp_path / "a", name="a")
-    record = Record("one", "k", "done", (state,), (state,), "s", 1.5, {"lean_m_per_m": 0.5}, None, "run")
+    record = Record("one", "k", "done", (state,), (state,), "s", 1.5, {}, None, "run")
     record.write(tmp_path / "one.json")
     assert Record.read(tmp_path / "one.json") == record
 

@@ -74,7 +74,7 @@ def together(parts: list[Points]) -> Points:
     def all_of(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    names = ("image", "ground", "roles", "sigma_image", "sigma_ground", "sigma_common")
+    names = ("image", "ground", "roles", "sigma_image", "sigma_ground", "sigma_common", "sigma_alike")
     return replace(parts[0], ids=tuple(one for part in parts for one in part.ids), covariance_image=None, groups=None,
                    **{name: all_of(name) for name in names})  # fmt: skip
 
