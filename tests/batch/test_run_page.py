@@ -64,7 +64,16 @@ def test_check_points_that_contradict_have_another_mark_than_a_formality(tmp_pat
     few = {"code": "few-check-points", "text": "6 check points: few"}
     formal, apart = scene("formal", 0.2), scene("apart", 7.2)
     formal["facts"]["notices"], formal["facts"]["rmse_points"] = [few], {"check": 6}
-    apart["facts"]["notices"] = [few, {"code": "checks-apart", "text": "3 of 6 check points contradict", "count": 3, "points": 6}]
+    apart["facts"]["notices"] = [
+        few,
+        {
+            "code": "checks-apart",
+            "text": "3 of 6 check points contradict",
+            "count": 6,
+            "off": 3,
+            "points": ["a", "b", "c"],
+        },
+    ]
     untested = scene("untested")
     untested["facts"]["rmse_px"]["loo"] = None
     write_run_page(tmp_path / "index.html", "june", [formal, untested, apart])
