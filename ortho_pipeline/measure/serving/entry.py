@@ -27,6 +27,7 @@ _LEADING = """<!doctype html>
 <meta name="referrer" content="no-referrer">
 <meta http-equiv="refresh" content="0; url={address}">
 <title>ortho measure</title>
+<link rel="icon" href="data:,">
 </head>
 <body><p><a href="{address}">Continue to ortho measure</a></p></body>
 </html>
