@@ -32,7 +32,120 @@ JOURNAL = ".journal"
 _MOVED = 0.2
 
 
-class Project(abc.ABC):
+class _Shown(abc.ABC):
+    """What a page is shown of a project: its points, their places in every view, and the figures."""
+
+    views: tuple[View, ...]
+    sheets: tuple[Sheet, ...]
+    surface: Surface
+    _history: History
+    _written: Written
+    _lock: threading.RLock
+
+    @abc.abstractmethod
+    def _geometries(self, version: int) -> Mapping[str, Geometry]: ...
+
+    @property
+    def marks(self) -> Marks:
+        """The points as they are now."""
+        return self._history.marks
+
+    @property
+    @abc.abstractmethod
+    def version(self) -> int:
+        """Number of the models that references are rendered with now."""
+
+    @abc.abstractmethod
+    def places_of(self, number: int) -> Places:
+        """Return the geometry of an image as it is adjusted now."""
+
+    @abc.abstractmethod
+    def _figures(self) -> dict[str, Any]:
+        """Return what is shown of the solution, as JSON values."""
+
+    @abc.abstractmethod
+    def _ahead(self) -> list[Next]:
+        """Return places where to measure next, the best first."""
+
+    def _grounds(self, marks: Sequence[Mark]) -> Array:
+        """Return the ground ``(N, 3)`` at which marks are shown; NaN where there is none."""
+        return np.array([mark.ground or (np.nan,) * 3 for mark in marks], dtype=float).reshape(-1, 3)
+
+    def _shown(self) -> dict[str, Any]:
+        """Return what `state` does, but for the number of actions."""
+        marks, history, version = list(self.marks.by_id.values()), self._history, self.version
+        shown, ahead = self._places(version, self._grounds(marks)), self._ahead()
+        there = np.full((len(ahead), 3), np.nan)
+        for number in {one.number for one in ahead}:
+            rows = [k for k, one in enumerate(ahead) if one.number == number]
+            there[rows] = self.places_of(number).ground_about(
+                [ahead[k].image for k in rows], [ahead[k].height for k in rows]
+            )
+        told = [self._written.of(mark) for mark in marks]
+        return {
+            "marks": [{**mark, "places": places} for mark, places in zip(told, shown, strict=True)],
+            "version": version, "undo": history.can_undo, "redo": history.can_redo, **self._figures(),
+            "next": [
+                {**json_value(one), "places": places}
+                for one, places in zip(ahead, self._places(version, there), strict=True)
+            ],
+        }  # fmt: skip
+
+    # -- places ------------------------------------------------------------------------------------------------------
+
+    def _places(self, version: int, ground: Array) -> list[dict[str, list[float] | None]]:
+        """Return where each ground ``(N, 3)`` lies in all geometries; null where it does not."""
+        found = {name: one.image_of(ground) for name, one in self._geometries(version).items()}
+        return [{name: json_position(places[k]) for name, places in found.items()} for k in range(len(ground))]
+
+    def _geometry(self, name: str, version: int) -> Geometry:
+        known = self._geometries(version)
+        if name not in known:
+            raise InputError("there is no such view", field="at")
+        return known[name]
+
+    def predict(self, version: int, at: str | None = None, place: Sequence[float] | None = None,
+                ground: Sequence[float] | None = None) -> dict[str, Any]:  # fmt: skip
+        """Return where a place of a geometry, or of the ground, lies in all of them.
+
+        Parameters
+        ----------
+        at : str, optional
+            The geometry of `place`.
+        ground : (lon, lat, h), optional
+            In `GROUND_CRS`.
+
+        Returns
+        -------
+        dict
+            `ground`; `places` by geometry, px; `sigma`, of the prediction in the first image; null is what cannot be
+            said.
+        """
+        with self._lock:
+            if ground is not None:
+                found = np.array([ground], dtype=float)
+            else:
+                found = self._geometry(str(at), version).ground_of(np.array([place], dtype=float))
+            return {
+                "ground": json_position(found[0]), "places": self._places(version, found)[0],
+                "sigma": self._sigma(found),
+            }  # fmt: skip
+
+    @abc.abstractmethod
+    def _sigma(self, ground: Array) -> list[float] | None:
+        """Return the standard deviations (px) of the predicted image of ground ``(1, 3)``, if they are known."""
+
+    def link(self, version: int, at: str, place: Sequence[float], to: str) -> dict[str, Any]:
+        """Return how one geometry lies in another about a place, as `places.linked`."""
+        with self._lock:
+            return linked(self._geometry(at, version), self._geometry(to, version), place)
+
+    def typed(self, values: Sequence[float | None], crs: str, vertical: str | None) -> list[float]:
+        """Return typed coordinates as ground in `GROUND_CRS`."""
+        return ground_typed(values, crs or GROUND_CRS, vertical, self.surface).tolist()
+
+
+class Project(_Shown):
     """Points that are measured, with their journal.
 
     Geometries have names: ``scene-K`` is image K as it is adjusted now, ``reference-K`` what is rendered into its
@@ -218,32 +331,6 @@ class Project(abc.ABC):
                 raise
             return {**shown, "actions": len(self.journal.actions)}
 
-    @property
-    def marks(self) -> Marks:
-        """The points as they are now."""
-        return self._history.marks
-
-    @property
-    @abc.abstractmethod
-    def version(self) -> int:
-        """Number of the models that references are rendered with now."""
-
-    @abc.abstractmethod
-    def places_of(self, number: int) -> Places:
-        """Return the geometry of an image as it is adjusted now."""
-
-    @abc.abstractmethod
-    def _figures(self) -> dict[str, Any]:
-        """Return what is shown of the solution, as JSON values."""
-
-    @abc.abstractmethod
-    def _ahead(self) -> list[Next]:
-        """Return places where to measure next, the best first."""
-
-    def _grounds(self, marks: Sequence[Mark]) -> Array:
-        """Return the ground ``(N, 3)`` at which marks are shown; NaN where there is none."""
-        return np.array([mark.ground or (np.nan,) * 3 for mark in marks], dtype=float).reshape(-1, 3)
-
     def _follow(self) -> None:
         """Do what another process has done since, if that one writes."""
         new = [] if self.stopped else self.journal.more()
@@ -256,79 +343,6 @@ class Project(abc.ABC):
         with self._lock:
             self._follow()
             return {**self._shown(), "actions": len(self.journal.actions)}
-
-    def _shown(self) -> dict[str, Any]:
-        """Return what `state` does, but for the number of actions."""
-        marks, history, version = list(self.marks.by_id.values()), self._history, self.version
-        shown, ahead = self._places(version, self._grounds(marks)), self._ahead()
-        there = np.full((len(ahead), 3), np.nan)
-        for number in {one.number for one in ahead}:
-            rows = [k for k, one in enumerate(ahead) if one.number == number]
-            there[rows] = self.places_of(number).ground_about(
-                [ahead[k].image for k in rows], [ahead[k].height for k in rows]
-            )
-        told = [self._written.of(mark) for mark in marks]
-        return {
-            "marks": [{**mark, "places": places} for mark, places in zip(told, shown, strict=True)],
-            "version": version, "undo": history.can_undo, "redo": history.can_redo, **self._figures(),
-            "next": [
-                {**json_value(one), "places": places}
-                for one, places in zip(ahead, self._places(version, there), strict=True)
-            ],
-        }  # fmt: skip
-
-    # -- places ------------------------------------------------------------------------------------------------------
-
-    def _places(self, version: int, ground: Array) -> list[dict[str, list[float] | None]]:
-        """Return where each ground ``(N, 3)`` lies in all geometries; null where it does not."""
-        found = {name: one.image_of(ground) for name, one in self._geometries(version).items()}
-        return [{name: json_position(places[k]) for name, places in found.items()} for k in range(len(ground))]
-
-    def _geometry(self, name: str, version: int) -> Geometry:
-        known = self._geometries(version)
-        if name not in known:
-            raise InputError("there is no such view", field="at")
-        return known[name]
-
-    def predict(self, version: int, at: str | None = None, place: Sequence[float] | None = None,
-                ground: Sequence[float] | None = None) -> dict[str, Any]:  # fmt: skip
-        """Return where a place of a geometry, or of the ground, lies in all of them.
-
-        Parameters
-        ----------
-        at : str, optional
-            The geometry of `place`.
-        ground : (lon, lat, h), optional
-            In `GROUND_CRS`.
-
-        Returns
-        -------
-        dict
-            `ground`; `places` by geometry, px; `sigma`, of the prediction in the first image; null is what cannot be
-            said.
-        """
-        with self._lock:
-            if ground is not None:
-                found = np.array([ground], dtype=float)
-            else:
-                found = self._geometry(str(at), version).ground_of(np.array([place], dtype=float))
-            return {
-                "ground": json_position(found[0]), "places": self._places(version, found)[0],
-                "sigma": self._sigma(found),
-            }  # fmt: skip
-
-    @abc.abstractmethod
-    def _sigma(self, ground: Array) -> list[float] | None:
-        """Return the standard deviations (px) of the predicted image of ground ``(1, 3)``, if they are known."""
-
-    def link(self, version: int, at: str, place: Sequence[float], to: str) -> dict[str, Any]:
-        """Return how one geometry lies in another about a place, as `places.linked`."""
-        with self._lock:
-            return linked(self._geometry(at, version), self._geometry(to, version), place)
-
-    def typed(self, values: Sequence[float | None], crs: str, vertical: str | None) -> list[float]:
-        """Return typed coordinates as ground in `GROUND_CRS`."""
-        return ground_typed(values, crs or GROUND_CRS, vertical, self.surface).tolist()
 
 
 def _plain(action: Mapping[str, Any]) -> dict[str, Any]:
