@@ -48,6 +48,7 @@ class Person:
 
 
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="no process list in /proc")
+@pytest.mark.slow
 def test_who_reads_the_process_list_does_not_get_in(reference: Path, tmp_path: Path) -> None:
     script, seen = tmp_path / "browser", tmp_path / "seen.json"
     script.write_text(BROWSER.format(python=sys.executable, seen=str(seen)))
