@@ -16,6 +16,8 @@ Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 Headers = dict[bytes, list[bytes]]
+#: Is told the address (host, port) of a client that has the cookie.
+Admit = Callable[[tuple[str, int]], None]
 
 #: A request has no longer body than this (bytes).
 MAX_BODY = 64_000
@@ -47,10 +49,12 @@ class Guard:
     hosts : set of str
         Host headers that are ours: name and port.
     entry : Entry
+    admit : callable, optional
+        Told the address of each client that has the cookie.
     """
 
-    def __init__(self, app: App, hosts: set[str], entry: Entry) -> None:
-        self._app, self._hosts, self._entry = app, {host.encode() for host in hosts}, entry
+    def __init__(self, app: App, hosts: set[str], entry: Entry, admit: Admit | None = None) -> None:
+        self._app, self._hosts, self._entry, self._admit = app, {host.encode() for host in hosts}, entry, admit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or refuse it."""
@@ -65,6 +69,8 @@ class Guard:
             await _refused(send, status)
             return
         query, known = scope["query_string"], self._entry.knows(headers.get(b"cookie", []))
+        if known and self._admit and scope["client"]:
+            self._admit(tuple(scope["client"]))
         path = scope["path"].removeprefix("/" + self._entry.folder)
         if path == "/" and scope["method"] == "GET" and query:
             cookie = None if known else self._entry.exchange(query)

@@ -10,7 +10,6 @@ import contextlib
 import json
 import math
 import os
-import socket
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -22,7 +21,9 @@ from ortho_pipeline.files import parse_json
 from ortho_pipeline.measure.block.session import BlockSession
 from ortho_pipeline.measure.project import Project
 from ortho_pipeline.measure.serving.entry import Entry
-from ortho_pipeline.measure.serving.guard import REPORT_POLICY, App, Guard
+from ortho_pipeline.measure.serving.guard import REPORT_POLICY, Admit, App, Guard
+from ortho_pipeline.measure.serving.listener import LOOPBACK, QUEUE, Listener
+from ortho_pipeline.measure.serving.log import repetitions_counted
 from ortho_pipeline.measure.serving.making import PICTURES, Making
 from ortho_pipeline.measure.serving.tiles import MOST, SIDE, Tiles
 from ortho_pipeline.measure.session import Session
@@ -44,7 +45,6 @@ PAGE = {
     "ol.css": "text/css; charset=utf-8",
     "ol-LICENSE.md": "text/plain; charset=utf-8",
 }
-_LOOPBACK = "127.0.0.1"
 _REMEDY = "load the page anew"
 
 
@@ -202,7 +202,9 @@ class _Answers:
         return band
 
 
-def application(session: Project, entry: Entry, hosts: set[str], opened: SceneOptions = SceneOptions()) -> App:
+def application(
+    session: Project, entry: Entry, hosts: set[str], opened: SceneOptions = SceneOptions(), admit: Admit | None = None
+) -> App:
     """Return the ASGI application of a session."""
     from starlette.applications import Starlette
     from starlette.routing import Route
@@ -215,7 +217,7 @@ def application(session: Project, entry: Entry, hosts: set[str], opened: SceneOp
         Route("/tiles/{pane}/{version:int}/{factor:int}/{column:int}/{row:int}", given.tile),
         Route("/{name}", given.page),
     ]
-    return Guard(Starlette(routes=routes), hosts, entry)
+    return Guard(Starlette(routes=routes), hosts, entry, admit)
 
 
 class _Given:
@@ -304,23 +306,23 @@ def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], 
     """
     import uvicorn
 
-    entry = Entry()
-    listening = socket.create_server((_LOOPBACK, port))
-    number = listening.getsockname()[1]
-    hosts = {f"{_LOOPBACK}:{number}", f"localhost:{number}"}
+    entry, listener = Entry(), Listener(port)
+    number = listener.getsockname()[1]
+    hosts = {f"{LOOPBACK}:{number}", f"localhost:{number}"}
     limit_cache(OutputOptions.memory, os.cpu_count() or 1)
-    app = application(session, entry, hosts, opened)
+    app = application(session, entry, hosts, opened, listener.admit)
+    # h11 limits the size of headers. The listener is told the true address of a client, whatever headers claim.
     config = uvicorn.Config(
-        app, log_level="warning", access_log=False, server_header=False, date_header=False, ws="none", lifespan="off",
-        timeout_graceful_shutdown=3,
+        app, loop="asyncio", http="h11", ws="none", lifespan="off", proxy_headers=False, server_header=False,
+        date_header=False, access_log=False, log_config=None, timeout_graceful_shutdown=3, backlog=QUEUE,
     )  # fmt: skip
     try:
-        ready(f"http://{_LOOPBACK}:{number}{entry.path}")
+        ready(f"http://{LOOPBACK}:{number}{entry.path}")
         # Ctrl-C is how this command ends.
-        with contextlib.suppress(KeyboardInterrupt):
-            uvicorn.Server(config).run([listening])
+        with contextlib.suppress(KeyboardInterrupt), repetitions_counted("uvicorn.error", "asyncio"):
+            uvicorn.Server(config).run([listener])
     finally:
-        listening.close()
+        listener.close()
         session.close()
 
 
