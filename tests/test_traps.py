@@ -52,3 +52,15 @@ def test_every_trap_has_a_test_that_exists():
     assert [int(number) for number, _, _ in rows] == list(range(1, 46))
     for _, file, name in rows:
         assert f"def {name}(" in (root / file).read_text(encoding="utf-8"), f"{file} has no {name}"
+
+
+def test_every_promise_of_security_names_tests_that_exist():
+    root = Path(__file__).resolve().parent
+    page = (root.parent / "SECURITY.md").read_text(encoding="utf-8")
+    # Tests are named alone, after their file, or after a colon.
+    names = set(re.findall(r"`(test_\w+)`", page)) | set(re.findall(r"\.py::(\w+)`", page))
+    files = [root.parent / path for path in re.findall(r"`(tests/[\w/]+\.py)", page)]
+    assert names
+    assert not [path for path in files if not path.exists()]
+    there = set(re.findall(r"^def (test_\w+)", "\n".join(path.read_text("utf-8") for path in root.rglob("*.py")), re.M))
+    assert not names - there

@@ -16,7 +16,7 @@ from urllib import error, request
 
 import pytest
 
-pytest.importorskip("uvicorn", reason="the extra 'measure' is not installed")
+from ortho_pipeline.measure.serving.entry import private_file
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 BROWSER = """#!{python}
@@ -49,6 +49,7 @@ class Person:
 
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="no process list in /proc")
 def test_who_reads_the_process_list_does_not_get_in(reference: Path, tmp_path: Path) -> None:
+    pytest.importorskip("uvicorn", reason="the extra 'measure' is not installed")
     script, seen = tmp_path / "browser", tmp_path / "seen.json"
     script.write_text(BROWSER.format(python=sys.executable, seen=str(seen)))
     script.chmod(0o700)
@@ -91,3 +92,29 @@ def test_who_reads_the_process_list_does_not_get_in(reference: Path, tmp_path: P
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0
     assert not [path.name for path in tmp_path.iterdir() if path.suffix == ".html"], "the file of the address is left"
+
+
+def test_an_address_is_written_to_no_file_that_others_could_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points, other = tmp_path / "p.geojson", tmp_path / "other"
+    other.write_text("of somebody else")
+    path = tmp_path / "p.geojson.open.html"
+    # What is there already is not written through, nor into.
+    path.symlink_to(other)
+    with private_file("http://127.0.0.1:1/a-secret", points) as written:
+        assert written == path
+        assert "a-secret" in path.read_text()
+        assert not path.is_symlink()
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert not path.exists()
+    assert other.read_text() == "of somebody else"
+    # A file system without owners, and a folder that nobody can write to.
+    with monkeypatch.context() as changed:
+        changed.setattr(os, "geteuid", lambda: 12345)
+        with private_file("http://127.0.0.1:1/a-secret", points) as written:
+            assert written is None
+            assert path.read_text() == ""
+    assert not path.exists()
+    with private_file("http://127.0.0.1:1/a-secret", tmp_path / "missing" / "p.geojson") as written:
+        assert written is None
