@@ -1,13 +1,20 @@
 # A slim image of the command line, with GDAL from its wheel; not root.
 #   docker build -t ortho-pipeline . && docker run --rm ortho-pipeline doctor
-FROM python:3.13-slim AS build
+# `make pin-image` pins the base image by its digest; the packages have the versions and hashes of tools/constraints.txt.
+ARG BASE=python:3.13-slim
+FROM ${BASE} AS build
 WORKDIR /src
 COPY pyproject.toml README.md LICENSE ./
+COPY tools/constraints.txt tools/requirements.py tools/
+RUN python -m venv /opt/ortho && sed -n '/^pip==/,/# via/p' tools/constraints.txt > /tmp/pip.txt \
+ && /opt/ortho/bin/pip install --no-cache-dir --require-hashes -r /tmp/pip.txt \
+ && python tools/requirements.py wheel dask > /tmp/requirements.txt \
+ && /opt/ortho/bin/pip install --no-cache-dir --require-hashes -c tools/constraints.txt -r /tmp/requirements.txt
 COPY ortho_pipeline ortho_pipeline
 COPY plugins plugins
-RUN python -m venv /opt/ortho && /opt/ortho/bin/pip install --no-cache-dir '.[wheel,dask]'
+RUN /opt/ortho/bin/pip install --no-cache-dir --no-deps --build-constraint tools/constraints.txt .
 
-FROM python:3.13-slim
+FROM ${BASE}
 RUN useradd --create-home --uid 10001 ortho && mkdir -p /cache /work /opt/numba/kernels-10001 \
  && chown ortho:ortho /cache /work /opt/numba/kernels-10001 && chmod 700 /opt/numba/kernels-10001
 COPY --from=build /opt/ortho /opt/ortho

@@ -12,19 +12,26 @@
 #   make docs     do the tutorials and draw their pictures, then the documentation as a site in out/site, links checked,
 #                 and manual pages in out/man
 #   make images   draw all pictures again: README.md, docs/measure.md, docs/report.md, the tutorials (Chromium)
+#   make constraints  pin the newest packages in tools/constraints.txt, with their hashes
+#   make pin-image    pin the base image of the Dockerfile by its digest (needs docker)
 #   make clean    remove .venv, caches and out/
 #
 # PYTHON=python3.12     the interpreter that .venv is made from (3.11 or newer)
 # GDAL=auto             auto:   the system's GDAL; installed with apt where it is missing and we may; otherwise the wheel
 #                       system: the system's GDAL or nothing
 #                       wheel:  the PyPI package gdal-wheel, which brings a GDAL of its own (Python 3.12 or newer, no root)
+# APT=auto              auto:   install missing system packages with apt-get, as root or with a sudo that asks no password;
+#                               says first which and why
+#                       no:     install none; say which command installs them
 
 PYTHON ?= python3
 GDAL ?= auto
+APT ?= auto
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
 WORKERS ?= 2
+IMAGE ?= python:3.13-slim
 N ?= 100000
 READER ?=
 
@@ -32,15 +39,15 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all faults check page-types fuzz bench packages docs images clean
+.PHONY: help setup demo test test-all faults check page-types fuzz bench packages docs images constraints pin-image clean
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
 
 setup: $(STAMP)
 
-$(STAMP): pyproject.toml Makefile tools/setup.sh
-	@PYTHON="$(PYTHON)" GDAL="$(GDAL)" VENV="$(VENV)" bash tools/setup.sh
+$(STAMP): pyproject.toml Makefile tools/setup.sh tools/constraints.txt
+	@PYTHON="$(PYTHON)" GDAL="$(GDAL)" APT="$(APT)" VENV="$(VENV)" bash tools/setup.sh
 	touch $@
 
 demo: setup
@@ -89,7 +96,7 @@ docs: setup
 	$(BIN)/python docs/make_reference.py
 	$(BIN)/python docs/make_man.py
 	rm -rf docs/__pycache__
-	$(BIN)/pip install --quiet --editable ".[docs]"
+	$(BIN)/python tools/requirements.py docs | $(BIN)/pip install --quiet --require-hashes -c tools/constraints.txt -r /dev/stdin
 	$(BIN)/zensical build --strict --clean
 	echo "Site:    $(CURDIR)/out/site/index.html"
 	echo "Manual:  man -l $(CURDIR)/out/man/ortho.1"
@@ -99,6 +106,18 @@ images: setup
 	$(BIN)/python docs/make_measure_images.py
 	$(BIN)/python docs/make_report_images.py
 	$(BIN)/python docs/make_tutorial_images.py
+
+constraints: setup
+	@$(BIN)/pip install --quiet --require-hashes -c tools/constraints.txt uv
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --upgrade --all-extras \
+	    --custom-compile-command "make constraints" -o tools/constraints.txt pyproject.toml tools/constraints.in
+	git diff --stat -- tools/constraints.txt
+
+pin-image:
+	@digest="$$(docker buildx imagetools inspect "$(IMAGE)" --format '{{.Manifest.Digest}}')"
+	[[ "$$digest" =~ ^sha256:[0-9a-f]{64}$$ ]] || { echo "docker gave no digest of $(IMAGE): $$digest" >&2; exit 1; }
+	sed -i -E "s|^(ARG BASE=).*|\1$(IMAGE)@$$digest|" Dockerfile
+	grep '^ARG BASE=' Dockerfile
 
 clean:
 	rm -rf $(VENV) out build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache
