@@ -14,6 +14,7 @@ import argparse
 import contextlib
 import hashlib
 import json
+import mmap
 import os
 import random
 import re
@@ -21,6 +22,7 @@ import resource
 import select
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
@@ -98,6 +100,15 @@ def cases(inputs: Path) -> list[Case]:
     bands = tuple(str(inputs / f"{band}.tif") for band in ("a", "b"))
     register = ("register", *bands, "-o", "out", "--transform")
     found.append(Case("register", (*register, "affine"), (*register, "similarity"), (("out", "a_bands"),)))
+    orthos = tuple(str(inputs / f"{name}_ortho.tif") for name in ("west", "east"))
+    mosaic = ("mosaic", *orthos, "-o", "out/mosaic.tif", "--order", "first-on-top")
+    for more in ("--seamlines", "--balance"):
+        found.append(Case(f"mosaic {more}", (*mosaic, more), mosaic, (("out", "mosaic"),)))
+    match = ("match", scene, "--reference", str(inputs / "reference.tif"), "--dem", dem, "-o", "out/points.geojson",
+             "--report", "out/points.html", "--match-points")  # fmt: skip
+    found.append(Case("match", (*match, "60"), (*match, "40"), (("out", "points"),)))
+    ties = ("ties", *stereo, "--dem", str(inputs / "cartosat" / "dem.tif"), "-o", "out/ties.csv", "--match-points")
+    found.append(Case("ties", (*ties, "60"), (*ties, "40"), (("out", "ties.csv"),)))
     folders = (("out/a", "a"), ("out/b", "b"), ("out", "mosaic"), ("out", "catalog"), ("out", "run"))
     for kind in ("VRT", "COG"):
         words = ("run", "--executor", "sequential", "--root", str(inputs.parent))
@@ -134,6 +145,16 @@ def copy_inputs(folder: Path) -> Path:
             for age, kernel in (("old", "nearest"), ("new", "bilinear")):
                 (folder / part / f"{age}_{kind}.yaml").write_text(_pipeline(kind, kernel, part))
     return folder
+
+
+def make_orthos(inputs: Path) -> None:
+    """Make the two orthos that overlap, which mosaics are of."""
+    west, south, east, north = map(int, EXTENT)
+    for name, box in {"west": (west, south, east - 200, north), "east": (west + 300, south, east, north)}.items():
+        words = ("rectify", str(inputs / "scene.tif"), "--dem", str(inputs / "dem.tif"), "-tr", "2.5", "-te")
+        ended = run((*words, *map(str, box), "-o", str(inputs / name)), inputs)
+        assert ended.code == 0, ended.said
+        (inputs / name / "scene_ortho.tif").rename(inputs / f"{name}_ortho.tif")
 
 
 # -- processes -------------------------------------------------------------------------------------------------------
@@ -253,8 +274,8 @@ def limit_memory(more: int) -> Callable[[], None]:
 _CALLS = ("replace", "unlink", "fsync", "open", "mkdir", "rmdir")
 
 
-def at_call(number: int, act: Callable[[], None]) -> Callable[[], None]:
-    """Return what does something at the n-th call of the system that changes a folder."""
+def at_calls(act: Callable[[int], None]) -> Callable[[], None]:
+    """Return what does something at each call of the system that changes a folder, given its number from 1."""
 
     def prepare() -> None:
         count = 0
@@ -263,8 +284,7 @@ def at_call(number: int, act: Callable[[], None]) -> Callable[[], None]:
             def call(*given: object, **named: object) -> object:
                 nonlocal count
                 count += 1
-                if count == number:
-                    act()
+                act(count)
                 return function(*given, **named)
 
             return call
@@ -273,6 +293,11 @@ def at_call(number: int, act: Callable[[], None]) -> Callable[[], None]:
             setattr(os, name, counted(getattr(os, name)))
 
     return prepare
+
+
+def at_call(number: int, act: Callable[[], None]) -> Callable[[], None]:
+    """Return what does something at the n-th of these calls."""
+    return at_calls(lambda count: act() if count == number else None)
 
 
 # -- what has to be true ---------------------------------------------------------------------------------------------
@@ -321,13 +346,16 @@ class Tally:
 class Attack:
     """A scratch folder, the cases, and what their outputs are when nothing disturbs them."""
 
-    def __init__(self, scratch: Path, seed: int = 1, only: str = "") -> None:
-        self.scratch, self.random = scratch, random.Random(seed)
+    def __init__(self, scratch: Path, seed: int = 1, only: str = "", again: int = 4) -> None:
+        self.scratch, self.random, self.again = scratch, random.Random(seed), again
         self.inputs = copy_inputs(scratch / "inputs")
         self.work, self.out = scratch / "work", scratch / "work" / "out"
         self.cases = [case for case in cases(self.inputs) if only in case.name]
+        if any(case.name.startswith("mosaic") for case in self.cases):
+            make_orthos(self.inputs)
         self.tallies: dict[str, Tally] = {}
         self._kept: dict[tuple[str, ...], tuple[Path, Files, float]] = {}
+        self._calls: dict[tuple[str, ...], int] = {}
 
     # -- sets of files -----------------------------------------------------------------------------------------------
 
@@ -335,7 +363,9 @@ class Attack:
         """Return a copy of the outputs of an undisturbed command, their checksums, and its seconds."""
         if words not in self._kept:
             self.clear()
-            ended = run(words, self.work)
+            with mmap.mmap(-1, 8) as shared:  # the command is another process
+                ended = run(words, self.work, at_calls(lambda count: struct.pack_into("<q", shared, 0, count)))
+                self._calls[words] = struct.unpack_from("<q", shared)[0]
             assert ended.code == 0, (words, ended.said)
             kept = self.scratch / f"kept{len(self._kept)}"
             shutil.copytree(self.out, kept)
@@ -451,7 +481,7 @@ class Attack:
             kind = kinds[turn % len(kinds)]
             delay = self.random.uniform(0.0, 1.1 * seconds)
             if kind == "at a call":
-                delay = float(self.random.randint(1, 120))
+                delay = float(self.random.randint(1, self._calls[case.words] + 2))
                 command = Running(case.words, self.work, at_call(int(delay), _die))
             else:
                 command = Running(case.words, self.work)
@@ -462,11 +492,11 @@ class Attack:
                 # These clean up by themselves; before Python's handlers are there, they end the process as any other.
                 early = ended.code < 0 and not list(self.work.rglob("*.part*"))
                 by_signal = early or ended.code in (129, 130, 143)
-                outcome, wrong = self.judge(case, before, ended, killed=by_signal, again=turn % 4 == 0)
+                outcome, wrong = self.judge(case, before, ended, killed=by_signal, again=turn % self.again == 0)
                 left = [] if early else [path.name for path in self.work.rglob(".*.part*")]
                 wrong += [f"{case.name}: {kind} leaves {left}"] if left else []
             else:
-                outcome, wrong = self.judge(case, before, ended, killed=ended.code != 0, again=turn % 4 == 0)
+                outcome, wrong = self.judge(case, before, ended, killed=ended.code != 0, again=turn % self.again == 0)
             self.tally(f"killed {kind}").add(outcome, [f"{text} [{kind} {delay:.3f}, old {old}]" for text in wrong])
 
     def kills_of_workers(self, count: int) -> None:
@@ -584,6 +614,9 @@ def load() -> None:
     import ortho_pipeline.batch.runner
     import ortho_pipeline.commands.bands
     import ortho_pipeline.commands.block
+    import ortho_pipeline.commands.control.command
+    import ortho_pipeline.commands.control.ties
+    import ortho_pipeline.commands.mosaic.assembly
     import ortho_pipeline.commands.rectification
     import ortho_pipeline.commands.studies
     import ortho_pipeline.warp.engine  # noqa: F401
@@ -599,11 +632,12 @@ def main() -> int:
         parser.add_argument(f"--{name}", type=int, default=count, metavar="N")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="", help="Part of the name of a case.")
+    parser.add_argument("--again", type=int, default=4, metavar="N", help="The next run follows each N-th kill.")
     given = parser.parse_args()
     load()
     begin = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="faults") as folder:
-        attack = Attack(Path(folder).resolve(), given.seed, given.only)
+        attack = Attack(Path(folder).resolve(), given.seed, given.only, given.again)
         attack.limits(given.limits)
         attack.kills(given.kills)
         attack.kills_of_workers(given.workers)

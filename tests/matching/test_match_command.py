@@ -102,6 +102,20 @@ def test_match_shows_what_it_found(case: Case, written_points: tuple[Path, dict]
     assert f"<b>{px(worst)}</b>" in page
 
 
+def test_points_and_their_page_appear_together(case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command that ended between the two left new points beside the page of old ones."""
+    there = []
+
+    def interrupted(*_: object, **__: object) -> None:
+        there.extend(path for path in tmp_path.iterdir() if not path.name.startswith("."))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ortho_pipeline.report.document.write_report_html", interrupted)
+    words = ("-o", tmp_path / "points.geojson", "--report", tmp_path / "points.html", "--match-points", "30")
+    assert matched(case, "match", *words).exit_code != 0
+    assert there == list(tmp_path.iterdir()) == []
+
+
 def test_the_page_of_matches_is_a_page(case: Case, tmp_path: Path) -> None:
     refused = matched(case, "match", "-o", tmp_path / "points.csv", "--report", tmp_path / "matches.pdf")
     assert refused.exit_code == 2

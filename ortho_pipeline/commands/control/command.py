@@ -17,6 +17,7 @@ from ortho_pipeline.commands.scene_fit import Adjusted, adjust, on_surface
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import together
 from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import write_points
@@ -81,10 +82,12 @@ def match(
     points = matched.matches.points
     # Those of a bundle or a strip serve its other images too, if they say where they were measured.
     said = bool(opened.pieces) and files["points"].suffix.lower() != ".geojson"
-    write_points(points, output, images=[Path(opened.path).name] * len(points) if said else None)
     failure = None
-    if adjusted is not None:
-        failure = attempted(functools.partial(_write_page, adjusted, heights, record, files), files, "html", "report")
+    with together(files["points"].parent, files["points"].stem):
+        write_points(points, output, images=[Path(opened.path).name] * len(points) if said else None)
+        if adjusted is not None:
+            make = functools.partial(_write_page, adjusted, heights, record, files)
+            failure = attempted(make, files, "html", "report")
     document = {"matching": matched.to_json(), "provenance": record, **to_document([*opened.notices, *matched.notices])}
     text = "\n".join(f"{name:<10}{said}" for name, said in matched.summary())
     return Result(files, document, text, failure)
