@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ortho_pipeline.imaging.matching.weights import Components, components
+from ortho_pipeline.imaging.matching.weights import Components, components, unexplained
 
 
 def drawn(angle: float, truth: Components, count: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -38,3 +38,21 @@ def test_parts_are_what_they_are_whatever_the_direction_of_view(degrees: int, he
     assert (found.matching, found.height, found.other) == pytest.approx(
         (upright.matching, upright.height, upright.other), rel=0.1, abs=0.01
     )
+
+
+@pytest.mark.parametrize("extent", [60, 200], ids=["overlapping", "apart"])
+def test_what_a_fit_leaves_of_errors_that_overlapping_chips_share(extent: int) -> None:
+    """Errors are means of white noise over squares about 20 places."""
+    random, side = np.random.default_rng(1), 30
+    corners = random.integers(0, extent, (20, 2))
+    design = np.column_stack([np.ones(20), corners / extent])
+    basis = np.linalg.qr(design)[0]
+    left = []
+    for _ in range(225):
+        sums = np.pad(random.normal(0, 1, (extent + side,) * 2), ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+        (x, y), (right, down) = corners.T, corners.T + side
+        errors = (sums[down, right] - sums[down, x] - sums[y, right] + sums[y, x]) / side
+        left.append(np.mean((errors - basis @ (basis.T @ errors)) ** 2))
+    found = unexplained(design, corners + side / 2, side)
+    assert np.mean(left) == pytest.approx(found, abs=4 * np.std(left) / 15)
+    assert found < 0.7 if extent == 60 else found > 0.75

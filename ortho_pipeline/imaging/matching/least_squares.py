@@ -34,6 +34,8 @@ _STEPS = 8
 _SMALL = 0.003
 #: Chips that differ by more than a shift of so many px from where the search put them do not belong together.
 _FARTHEST = 1.5
+#: A sigma (chip px) above which a shift is none: no farther is the likeness of chips a parabola.
+_VAGUE = 0.5
 #: Residual correlation of intensities above which they follow gain and offset.
 _ALIKE = 0.4
 #: Standard deviation (chip px) of the blur that is taken away: shadows, haze and seasons differ in what is broad.
@@ -51,7 +53,7 @@ class Measured:
     Parameters
     ----------
     shift : (n, 2)
-        Column and row, chip px; NaN where it did not converge.
+        Column and row, chip px; NaN where it did not converge, or is not known to half a pixel.
     covariance : (n, 2, 2)
         chip px², up to a common factor.
     correlation : (n,)
@@ -108,4 +110,5 @@ def _shifts(scene: NDArray[np.float32], target: NDArray[np.float32], start: Arra
         np.ascontiguousarray(scene), np.ascontiguousarray(target), np.ascontiguousarray(start, dtype=float), offset,
         RIM, np.array([_STEPS, _SMALL, _FARTHEST]), shift, covariance, correlation,
     )  # fmt: skip
+    shift[np.linalg.eigvalsh(np.nan_to_num(covariance))[:, 1] > _VAGUE**2] = np.nan
     return Measured(shift, covariance, correlation, np.full(count, not offset))

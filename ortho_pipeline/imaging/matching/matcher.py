@@ -37,7 +37,7 @@ from ortho_pipeline.imaging.matching.targets import (
     shown_by,
     spread_over,
 )
-from ortho_pipeline.imaging.matching.weights import Components, components
+from ortho_pipeline.imaging.matching.weights import Components, components, unexplained
 from ortho_pipeline.imaging.turns import orientations
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
@@ -64,7 +64,7 @@ REASONS = {
     "weak": "the chips do not look alike",
     "ambiguous": "a second place fits nearly as well",
     "backward": "the match back leads elsewhere",
-    "not measured": "least-squares matching did not converge",
+    "not measured": "least-squares matching does not give its place to half a pixel",
     "contradicts": "contradicts the other matches",
 }
 
@@ -354,7 +354,8 @@ class _Tried:
             design = np.column_stack([np.ones(len(good)), (self.centres[good] - origin) / origin.max()])
             along = self.view.model.ground_partials(self.ground[good])[:, :, 2]
             residuals = off - design @ _robust(design, off)
-            self.components = components(residuals, self.covariance[good], along)
+            left = unexplained(design, self.centres[good], SIDE * self.factor)
+            self.components = components(residuals / np.sqrt(left), self.covariance[good], along)
             total = self.components.covariance(self.covariance[good], along)
             distance = squared_distances(residuals, total)
             bad = distance > SIGMAS**2

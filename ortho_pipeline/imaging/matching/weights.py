@@ -3,7 +3,9 @@
 Least-squares matching gives the shape of a match's covariance and a size that is several times too small. An error of
 the DEM moves a point along the line of sight, by ``d(image)/d(height)``. What remains is alike in both directions: the
 reference's own errors, ground that has changed. The three factors are estimated from the residuals of a robust fit
-(variance components), so the covariances are true in the mean whatever was assumed.
+(variance components), so the covariances are true in the mean whatever was assumed. The fit takes up a part of the
+errors, and more than one match per parameter where chips overlap: those share the noise of the pixels that they share
+(`unexplained`).
 
 Source: Koch 1999, section 3.6 (variance components); Lawson and Hanson 1974 (non-negative least squares).
 """
@@ -13,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize
+from scipy import optimize, spatial
 
 from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.models.base import Array
@@ -94,6 +96,26 @@ def components(residuals: Array, matched: Array, along: Array) -> Components:
             break
         before = found
     return Components(float(found[0]), float(np.sqrt(found[1])), max(float(np.sqrt(found[2])), _LEAST))
+
+
+def unexplained(design: Array, centres: Array, side: float) -> float:
+    """Return the part (0 to 1) of the variance of errors that a least-squares fit leaves in its residuals.
+
+    It is ``1 - tr(H R) / n`` with the hat matrix H and the correlations R of the errors: the part of its area that a
+    chip shares with another one.
+
+    Parameters
+    ----------
+    design : (n, k)
+        Of each axis.
+    centres : (n, 2)
+        Of chips of `side` x `side`.
+    """
+    basis = np.linalg.qr(design)[0]
+    one, other = spatial.cKDTree(centres).query_pairs(side, p=np.inf, output_type="ndarray").T
+    shared = (1.0 - np.abs(centres[one] - centres[other]) / side).prod(axis=1)
+    taken = basis.shape[1] + 2.0 * float(((basis[one] * basis[other]).sum(axis=1) * shared).sum())
+    return max(1.0 - taken / len(design), 1.0 / len(design))
 
 
 def _start(residuals: Array, along: Array) -> Array:
