@@ -446,7 +446,7 @@ class MatchOptions:
     search_rotation: Annotated[
         float | None,
         Option(
-            "--search-rotation", "How far the image's model may be turned (degrees; tested to 5).", "DEG",
+            "--search-rotation", "How far the image's model may be turned (degrees; 180 for any angle).", "DEG",
             kind="number", above=0, below=180.001, unset="5 where the model comes from metadata on orbit or attitude, "
             "else none",
         ),

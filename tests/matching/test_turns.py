@@ -25,10 +25,10 @@ SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 
 def turned(folder: Path, angle_deg: float, **changes: object) -> Case:
     """Return a case whose delivered model has a heading that is wrong by an angle."""
-    half = PLAIN.side / 2
+    setting = replace(PLAIN, **changes)
+    half = setting.side / 2
     far = 60 + 1.3 * half * min(abs(math.radians(angle_deg)), 1.0)
-    setting = replace(PLAIN, kind="attitude", slope=math.radians(angle_deg) * half, margin=far, **changes)
-    return Case(setting, folder).write()
+    return Case(replace(setting, kind="attitude", slope=math.radians(angle_deg) * half, margin=far), folder).write()
 
 
 class Larger(Case):
@@ -41,23 +41,26 @@ class Larger(Case):
     correction = "affine"
 
 
-def test_a_heading_that_is_wrong_by_three_degrees_is_found(tmp_path: Path) -> None:
-    case = turned(tmp_path, 3.0)
-    refused = tried(case, search=30.0, points=100)
+def test_a_heading_that_is_wrong_by_40_degrees_is_found(tmp_path: Path) -> None:
+    case = turned(tmp_path, 40.0, side=360)
+    refused = tried(case, search=30.0, points=60)
     assert "search_rotation" in refused.refused
-    found = tried(case, search=30.0, points=100, rotation_deg=5.0)
+    found = tried(case, search=30.0, points=60, rotation_deg=42.0)
     assert found.succeeded, found
     assert found.rms < 0.05, found
-    assert found.found > 60, found
+    assert found.found > 40, found
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("angle", "within"), [(1.0, 5.0), (-4.4, 5.0), (5.0, 5.0)])
+@pytest.mark.parametrize(("angle", "within"), [
+    (1.0, 5.0), (3.0, 5.0), (-4.4, 5.0), (5.0, 5.0), (10.0, 180.0), (40.0, 180.0), (-70.0, 180.0), (90.0, 180.0),
+    (133.0, 180.0), (180.0, 180.0),
+])  # fmt: skip
 def test_headings_are_found_within_what_is_searched(tmp_path: Path, angle: float, within: float) -> None:
     found = tried(turned(tmp_path, angle), search=30.0, rotation_deg=within)
     assert found.succeeded, found
-    # Of the matches: the correction that is fitted to them does not turn the displacement by relief.
-    assert found.rms < 0.05, found
+    # Of the matches: the correction that is fitted to them does not turn the displacement by relief. It shears chips.
+    assert found.rms < (0.05 if within < 10 else 0.15), found
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,6 +49,8 @@ _SMEAR = 1.5
 _HYPOTHESES, _WORTH = 5, 0.4
 #: Places nearer than this (chip px) are the same peak.
 _APART = 6
+#: Steps in which a place that is turned settles; the last one is shorter than this (chip px).
+_SETTLING, _STANDS = 4, 0.3
 #: Chance at which the best place passes for better than the second best one, and chips for agreeing by accident.
 _UNIQUE, _ACCIDENT = 1e-3, 1e-6
 #: Part of the highest mean correlation that the second highest may have. Where a pattern repeats itself it has nearly
@@ -115,11 +117,10 @@ def place(
         return _refined(view, targets, reach, base, region, (factor, radius), alone)
     except InputError as error:
         if rotation_deg:
-            corrections = _turned(view, targets, region, start, (factor, radius), rotation_deg)
+            turned = _turned(view, targets, region, start, (factor, radius), rotation_deg)
+            corrections = _distinct((_settled(view, targets, region, one, factor) for one in turned), region, factor)
             # What stands out has to do so among shifts alone too: of a pattern that repeats itself no turn is unique.
-            corrections += [
-                one for one in alone if all(_apart(one, other, region) > _APART * factor for other in corrections)
-            ]
+            corrections = _distinct([*corrections, *alone], region, factor)
             with contextlib.suppress(InputError):
                 return _refined(view, targets, reach, base, region, (factor, radius), corrections)
         raise error from None
@@ -140,14 +141,44 @@ def _turned(
         shown = _correlated(replace(view, model=model), targets, region, side, factor, wide)
         if len(shown.centres) >= _FEWEST:
             found += votes(shown.smooth(), (shown.centres - origin) / factor, radius, matrix, factor)
-    best: list[ImageCorrection] = []
-    for turn in sorted(found, key=lambda one: -one.value):
-        if len(best) == _HYPOTHESES or turn.value <= _WORTH * max(one.value for one in found):
+    found.sort(key=lambda one: -one.value)
+    likely = (
+        followed_by(start, _step(turn.matrix, turn.shift)) for turn in found if turn.value > _WORTH * found[0].value
+    )
+    return _distinct(likely, region, factor)
+
+
+def _settled(
+    view: View, targets: Sequence[Target], region: Region, correction: ImageCorrection, factor: int
+) -> ImageCorrection:
+    """Return what a correction leads to where its chips agree on a better one, step by step.
+
+    Rotation and scale are known to their steps alone, and an oblique image that is turned is sheared as well. So
+    several places beside each other may lead to one correction.
+    """
+    # Small chips: there have to be many for slopes to be fitted.
+    side = min(_LEAST_SIDE, _chip_side(region, factor, 3))
+    for _ in range(_SETTLING):
+        shown = _correlated(replace(view, model=correction), targets, region, side, factor, _NEXT)
+        if len(shown.centres) < _FEWEST:
             break
-        correction = followed_by(start, _step(turn.matrix, turn.shift))
-        if all(_apart(correction, other, region) > _APART * factor for other in best):
-            best.append(correction)
-    return best
+        found = peaks(shown.surface, 2)
+        before = correction
+        correction, _ = agreed(correction, shown.centres, found.shift * factor, found.score, _AGREE * factor)
+        if _apart(before, correction, region) < _STANDS * factor:
+            break
+    return correction
+
+
+def _distinct(corrections: Iterable[ImageCorrection], region: Region, factor: int) -> list[ImageCorrection]:
+    """Return the first corrections that are not the same as one before."""
+    found: list[ImageCorrection] = []
+    for one in corrections:
+        if all(_apart(one, other, region) > _APART * factor for other in found):
+            found.append(one)
+        if len(found) == _HYPOTHESES:
+            break
+    return found
 
 
 def _apart(one: ImageCorrection, other: ImageCorrection, region: Region) -> float:
