@@ -381,29 +381,40 @@ def test_panes_stay_where_they_are_whatever_is_said(serve, reference: Path, feat
     assert not served.faults
 
 
+#: What a pane shows.
+SEEN = """(pane) => [...document.querySelectorAll(`#${pane} canvas`)].map((one) => one.toDataURL()).join()"""
+
+
+def at_rest(page: playwright.Page, pane: str) -> str:
+    """Return what a pane shows as soon as no tile and no animation has changed it for half a second."""
+    seen, later = None, page.evaluate(SEEN, pane)
+    while seen != later:
+        page.wait_for_load_state("networkidle")
+        page.wait_for_timeout(500)
+        seen, later = later, page.evaluate(SEEN, pane)
+    return str(later)
+
+
 def test_the_wheel_zooms_whichever_pane_is_under_the_pointer(serve, reference: Path, features: np.ndarray) -> None:
     served = serve(reference)
     page = served.page
 
     def zooms(pane: str) -> bool:
-        tiles: list[str] = []
-        page.on("request", lambda request: tiles.append(request.url))
         box = page.locator(f"#{pane}").bounding_box()
         page.mouse.move(box["x"] + 100, box["y"] + 100)
-        before = page.evaluate(SEEN, pane)
+        before = at_rest(page, pane)
         page.mouse.wheel(0, -300)
-        page.wait_for_timeout(600)
-        return page.evaluate(SEEN, pane) != before
+        try:
+            page.wait_for_function(f"(before) => ({SEEN})({pane!r}) !== before", arg=before)
+        except playwright.TimeoutError:
+            return False
+        return at_rest(page, pane) != before
 
     assert zooms("scene"), "nothing has the focus yet"
     assert zooms("reference")
     page.locator("#cancel").evaluate("(button) => button.focus()")
     assert zooms("reference")
     assert zooms("scene")
-
-
-#: What a pane shows, as the checksum of its canvas.
-SEEN = """(pane) => [...document.querySelectorAll(`#${pane} canvas`)].map((one) => one.toDataURL()).join()"""
 
 
 def test_a_dragged_point_stays_where_it_was_put(serve, reference: Path, features: np.ndarray) -> None:
