@@ -160,7 +160,9 @@ def _check_measurement(one: Mark | Ray, where: str) -> None:
         raise InputError("a standard deviation is positive", field=f"{where}sigma_image", remedy="give pixels")
     if one.covariance is not None:
         column, row, both = one.covariance
-        if not (least**2 <= min(column, row) and max(column, row) <= most**2 and both**2 < column * row * (1 - 1e-9)):
+        possible = least**2 <= min(column, row) and max(column, row) <= most**2
+        # A power of a float, unlike a root, has no result beyond 1e308.
+        if not (possible and abs(both) < math.sqrt(column * row * (1 - 1e-9))):
             raise InputError("this is no covariance", field=f"{where}covariance")
 
 

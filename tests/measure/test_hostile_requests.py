@@ -25,6 +25,7 @@ IMPOSSIBLE: tuple[dict[str, Any], ...] = (
     {"do": "put", "mark": {**MARK, "role": "tie"}}, {"do": "put", "mark": {**MARK, "group": 2**63 - 1}},
     {"do": "put", "mark": {**MARK, "covariance": [1e200, 1e200, 0.0]}},
     {"do": "put", "mark": {**MARK, "covariance": [1e-200, 1e-200, 0.0]}},
+    {"do": "put", "mark": {**MARK, "covariance": [0.1, 0.2, 1e200]}},
     {"do": "put", "mark": {**MARK, "ground": [33.35, 900.0, 900.0]}}, {"do": "correct", "correction": []},
 )  # fmt: skip
 
@@ -54,7 +55,7 @@ def test_what_cannot_be_solved_or_shown_is_not_stored(projects: list[Any], monke
     session.close()
 
 
-@pytest.mark.parametrize("action", [IMPOSSIBLE[0], IMPOSSIBLE[5], IMPOSSIBLE[10]])
+@pytest.mark.parametrize("action", [IMPOSSIBLE[0], IMPOSSIBLE[5], IMPOSSIBLE[10], IMPOSSIBLE[11]])
 def test_a_journal_opens_up_to_an_impossible_action(projects: list[Any], action: dict[str, Any]) -> None:
     journal_of_both(projects[0], action)
     session: Project = projects[0]()

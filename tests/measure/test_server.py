@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
+import warnings
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -191,6 +192,10 @@ def test_a_tile_is_a_picture_and_nonsense_is_none(client: TestClient) -> None:
     answer = client.get(f"/{FOLDER}/tiles/scene-0/0/2/0/1?b=0&l=0,2000")
     assert answer.headers["content-type"] == "image/png"
     assert answer.content[:4] == b"\x89PNG"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Black and white of one value, far from all pixels.
+        assert client.get(f"/{FOLDER}/tiles/scene-0/0/2/0/1?b=0&l=1e12,1e12").status_code == 200
     for wrong in ("scene-0/0/3/0/0?l=0,1", "scene-0/0/1/0/0?l=0,nan", "scene-0/0/1/0/0?l=0",
                   "scene-0/0/1/0/0?b=1,2&l=0,1,2,3", "scene-0/0/131072/0/0?l=0,1",
                   "scene-0/0/1/9999999/0?l=0,1"):  # fmt: skip

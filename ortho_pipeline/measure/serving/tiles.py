@@ -134,5 +134,6 @@ class Tiles:
 
 
 def _shade(plane: Pixels, low: float, high: float) -> NDArray[np.uint8]:
-    scaled = np.clip((plane - low) * (255.0 / max(high - low, 1e-30)), 0.0, 255.0)
+    with np.errstate(over="ignore"):  # black and white may be one value
+        scaled = np.clip((plane - low) * (255.0 / max(high - low, 1e-30)), 0.0, 255.0)
     return np.nan_to_num(scaled).astype(np.uint8)
