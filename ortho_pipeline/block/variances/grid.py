@@ -13,7 +13,8 @@ with the spread of the estimates; for a single component of :math:`\nu` degrees 
 Only control enters point by point: with parameters :math:`z` in which the cofactors of a solution are the unit matrix,
 the normal equations of everything else are the rest of the unit matrix, so a node of the grid costs next to nothing.
 
-Source: Patterson and Thompson 1971 (restricted likelihood); Gelman 2006 (priors of variances); Koch 2007 (in geodesy).
+Source: Patterson and Thompson 1971 (restricted likelihood); Tiao and Tan 1965 (a prior that is even in the log of the
+sum of two variances); Gelman 2006 (priors of variances); Koch 2007 (in geodesy).
 """
 
 from __future__ import annotations
@@ -30,15 +31,14 @@ from ortho_pipeline.block.variances.control_equations import ControlEquations, N
 from ortho_pipeline.errors import NotConverged
 from ortho_pipeline.models.base import Array
 
-#: Errors of the ground below this part of what a point's own rays leave open change nothing that could be seen: the
-#: prior is even in log sigma above it, and even in sigma below.
-_UNSEEN = 0.25
 #: Ground that is wrong by more than so many pixels is hardly taken as control: there the prior falls.
 _WORST_PIXELS = 20.0
-#: Plan and height of one survey are alike within a factor of four (two standard deviations of the log of their ratio).
-_ALIKE = math.log(2.0)
+#: Heights of a survey that are ten times worse than plan, or better, are one standard deviation of the prior.
+_RATIO = 10.0
 #: The same for the factor of the measurements: below a tenth and above ten times what was stated the prior falls.
 _IMAGE_LOW, _IMAGE_HIGH = 0.1, 10.0
+#: The grid begins so far (log) below what a point's own rays leave open: less of its ground cannot be seen.
+_UNSEEN = 3.0
 #: Step of the grid in log sigma; how much less likely than the best (log) a node may be to count.
 _COARSE, _COUNTS = 0.5, 12.0
 #: Matrices of points by nodes that are worth while; parameters beyond which nodes are dear.
@@ -104,8 +104,10 @@ class _Grid:
         if any(self.free) and equations.redundancy(self._at(far))[0] < _LEAST:
             # One image, or no redundancy: an error of the ground is one of the measurement.
             self.free, self.separable = [False, False], False
-        self.unseen = self._unseen()
-        self.centre = self._centre()
+        self.worst = _WORST_PIXELS * equations.pixel
+        self.of_rays = self._of_rays()
+        self.centre = np.zeros(3)
+        self._find_centre()
         # So much better than stated that rounding of the equations drowns the ground: no better than they can tell.
         while not np.isfinite(self.chances(self.centre[None])[0]) and self.centre[0] < 0.0:
             self.centre[0] = min(self.centre[0] + _COARSE, 0.0)
@@ -123,23 +125,33 @@ class _Grid:
             self._last = logs.copy(), self.equations.at(self._variances(logs))
         return self._last[1]
 
-    def _unseen(self) -> float:
-        """Return the sigma (m) of ground below which nothing could be seen of it, times the factor of measurements."""
+    def _of_rays(self) -> Array:
+        """Return the variances ``(2,)``, m² in plan and height, that a control point's rays leave open.
+
+        They are over the square of the factor of measurements. One ray leaves the height open: there it is the worst.
+        """
         if not any(self.free):
-            return 1.0
+            return np.ones(2)
         values = np.linalg.eigvalsh(self.equations.u)
-        middle = float(np.median(values[:, 1]))
-        return _UNSEEN / math.sqrt(middle) if middle > 0 else _UNSEEN * self.equations.pixel
+        return np.asarray(np.median(1.0 / np.maximum(values[:, 1::-1], self.worst**-2), axis=0))
 
     def _prior(self, logs: Array) -> Array:
-        sigma = np.exp(logs)
-        found = -np.log1p(_IMAGE_LOW / sigma[:, 0]) - np.log1p((sigma[:, 0] / _IMAGE_HIGH) ** 2)
+        """Return the log prior ``(b,)`` at nodes.
+
+        A misfit of the ground has the variance of the ground plus that of its rays. In plan and in height, the prior
+        is even in the log of this sum, which is all that misfits show. The variance of rays is that at the centre: if
+        it were each node's own, good control would make measurements seem better than they are. The last line says
+        how plan and height are related: four points outweigh it; with fewer it keeps heights from being anything.
+        """
+        squares = np.exp(2.0 * logs)
+        of_rays = self.of_rays * math.exp(2.0 * self.centre[0])
+        found = -np.log1p(_IMAGE_LOW / np.exp(logs[:, 0])) - np.log1p(squares[:, 0] / _IMAGE_HIGH**2)
         for axis, free in enumerate(self.free, start=1):
             if free:
-                low, high = self.unseen * sigma[:, 0], _WORST_PIXELS * self.equations.pixel
-                found = found - np.log1p(low / sigma[:, axis]) - np.log1p((sigma[:, axis] / high) ** 2)
+                found = found - np.log1p(of_rays[axis - 1] / squares[:, axis])
+                found = found - np.log1p(squares[:, axis] / self.worst**2)
         if all(self.free):
-            found = found - 0.5 * ((logs[:, 1] - logs[:, 2]) / _ALIKE) ** 2
+            found = found - 0.5 * ((logs[:, 1] - logs[:, 2]) / math.log(_RATIO)) ** 2
         return np.asarray(found)
 
     def chances(self, logs: Array) -> Array:
@@ -147,28 +159,28 @@ class _Grid:
         found = self.equations.likelihoods(self._variances(logs)) + self._prior(logs)
         return np.where(np.isfinite(found), found, -np.inf)
 
-    def _centre(self) -> Array:
-        """Return the logs ``(3,)`` near the best, found by turns for the ground and for the measurements."""
-        equations = self.equations
+    def _find_centre(self) -> None:
+        """Find the logs ``(3,)`` near the best, by turns for the ground and for the measurements."""
+        equations, centre = self.equations, self.centre
         redundancy = max(equations.redundancy(self._at(np.zeros(3)))[0], 1.0)
-        centre = np.array([self._log_of(equations.square / redundancy), 0.0, 0.0])
+        centre[0] = self._log_of(equations.square / redundancy)
         for number in range(_ROUNDS):
             if any(self.free):
                 logs = self._plane(centre[0], self._span(centre[0]))
                 if number:
                     # Another factor of the measurements moves the best ones a little.
                     logs = logs[(np.abs(logs[:, 1:] - centre[1:]) < _NEAR).all(axis=1)]
-                centre = logs[int(np.argmax(self.chances(logs)))]
+                centre[:] = logs[int(np.argmax(self.chances(logs)))]
             node = self._at(centre)
             redundancy = equations.redundancy(node)[0]
             if redundancy < _LEAST:
-                return np.array([0.0, *centre[1:]])
+                centre[0] = 0.0
+                return
             # Measured minus predicted after the step; the ground's part of the square is not the measurements'.
             square = self._image_square(node, centre)
             before, centre[0] = centre[0], self._log_of(square / redundancy)
             if abs(centre[0] - before) < 0.01:
-                break
-        return centre
+                return
 
     def _log_of(self, square: float) -> float:
         return max(0.5 * math.log(max(square, 1e-300)), self.equations.finest)
@@ -182,10 +194,10 @@ class _Grid:
         return max(node.square - ground - pseudo, 0.0) * math.exp(2.0 * logs[0])
 
     def _span(self, image: float) -> tuple[Array, Array]:
-        low = math.log(self.unseen / 8.0) + image
-        worst = max(_WORST_PIXELS * self.equations.pixel, float(np.abs(self.equations.d).max(initial=0.0)))
-        axis = np.arange(min(low, math.log(worst) - 1.0), math.log(4.0 * worst) + _COARSE, self._step())
-        return axis, axis
+        worst = max(self.worst, float(np.abs(self.equations.d).max(initial=0.0)))
+        lows = np.minimum(0.5 * np.log(self.of_rays) - _UNSEEN + image, math.log(worst) - 1.0)
+        plan, height = (np.arange(low, math.log(4.0 * worst) + _COARSE, self._step()) for low in lows)
+        return plan, height
 
     def _step(self) -> float:
         return _COARSE if self.equations.size <= _DEAR and len(self.equations.rows) <= 100 else 2.0 * _COARSE
@@ -247,10 +259,8 @@ class _Grid:
         """
         if not any(self.free):
             return math.inf
-        values = np.linalg.eigvalsh(self.equations.u)
-        own = np.median(1.0 / np.maximum(values, 1e-6 * values[:, 2:]), axis=0)
         squares, found = np.exp(2.0 * self.logs), math.inf
-        for axis, of_rays in ((1, own[1]), (2, own[0])):
+        for axis, of_rays in enumerate(self.of_rays, start=1):
             logs = np.log(squares[:, 0] * of_rays + (squares[:, axis] if self.free[axis - 1] else 0.0))
             spread = float(self.chance @ (logs - self.chance @ logs) ** 2)
             found = min(found, (1.0 + math.sqrt(1.0 + 2.0 * spread)) / spread if spread > 0 else math.inf)
