@@ -4,7 +4,8 @@ As for one image (`estimation.spatial.shared_errors`), for each by itself: of th
 with a group, what no value of its parameters explains says how alike neighbours err. With the rows :math:`F` of these
 measurements, the ground of their points eliminated, and cofactors :math:`C` of all parameters, it adds
 :math:`C F^T (\Sigma - \sigma_0^2 I) F C` to their covariance, summed over images. What two images share of one
-reference counts as if each had its own: nothing tells it apart from the rest.
+reference counts as if each had its own: nothing tells it apart from the rest. What all matches of an image err alike,
+which residuals do not show, is added as it is known (`MATCHED_ALIKE`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.points import Index
-from ortho_pipeline.estimation.spatial.shared_errors import Neighbours, SharedErrors
+from ortho_pipeline.estimation.spatial.shared_errors import MATCHED_ALIKE, Neighbours, SharedErrors
 from ortho_pipeline.models.base import Array
 
 #: Of blocks with more parameters it is not estimated: each measurement has an influence on all of them.
@@ -93,25 +94,30 @@ def _rows(linear: Linear, rays: Index) -> Array:
 
 
 def _estimated(solved: Solved, rays: Index, design: Array, variance: float) -> tuple[SharedErrors, Array]:
-    """Return what neighbours share, and F' (Sigma - variance I) F ``(m, m)`` of a design F ``(n, 2, m)``."""
+    """Return what neighbours share, and F' (Sigma - variance I) F ``(m, m)`` of a design F ``(n, 2, m)``.
+
+    Sigma contains what all of them err alike.
+    """
     points, count, size = solved.problem.points, len(rays), design.shape[2]
     groups = len(np.unique(points.grouped[rays]))
     sigmas = points.sigma_image[rays, None, None]
     shift = points.whitened(np.broadcast_to(np.eye(2), (count, 2, 2)) / sigmas, rays)
     whole = np.concatenate([design, shift], axis=2)
     scene = Neighbours.of(points.measured[rays], solved.linear.misfits.rays[rays], whole)
-    flat = design.reshape(2 * count, size)
+    flat, left = design.reshape(2 * count, size), shift.reshape(2 * count, 2)
+    moved = MATCHED_ALIKE * flat.T @ left
     if scene is None:
         # All that is known is who shares: a group is one point.
-        return SharedErrors(count, groups, float(groups)), (count / groups - 1.0) * variance * flat.T @ flat
+        own = (count / groups - 1.0) * variance * flat.T @ flat
+        return SharedErrors(count, groups, float(groups)), own + moved @ moved.T
     middle, likely = scene.middle(variance)
-    left = shift.reshape(2 * count, 2)
     normal = variance * left.T @ left
     grown = normal + _positive(middle[size:, size:], left)
     # Of a shift alone: the covariance is N^-1 (N + excess) N^-1.
     inverse = np.linalg.inv(left.T @ left)
     ratio = np.trace(inverse @ normal @ inverse) / np.trace(inverse @ grown @ inverse)
-    return SharedErrors(count, groups, count * float(ratio), *likely), _positive(middle[:size, :size], flat)
+    own = _positive(middle[:size, :size], flat)
+    return SharedErrors(count, groups, count * float(ratio), *likely), own + moved @ moved.T
 
 
 def _positive(excess: Array, design: Array) -> Array:
