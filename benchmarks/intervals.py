@@ -3,11 +3,13 @@
 python benchmarks/intervals.py                     60 blocks of each kind; about an hour on two cores
 python benchmarks/intervals.py --blocks 12         a first look
 python benchmarks/intervals.py --control 4 --error 0.5   one kind
+python benchmarks/intervals.py --ratio 4           heights of the control are four times worse than plan
 python benchmarks/intervals.py --json FILE         what was found in each block, one line each
 
 Three line scanners over one place with RPCs and shifts; control (4, 6, 9 or 20 points) whose ground is wrong by 0, 0.2,
-0.5 or 1 m and states no sigma; 10 check and 20 tie points; measurements good to 0.3 px that state the default of 0.5.
-Each block is adjusted as it is, and once more with the first control point moved by ten true sigmas in any direction.
+0.5 or 1 m on each axis (heights by `--ratio` times as much) and states no sigma; 10 check and 20 tie points;
+measurements good to 0.3 px that state the default of 0.5. Each block is adjusted as it is, and once more with the first
+control point moved by ten true sigmas in any direction.
 
 The intervals of one block share the errors of its control, so what is behind ± is the standard error over blocks. Exit
 code 1 if a share is outside of 0.92 to 0.97 by more than two of these, or more than 2 % of a kind are refused.
@@ -23,6 +25,7 @@ import os
 import sys
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -64,9 +67,9 @@ def cameras(gsd: float) -> dict[str, RPC]:
 
 
 def block(
-    gsd: float, control: int, error: float, seed: int
+    gsd: float, control: int, error: float, ratio: float, seed: int
 ) -> tuple[dict[str, ImageCorrection], BlockPoints, np.ndarray]:
-    """Return true models, points whose control is wrong by `error` metres on each axis, and the true ground."""
+    """Return true models, points whose control is wrong by `error` m, in height times `ratio`, and the true ground."""
     random = np.random.default_rng([seed, control, round(1000 * error)])
     middle = (PIXELS / 2, PIXELS / 2)
     truth = {
@@ -81,7 +84,7 @@ def block(
     ])  # fmt: skip
     seen = np.concatenate([model.ground_to_image(ground) for model in truth.values()])
     known = ground.copy()
-    known[:control] = moved(ground[:control], random.normal(0, 1, (control, 3)) * error)
+    known[:control] = moved(ground[:control], random.normal(0, 1, (control, 3)) * error * (1.0, 1.0, ratio))
     points = BlockPoints(
         ids=tuple(f"p{k}" for k in range(count)), ground=known,
         roles=np.array(["control"] * control + ["check"] * CHECK + ["tie"] * TIES), sigma_ground=np.zeros((count, 3)),
@@ -114,12 +117,12 @@ def covered(found: BlockFit, truth: dict[str, ImageCorrection], ground: np.ndarr
     }
 
 
-def measure(case: tuple[float, int, float, int]) -> dict[str, Any]:
+def measure(case: tuple[float, int, float, float, int]) -> dict[str, Any]:
     """Adjust one block, without and with a gross error."""
-    gsd, control, error, seed = case
-    truth, points, ground = block(gsd, control, error, seed)
+    gsd, control, error, ratio, seed = case
+    truth, points, ground = block(gsd, control, error, ratio, seed)
     start = {name: model.with_params(np.zeros(2)) for name, model in truth.items()}
-    row: dict[str, Any] = {"gsd": gsd, "points": control, "error": error, "seed": seed}
+    row: dict[str, Any] = {"gsd": gsd, "points": control, "error": error, "ratio": ratio, "seed": seed}
     try:
         found = adjust(start, points)
         row |= covered(found, truth, ground) | {
@@ -129,11 +132,11 @@ def measure(case: tuple[float, int, float, int]) -> dict[str, Any]:
     except DegeneratePoints as problem:
         row["refused"] = str(problem)
     direction = np.random.default_rng([seed, 1]).normal(0, 1, 3)
-    size = TIMES * max(error, NOISE * gsd)
+    sigmas = max(error, NOISE * gsd) * np.array([1.0, 1.0, ratio])
     known = points.ground.copy()
-    known[:1] = moved(ground[:1], size * (direction / np.linalg.norm(direction))[None])
+    known[:1] = moved(ground[:1], TIMES * sigmas * (direction / np.linalg.norm(direction))[None])
     try:
-        spoiled = adjust(start, BlockPoints(**{**vars(points), "ground": known}))
+        spoiled = adjust(start, replace(points, ground=known))
         names = {one.point for one in spoiled.rejected}
         row |= {
             "blunder": "p0" in names, "others": sorted(names - {"p0"}),
@@ -193,13 +196,14 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="seed of the first (0)")
     parser.add_argument("--control", type=int, action="append", metavar="N", help="control points; may be repeated")
     parser.add_argument("--error", type=float, action="append", metavar="M", help="error in metres; may be repeated")
+    parser.add_argument("--ratio", type=float, default=1.0, metavar="R", help="error in height over that in plan (1)")
     parser.add_argument("--gsd", type=float, default=0.5, metavar="M", help="size of a pixel in metres (0.5)")
     parser.add_argument("--processes", type=int, default=2, metavar="N", help="processes at a time (2)")
     parser.add_argument("--json", metavar="FILE", help="write a line for each block")
     given = parser.parse_args()
     seeds = range(given.first, given.first + given.blocks)
     cases = [
-        (given.gsd, control, error, seed)
+        (given.gsd, control, error, given.ratio, seed)
         for seed, error, control in itertools.product(seeds, given.error or ERRORS, given.control or CONTROL)
     ]
     rows = []
