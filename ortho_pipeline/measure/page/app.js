@@ -306,6 +306,7 @@ const accept = safely(async () => {
   const mark = plain({ ...pending, id: $('name').value.trim() || freeName(), role: $('role').value, note: $('note').value,
     sigma_xy: decimal('sigma-xy') ?? 0, sigma_h: decimal('sigma-h') ?? 0,
     ...(sigma === null ? {} : { sigma_image: sigma, covariance: null }) });
+  say(`Saving ${mark.id} …`);
   const done = await act({ do: 'put', mark, ...(pending.was ? { was: pending.was } : {}) });
   if (!done) return;
   pending = null;
