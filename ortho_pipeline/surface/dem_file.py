@@ -17,6 +17,7 @@ from pyproj.exceptions import CRSError
 
 from ortho_pipeline.errors import CrsError, InputError
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
+from ortho_pipeline.geodesy.distortion import metres_of_steps
 from ortho_pipeline.raster.source import first_line, open_pixels
 from ortho_pipeline.surface.base import Array
 
@@ -60,12 +61,19 @@ class SampleGrid:
             float(shift[1]), float(inverse[1, 0]), float(inverse[1, 1]),
         )  # fmt: skip
 
-    @property
+    @functools.cached_property
     def sample_size(self) -> float:
-        """Larger side of a sample, in metres (on the equator where the DEM is in degrees)."""
-        _, a, b, _, c, d = self.crs_from_pixel
+        """Larger side of a sample, in metres on the ground in the middle of the grid."""
+        x, a, b, y, c, d = self.crs_from_pixel
+        v, u = (count / 2 for count in self.shape)
+        middle = np.array([[x + a * u + b * v, y + c * u + d * v, 0.0]])
+        sides = np.array([(a, c), (b, d)])
+        size = float(np.max([metres_of_steps(self.crs, middle, side) for side in sides]))
+        if math.isfinite(size):
+            return size
+        # The middle is outside the domain of the CRS: metres on the map.
         unit = 111320.0 if self.crs.is_geographic else self.crs.axis_info[0].unit_conversion_factor
-        return unit * max(math.hypot(a, c), math.hypot(b, d))
+        return unit * float(np.linalg.norm(sides, axis=1).max())
 
     def around(self, lon: float) -> SampleGrid:
         """Return the grid with the seam opposite to `lon` (degrees) if it goes round the world, else as it is."""

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import pyproj
 import pytest
 from osgeo import gdal, osr
 
@@ -357,6 +358,21 @@ def test_a_worker_process_gets_a_surface(tmp_path: Path) -> None:
         np.testing.assert_array_equal(pool.submit(surface.heights, where).result(), surface.heights(where))
         np.testing.assert_array_equal(pool.submit(flat.heights, where).result(), [7.5, 7.5, 7.5])
     assert pickle.loads(pickle.dumps(surface)).provenance == surface.provenance
+
+
+@pytest.mark.parametrize(
+    ("code", "x", "y"),
+    [(3857, 1.0e6, 8.4e6), (32633, 500_000.0, 6.65e6), (3413, 1.0e6, -1.0e6), (4326, 9.0, 60.0), (2263, 9.9e5, 2.0e5)],
+)
+def test_the_size_of_samples_is_that_on_the_ground(tmp_path: Path, code: int, x: float, y: float) -> None:
+    """`nearest` looks for heights within metres of the ground: in EPSG:3857 at 60° N the map has twice as many."""
+    side = 3e-4 if code == 4326 else 30.0
+    path = write_dem(tmp_path / "d.tif", hills(40, 40), f"EPSG:{code}", (x, side, 0.0, y, 0.0, -side))
+    to_lonlat = pyproj.Transformer.from_crs(code, 4326, always_xy=True)
+    u, v = np.array([20.0, 21.0, 20.0]), np.array([20.0, 20.0, 21.0])
+    lon, lat = to_lonlat.transform(x + side * (u + 0.5), y - side * (v + 0.5))
+    _, _, metres = pyproj.Geod(ellps="GRS80").inv(lon[[0, 0]], lat[[0, 0]], lon[1:], lat[1:])
+    assert Surface.open(path, "ellipsoid").sample_size == pytest.approx(max(metres), rel=1e-3)
 
 
 def test_rays_that_stand_far_apart_read_every_tile_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
