@@ -7,11 +7,7 @@ The names below are the public interface; each is loaded when it is first used, 
 from __future__ import annotations
 
 import importlib
-import sys
-import warnings
-from importlib.machinery import ModuleSpec
-from types import ModuleType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.adjustment import adjust as adjust
@@ -36,8 +32,6 @@ if TYPE_CHECKING:
     from ortho_pipeline.hookspecs import Scene as Scene
     from ortho_pipeline.hookspecs import Sensor as Sensor
     from ortho_pipeline.hookspecs import hookimpl as hookimpl
-    from ortho_pipeline.imaging.ellipse import Ellipse as Ellipse
-    from ortho_pipeline.imaging.ellipse import fit_ellipse as fit_ellipse
     from ortho_pipeline.models import RPC as RPC
     from ortho_pipeline.models import ImageCorrection as ImageCorrection
     from ortho_pipeline.models import SensorModel as SensorModel
@@ -59,7 +53,6 @@ __version__: str
 #: Public name -> module that holds it.
 _HOMES = {
     "BlockPoints": "block.points",
-    "Ellipse": "imaging.ellipse",
     "Fit": "estimation.fit",
     "Grid": "raster.source",
     "ImageCorrection": "models",
@@ -83,7 +76,6 @@ _HOMES = {
     "compare": "estimation.comparison",
     "export_rpc": "exchange.rpc",
     "fit": "estimation.fit",
-    "fit_ellipse": "imaging.ellipse",
     "hookimpl": "hookspecs",
     "intersect": "block.intersection",
     "load_model": "exchange.model_file",
@@ -101,19 +93,6 @@ _HOMES = {
 
 __all__ = sorted(_HOMES)  # noqa: PLE0605
 
-#: Modules that plugins and scripts imported before there were rooms -> where they are now.
-_MOVED = {
-    "bands": "commands.bands",
-    "contract": "plugins.contract",
-    "crs": "geodesy.crs",
-    "dem": "surface.dem",
-    "geometry": "geodesy.ellipsoid",
-    "locations": "files.locations",
-    "pipeline": "commands",
-    "problem": "estimation.problem",
-    "rpc": "exchange.rpc",
-}
-
 if not TYPE_CHECKING:  # a checker knows the names from above, and no others
 
     def __getattr__(name: str) -> Any:
@@ -130,30 +109,3 @@ if not TYPE_CHECKING:  # a checker knows the names from above, and no others
 
 def __dir__() -> list[str]:
     return [*__all__, "__version__"]
-
-
-class _Moved:
-    """Find a module under the name that it had before.
-
-    A finder and a loader without their base classes: those load a fifth of what ``ortho --help`` needs.
-    """
-
-    def find_spec(self, fullname: str, path: object = None, target: object = None) -> ModuleSpec | None:
-        package, _, name = fullname.rpartition(".")
-        return ModuleSpec(fullname, cast(Any, self)) if package == __name__ and name in _MOVED else None
-
-    def create_module(self, spec: ModuleSpec) -> ModuleType:
-        now = f"{__name__}.{_MOVED[spec.name.rpartition('.')[2]]}"
-        warnings.warn(f"{spec.name} is {now} now", DeprecationWarning, stacklevel=2)
-        # The import system writes into the module it gets; the real one must keep its own name.
-        real = importlib.import_module(now)
-        module = ModuleType(spec.name, real.__doc__)
-        own = {name: value for name, value in vars(real).items() if not name.startswith("__") or name == "__getattr__"}
-        module.__dict__.update(own)
-        return module
-
-    def exec_module(self, module: ModuleType) -> None:
-        """Do nothing: it is filled already."""
-
-
-sys.meta_path.append(_Moved())

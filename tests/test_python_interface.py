@@ -188,24 +188,6 @@ def test_the_table_of_options_is_that_of_the_command_line() -> None:
     assert rows == other
 
 
-def test_modules_are_found_under_the_names_that_they_had_before_there_were_rooms() -> None:
-    code = (
-        "import warnings; warnings.simplefilter('error')\n"
-        "from ortho_pipeline.geodesy import ellipsoid\n"
-        "try:\n    import ortho_pipeline.geometry\n"
-        "except DeprecationWarning as said:\n    print(said)\n"
-        "warnings.simplefilter('ignore')\n"
-        "from ortho_pipeline.geometry import geocentric\n"
-        "from ortho_pipeline import pipeline, rpc\n"
-        "print(geocentric is ellipsoid.geocentric, pipeline.rectify is not None, rpc.rpc_of_dataset is not None)\n"
-        "for name in __import__('ortho_pipeline')._MOVED: __import__(f'ortho_pipeline.{name}')\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines() == [
-        "ortho_pipeline.geometry is ortho_pipeline.geodesy.ellipsoid now", "True True True",
-    ]  # fmt: skip
-
-
 # -- scenes that are adjusted, and what help() shows
 
 

@@ -7,7 +7,6 @@ before it begins.
 
 from __future__ import annotations
 
-import _thread
 import ctypes
 import functools
 import itertools
@@ -33,9 +32,6 @@ MOST_THREADS = 512
 _M_ARENA_MAX = -8
 #: Parts that a work is shared out in, on any machine, so that sums over them are rounded alike.
 _PARTS = 8
-#: Seconds in which a thread has begun, if it ever does.
-_PATIENCE = 10.0
-
 
 #: Told what is being done (or was done) and the finished share of it, 0 to 1.
 Progress = Callable[[str, float], None]
@@ -99,34 +95,24 @@ def startable_threads(wanted: int) -> int:
     OrthoError
         If there can be none.
     """
-    begun, ended = threading.Semaphore(0), threading.Semaphore(0)
-    leave = threading.Event()
-
-    def wait() -> None:
-        begun.release()
-        leave.wait()
-        ended.release()
-
-    count = 0
+    leave, started = threading.Event(), list[threading.Thread]()
     try:
-        while count < min(wanted, MOST_THREADS):
-            # Not `Thread.start`, which waits without end for a thread that fails before it has begun.
-            _thread.start_new_thread(wait, ())
-            if not begun.acquire(timeout=_PATIENCE):
-                break
-            count += 1
+        while len(started) < min(wanted, MOST_THREADS):
+            thread = threading.Thread(target=leave.wait, daemon=True)
+            thread.start()
+            started.append(thread)
     except (RuntimeError, MemoryError):
         pass
     finally:
         leave.set()
-    for _ in range(count):
-        ended.acquire(timeout=_PATIENCE)
-    if not count:
+    for thread in started:
+        thread.join()
+    if not started:
         raise OrthoError(
             "no thread can be started",
             remedy="raise the limits on processes and memory (ulimit -u, ulimit -v, pids and memory of the container)",
         )
-    return count
+    return len(started)
 
 
 class _Pool:
@@ -174,8 +160,8 @@ def parts_of(count: int, least: int) -> list[tuple[int, int]]:
 def side_by_side(work: Callable[[int, int, int], None], parts: list[tuple[int, int]]) -> None:
     """Do a work on parts, each given by its number, begin and end, with as many threads as there are processors.
 
-    It has to let the interpreter go, as compiled code does, and each part to write to a place of its own. This thread
-    works too; threads that cannot be started, or fail before they begin, leave their parts to the others.
+    The work has to release the GIL, as compiled code does, and each part to write to a place of its own. This thread
+    works too; threads that cannot be started leave their parts to the others.
     """
     jobs = iter([(number, *part) for number, part in enumerate(parts)])
     done, failed = threading.Semaphore(0), list[BaseException]()
@@ -191,8 +177,7 @@ def side_by_side(work: Callable[[int, int, int], None], parts: list[tuple[int, i
 
     try:
         for _ in range(min(os.cpu_count() or 1, len(parts)) - 1):
-            # Not `Thread.start`, which waits until it has begun, and without end if it does not.
-            _thread.start_new_thread(take_part, ())
+            threading.Thread(target=take_part, daemon=True).start()
     except (RuntimeError, MemoryError):
         pass
     take_part()

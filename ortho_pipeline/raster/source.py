@@ -442,9 +442,9 @@ class RasterSource:
             for band in file.bands
         )
 
-    def read(self, left: int, top: int, width: int, height: int, empty: Any = np.empty) -> NDArray[Any]:
-        """Return the pixels ``(count, height, width)`` of a window inside the raster, in an array made by `empty`."""
-        pixels, start = empty((self.count, height, width), self.dtype), 0
+    def read(self, left: int, top: int, width: int, height: int) -> NDArray[Any]:
+        """Return the pixels ``(count, height, width)`` of a window inside the raster."""
+        pixels, start = np.empty((self.count, height, width), self.dtype), 0
         for file in self._files:
             file.read(left, top, pixels[start : start + file.count])
             start += file.count

@@ -43,7 +43,6 @@ from ortho_pipeline.warp.block_kernel import DemWindow, Target, warp_block
 from ortho_pipeline.warp.gdal_engine import WARPING, warp_with_gdal
 from ortho_pipeline.warp.lattice import BLOCK, Lattices, OutputBlock, Terrain, block_cells
 from ortho_pipeline.warp.layers.hiding import Hiding, Looked
-from ortho_pipeline.warp.reused import Reused
 
 #: Side of a tile, the piece of work of a thread, of few bands (`square_side`). What a tile is may not depend on memory
 #: or threads, which the order of blocks in a file would tell.
@@ -158,7 +157,6 @@ def rectify(
             writer.write(made.left, made.top, made.pixels, made.valid)
             if mask is not None:
                 mask.write(made.left, made.top, made.classes[None], None)
-            job.give_back(made)
             if resources.progress:
                 resources.progress(WARPING, done / len(tiles))
         refuse_empty(job.valid_pixels, path)
@@ -326,14 +324,13 @@ def _in_order(threads: int, job: TileMaker, tiles: list[tuple[int, int, int, int
 
 
 class Made(NamedTuple):
-    """A tile: its place in the ortho, pixels ``(bands, h, w)``, which of them are valid ``(h, w)``, classes, memory."""
+    """A tile: its place in the ortho, pixels ``(bands, h, w)``, which of them are valid ``(h, w)``, classes."""
 
     left: int
     top: int
     pixels: NDArray[Any]
     valid: NDArray[np.bool_]
     classes: Any
-    memory: NDArray[Any]
 
 
 class TileMaker:
@@ -362,7 +359,6 @@ class TileMaker:
         self.resampling = kernels.Resampling(kernel, 0, (1.0, 1.0), *value_range(source.dtype, profile), real=None)
         self.any_band = profile.validity == "nodata" or profile.dtype.kind == "f"
         self._lock = threading.Lock()
-        self._tiles, self._windows = Reused(), Reused()
         self.valid_pixels = 0
         self.looked: Looked | None = None
 
@@ -391,10 +387,7 @@ class TileMaker:
         """Compute one tile (top, left, height, width)."""
         top, left, height, width = part
         shape, dtype = (self.source.count, height, width), self.source.dtype
-        memory = self._tiles.empty((math.prod(shape) * (dtype.itemsize + 1),), np.uint8)
-        pixels, valid = np.split(memory, [math.prod(shape) * dtype.itemsize])
-        tile = _Tile(top, left, pixels.view(dtype).reshape(shape), valid.view(bool).reshape(shape))
-        tile.pixels[:], tile.valid[:] = self.resampling.fill, False
+        tile = _Tile(top, left, np.full(shape, self.resampling.fill, dtype), np.zeros(shape, dtype=bool))
         terrain, seen = self.prepare(part) if prepared is None else prepared.result()
         for group, dem, area in terrain.groups(seen):
             self._warp(group, dem, area, tile)
@@ -412,11 +405,7 @@ class TileMaker:
         mask = bands[0] if len(bands) == 1 else np.asarray((np.any if self.any_band else np.all)(bands, axis=0))
         with self._lock:
             self.valid_pixels += int(np.count_nonzero(mask))
-        return Made(left, top, out, mask, classes, memory)
-
-    def give_back(self, made: Made) -> None:
-        """Use the memory of a tile again, at which nobody looks any more."""
-        self._tiles.give_back(made.memory)
+        return Made(left, top, out, mask, classes)
 
     # -- pixels ------------------------------------------------------------------------------------------------------
 
@@ -432,7 +421,6 @@ class TileMaker:
         window = self._window(*together, max(block.reach for block in blocks))
         for block in blocks:
             self._warp_block(block, window, dem, tile.target(block, area))
-        self._windows.give_back(window.pixels)
 
     def _together(self, blocks: list[OutputBlock]) -> tuple[int, int, int, int] | None:
         """Return the window of the source under some blocks; None where it is too large for the memory."""
@@ -460,7 +448,7 @@ class TileMaker:
 
     def _window(self, left: int, top: int, right: int, bottom: int, reach: int) -> kernels.SourceWindow:
         source = self.source
-        pixels = source.read(left, top, right - left, bottom - top, self._windows.empty)
+        pixels = source.read(left, top, right - left, bottom - top)
         valid = source.read_valid(left, top, pixels)
         masked = valid is not None
         whole = np.ones(pixels.shape[1:] if masked else (1, 1), dtype=bool)

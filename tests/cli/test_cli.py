@@ -79,8 +79,8 @@ def test_python_m_is_the_same_command():
 @pytest.mark.parametrize(("words", "code"), [(["--version"], 0), (["rectify", "--nonsense"], 2)])
 def test_the_process_ends_with_its_code_and_what_was_asked_for_at_the_end(words, code):
     program = (
-        "import atexit, sys; atexit.register(print, 'at the end'); from ortho_pipeline.__main__ import run; "
-        f"sys.argv = ['ortho', *{words!r}]; run()"
+        "import atexit, sys; atexit.register(print, 'at the end'); from ortho_pipeline.cli.program import main; "
+        f"sys.argv = ['ortho', *{words!r}]; main()"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.splitlines()[-1]) == (code, "at the end")
@@ -99,21 +99,6 @@ def test_an_ortho_without_points_loads_nothing_that_few_need(tiny, tmp_path):
     # Kernels are compiled in the first run, which loads more.
     runs = [subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True) for _ in range(2)]
     assert runs[1].stdout.splitlines()[-1] == "[]"
-
-
-def test_a_command_does_not_look_for_garbage_while_it_loads(tiny, tmp_path):
-    """Three looks through all that was loaded, and no garbage among it, took a thirtieth of a second."""
-    words = ["ortho", "rectify", str(tiny.image), "--height", "700", "-o", str(tmp_path / "out"), "-tr", "20"]
-    code = (
-        "import gc, os, sys; from ortho_pipeline.__main__ import run; looked = []\n"
-        "gc.callbacks.append(lambda phase, found: looked.append(gc.get_threshold()))\n"
-        f"end, sys.argv = os._exit, {words!r}\n"
-        "os._exit = lambda code: (print(sum(now[0] > 1000 for now in looked)), end(code))\n"
-        "run()"
-    )
-    # Kernels are compiled in the first run, which makes more.
-    runs = [subprocess.run([sys.executable, "-uc", code], capture_output=True, text=True, check=True) for _ in range(2)]
-    assert runs[1].stdout.splitlines()[-1] == "0"
 
 
 def test_importing_the_package_is_light():

@@ -45,9 +45,9 @@ class Ramp(RasterSource):
             )
         super().__init__(path)
 
-    def read(self, left, top, width, height, empty=np.empty):
+    def read(self, left, top, width, height):
         rows, columns = np.mgrid[top : top + height, left : left + width] + 0.5
-        return np.stack([columns, rows], out=empty((2, height, width), float))
+        return np.stack([columns, rows], out=np.empty((2, height, width)))
 
 
 def compare(

@@ -89,9 +89,9 @@ class ReadAhead(RasterSource):
             if sum(part.size for part in self._parts if not part.used) < self._memory // 2:
                 self._asked(left, top, right, bottom)
 
-    def read(self, left: int, top: int, width: int, height: int, empty: Any = np.empty) -> NDArray[Any]:
-        """Return the pixels ``(count, height, width)`` of a window inside the raster, in an array made by `empty`."""
-        out = empty((self.count, height, width), self.dtype)
+    def read(self, left: int, top: int, width: int, height: int) -> NDArray[Any]:
+        """Return the pixels ``(count, height, width)`` of a window inside the raster."""
+        out = np.empty((self.count, height, width), self.dtype)
         for part in self._taken(left, top, width, height):
             to, of = _shared(part, left, top, width, height)
             out[to] = part.content.result()[0][of]
