@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import graphlib
 import re
 import subprocess
@@ -111,6 +112,7 @@ def is_module(dotted: str) -> bool:
     return dotted.startswith("ortho_pipeline.") and (path.is_dir() or path.with_suffix(".py").is_file())
 
 
+@functools.cache
 def parse(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
@@ -177,9 +179,8 @@ def test_the_command_line_defers_heavy_imports() -> None:
 
 @pytest.mark.parametrize("path", FILES + PLUGIN_FILES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_nothing_grows_too_long(path: Path) -> None:
-    text = path.read_text(encoding="utf-8")
-    assert text.count("\n") <= MAX_LINES, "split it"
-    for node in ast.walk(ast.parse(text)):
+    assert path.read_text(encoding="utf-8").count("\n") <= MAX_LINES, "split it"
+    for node in ast.walk(parse(path)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             assert code_lines(node) <= MAX_FUNCTION, f"{node.name} has {code_lines(node)} lines"
             assert parameters(node) <= MAX_PARAMETERS, f"{node.name} has {parameters(node)} parameters"

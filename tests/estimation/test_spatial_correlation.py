@@ -78,7 +78,15 @@ def test_a_random_field_is_called_systematic_and_neighbours_are_more_accurate():
         assert function.covariance(0.0) == pytest.approx(function.systematic**2)
 
 
-@pytest.mark.parametrize(("count", "affine"), [(10, False), (34, False), (12, True), (34, True)])
+@pytest.mark.parametrize(
+    ("count", "affine"),
+    [
+        (10, False),
+        pytest.param(34, False, marks=pytest.mark.slow),
+        (12, True),
+        pytest.param(34, True, marks=pytest.mark.slow),
+    ],
+)
 def test_chance_is_called_systematic_in_5_per_cent(count, affine):
     """500 repeats of white noise; the number of false alarms lies within what 5 % make of 500 (99.9 %)."""
     alarms = 0

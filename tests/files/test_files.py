@@ -78,7 +78,7 @@ warp.rectify(model, raster.RasterSource(image), Surface.constant(500.0), grid, o
 """
 
 
-@pytest.mark.parametrize("driver", ["GTiff", "COG"])
+@pytest.mark.parametrize("driver", ["GTiff", pytest.param("COG", marks=pytest.mark.slow)])
 def test_a_full_disk_leaves_the_old_ortho_and_a_message(tiny, tmp_path, driver):
     """A limit on the size of files stands for the full disk: the ortho would have 130 MB."""
     out = tmp_path / "out" / "o.tif"

@@ -40,7 +40,7 @@ def rms(rows) -> float:
 
 
 def test_matches_over_good_texture_are_within_015_px_of_the_truth():
-    rows = run(good_texture(2, ("country",)))
+    rows = run(good_texture(1, ("country",)))
     assert all(row["succeeded"] for row in rows), told(rows)
     assert rms(rows) < 0.15, told(rows)
 
@@ -56,7 +56,7 @@ def test_matches_over_all_good_textures_are_within_015_px_of_the_truth():
     pytest.param({"pushbroom": False, "heading_deg": 100.0}, marks=pytest.mark.slow),
     pytest.param({"scene": View(dtype="uint8"), "reference": View(bands="aba")}, marks=pytest.mark.slow),
     {"scene": View(holes=0.15), "reference": View(holes=0.1), "reference_crs": "EPSG:3857"},
-    {"reference": View(season=1)},
+    pytest.param({"reference": View(season=1)}, marks=pytest.mark.slow),
     {"error": 90.0, "kind": "affine", "margin": 110.0},
 ], ids="+".join)  # fmt: skip
 def test_what_scene_and_reference_are_like_does_not_matter(tmp_path, change):
@@ -140,14 +140,15 @@ def test_chips_show_the_same_where_it_was_found(tmp_path):
 # -- often, and honest -------------------------------------------------------------------------------------------------
 
 
-def test_five_scenes_of_all_kinds_are_matched_or_refused_never_wrong():
-    """Five of what `benchmarks/match.py --truth` runs, smaller and without real grounds: one failure is allowed."""
-    drawn = [trials.drawn(40 * k, ("country",)) for k in range(5)]
+@pytest.mark.parametrize("numbers", [(0, 80), pytest.param(tuple(range(0, 200, 40)), marks=pytest.mark.slow)])
+def test_scenes_of_all_kinds_are_matched_or_refused_never_wrong(numbers):
+    """Some of what `benchmarks/match.py --truth` runs, smaller and without real grounds: of five one may fail."""
+    drawn = [trials.drawn(number, ("country",)) for number in numbers]
     rows = run(
         replace(one, side=one.side * 3 // 5, error=min(one.error, 60.0), margin=min(one.margin, 90.0)) for one in drawn
     )
     assert not any(row["wrong"] for row in rows), told(rows)
-    assert sum(row["succeeded"] for row in rows) >= 4, told(rows)
+    assert sum(row["succeeded"] for row in rows) >= 0.8 * len(rows), told(rows)
 
 
 @pytest.mark.slow

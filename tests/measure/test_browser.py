@@ -375,7 +375,7 @@ def _panes(page: playwright.Page) -> list:
     return [page.locator(f"#{pane}").bounding_box() for pane in ("scene", "reference")]
 
 
-@pytest.mark.parametrize("width", [1400, 1000])
+@pytest.mark.parametrize("width", [1400, pytest.param(1000, marks=pytest.mark.slow)])
 def test_panes_stay_where_they_are_whatever_is_said(serve, reference: Path, features: np.ndarray, width: int) -> None:
     served = serve(reference, viewport={"width": width, "height": 860})
     page, before = served.page, _panes(served.page)

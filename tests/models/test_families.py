@@ -206,23 +206,28 @@ def test_truth_lies_within_the_claimed_sigma(name):
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["affine14-row", "rfm1", *(pytest.param(one, marks=pytest.mark.slow) for one in ("poly2", "projective", "dlt"))],
-)
-def test_claimed_covariance_is_honest(name):
-    """Over 1,000 repeats the spread of (estimate - truth) / sigma is 1, but for Student's t: sqrt(r / (r - 2))."""
+    ("name", "repeats"),
+    [
+        ("affine14-row", 200), ("rfm1", 200),
+        *(pytest.param(one, 1000, marks=pytest.mark.slow)
+          for one in ("affine14-row", "rfm1", "poly2", "projective", "dlt")),
+    ],
+)  # fmt: skip
+def test_claimed_covariance_is_honest(name, repeats):
+    """Over many repeats the spread of (estimate - truth) / sigma is 1, but for Student's t: sqrt(r / (r - 2))."""
     truth = truth_of(name)
     points = make_points(30, noise=0.0, camera=truth.ground_to_image)
     random = np.random.default_rng(1)
     ratios = []
-    for _ in range(1000):
+    for _ in range(repeats):
         noisy = make_points(30, ground=points.ground, image=points.image + random.normal(0, 0.5, (30, 2)))
         found = fit(truth, noisy, robust=False)
         ratios.append((found.values - truth.params) / found.sigmas)
     redundancy = 60 - len(truth.params)
     spread = np.std(ratios, axis=0) / np.sqrt(redundancy / (redundancy - 2))
-    assert ((spread > 0.93) & (spread < 1.07)).all(), spread
-    assert (np.abs(np.mean(ratios, axis=0)) < 0.13).all()
+    # Within three standard errors of the spread, four of the mean.
+    assert (np.abs(spread - 1) < 3 / np.sqrt(2 * repeats)).all(), spread
+    assert (np.abs(np.mean(ratios, axis=0)) < 4 / np.sqrt(repeats)).all()
 
 
 @pytest.mark.parametrize(("transposed", "expected"), [(False, "affine14-row"), (True, "affine14-col")])
@@ -282,14 +287,15 @@ def test_too_many_gross_errors_are_not_cleaned_up(name):
         fit_family(name, make_points(40, ground=points.ground, image=image), size=SIZE)
 
 
-def test_good_points_are_kept():
+@pytest.mark.parametrize(("sets", "most"), [(10, 1), pytest.param(40, 2, marks=pytest.mark.slow)])
+def test_good_points_are_kept(sets, most):
     lost = 0
-    for seed in range(40):
+    for seed in range(sets):
         for name in ("dlt", "rfm1", "poly3d2", "rfm2"):
             lost += len(
                 fit_family(name, make_points(30 + seed % 7, seed=seed, camera=truth_of("dlt").ground_to_image)).rejected
             )
-    assert lost <= 2
+    assert lost <= most
 
 
 # -- poor geometry ---------------------------------------------------------------------------------------------------
@@ -360,7 +366,7 @@ def test_collapse_without_normalisation_does_not_happen():
 # -- regularisation --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ridge", ["gcv", "lcurve"])
+@pytest.mark.parametrize("ridge", ["gcv", pytest.param("lcurve", marks=pytest.mark.slow)])
 def test_rfm3_with_40_points_is_no_catastrophe(ridge):
     """Trap 20: 39 parameters an axis from 40 points; unregularised, the check error is hundreds of pixels."""
     for seed in range(12):

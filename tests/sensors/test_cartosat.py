@@ -459,7 +459,7 @@ def fitted(folder, view: str, count: int, **options: str):
 NO_ATTITUDE = {"sigma_attitude_deg": "none", "sigma_rate_rad_s": "none"}
 
 
-@pytest.mark.parametrize("view", ["fore", "aft"])
+@pytest.mark.parametrize("view", ["fore", pytest.param("aft", marks=pytest.mark.slow)])
 def test_without_the_constraints_of_attitude_nine_points_determine_nothing(pair_folder, view):
     assert fitted(pair_folder, view, 9).rmse("check")["total"] < 1.0
     with pytest.raises(DegeneratePoints):
