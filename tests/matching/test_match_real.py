@@ -144,10 +144,8 @@ def test_matches_with_aerial_orthos_agree_with_surveyed_points(quickbird):
     assert np.sqrt((residuals**2).mean(axis=0).sum()) <= 0.2
 
 
-_SLOW = [pytest.param(one, marks=pytest.mark.slow) for one in ("finer", "inverted", "clouded")]
-
-
-@pytest.mark.parametrize("variant", ["coarser", *_SLOW])
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["finer", "coarser", "inverted", "clouded"])
 def test_variants_agree_with_surveyed_points(quickbird, variant):
     image = None
     if variant in ("finer", "coarser"):
