@@ -117,28 +117,43 @@ class Outputs:
 
     def _recover(self) -> None:
         """Complete the renames that a killed command had begun, and remove its other temporary files."""
-        try:
-            listed = json.loads(read_bounded(self.journal, 1_000_000))
-            renames, obsolete = listed["renames"], listed["obsolete"]
-            names = [name for pair in renames for name in pair] + obsolete
-            # A journal of somebody else cannot lead out of the folder.
-            sound = all(isinstance(name, str) and Path(name).name == name for name in names) and all(
-                name.startswith(self.prefix) for name, _ in renames
-            )
-        except (InputError, ValueError, KeyError, TypeError, RecursionError):
-            sound = False
-        if sound:
-            for name, final in renames:
-                if (self.folder / name).is_file() and not (self.folder / name).is_symlink():
-                    os.replace(self.folder / name, self.folder / final)
-            for name in obsolete:
-                (self.folder / name).unlink(missing_ok=True)
+        renames, obsolete = self._listed()
+        for name, final in renames:
+            if (self.folder / name).is_file() and not (self.folder / name).is_symlink():
+                os.replace(self.folder / name, self.folder / final)
+        for name in obsolete:
+            (self.folder / name).unlink(missing_ok=True)
         self._clear()
+
+    def _listed(self) -> tuple[list[tuple[str, str]], list[str]]:
+        """Return the renames of the journal, and the names to remove.
+
+        Somebody else may have written it: one that leads out of the folder, or to what is no file, lists nothing.
+        """
+        with contextlib.suppress(InputError, ValueError, KeyError, TypeError, RecursionError):
+            # Half characters are allowed here: they stand for the bytes of names that are not UTF-8.
+            document = json.loads(read_bounded(self.journal, 1_000_000))
+            renames, obsolete = [(name, final) for name, final in document["renames"]], list(document["obsolete"])
+            names = [*(name for pair in renames for name in pair), *obsolete]
+            if all(map(self._is_file_here, names)) and all(name.startswith(self.prefix) for name, _ in renames):
+                return renames, obsolete
+        return [], []
+
+    def _is_file_here(self, name: str) -> bool:
+        """Tell whether a file in the folder may have this name; ValueError for what no file can have."""
+        encoded = os.fsencode(name)
+        return (
+            Path(name).name == name not in ("", "..")
+            and b"\0" not in encoded
+            and len(encoded) <= os.pathconf(self.folder, "PC_NAME_MAX")
+            and not os.path.isdir(self.folder / name)
+        )
 
     def _clear(self) -> None:
         with os.scandir(self.folder) as entries:
             left = [entry.path for entry in entries
-                    if entry.name.startswith(self.prefix) and not entry.name.endswith(f"lock{_PART}")]  # fmt: skip
+                    if entry.name.startswith(self.prefix) and not entry.name.endswith(f"lock{_PART}")
+                    and not entry.is_dir(follow_symlinks=False)]  # fmt: skip
         for path in left:
             Path(path).unlink(missing_ok=True)
 

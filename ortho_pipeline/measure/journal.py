@@ -22,7 +22,8 @@ from ortho_pipeline.files import allowed, parse_json, sync_folder
 MAX_BYTES = 256_000_000
 #: What is appended to the name of a journal for what follows an impossible action.
 REST = ".rest"
-_REMEDY = "move it away to begin anew, or restore it from a copy"
+#: What helps where a journal cannot be opened.
+REMEDY = "move it away to begin anew, or restore it from a copy"
 
 
 class Journal:
@@ -150,7 +151,7 @@ def _locked(descriptor: int) -> bool:
 
 def _whole(descriptor: int, path: Path) -> bytes:
     if os.fstat(descriptor).st_size > MAX_BYTES:
-        raise InputError("this is no journal of measured points: it is too large", file=path, remedy=_REMEDY)
+        raise InputError("this is no journal of measured points: it is too large", file=path, remedy=REMEDY)
     parts = []
     while part := os.read(descriptor, 1 << 20):
         parts.append(part)
@@ -171,7 +172,7 @@ def _lines(data: bytes, path: Path) -> tuple[int, list[dict[str, Any]]]:
                 # A power cut can leave the length of a line without its bytes.
                 return start, found
             raise InputError("this journal is damaged, and what follows rests on it", file=path,
-                             field=f"line {len(found) + 1}", remedy=_REMEDY)  # fmt: skip
+                             field=f"line {len(found) + 1}", remedy=REMEDY)  # fmt: skip
         found.append(action)
         start = end + 1
     return start, found
@@ -180,7 +181,7 @@ def _lines(data: bytes, path: Path) -> tuple[int, list[dict[str, Any]]]:
 def _action(line: bytes) -> dict[str, Any] | None:
     """Return the action of a line, None where it is not what was written."""
     try:
-        document = parse_json(line, "journal", _REMEDY)
+        document = parse_json(line, "journal", REMEDY)
     except InputError:
         return None
     action = document.get("action") if isinstance(document, dict) else None

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.commands.results import Result
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.files import write_json
 from ortho_pipeline.files.documents import json_position, json_value
 from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.imaging.matching import View
+from ortho_pipeline.measure.journal import REMEDY as JOURNAL_REMEDY
 from ortho_pipeline.measure.journal import Journal
 from ortho_pipeline.measure.marks import GROUND_CRS, History, Mark, Marks, Written
 from ortho_pipeline.measure.places import Geometry, Places, Sheet, ground_typed, linked
@@ -249,7 +250,8 @@ class Project(_Shown):
                     "there is a journal of these points, which began with others", file=self.journal.path,
                     field="points.gcps", remedy="leave out `points.gcps` to go on, or choose another output",
                 )  # fmt: skip
-            count = self._take(self.journal.actions)
+            with completed(self.journal.path, remedy=JOURNAL_REMEDY):
+                count = self._take(self.journal.actions)
             if self.stopped:
                 self.journal.set_aside(count)
         except BaseException:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 import math
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import products
 import seeds
+import state
 from ortho_asp.cameras import read_adjust, read_aster, read_tsai
 from ortho_bilsat.survey import read_survey
 from ortho_cartosat.metadata import read_metadata as read_cartosat
@@ -502,6 +504,12 @@ READERS = (
     Reader("report", "json", "one_report.json", _report_seed, _report),
     Reader("pipeline-file", "json", "pipeline.yaml", _yaml_seed, _yaml),
     Reader("run-record", "json", "one.json", _record_seed, _record, of_files=False),
+    Reader("result", "json", "one.json", _record_seed, state.read_result, of_files=False),
+    Reader("lease", "json", "one.json", state.lease, state.read_lease, of_files=False),
+    Reader("kept-record", "json", "one.json", state.kept_record, state.read_kept_record, of_files=False),
+    Reader("renames", "json", "one.json", state.renames, state.read_renames, of_files=False),
+    Reader("journal", "json", "one.json", functools.partial(state.journal, False), state.read_journal),
+    Reader("project", "json", "one.json", functools.partial(state.journal, True), state.read_project),
     Reader("acquired", "text", "time.txt", _text("2005-08-03T08:12:31Z"), _time, of_files=False),
     Reader("crs-wkt", "text", "crs.txt", _text(_WKT), _system, of_files=False),
     Reader("crs-proj", "text", "crs.txt", _text(_UTM), _system, of_files=False),

@@ -124,6 +124,13 @@ def test_a_journal_of_somebody_else_leads_nowhere(tmp_path):
         {"renames": [["a.txt", "b.txt"]], "obsolete": []},
         {"renames": [[1, 2]], "obsolete": {}},
         [],
+        # Each of these ended every later command with "cannot write here" before, or with an error of no type.
+        {"renames": [], "obsolete": [""]},
+        {"renames": [], "obsolete": [".."]},
+        {"renames": [], "obsolete": ["a" * 300]},
+        {"renames": [], "obsolete": ["\0"]},
+        {"renames": [], "obsolete": ["\ud800"]},
+        {"renames": [[f"{prefix}x.part", ".."]], "obsolete": []},
     ):
         (folder / f"{prefix}x.part").write_text("evil")
         journal.write_text(json.dumps(listed))

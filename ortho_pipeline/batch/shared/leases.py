@@ -22,8 +22,6 @@ from ortho_pipeline.files.storage.objects import Conflict, Objects
 PATIENCE = 120.0
 _RENEWALS = 4
 _LEASE, _RESULT = ".lease.json", ".result.json"
-#: A larger object is not a lease.
-_LEASE_BYTES = 10_000
 
 
 class Lost(OrthoError):
@@ -106,7 +104,7 @@ class Leases:
             made = self._store.put(name + _LEASE, data, new=seen is None, replacing=seen)
         except Conflict:
             with contextlib.suppress(FileNotFoundError):
-                return self._store.read(name + _LEASE, _LEASE_BYTES)[1].version or ""
+                return self._store.version(name + _LEASE) or ""
             return ""
         return Lease(self._store, name, made.version, self._holder)
 

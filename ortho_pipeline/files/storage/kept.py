@@ -19,17 +19,18 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.folders import cache_folder
-from ortho_pipeline.files.reading import read_bounded, sha256
+from ortho_pipeline.files.reading import parse_json, read_bounded, sha256
 from ortho_pipeline.files.storage.objects import Content
 
 #: Environment variable: the folder of what is kept.
 FOLDER = "ORTHO_CACHE"
 _RECORD, _LOCK, _PART = ".json", ".lock", ".part"
 _RECORD_BYTES = 100_000
+#: Members of a record, and of which types they are.
+_FIELDS: dict[str, tuple[type, ...]] = {"address": (str,), "bytes": (int,), "sha256": (str,), "fetched": (int, float)}
 #: Files of this process that agreed with their records, by size, time of change and inode.
 _agreed: dict[str, tuple[int, int, int]] = {}
 
@@ -169,12 +170,14 @@ def _agrees(path: Path, address: str) -> bool:
 
 
 def _read(path: Path) -> Record | None:
+    """Return the record of a kept file; None where it is none, so that the file is fetched again."""
     try:
-        given: Any = json.loads(read_bounded(path, _RECORD_BYTES))
-        file = path.with_name(path.name.removesuffix(_RECORD))
-        return Record(file, str(given["address"]), int(given["bytes"]), str(given["sha256"]), float(given["fetched"]))
-    except (InputError, ValueError, KeyError, TypeError, RecursionError):
+        given = parse_json(read_bounded(path, _RECORD_BYTES), path, "fetch the file again")
+        record = Record(path.with_name(path.name.removesuffix(_RECORD)), **{name: given[name] for name in _FIELDS})
+    except (InputError, KeyError, TypeError):
         return None
+    kinds = all(type(getattr(record, name)) in kinds for name, kinds in _FIELDS.items())
+    return record if kinds and record.bytes >= 0 else None
 
 
 @contextlib.contextmanager

@@ -173,6 +173,18 @@ class Objects:
             found = self._store.head(name)
         return found["size"], found["e_tag"] or ""
 
+    def version(self, name: str) -> str | None:
+        """Return the store's name of this version of an object, whose content is not read.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is none.
+        """
+        with self._errors(name):
+            found = self._store.head(name)[self._version]
+        return None if found is None else str(found)
+
     def exists(self, name: str) -> bool:
         """Tell whether there is such an object."""
         try:
