@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from house import House
 
 from ortho_pipeline.estimation import comparison
 from ortho_pipeline.models.correction import FREE
@@ -206,6 +207,19 @@ def test_rooms_are_few_and_small() -> None:
     assert len([path for path in PACKAGE.iterdir() if path.name != "__pycache__"]) <= MAX_ENTRIES
     for folder in {path.parent for path in FILES}:
         assert len(list(folder.glob("*.py"))) <= MAX_MODULES, f"{folder.name} is full"
+
+
+#: Private names of other packages that are used, and why.
+PRIVATE = {
+    # A documented function: the watch over a worker whose parent is gone ends it without unwinding.
+    "os._exit",
+    # numba has no other way to give a function a cache whose folder was checked.
+    "made._cache",
+}
+
+
+def test_nothing_private_of_other_packages_is_used() -> None:
+    assert {name for _, _, name in House(ROOT).private_names()} == PRIVATE
 
 
 def test_no_drawer_for_everything() -> None:

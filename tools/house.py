@@ -138,14 +138,15 @@ def statements(tree: ast.AST) -> int:
 
 
 def defined(tree: ast.AST) -> Iterator[str]:
-    """Yield the names of functions, classes, variables and attributes that a tree defines."""
+    """Yield the names of functions, classes, variables and attributes of `self` that a tree defines."""
     for node in ast.walk(tree):
-        if isinstance(node, (*_FUNCTIONS, ast.ClassDef)):
-            yield node.name
-        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            yield node.id
-        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
-            yield node.attr
+        match node:
+            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+                yield node.name
+            case ast.Name(ctx=ast.Store()):
+                yield node.id
+            case ast.Attribute(ctx=ast.Store(), value=ast.Name(id="self")):
+                yield node.attr
 
 
 def is_private(dotted: str) -> bool:

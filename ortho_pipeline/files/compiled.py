@@ -20,11 +20,7 @@ _lock = threading.Lock()
 
 
 def compiled(function: Callable[..., Any]) -> Any:
-    """Compile a function that runs without the interpreter lock; indices are not checked, and x / 0 is infinite.
-
-    Kernels are loops over numbers and arrays. Hashes (dictionaries, sets) and BLAS (``np.dot``, ``np.linalg``) are
-    missing when compiled code is loaded from its cache.
-    """
+    """Compile a function that releases the GIL; indices are not checked, and x / 0 is infinite."""
     return Kernel(function)
 
 

@@ -17,7 +17,6 @@ from typing import Any
 
 import numba
 from numba.core.caching import FunctionCache, NullCache
-from numba.core.runtime import rtsys
 
 from ortho_pipeline.files.compiled import Kernel
 from ortho_pipeline.files.kernels import places
@@ -34,15 +33,15 @@ def dispatcher(kernel: Kernel) -> Any:
     if kernel.inline:
         return _njit(forceinline=True)(function)
     made: Any = _njit()(function)
-    own = _cache(_Cache, _Own, function) if places.own()[0] else None
-    root = _cache(_OfRoot, _Roots, function) if places.of_root() else None
+    own = _placed(_Cache, _Own, function) if places.own()[0] else None
+    root = _placed(_OfRoot, _Roots, function) if places.of_root() else None
     if own is not None:
         own.shared = root
     made._cache = own or root or _Nowhere()  # as enable_caching() does with numba's own
     return made
 
 
-def _cache(kind: Callable[..., Any], place: type[_Own], function: Callable[..., Any]) -> Any:
+def _placed(kind: Callable[..., Any], place: type[_Own], function: Callable[..., Any]) -> Any:
     """Return a cache in a place of ours, whatever places numba's settings name."""
     settings: Any = numba.config
     with _lock:
@@ -96,14 +95,8 @@ class _Cache(FunctionCache):
     shared: _Cache | None = None
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load what is compiled with the runtime that it calls, and nothing else.
-
-        numba would first load all that it can compile, SciPy's linear algebra too: a fifth of a small scene's time. It
-        does so by itself where something is to be compiled. What kernels may use is thereby narrow: see `compiled`.
-        """
-        rtsys.initialize(target_context)
-        with self._guard_against_spurious_io_errors():
-            found = self._load_overload(sig, target_context)
+        """Load what is compiled, from where this user keeps it, else from where root does."""
+        found = super().load_overload(sig, target_context)
         return self.shared.load_overload(sig, target_context) if found is None and self.shared is not None else found
 
 
