@@ -19,7 +19,6 @@ from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.local_frame import GroundFrame
 from ortho_pipeline.block.points import BlockPoints
-from ortho_pipeline.errors import DegeneratePoints
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.models.base import Array
@@ -74,9 +73,10 @@ def surveyed(
     return points, ground
 
 
-def adjusted(rpcs: dict[str, RPC], points: BlockPoints, *, robust: bool) -> BlockFit:
+def adjusted(rpcs: dict[str, RPC], points: BlockPoints) -> BlockFit:
+    """Return the block with all points: a search for gross errors would take the largest errors of good points."""
     start = {name: ImageCorrection.identity(rpc, "shift", (SIZE / 2, SIZE / 2)) for name, rpc in rpcs.items()}
-    return adjust(start, points, robust=robust)
+    return adjust(start, points, robust=False)
 
 
 def normalised(found: BlockFit, ground: Array) -> Array:
@@ -99,7 +99,7 @@ def test_plan_and_height_get_the_sigmas_that_they_have(
     logs, ratios = [], []
     for seed in range(25):
         points, ground = surveyed(block, control, errors, 0.03, seed)
-        found = adjusted(block, points, robust=False)
+        found = adjusted(block, points)
         assert found.variances.sigma_xy is not None
         assert found.variances.sigma_h is not None
         logs.append(np.log(found.variances.sigma_h / found.variances.sigma_xy))
@@ -122,13 +122,9 @@ def test_errors_of_the_ground_are_as_large_as_their_sigmas(
     """Rays of 0.06 px leave some 0.4 m open in height: what is below is hardly seen, and heights are claimed worse."""
     block = {name: rpcs[name] for name in list(rpcs)[:images]}
     ratios = []
-    for seed in range(200):
+    for seed in range(100):
         points, ground = surveyed(block, control, errors, 0.06, seed)
-        try:
-            ratios.append(normalised(adjusted(block, points, robust=True), ground))
-        except DegeneratePoints:  # two blunders of four points by chance
-            continue
-    assert len(ratios) >= 196
+        ratios.append(normalised(adjusted(block, points), ground))
     array = np.array(ratios)
     for part in (array[:, :control], array[:, control:]):
         for values, far_above_rays in ((part[..., :2], True), (part[..., 2:], errors[1] > 0.5)):
