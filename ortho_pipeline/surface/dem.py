@@ -29,7 +29,7 @@ from ortho_pipeline.surface.voids import nearest_heights
 
 #: ``fill='nearest'`` looks so far for a valid height: samples, and metres after which real terrain is another one.
 NEAREST_REACH, NEAREST_METRES = 512, 20_000.0
-#: The undulation is computed exactly on a lattice no wider than this (m) and interpolated between: within 2 mm.
+#: The undulation is computed exactly on a lattice about this wide (m) and interpolated between: within 2 mm.
 UNDULATION_SPACING = 500.0
 #: Side (samples) of what is read and kept for single positions. Rays that are followed together each stand on a tile of
 #: their own, over a thousand of them: small tiles are all kept until the rays have left them.
@@ -395,7 +395,7 @@ def _undulations(vertical: Vertical, grid: SampleGrid, window: tuple[int, int, i
         return vertical.undulation(*grid.lonlat(grid_u.ravel(), grid_v.ravel())).reshape(grid_u.shape)
 
     left, top, width, height = window
-    step = int(np.clip(UNDULATION_SPACING / grid.sample_size, 1, 64))
+    step = int(np.clip(round(UNDULATION_SPACING / grid.sample_size), 1, 64))
     first_u, first_v = left // step, top // step
     node_u = np.arange(first_u, (left + width - 1) // step + 2) * step
     node_v = np.arange(first_v, (top + height - 1) // step + 2) * step
