@@ -48,6 +48,8 @@ _FETCHING = (
 _RASTER_SIDE_CAR = re.compile(r"\.(ovr|msk|aux|rrd|r[0-9])$")
 #: Side-cars that say in which coordinate system a raster is.
 _CRS_SIDE_CARS = (".aux.xml", ".prj", ".hdr")
+#: Side-cars with text that GDAL reads while it opens an image.
+_TEXT_SIDE_CAR = re.compile(r"\.(rpb|imd|eph|att|geo|tab|wld|\w{1,3}w)|[_.]?rpc\.(txt|xml)|_metadata\.txt")
 #: Formats that a GDAL may have been built without, by the beginning of a file: wheels have fewer drivers.
 _BEGINNINGS = {
     b"NITF": "NITF", b"EHFA_HEADER_TAG": "HFA", b"\x00\x00\x00\x0cjP": "JP2OpenJPEG", b"UHL1": "DTED",
@@ -141,7 +143,7 @@ class _Gate:
                 name = os.fspath(product)
                 self._see_named(product, "DIMAP", frozenset())
         else:
-            self._see_crs_beside(there)
+            self._see_texts_beside(there)
             kind = _identified(name, drivers)
             if kind is None and not isinstance(there, VsiPath) and (format := _format_of(there)) is not None:
                 _require_driver(format, there)
@@ -170,7 +172,7 @@ class _Gate:
         if len(self._seen) > _MANY:
             raise InputError(f"this leads to more than {_MANY} files", file=by, remedy=PLAIN_VRT)
         name = str(path)
-        self._see_crs_beside(path)
+        self._see_texts_beside(path)
         kind = _identified(name, DRIVERS)
         first = None if kind is None else _identified(name, None)
         if kind is None or first not in DRIVERS or (kind == "VRT" and isinstance(path, VsiPath)):
@@ -232,14 +234,16 @@ class _Gate:
             )  # fmt: skip
         return places[0] if places else None
 
-    def _see_crs_beside(self, path: Any) -> None:
-        """See to the coordinate systems in side-cars: some drivers ask PROJ for them to identify a file."""
+    def _see_texts_beside(self, path: Any) -> None:
+        """See to the texts in side-cars: some drivers read them, and ask PROJ for their CRS, to identify a file."""
         for other in self._beside(path):
             rest = other.lower()
             for start in (path.name.lower(), path.stem.lower()):
                 rest = rest.removeprefix(start)
-            if rest in _CRS_SIDE_CARS:
-                side_car = path.parent / other
+            side_car = path.parent / other
+            if _TEXT_SIDE_CAR.fullmatch(rest):
+                self._must_be_inside(side_car, path, other)
+            elif rest in _CRS_SIDE_CARS:
                 self._must_be_inside(side_car, path, other)
                 if side_car.is_file():
                     _see_crs(crs_texts(side_car, rest), side_car)

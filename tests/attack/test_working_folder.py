@@ -5,6 +5,7 @@ What is opened, executed and connected to is told by the system (strace), not by
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -12,7 +13,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import hostile
 import pytest
+from deliveries import DELIVERIES, URL
+from deliveries import deliver as deliver_data
 
 ORTHO = Path(sys.executable).parent / "ortho"
 #: Writes a file when it is run, if anything runs it.
@@ -40,6 +44,34 @@ PLANTED: dict[str, dict[str, str]] = {
     "PROJ": {"proj.ini": "[general]\nnetwork = on\n", "proj.db": "", "proj/proj.ini": "[general]\nnetwork = on\n"},
     "PROJ's folder of the user": {".local/share/proj/proj.ini": "[general]\n", ".local/share/proj/proj.db": ""},
     "credentials": {".aws/credentials": "[default]\n", ".aws/config": "[default]\n", ".netrc": "", ".boto": ""},
+    "GDAL's settings of a folder": {".gdalrc": "[configoptions]\n", "gdal.conf": "", "gdal_data/gdalvrt.xsd": ""},
+    "PROJ's grids": {"egm96_15.gtx": "", "us_nga_egm96_15.tif": "", "conus": "", "null": "", "proj_data/proj.db": ""},
+    "fsspec": {".config/fsspec/conf.json": "{}", "fsspec.json": "{}"},
+    "stores": {".aws/sso/cache/a.json": "{}", ".azure/config": "", ".config/gcloud/credentials.db": "", ".s3cfg": ""},
+    "certificates": {".pki/nssdb/cert9.db": "", "cert.pem": "", "ca-bundle.crt": "", ".curlrc": "insecure\n"},
+    "environment files": {".env": "GDAL_DRIVER_PATH=.\nPYTHONSTARTUP=evil.py\n", ".envrc": "touch EXECUTED\n"},
+    "projects of Python": {
+        "setup.cfg": "[options]\n",
+        "setup.py": _CODE,
+        "pyproject.toml": "[tool.x]\n",
+        "tox.ini": "",
+    },
+    "tests": {"conftest.py": _CODE, "pytest.ini": "[pytest]\n", "mypy.ini": "", "ruff.toml": ""},
+    "distributions": {
+        "ortho_pipeline-9.dist-info/entry_points.txt": "[ortho_pipeline]\nevil = evil\n",
+        "ortho_pipeline-9.dist-info/METADATA": "Name: ortho-pipeline\nVersion: 9\n",
+        "evil.egg-info/entry_points.txt": "[ortho_pipeline]\nevil = evil\n",
+        "evil.egg-link": ".",
+    },
+    "pluggy": {"pluggy.py": _CODE, "plugins/evil.py": _CODE, "hooks.py": _CODE},
+    "rasters of others": {"rasterio.py": _CODE, "odc/__init__.py": _CODE, ".rasterio": "", "rioxarray.py": _CODE},
+    "servers": {"aiohttp.py": _CODE, "starlette.py": _CODE, "uvicorn.py": _CODE, "logging.ini": "[loggers]\n"},
+    "pages": {"jinja2/__init__.py": _CODE, "templates/report.html.j2": "{{ evil }}", "report.html.j2": "{{ evil }}"},
+    "readers": {"rich.py": _CODE, "click.py": _CODE, "pydantic/__init__.py": _CODE, "pystac.py": _CODE},
+    "sqlite": {".sqliterc": ".shell touch EXECUTED\n", "spatialite.so": "", "mod_spatialite.so": ""},
+    "interpreters": {".python-version": "3.6\n", "python311.zip": "", "python311._pth": ".\n", "__init__.py": _CODE},
+    "start-up files": {".pythonrc.py": _CODE, ".pythonstartup": _CODE, ".pdbrc": "import os\n", ".inputrc": ""},
+    "threads": {"libgomp.so.1": "", "libopenblas.so": "", "libtbb.so.12": "", ".numba_config": ""},
     "shells": {".bashrc": "touch EXECUTED\n", ".profile": "touch EXECUTED\n", "uname": "#!/bin/sh\ntouch EXECUTED\n"},
     "libraries of the system": {"libgdal.so": "", "libproj.so": "", "libc.so.6": "", "libm.so.6": ""},
     "a home in the delivery": {
@@ -101,6 +133,82 @@ def test_nothing_that_is_planted_in_a_delivery_is_opened(
     programs = re.findall(r'execve\("([^"]+)"', log)
     assert all(Path(program).name == "ortho" or "python" in program for program in programs), programs
     assert not re.search(r"(connect|sendto)\(.*AF_INET", log)
+
+
+#: Runs commands in one process, each in a folder of its own; says how each ended.
+_COMMANDS = """
+import json, os, sys
+from ortho_pipeline.cli import program
+for folder, words in json.loads(open(sys.argv[1]).read()):
+    os.chdir(folder)
+    sys.argv = ["ortho", *words]
+    sys.stderr.write(f"== {folder} {words}\\n")
+    try:
+        program.main()
+        code = 0
+    except SystemExit as end:
+        code = end.code
+    assert code in (0, 1, 2, 3), (folder, words, code)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("strace") is None, reason="strace, which tells what is opened, is not on this machine")
+@pytest.mark.parametrize("kind", ["data", "rasters"])
+def test_no_data_of_a_delivery_lead_elsewhere(tmp_path: Path, sample: Path, kind: str) -> None:
+    """Neither what its texts name, nor what lies beside the delivery, is opened; nothing is run, nobody asked."""
+    place = tmp_path / "place"
+    place.mkdir()
+    secret = hostile.raster(place / "secret.tif", hostile.SECRET)
+    shutil.copy(sample / "scene_RPC.TXT", place / "secret.tif_RPC.TXT")
+    shutil.copy(sample / "gcps.csv", place / "secret.csv")
+
+    def copy(folder: Path) -> None:
+        for name in ("scene.tif", "scene_RPC.TXT", "dem.tif"):
+            shutil.copy(sample / name, folder)
+
+    if kind == "data":
+        jobs = [
+            (place / str(number), deliver_data(place / str(number), name, secret, copy))
+            for number, name in enumerate(DELIVERIES)
+        ]
+    else:
+        made = hostile.write(place / "rasters", secret, URL)
+        jobs = [(place / "rasters" / name, ("info", str(file))) for name, file in made.items()]
+        assert len(jobs) + len(DELIVERIES) + len(PLANTED) >= 60
+    list_of_jobs, script, log = tmp_path / "jobs.json", tmp_path / "commands.py", tmp_path / "log"
+    list_of_jobs.write_text(json.dumps([(str(folder), words) for folder, words in jobs]))
+    script.write_text(_COMMANDS)
+    home = tmp_path / "home"
+    home.mkdir()
+    done = subprocess.run(
+        ["strace", "-f", "-qq", "-s", "300", "-e",
+         "trace=open,openat,openat2,chdir,execve,connect,sendto,sendmmsg", "-o", str(log),
+         sys.executable, "-P", str(script), str(list_of_jobs)],
+        cwd=tmp_path, env={**os.environ, "HOME": str(home)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "Traceback" not in done.stderr
+    assert "fault of ortho-pipeline" not in done.stderr
+    assert "Unknown" not in done.stderr  # every command reads what it is given
+    assert not re.search(r"(connect|sendto|sendmmsg)\(.*AF_INET", log.read_text(errors="replace"))
+    assert outside(log, place, tmp_path) == []
+    assert not list(place.rglob("EXECUTED"))
+
+
+def outside(log: Path, place: Path, start: Path) -> list[str]:
+    """Return what was opened of the deliveries' surroundings by a command of another folder, and what was run."""
+    found, here = [], start
+    for line in log.read_text(errors="replace").splitlines():
+        if entered := re.search(r'chdir\("([^"]+)"\) = 0', line):
+            here = Path(entered[1])
+        elif opened := re.search(r'open(?:at2?)?\((?:AT_FDCWD, )?"([^"]+)".* = \d', line):
+            path = (here / opened[1]).resolve()  # where a link leads
+            if place in path.parents and here != path and here not in path.parents:
+                found.append(f"{here.name}: {path}")
+        elif "execve(" in line and " = 0" in line and "python" not in line:
+            found.append(line)
+    return found
 
 
 def test_child_processes_and_libraries_take_nothing_from_the_working_folder(tmp_path: Path) -> None:
