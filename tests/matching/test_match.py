@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trials
 from osgeo import gdal
-from scenes import Case, Setting, View, write_raster
+from scenes import Case, Setting, View, lonlat, write_raster
 from scipy import ndimage
 from trials import Outcome, good_texture, grounds, matches, refusals, run, tried
 
@@ -135,6 +135,34 @@ def test_chips_show_the_same_where_it_was_found(tmp_path):
 
     # As far from it on one side as on the other, so that interpolation smooths both alike.
     assert alike(1.0) > max(alike(-1.0), alike(3.0)) + 0.01
+
+
+#: Wrong heights displace chips by 8 px along the line of sight, and by another length 60 px farther on.
+COARSE = Setting(side=360, seed=3, error=12, dem_sigma=20, dem_length=60, off_nadir_deg=25)
+
+
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)])
+def test_a_scene_that_looks_sideways_is_matched_over_a_coarse_dem(tmp_path, seed):
+    case = Case(replace(COARSE, seed=seed), tmp_path).write()
+    surface = Surface.open(case.dem_file, "ellipsoid")
+    found = matches(
+        case.scene_file, case.model, surface, [case.reference_file], search=case.search, dem_sigma=20.0, points=100
+    )
+    assert len(found) > 30
+    errors = trials.errors_of(case, found)
+    ground, metre = lonlat(case.ground_of(found.image)), np.array([0.0, 0.0, 1.0])
+    sight = case.model.ground_to_image(ground + metre) - case.model.ground_to_image(ground)
+    across = (errors[:, 0] * sight[:, 1] - errors[:, 1] * sight[:, 0]) / np.hypot(*sight.T)
+    assert np.sqrt(np.mean(across**2)) < 0.35
+    # Half of them have a place of the map within a pixel: chips are sheared by the slopes of wrong heights.
+    assert np.median(np.hypot(*errors.T)) < 1.0
+
+
+@pytest.mark.slow
+def test_another_place_is_refused_over_a_coarse_dem_with_heights_as_a_cause(tmp_path):
+    for seed in (3, 4, 5):
+        found = tried(Case(replace(COARSE, seed=seed, elsewhere=True), tmp_path / str(seed)).write())
+        assert "line of sight" in found.refused
 
 
 # -- often, and honest -------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import CoverageError
-from ortho_pipeline.imaging.matching import chip_kernel
+from ortho_pipeline.imaging.matching.kernels import chip_kernel
 from ortho_pipeline.imaging.matching.targets import Target, View
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.intensity import EXACT
@@ -49,11 +49,6 @@ def scene_chips(view: View, origins: NDArray[np.int_], size: int, factor: int) -
     """
     read = [view.intensity.read(int(column), int(row), size, size, factor) for column, row in origins]
     return np.array(read, dtype=np.float32).reshape(len(origins), size, size)
-
-
-def rendered_chips(view: View, target: Target, origins: NDArray[np.int_], size: int, factor: int) -> Pixels:
-    """Return what the target shows at chips of the scene ``(n, size, size)``; NaN where it shows nothing."""
-    return Renderer(view, [target], origins, size, factor).render(np.arange(len(origins)))
 
 
 class Renderer:

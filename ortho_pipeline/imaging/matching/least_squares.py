@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ortho_pipeline.imaging.matching import shift_kernel
 from ortho_pipeline.imaging.matching.correlation import orientation
+from ortho_pipeline.imaging.matching.kernels import shift_kernel
 from ortho_pipeline.models.base import Array
 
 _STEPS = 8

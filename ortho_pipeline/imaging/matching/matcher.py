@@ -27,6 +27,7 @@ from ortho_pipeline.imaging.matching.chip_search import (
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.least_squares import measure
 from ortho_pipeline.imaging.matching.search import Level, agreed, place, refuse_accident
+from ortho_pipeline.imaging.matching.sight import HEIGHTS, Chips, across, displacement, placed_along_sight
 from ortho_pipeline.imaging.matching.targets import (
     SAMPLES,
     Target,
@@ -167,20 +168,23 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     base = chip_factor(view, targets, shown)
     reach = max(reach, 2.0 * base)
     region = _region(view, shown)
-    correction, levels = place(view, targets, reach, base, region, settings.rotation_deg)
+    try:
+        (correction, levels), displaced = place(view, targets, reach, base, region, settings.rotation_deg), 0.0
+    except InputError as error:
+        displaced = displacement(view, shown, settings.dem_sigma, base)
+        correction, levels = placed_along_sight(view, targets, (base, reach), region, displaced, threads, error)
     extent = region[2] - region[0], region[3] - region[1]
     # The targets may show a part of that rectangle only.
     share = len(shown) / SAMPLES**2 * view.size[0] * view.size[1] / (extent[0] * extent[1])
     grid = cells_of(*extent, round(settings.points / min(max(share, 0.05), 1.0)))
     corrected = View(view.intensity, correction, view.surface)
     origins, cells = candidates(view, region, grid, SIDE, base, _cells_shown(corrected, targets, region, grid))
-    tried = _Tried(view, targets, origins, cells, base, threads)
+    tried = _Tried(view, targets, origins, cells, base, threads, displaced)
     tried.search(correction)
-    for turn in range(_ROUNDS):
-        correction = tried.agreed(correction, None if turn else reach, orientations(settings.rotation_deg))
+    if displaced:
         tried.measure(correction)
-        if tried.moved(correction) < _STANDS:
-            break
+    else:
+        correction = tried.settled(correction, reach, orientations(settings.rotation_deg))
     tried.judge()
     found, bands = tried.matches(settings, tuple(levels)), tried.bands(correction)
     points = replace(found.points, sigma_alike=np.full(len(found.points), spread(bands)))
@@ -242,10 +246,11 @@ class _Tried:
 
     def __init__(
         self, view: View, targets: Sequence[Target], origins: NDArray[np.int_], cells: NDArray[np.int_], factor: int,
-        threads: int,
+        threads: int, displaced: float,
     ) -> None:  # fmt: skip
         self.view, self.targets, self.origins, self.cells, self.factor = view, targets, origins, cells, factor
-        self.threads = threads
+        # Where heights displace chips by more than they bear (px), each is sought by itself.
+        self.threads, self.displaced = threads, displaced
         count = len(origins)
         self.centres = np.asarray(origins + SIDE * factor / 2, dtype=np.float64)
         self.scene = scene_chips(view, origins, SIDE, factor)
@@ -253,6 +258,7 @@ class _Tried:
         self.reason = np.full(count, "hidden", dtype="<U12")
         self.score = np.zeros(count)
         self.offset = np.full((count, 2), np.nan)  # px, against the correction of the last step
+        self.whole = np.zeros((count, 2), dtype=int)  # px, where targets are rendered: near the offset
         self.found = np.full((count, 2), np.nan)  # chip px, in the target's chip
         self.covariance = np.full((count, 2, 2), np.nan)
         self.ground = np.full((count, 3), np.nan)
@@ -261,18 +267,27 @@ class _Tried:
         """Return what single bands say of the matches that are kept, measured with the last correction."""
         good = np.flatnonzero(self.reason == "")
         return in_each_band(
-            View(self.view.intensity, correction, self.view.surface), self.targets, self.origins[good],
-            self.scene[good], self.offset[good] / self.factor, self.factor, self.threads,
+            View(self.view.intensity, correction, self.view.surface), self.targets,
+            self.origins[good] + self.whole[good], self.scene[good],
+            (self.offset[good] - self.whole[good]) / self.factor, self.factor, self.threads,
         )  # fmt: skip
 
     def _renderer(self, correction: SensorModel, index: NDArray[np.int_], radius: int) -> Renderer:
         seen = View(self.view.intensity, correction, self.view.surface)
-        origins = self.origins[index] - radius * self.factor
+        origins = self.origins[index] + self.whole[index] - radius * self.factor
         return Renderer(seen, self.targets, origins, SIDE + 2 * radius, self.factor)
 
     def search(self, correction: SensorModel) -> None:
-        """Find each chip to a chip px about where the correction puts it."""
-
+        """Find each chip to a chip px about where the correction puts it, or along the line of sight."""
+        if self.displaced:
+            seen, reach = View(self.view.intensity, correction, self.view.surface), 2 * HEIGHTS * self.displaced
+            chips = Chips(
+                seen, self.targets, self.centres.astype(int), self.factor, reach + 2 * self.factor, self.threads
+            )
+            chips.search()
+            self.offset, self.score, self.reason = chips.offset, chips.score, chips.reason
+            self.whole = np.round(np.nan_to_num(self.offset)).astype(int)
+            return
         renderer = self._renderer(correction, np.arange(len(self.origins)), 2 * _RADIUS)
 
         def work(index: NDArray[np.int_]) -> None:
@@ -320,12 +335,12 @@ class _Tried:
 
         def work(batch: NDArray[np.int_]) -> None:
             index, wide = good[batch], renderer.render(batch)
-            start = np.nan_to_num(self.offset[index] / self.factor)
+            start = np.nan_to_num((self.offset[index] - self.whole[index]) / self.factor)
             start = np.where(np.abs(start) < radius - 2, start, 0.0)
             found = measure(self.scene[index], wide, start)
             self.target[index] = wide[:, radius:-radius, radius:-radius]
             self.found[index] = found.shift
-            self.offset[index] = found.shift * self.factor
+            self.offset[index] = self.whole[index] + found.shift * self.factor
             self.covariance[index] = found.covariance * self.factor**2
             self.score[index] = found.correlation
             bad = ~np.isfinite(found.shift).all(axis=1)
@@ -336,10 +351,15 @@ class _Tried:
         self.ground[good] = meet_surface(correction, self.centres[good] + self.offset[good], self.view.surface)
         self.reason[good[np.isnan(self.ground[good]).any(axis=1)]] = "hidden"
 
-    def moved(self, correction: SensorModel) -> float:
-        """Return how far (px) the matches still lie from the correction in the mean."""
-        good = self.reason == ""
-        return float(np.hypot(*np.median(self.offset[good], axis=0))) if good.any() else 0.0
+    def settled(self, correction: ImageCorrection, searched: float, turns: int) -> ImageCorrection:
+        """Return the correction on which measured chips agree, round by round; see `agreed`."""
+        for turn in range(_ROUNDS):
+            correction = self.agreed(correction, None if turn else searched, turns)
+            self.measure(correction)
+            good = self.reason == ""
+            if not good.any() or np.hypot(*np.median(self.offset[good], axis=0)) < _STANDS:
+                break
+        return correction
 
     def judge(self) -> None:
         """Estimate what the covariances are made of, and leave out what contradicts the others by its own."""
@@ -362,7 +382,10 @@ class _Tried:
             if not bad.any():
                 break
             self.reason[good[bad]] = "contradicts"
-        self._refuse_vague(residuals[~bad])
+        residuals = residuals[~bad]
+        if self.displaced:
+            residuals = across(residuals, np.median(along, axis=0))
+        self._refuse_vague(residuals)
 
     def _refuse_vague(self, residuals: Array) -> None:
         """Raise an error where ground that looks alike elsewhere (furrows, rows of trees) explains all that was found.

@@ -349,8 +349,9 @@ def _standing_out(
             f"(correlation {means[best]:.2f} and {means[other]:.2f} in the mean of {counted(len(common), 'chip')})",
             file=targets[0].path, field=targets[0].field,
             remedy=f"check that {targets[0].called} shows this place, search farther (`match.search`) if the model "
-            "may be off by more, and for rotations (`match.search_rotation=5`) if it may be turned; measure points by "
-            "hand where the ground is uniform or repeats itself",
+            "may be off by more, and for rotations (`match.search_rotation=5`) if it may be turned; state how wrong "
+            "heights may be (`surface.sigma=20`) if the DEM is coarse and the view oblique; measure points by hand "
+            "where the ground is uniform or repeats itself",
         )  # fmt: skip
     return best
 

@@ -1,11 +1,11 @@
-"""Compiled least-squares matching of chips; see least_squares.py."""
+"""Compiled least-squares matching of chips; see matching/least_squares.py."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ortho_pipeline.files.compiled import compiled
-from ortho_pipeline.imaging.matching.chip_kernel import BEFORE, TAPS, weights_at
+from ortho_pipeline.imaging.matching.kernels.chip_kernel import BEFORE, TAPS, weights_at
 
 
 @compiled

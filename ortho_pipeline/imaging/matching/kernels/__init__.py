@@ -1,0 +1,1 @@
+"""Compiled kernels of matching: pixels of chips, and shifts between them."""
