@@ -132,3 +132,15 @@ def test_changes_stand_by_version():
     assert not twice
     assert "\n- " not in text.rpartition("<!--")[2], "the last line of CHANGELOG.md belongs to Unreleased, at the top"
     assert "- " not in intro.splitlines()
+
+
+@pytest.mark.parametrize("page", ["SECURITY.md", "docs/reliability.md"])
+def test_tests_that_hold_promises_are_there(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    named = set(re.findall(r"`(?:[\w/]+\.py::)?(test_\w+)`", text))
+    files = set(re.findall(r"`(?:tests/)?([\w/]+/test_\w+\.py|test_\w+\.py)\b", text))
+    assert len(named | files) > 20
+    there = {path: path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py")}
+    defined = set(re.findall(r"^def (test_\w+)", "\n".join(there.values()), flags=re.MULTILINE))
+    assert named - defined == set()
+    assert {name for name in files if ROOT / "tests" / name not in there} == set()

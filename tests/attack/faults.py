@@ -419,7 +419,8 @@ class Attack:
         """Do what the next command does before anything else."""
         from ortho_pipeline.files import together
 
-        for folder, name in (*case.names, ("out", "catalog.json"), ("out", "run.json")):
+        records = [("out/.run", f"{one}.json") for one in "ab"]
+        for folder, name in (*case.names, ("out", "catalog.json"), ("out", "run.json"), *records):
             if (self.work / folder).is_dir():
                 with together(self.work / folder, name):
                     pass
