@@ -80,6 +80,12 @@ function complete(mark) {
   return role === 'tie' ? rays >= 2 : Boolean(mark.ground) && rays >= (role === 'control' ? 1 : 2);
 }
 
+/** What a point of a role needs. */
+function needs(role) {
+  if (!facts.labels) return 'A point has a place in the scene and one on the ground.';
+  return { tie: 'A tie is measured in two images.', control: 'A control point has its ground, and is measured in an image.', check: 'A check point has its ground, and is measured in two images.' }[role];
+}
+
 function draw() {
   const marks = shownMarks();
   views.draw(marks, selected, pending, nextPlace(), placed);
@@ -298,7 +304,7 @@ const act = safely(async (action) => { const next = await ask('act', { action })
 
 const accept = safely(async () => {
   if (!complete(pending)) {
-    say(facts.labels ? 'A tie is measured in two images or more; control and check points have their ground too.' : 'A point has a place in the scene and one on the ground.', true);
+    say(needs($('role').value), true);
     return;
   }
   const sigma = decimal('sigma');
@@ -466,6 +472,15 @@ const typed = safely(async () => {
   draw();
 });
 
+/** Take the role that is chosen for the point under way, and say whether that has all that it needs. */
+function changeRole() {
+  const { value } = $('role');
+  if (pending) pending.role = value;
+  const missing = pending && !complete(pending);
+  say(`Role: ${value}.${missing ? ` ${needs(value)}` : pending ? ' Enter accepts.' : ''}`, missing);
+  if (pending) fill();
+}
+
 function pressed(event) {
   const { target, key } = event;
   if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector('dialog[open]')) return;
@@ -486,7 +501,7 @@ function pressed(event) {
     m: () => { const pane = target.id === 'reference' ? 'reference' : 'scene'; measure(pane, views.middle(pane)); },
     u: () => { const select = $('reference-shows'); showIn('reference', select.options[(select.selectedIndex + 1) % select.options.length].value); },
     n: goNext, j: () => along(1), k: () => along(-1), o: toggleOff, Delete: remove, s: stretch, c: models, g: makeOrtho,
-    r: () => { const roles = ['control', 'check', 'tie']; $('role').value = roles[(roles.indexOf($('role').value) + 1) % 3]; if (pending) pending.role = $('role').value; say(`Role: ${$('role').value}.`); if (pending) fill(); },
+    r: () => { const roles = ['control', 'check', 'tie']; $('role').value = roles[(roles.indexOf($('role').value) + 1) % 3]; changeRole(); },
     f: () => compare({ flicker: !compared.flicker, difference: false }), d: () => compare({ difference: !compared.difference, flicker: false }),
     z: () => act({ do: 'undo' }), Z: () => act({ do: 'redo' }), '?': () => $('keys').showModal(),
   };
