@@ -40,6 +40,7 @@ from ortho_pipeline.models.rpc_box import RPC_TERMS
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp.engine import rectify
+from ortho_pipeline.warp.job import WarpJob
 from ortho_pipeline.warp.layers.accuracy import Budget, write_accuracy
 from ortho_pipeline.warp.layers.hiding import Hiding
 from ortho_pipeline.warp.layers.sight import Sight
@@ -218,11 +219,13 @@ from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.warp.engine import rectify
+from ortho_pipeline.warp.job import WarpJob
 image, dem, out, step, *extent = sys.argv[1:]
 grid = Grid.of_extent(pyproj.CRS("EPSG:32735"), [float(value) for value in extent], (float(step), float(step)))
 model = rpc_of_dataset(open_dataset(image))[0]
 def make():
-    rectify(model, RasterSource(image), Surface.open(dem, "ellipsoid"), grid, out, driver="GTiff")
+    surface = Surface.open(dem, "ellipsoid")
+    rectify(WarpJob(model, RasterSource(image), surface, grid, driver="GTiff"), out)
 """
 
 
@@ -363,9 +366,8 @@ def alone(job: Job, model: SensorModel | None = None, kernel: str = "bilinear") 
     surface, (xmin, ymin, xmax, ymax) = Surface.open(job.dem, "ellipsoid"), job.extent
     grid = Grid.of_extent(pyproj.CRS.from_epsg(UTM), (xmin, ymin, xmax, ymax), (GSD, GSD))
     out = job.folder / "alone.tif"
-    result = rectify(
-        model or job.model(), RasterSource(job.image), surface, grid, out, resampling=kernel, driver="GTiff"
-    )
+    source = RasterSource(job.image)
+    result = rectify(WarpJob(model or job.model(), source, surface, grid, kernel, driver="GTiff"), out)
     out.unlink()
     return result.seconds
 
@@ -430,13 +432,14 @@ def layers(job: Job, pairs: int) -> dict[str, list[tuple[float, float]]]:
         write_accuracy(budget, Sight(corrected, grid), surface, size, job.folder / "accuracy.tif", heights=heights)
 
     def plain(surface: Surface) -> None:
-        rectify(model, source, surface, grid, out, driver="GTiff")
+        rectify(WarpJob(model, source, surface, grid, driver="GTiff"), out)
 
     def empty(surface: Surface) -> None:
-        rectify(model, source, surface, grid, Hiding(out, heights), driver="GTiff")
+        rectify(WarpJob(model, source, surface, grid, driver="GTiff"), Hiding(out, heights))
 
     def mask(surface: Surface) -> None:
-        rectify(model, source, surface, grid, Hiding(out, heights, job.folder / "mask.tif"), driver="GTiff")
+        hiding = Hiding(out, heights, job.folder / "mask.tif")
+        rectify(WarpJob(model, source, surface, grid, driver="GTiff"), hiding)
 
     dem, dsm = Surface.open(job.dem, "ellipsoid"), Surface.open(job.write_dsm(), "ellipsoid")
     todo = {

@@ -20,7 +20,7 @@ from house import House
 from ortho_pipeline.estimation import comparison
 from ortho_pipeline.models.correction import FREE
 from ortho_pipeline.options import CORRECTIONS, GROUPS, RESAMPLING, BlockOptions, options_of
-from ortho_pipeline.warp import engine
+from ortho_pipeline.warp import job
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "ortho_pipeline"
@@ -121,7 +121,7 @@ def parse(path: Path) -> ast.Module:
 def test_what_a_user_may_choose_is_what_there_is() -> None:
     """`options` is read before NumPy is there, so it repeats these names."""
     assert CORRECTIONS == (*FREE, "model") == (*comparison.CORRECTIONS, "model")
-    assert tuple(engine._KERNELS) == RESAMPLING
+    assert tuple(job.KERNELS) == RESAMPLING
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))

@@ -14,6 +14,7 @@ import pyproj
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from orthos import rectify
 
 from ortho_pipeline.errors import DegeneratePoints, InputError
 from ortho_pipeline.estimation.family_fit import fit_family
@@ -342,7 +343,7 @@ def test_an_ortho_depends_on_no_tiles_memory_or_threads(
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(warp, "TILE", blocks * warp.BLOCK)
             path = tiny.folder / "ortho.tif"
-            warp.rectify(
+            rectify(
                 tiny.model, source, surface, grid, path, resampling=kernel, driver="GTiff",
                 resources=Resources(memory=given_memory, threads=given_threads),
             )  # fmt: skip

@@ -49,7 +49,7 @@ from ortho_pipeline.surface import footprint
 from ortho_pipeline.surface.base import Surface
 
 if TYPE_CHECKING:
-    from ortho_pipeline.warp import engine as warp
+    from ortho_pipeline.warp.job import WarpResult
     from ortho_pipeline.warp.layers.hiding import Hiding
 
 
@@ -294,27 +294,17 @@ def _warp(
     path: Path | Hiding,
     output: OutputOptions,
     progress: Progress,
-) -> warp.WarpResult:
-    from ortho_pipeline.warp import engine as warp  # the compiled kernels take a while to load: beside the checksums
+) -> WarpResult:
+    # The compiled kernels take a while to load: beside the checksums.
+    from ortho_pipeline.warp.engines import engine_of
+    from ortho_pipeline.warp.job import WarpJob
 
-    common: dict[str, Any] = {
-        "resampling": output.resampling,
-        "dem_interpolation": output.dem_interpolation,
-        "resources": Resources(output.memory, output.threads, progress),
-        "driver": output.format,
-        "creation_options": dict(output.creation_options),
-        "profile": Profile.of(source, output.dtype, output.nodata),
-    }
-    if output.engine == "ortho":
-        return warp.rectify(model, source, surface, grid, path, tolerance=output.tolerance, **common)
-    if not isinstance(path, Path):
-        raise InputError(
-            "GDAL's warper does not look for what terrain hides", field="output.visibility",
-            remedy="leave out `output.visibility` or `output.engine=gdal`",
-        )  # fmt: skip
-    if output.engine != "gdal":
-        raise InputError(f"no engine is called {output.engine!r}", field="output.engine", remedy="ortho or gdal")
-    return warp.rectify_gdal(model, exported, source, surface, grid, path, **common)
+    job = WarpJob(
+        model, source, surface, grid, output.resampling, output.dem_interpolation, output.tolerance,
+        Resources(output.memory, output.threads, progress), output.format, dict(output.creation_options),
+        Profile.of(source, output.dtype, output.nodata), exported,
+    )  # fmt: skip
+    return engine_of(output.engine).rectify(job, path)
 
 
 def _write_models(

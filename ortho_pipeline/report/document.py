@@ -66,7 +66,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.hookspecs import Scene
     from ortho_pipeline.raster.source import Grid
     from ortho_pipeline.surface.base import Surface
-    from ortho_pipeline.warp.engine import WarpResult
+    from ortho_pipeline.warp.job import WarpResult
 
 Array = NDArray[np.float64]
 

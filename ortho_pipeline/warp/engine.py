@@ -12,7 +12,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -20,11 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.rpc_fit import RpcExport
-from ortho_pipeline.files.process_limits import Resources, require_memory, startable_threads
-from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.raster.far.ahead import AHEAD, ReadAhead, read_ahead
 from ortho_pipeline.raster.ortho import (
@@ -36,93 +32,25 @@ from ortho_pipeline.raster.ortho import (
     square_side,
     value_range,
 )
-from ortho_pipeline.raster.source import Grid, RasterSource
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.warp import kernels
 from ortho_pipeline.warp.block_kernel import DemWindow, Target, warp_block
-from ortho_pipeline.warp.gdal_engine import WARPING, warp_with_gdal
+from ortho_pipeline.warp.job import KERNELS, WARPING, WarpJob, WarpResult
 from ortho_pipeline.warp.lattice import BLOCK, Lattices, OutputBlock, Terrain, block_cells
 from ortho_pipeline.warp.layers.hiding import Hiding, Looked
 
 #: Side of a tile, the piece of work of a thread, of few bands (`square_side`). What a tile is may not depend on memory
 #: or threads, which the order of blocks in a file would tell.
 TILE = 4 * BLOCK
-#: Kernels by the name on the command line, with the source pixels that each reads around the one that holds the point
-#: ('average': plus half of its box).
-_KERNELS = {
-    "nearest": (kernels.NEAREST, 0),
-    "bilinear": (kernels.BILINEAR, 1),
-    "cubic": (kernels.CUBIC, 2),
-    "lanczos": (kernels.LANCZOS, 3),
-    "average": (kernels.AVERAGE, 1),
-}
-#: What GDAL's warper takes for each pixel of an ortho whose image points are geolocation arrays: 1.4 GB for 13.7 Mpx.
-_ARRAYS_BYTES = 100
 
 
-@dataclass(frozen=True)
-class WarpResult:
-    """The outcome of `rectify`.
-
-    `max_error_px` is a bound on the difference (source pixels) between the geometry used and the exact model at every
-    output pixel; `finest_spacing` the smallest lattice spacing that a block needed, 1 where every pixel was projected;
-    `valid_pixels` how many output pixels have a value. `transformer` names the one of GDAL's that stood for the model,
-    where GDAL's warper made the pixels: then the error is what was measured through it. `hidden_share` is that of the
-    pixels that the image reaches which terrain hides, where that was looked for, `filled_share` that of those which
-    another ortho filled, where one was given.
-    """
-
-    max_error_px: float
-    tolerance_px: float
-    finest_spacing: int
-    refined_blocks: int
-    blocks: int
-    pixels: int
-    valid_pixels: int
-    seconds: float
-    transformer: str | None = None
-    hidden_share: float | None = None
-    filled_share: float | None = None
-
-    def notes(self, memory: int) -> list[Notice]:
-        """Return a notice if GDAL's geolocation arrays took more memory (bytes) than was allowed, which they may."""
-        took = self.pixels * _ARRAYS_BYTES
-        if self.transformer != "GEOLOC_ARRAY" or took <= memory:
-            return []
-        text = (
-            f"GDAL's warper takes about {took / 1e6:.0f} MB for the arrays that stand for this model, beyond "
-            f"`output.memory` {memory / 1e6:.0f}: make a smaller extent, or leave out `output.engine=gdal`"
-        )
-        return [Notice("memory-exceeded", text, bytes=took)]
-
-
-def rectify(
-    model: SensorModel,
-    source: RasterSource,
-    surface: Surface,
-    grid: Grid,
-    path: str | os.PathLike[str] | Hiding,
-    *,
-    resampling: str = "bilinear",
-    dem_interpolation: str = "bilinear",
-    tolerance: float = 0.01,
-    resources: Resources | None = None,
-    driver: str = "COG",
-    creation_options: Mapping[str, str] | None = None,
-    profile: Profile | None = None,
-) -> WarpResult:
-    """Write the orthoimage of `source` on `grid`.
+def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpResult:
+    """Write the orthoimage of a source on a grid.
 
     Parameters
     ----------
-    surface : Surface
-        The seam of a global DEM beside the grid (`Surface.around`).
     path : path or Hiding
         Where the ortho is written, or that and what is done about pixels that terrain hides.
-    profile : Profile, optional
-        What the ortho looks like; like its source without.
-    tolerance : float
-        Bound on the geometric error of the lattice in source pixels.
 
     Raises
     ------
@@ -132,163 +60,60 @@ def rectify(
         If the tolerance cannot be held.
     """
     begin = time.monotonic()
-    _check(source, resampling, dem_interpolation, tolerance)
-    resources = resources or Resources()
-    memory = resources.memory
+    _check(job)
+    memory, progress, grid, profile = job.resources.memory, job.resources.progress, job.grid, job.look()
     other = path.other.block if isinstance(path, Hiding) and path.other is not None else 0
-    threads = limit_cache(memory, _threads(resources), source.block, surface.block, other)
-    profile = profile or Profile.of(source)
+    threads = limit_cache(memory, job.threads(), job.source.block, job.surface.block, other)
     with contextlib.ExitStack() as stack:
-        source = stack.enter_context(read_ahead(source, memory // 4))
+        source = stack.enter_context(read_ahead(job.source, memory // 4))
         ahead = AHEAD if isinstance(source, ReadAhead) else 0
         window = memory // (4 * (threads + ahead))
-        job = TileMaker(
-            model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, window, profile
-        )
+        work = TileMaker(replace(job, source=source), profile, window)
         if isinstance(path, Hiding):
-            job.looked, path = path.begun(model, surface, grid, window), path.ortho
+            work.looked, path = path.begun(job.model, job.surface, grid, window), path.ortho
         writer = stack.enter_context(
-            RasterWriter(path, grid, profile, driver=driver, creation_options=creation_options, threads=threads,
-                         progress=resources.progress)
+            RasterWriter(path, grid, profile, driver=job.driver, creation_options=job.creation_options,
+                         threads=threads, progress=progress)
         )  # fmt: skip
-        mask = None if job.looked is None else stack.enter_context(job.looked.writer(driver, threads))
+        mask = None if work.looked is None else stack.enter_context(work.looked.writer(job.driver, threads))
         tiles = list(_tiles(grid, square_side(profile, TILE)))
-        for done, made in enumerate(_in_order(threads, job, tiles, ahead), start=1):
+        for done, made in enumerate(_in_order(threads, work, tiles, ahead), start=1):
             writer.write(made.left, made.top, made.pixels, made.valid)
             if mask is not None:
                 mask.write(made.left, made.top, made.classes[None], None)
-            if resources.progress:
-                resources.progress(WARPING, done / len(tiles))
-        refuse_empty(job.valid_pixels, path)
+            if progress:
+                progress(WARPING, done / len(tiles))
+        refuse_empty(work.valid_pixels, path)
     return WarpResult(
-        max_error_px=job.lattices.worst,
-        tolerance_px=tolerance,
-        finest_spacing=job.lattices.finest,
-        refined_blocks=job.lattices.refined,
+        max_error_px=work.lattices.worst,
+        tolerance_px=job.tolerance,
+        finest_spacing=work.lattices.finest,
+        refined_blocks=work.lattices.refined,
         blocks=math.ceil(grid.width / BLOCK) * math.ceil(grid.height / BLOCK),
         pixels=grid.width * grid.height,
-        valid_pixels=job.valid_pixels,
+        valid_pixels=work.valid_pixels,
         seconds=time.monotonic() - begin,
-        hidden_share=None if job.looked is None else job.looked.hidden_share,
-        filled_share=None if job.looked is None else job.looked.filled_share,
+        hidden_share=None if work.looked is None else work.looked.hidden_share,
+        filled_share=None if work.looked is None else work.looked.filled_share,
     )
 
 
-def tile_maker(
-    model: SensorModel,
-    source: RasterSource,
-    surface: Surface,
-    grid: Grid,
-    *,
-    profile: Profile,
-    resampling: str = "bilinear",
-    dem_interpolation: str = "bilinear",
-    tolerance: float = 0.01,
-    memory: int = 512_000_000,
-) -> TileMaker:
-    """Return what makes the tiles of an ortho one by one, those that `rectify` writes; its threads share `memory`.
+def tile_maker(job: WarpJob) -> TileMaker:
+    """Return what makes the tiles of an ortho one by one, those that `rectify` writes; its threads share the memory.
 
     Raises
     ------
     InputError
         As `rectify`.
     """
-    _check(source, resampling, dem_interpolation, tolerance)
-    threads = os.cpu_count() or 1
-    return TileMaker(
-        model, source, surface, grid, resampling, dem_interpolation == "cubic", tolerance, memory // (4 * threads),
-        profile,
-    )  # fmt: skip
+    _check(job)
+    return TileMaker(job, job.look(), job.resources.memory // (4 * (os.cpu_count() or 1)))
 
 
-def rectify_gdal(
-    model: SensorModel,
-    exported: RpcExport | None,
-    source: RasterSource,
-    surface: Surface,
-    grid: Grid,
-    path: str | os.PathLike[str],
-    *,
-    resampling: str = "bilinear",
-    dem_interpolation: str = "bilinear",
-    resources: Resources | None = None,
-    driver: str = "COG",
-    creation_options: Mapping[str, str] | None = None,
-    profile: Profile | None = None,
-) -> WarpResult:
-    """Write the orthoimage by GDAL's own warper with one of its exact transformers: a cross-check of `rectify`.
-
-    Parameters
-    ----------
-    exported : RpcExport or None
-        The RPC that stands for the model (`rpc.export_rpc`), where there is one; GDAL's polynomials, homography and
-        geolocation arrays stand for others (`gdal_engine`).
-
-    Raises
-    ------
-    InputError
-        As `rectify`; for an image in several files; for cubic heights, which GDAL's warper does not take from a DEM as
-        our engine does; if no transformer of GDAL stands for the model within 0.1 px.
-    """
-    begin = time.monotonic()
-    _check(source, resampling, dem_interpolation, 1.0)
-    if dem_interpolation != "bilinear":
-        raise InputError(
-            "with GDAL's warper heights of the DEM are interpolated bilinearly", field="output.dem_interpolation",
-            remedy="leave out `output.dem_interpolation` or `output.engine=gdal`",
-        )  # fmt: skip
-    resources = resources or Resources()
-    # GDAL's warper reads in one of its threads.
-    limit_cache(resources.memory, 1, source.block, surface.block)
-    transformer, valid = warp_with_gdal(
-        model, exported, source, surface, grid, path, resampling=resampling, driver=driver,
-        creation_options=creation_options, profile=profile, resources=replace(resources, threads=_threads(resources)),
-    )  # fmt: skip
-    return WarpResult(
-        max_error_px=transformer.max_error_px,
-        tolerance_px=transformer.limit,
-        finest_spacing=1,
-        refined_blocks=0,
-        blocks=0,
-        pixels=grid.width * grid.height,
-        valid_pixels=valid,
-        seconds=time.monotonic() - begin,
-        transformer=transformer.method,
-    )
-
-
-def _check(source: RasterSource, resampling: str, dem_interpolation: str, tolerance: float) -> None:
-    if resampling not in _KERNELS:
-        raise InputError(
-            f"no kernel is called {resampling!r}", field="resampling", remedy=f"one of {', '.join(_KERNELS)}"
-        )
-    if dem_interpolation not in ("bilinear", "cubic"):
-        raise InputError(
-            f"DEMs are not interpolated by {dem_interpolation!r}", field="dem-interpolation", remedy="bilinear or cubic"
-        )
-    if source.dtype.kind in "iu" and source.dtype.itemsize == 8 and resampling != "nearest":
-        raise InputError(
-            "integers of 64 bits are not interpolated without loss",
-            file=source.path,
-            field="resampling",
-            remedy="use `output.resampling=nearest`, or convert the pixels first (gdal_translate -ot Float64)",
-        )
-    if source.palette and resampling != "nearest":
-        raise InputError(
-            "the pixels are indices into a palette, which cannot be averaged",
-            file=source.path,
-            field="resampling",
-            remedy="use `output.resampling=nearest`, or expand the palette first (gdal_translate -expand rgb)",
-        )
-    if not 0 < tolerance < math.inf:
+def _check(job: WarpJob) -> None:
+    job.check()
+    if not 0 < job.tolerance < math.inf:
         raise InputError("the tolerance is positive and finite", field="tolerance", remedy="0.01 px is the default")
-
-
-def _threads(resources: Resources) -> int:
-    """Return how many threads there are for tiles, with as many again for GDAL, which waits for missing ones."""
-    wanted = resources.threads or os.cpu_count() or 1
-    require_memory(resources.memory, 2 * wanted)
-    return max(1, startable_threads(2 * wanted) // 2)
 
 
 def _tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
@@ -297,23 +122,23 @@ def _tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
             yield top, left, min(side, grid.height - top), min(side, grid.width - left)
 
 
-def _in_order(threads: int, job: TileMaker, tiles: list[tuple[int, int, int, int]], ahead: int) -> Iterator[Made]:
+def _in_order(threads: int, work: TileMaker, tiles: list[tuple[int, int, int, int]], ahead: int) -> Iterator[Made]:
     """Yield tiles in their order, so that equal orthos are equal files; few are made, and `ahead` prepared, before.
 
     Threads begin work in the order in which it is handed to them: what a tile waits for has begun.
     """
     if len(tiles) == 1 and not ahead:
         # A thread of its own would open the files again, and ask PROJ for its transformations anew.
-        yield job.make(tiles[0])
+        yield work.make(tiles[0])
         return
     with ThreadPoolExecutor(threads, thread_name_prefix="warp") as pool:
-        prepared = deque(pool.submit(job.prepare, tile) for tile in tiles[:ahead])
+        prepared = deque(pool.submit(work.prepare, tile) for tile in tiles[:ahead])
         pending: deque[Future[Any]] = deque()
         try:
             for number, tile in enumerate(tiles):
                 if ahead and number + ahead < len(tiles):
-                    prepared.append(pool.submit(job.prepare, tiles[number + ahead]))
-                pending.append(pool.submit(job.make, tile, prepared.popleft() if ahead else None))
+                    prepared.append(pool.submit(work.prepare, tiles[number + ahead]))
+                pending.append(pool.submit(work.make, tile, prepared.popleft() if ahead else None))
                 if len(pending) > threads + 1:
                     yield pending.popleft().result()
             while pending:
@@ -336,26 +161,15 @@ class Made(NamedTuple):
 class TileMaker:
     """The work on one output raster, shared by its threads: see `tile_maker`."""
 
-    def __init__(
-        self,
-        model: SensorModel,
-        source: RasterSource,
-        surface: Surface,
-        grid: Grid,
-        resampling: str,
-        cubic_dem: bool,
-        tolerance: float,
-        window_bytes: int,
-        profile: Profile,
-    ) -> None:
-        self.source, self.surface, self.grid = source, surface, grid
-        kernel, reach = _KERNELS[resampling]
+    def __init__(self, job: WarpJob, profile: Profile, window_bytes: int) -> None:
+        source = job.source
+        kernel, reach = KERNELS[job.resampling]
+        self.source, self.surface, self.profile, self.window_bytes = source, job.surface, profile, window_bytes
         self.lattices = Lattices(
-            model, surface, grid, (source.width, source.height), tolerance=tolerance, reach=reach,
-            averages=resampling == "average",
+            job.model, job.surface, job.grid, (source.width, source.height), tolerance=job.tolerance, reach=reach,
+            averages=job.resampling == "average",
         )  # fmt: skip
-        self.cubic_dem, self.window_bytes = cubic_dem, window_bytes
-        self.profile = profile
+        self.cubic_dem = job.dem_interpolation == "cubic"
         self.resampling = kernels.Resampling(kernel, 0, (1.0, 1.0), *value_range(source.dtype, profile), real=None)
         self.any_band = profile.validity == "nodata" or profile.dtype.kind == "f"
         self._lock = threading.Lock()

@@ -21,6 +21,7 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,16 +33,16 @@ from osgeo import gdal, gdal_array
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.exchange.rpc_fit import REFUSE_ERROR, RpcExport
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
 from ortho_pipeline.raster.output import gdal_errors, written
-from ortho_pipeline.raster.source import Grid, RasterSource, first_line
+from ortho_pipeline.raster.source import Grid, first_line
 from ortho_pipeline.surface.base import Excerpt, Surface
+from ortho_pipeline.warp.job import WARPING, WarpJob, WarpResult
+from ortho_pipeline.warp.layers.hiding import Hiding
 
-#: The stage of a job that makes pixels, for its progress.
-WARPING = "Warping"
 #: GDAL's fit to points of a model expresses it if it repeats it this closely (px); another fit only resembles it.
 EXPRESSED = 1e-3
 #: Points per side of the ortho at which a transformer is held against the model.
@@ -148,60 +149,67 @@ class Exact:
         return float(worst) if np.isfinite(worst) else np.inf
 
 
-def warp_with_gdal(
-    model: SensorModel,
-    exported: RpcExport | None,
-    source: RasterSource,
-    surface: Surface,
-    grid: Grid,
-    path: str | os.PathLike[str],
-    *,
-    resampling: str = "bilinear",
-    driver: str = "COG",
-    creation_options: Mapping[str, str] | None = None,
-    profile: Profile | None = None,
-    resources: Resources,
-) -> tuple[Transformer, int]:
-    """Write the orthoimage of `source` by GDAL's own warper, without approximating its transformer.
-
-    Parameters
-    ----------
-    exported : RpcExport, optional
-        The RPC that stands for the model, where there is one.
-
-    Returns
-    -------
-    Transformer, int
-        What stood for the model, and how many pixels are valid.
+def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpResult:
+    """Write the orthoimage by GDAL's own warper, without approximating its transformer: a cross-check of our engine.
 
     Raises
     ------
     InputError
-        If no transformer of GDAL stands for the model within 0.1 px, or the image lies in several files.
+        As our engine; for an image in several files; for pixels that terrain hides; for cubic heights, which GDAL's
+        warper does not take from a DEM as our engine does; if no transformer of GDAL stands for the model within
+        0.1 px.
     """
-    if len(source.paths) > 1:
+    begin = time.monotonic()
+    if isinstance(path, Hiding):
         raise InputError(
-            "GDAL's warper takes one file", file=source.paths[1], field="engine", remedy="use our own engine"
-        )
-    exact = Exact(model, surface, grid, (source.width, source.height))
-    profile = profile or Profile.of(source)
+            "GDAL's warper does not look for what terrain hides", field="output.visibility",
+            remedy="leave out `output.visibility` or `output.engine=gdal`",
+        )  # fmt: skip
+    _check(job)
+    source, profile, grid, threads = job.source, job.look(), job.grid, job.threads()
+    # GDAL's warper reads in one of its threads.
+    limit_cache(job.resources.memory, 1, source.block, job.surface.block)
+    exact = Exact(job.model, job.surface, grid, (source.width, source.height))
     writer = RasterWriter(
-        path, grid, profile, driver=driver, creation_options=creation_options, threads=resources.threads or 1,
-        progress=resources.progress,
+        path, grid, profile, driver=job.driver, creation_options=job.creation_options, threads=threads,
+        progress=job.resources.progress,
     )  # fmt: skip
     with writer, gdal_errors(path), contextlib.ExitStack() as scratch:
         arrays, target = writer.scratch("arrays"), writer.scratch("gdal")
         for temporary in (arrays, target):
             scratch.callback(temporary.unlink, missing_ok=True)
-        transformer = _standing(exact, exported, source.dataset, arrays, scratch)
+        transformer = _standing(exact, job.exported, source.dataset, arrays, scratch)
         view = transformer.source(source.dataset, tuple(source.band_numbers))
         with written(_create(target, profile, grid)) as ortho:
             _describe(ortho, profile)
             transformer.georeference(ortho, grid)
-            _warp_exactly(view, ortho, source, profile, transformer, resampling, resources)
+            _warp_exactly(view, ortho, job, profile, transformer, threads)
         valid = writer.copy(target)
         refuse_empty(valid, path)
-        return transformer, valid
+    return WarpResult(
+        max_error_px=transformer.max_error_px,
+        tolerance_px=transformer.limit,
+        finest_spacing=1,
+        refined_blocks=0,
+        blocks=0,
+        pixels=grid.width * grid.height,
+        valid_pixels=valid,
+        seconds=time.monotonic() - begin,
+        transformer=transformer.method,
+    )
+
+
+def _check(job: WarpJob) -> None:
+    job.check()
+    if job.dem_interpolation != "bilinear":
+        raise InputError(
+            "with GDAL's warper heights of the DEM are interpolated bilinearly", field="output.dem_interpolation",
+            remedy="leave out `output.dem_interpolation` or `output.engine=gdal`",
+        )  # fmt: skip
+    if len(job.source.paths) > 1:
+        raise InputError(
+            "GDAL's warper takes one file", file=job.source.paths[1], field="engine", remedy="use our own engine"
+        )
 
 
 # -- what stands for a model -------------------------------------------------------------------------------------------
@@ -331,15 +339,9 @@ def _gdal_type(dtype: np.dtype[Any]) -> int:
 
 
 def _warp_exactly(
-    view: gdal.Dataset,
-    ortho: gdal.Dataset,
-    source: RasterSource,
-    profile: Profile,
-    transformer: Transformer,
-    resampling: str,
-    resources: Resources,
+    view: gdal.Dataset, ortho: gdal.Dataset, job: WarpJob, profile: Profile, transformer: Transformer, threads: int
 ) -> None:
-    progress, threads = resources.progress, resources.threads or 1
+    progress = job.resources.progress
     callback = None if progress is None else (lambda share, *_: progress(WARPING, share) or 1)
     # Without the first two the values depend on how the warper cuts the image into chunks; the next two let it find
     # the window of a chunk in the image from points all over it, because terrain moves them.
@@ -349,12 +351,12 @@ def _warp_exactly(
         view,
         transformerOptions=list(transformer.options),
         errorThreshold=0,
-        resampleAlg=resampling,
+        resampleAlg=job.resampling,
         # By itself the warper clamps the source to the type of the output before it interpolates.
-        workingType=_gdal_type(source.dtype),
+        workingType=_gdal_type(job.source.dtype),
         dstNodata=profile.nodata,
         multithread=threads > 1,
-        warpMemoryLimit=resources.memory // 2,
+        warpMemoryLimit=job.resources.memory // 2,
         warpOptions=[*settings, f"NUM_THREADS={threads}", "INIT_DEST=0" if profile.nodata is None else
                      "INIT_DEST=NO_DATA"],
         callback=callback,

@@ -63,6 +63,7 @@ def test_sha256(tmp_path):
 RECTIFY = """
 import resource, signal, sys
 from ortho_pipeline.warp import engine as warp
+from ortho_pipeline.warp.job import WarpJob
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.geodesy.crs import parse_crs
@@ -74,7 +75,7 @@ if limit:
 model = rpc_of_dataset(raster.open_dataset(image))[0]
 grid = raster.Grid.of_extent(parse_crs("EPSG:4326"), (19.99, -30.0065, 20.01, -29.9935), (2e-6, 2e-6))
 print("start", flush=True)
-warp.rectify(model, raster.RasterSource(image), Surface.constant(500.0), grid, out, driver=driver)
+warp.rectify(WarpJob(model, raster.RasterSource(image), Surface.constant(500.0), grid, driver=driver), out)
 """
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pyproj
 import pytest
 from erring import Field, Truth, follow, pooled, scene_of, trial
+from orthos import rectify
 from osgeo import gdal
 
 from ortho_pipeline.estimation.fit import fit
@@ -16,7 +17,6 @@ from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.writing import write_dem
-from ortho_pipeline.warp.engine import rectify
 from ortho_pipeline.warp.layers.accuracy import Budget, parts_at, predictive
 from ortho_pipeline.warp.layers.sight import Sight
 

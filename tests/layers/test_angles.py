@@ -5,6 +5,7 @@ from __future__ import annotations
 from xml.etree import ElementTree
 
 import numpy as np
+import orthos
 import pyproj
 import pytest
 from blocks import FLOOR, NORTH, WEST, City, Parallel, f1, towards
@@ -17,7 +18,6 @@ from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.report.document import read_report
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.warp import engine
 from ortho_pipeline.warp.layers.angles import Sun, write_angles, write_shadows
 from ortho_pipeline.warp.layers.hiding import Hiding
 from ortho_pipeline.warp.layers.sight import Sight
@@ -93,7 +93,7 @@ def test_shadows_of_a_rendered_scene_are_where_the_mask_has_them(tmp_path):
     made = None
     heights = (FLOOR, FLOOR + 60)
     hiding = Hiding(tmp_path / "ortho.tif", heights, tmp_path / "mask.tif")
-    engine.rectify(model, RasterSource(tmp_path / "image.tif"), surface, grid, hiding, resampling="nearest")
+    orthos.rectify(model, RasterSource(tmp_path / "image.tif"), surface, grid, hiding, resampling="nearest")
     # The map's north, not the true one, is the renderer's.
     bearing = Sun(SUN.azimuth_deg + _convergence(grid), SUN.elevation_deg)
     share = write_shadows(Sight(model, grid), surface, bearing, tmp_path / "shadow.tif", heights=heights)

@@ -6,6 +6,7 @@ import dataclasses
 import json
 
 import numpy as np
+import orthos
 import pytest
 from blocks import FLOOR, City, Parallel, towards
 from osgeo import gdal
@@ -39,7 +40,7 @@ def town(tmp_path_factory):
         RasterSource(folder / "image.tif"),
         TOWN.surface(folder / "d.tif"),
     )
-    engine.rectify(*job, TOWN.grid(), Hiding(folder / "own.tif", HEIGHTS), driver="GTiff")
+    orthos.rectify(*job, TOWN.grid(), Hiding(folder / "own.tif", HEIGHTS), driver="GTiff")
     return job, folder / "own.tif"
 
 
@@ -62,7 +63,7 @@ def other_ortho(path, grid: Grid, *, dtype="uint8", count: int = 1, nodata: floa
 
 def filled(town, path, other, **more):
     job, _ = town
-    return engine.rectify(*job, TOWN.grid(), Hiding(path, HEIGHTS, other=other), driver="GTiff", **more)
+    return orthos.rectify(*job, TOWN.grid(), Hiding(path, HEIGHTS, other=other), driver="GTiff", **more)
 
 
 @pytest.mark.parametrize("nodata", [None, 7.0])

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import orthos
 from blocks import FLOOR, City, Parallel, towards
 from osgeo import gdal
 from scipy.ndimage import binary_dilation
 
 from ortho_pipeline.raster.source import RasterSource
-from ortho_pipeline.warp import engine
 from ortho_pipeline.warp.layers.hiding import Hiding
 from ortho_pipeline.warp.mosaic import Ortho, lay_out, owners_of, write_cog
 
@@ -50,7 +50,7 @@ def made(tmp_path, name: str, azimuth: float, surface, *, hide: bool):
     dataset = None
     path = tmp_path / f"{name}_ortho.tif"
     target = Hiding(path, (FLOOR, FLOOR + 25)) if hide else path
-    engine.rectify(model, RasterSource(tmp_path / f"{name}.tif"), surface, grid, target, resampling="nearest")
+    orthos.rectify(model, RasterSource(tmp_path / f"{name}.tif"), surface, grid, target, resampling="nearest")
     return Ortho(name, path, float(np.tan(np.radians(25))))
 
 

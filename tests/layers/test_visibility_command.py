@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import orthos
 import pytest
 from blocks import FLOOR, City, Parallel, f1, towards
 from osgeo import gdal
@@ -36,7 +37,7 @@ def town(tmp_path_factory):
 
 def warped(town, hiding, **more):
     model, source, surface = town
-    return engine.rectify(model, source, surface, TOWN.grid(), hiding, driver="GTiff", **more)
+    return orthos.rectify(model, source, surface, TOWN.grid(), hiding, driver="GTiff", **more)
 
 
 def test_a_mask_has_the_classes_and_nodata_leaves_them_empty(town, tmp_path):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ortho_frame import open_scene
+from orthos import rectify
 from osgeo import gdal
 from scenes import Sky, View
 from trials import fitted, matches
@@ -21,7 +22,6 @@ from ortho_pipeline.models.frame.camera import TOPOCENTRIC, FrameCamera
 from ortho_pipeline.points import Points, read_points
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.warp.engine import rectify
 
 pytestmark = pytest.mark.realdata
 FRAMES = ("05_0182", "05_0184", "06_0251", "06_0253")

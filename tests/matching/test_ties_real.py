@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
+from orthos import rectify
 from osgeo import gdal
 from scipy.spatial import cKDTree
 
@@ -25,7 +26,6 @@ from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import meet_surface
-from ortho_pipeline.warp.engine import rectify
 
 pytestmark = pytest.mark.realdata
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ortho_frame import open_scene
+from orthos import rectify
 from scipy.spatial.transform import Rotation
 from skimage.registration import phase_cross_correlation
 
@@ -20,7 +21,6 @@ from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import meet_surface
-from ortho_pipeline.warp.engine import rectify
 
 pytestmark = pytest.mark.realdata
 NGI = ("05_0182", "05_0184", "06_0251", "06_0253")

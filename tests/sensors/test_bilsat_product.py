@@ -15,6 +15,7 @@ from ortho_bilsat.page import page
 from ortho_bilsat.simulation import write_product
 from ortho_bilsat.survey import read_survey
 from ortho_bilsat.truth import FOCAL_LENGTH, PITCH, SIZE
+from orthos import rectify
 from osgeo import gdal
 
 from ortho_pipeline import commands
@@ -34,7 +35,6 @@ from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.simulation.page import text
 from ortho_pipeline.simulation.tables import is_missed
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.warp.engine import rectify
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pyproj
 import pytest
+from orthos import rectify as warp
 from osgeo import gdal, osr
 
 from ortho_pipeline.commands import rectify
@@ -17,7 +18,6 @@ from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.options import SurfaceOptions
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.warp.engine import rectify as warp
 
 gdal.UseExceptions()
 #: Samples from one degree to the next in this test's cells.

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
+from orthos import rectify, rectify_gdal
 from osgeo import gdal
 
 from ortho_pipeline import commands
@@ -29,8 +30,10 @@ from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.warp.engine import WarpResult, rectify, rectify_gdal
+from ortho_pipeline.warp.engines import engine_of
 from ortho_pipeline.warp.gdal_engine import EXPRESSED, Exact, Transformer
+from ortho_pipeline.warp.job import WarpJob, WarpResult
+from ortho_pipeline.warp.layers.hiding import Hiding
 
 UTM = pyproj.CRS.from_epsg(32651)
 EAST, NORTH = 500_000.0, 1_000_000.0
@@ -132,6 +135,21 @@ def both(model: SensorModel, surface: Surface, folder: Path, **options) -> tuple
     difference = float(np.abs(one - other)[:, use].max())
     assert difference <= ours.max_error_px + theirs.max_error_px + ROUNDING
     return difference, float((valid != their_valid).mean()), theirs
+
+
+def test_an_unknown_engine_is_refused_with_the_names_of_those_there_are():
+    with pytest.raises(InputError, match="no engine is called 'warp9'") as refused:
+        engine_of("warp9")
+    assert (refused.value.field, refused.value.remedy) == ("output.engine", "ortho or gdal")
+
+
+def test_gdals_warper_refuses_to_look_for_what_terrain_hides(tmp_path):
+    source, surface = ramp(tmp_path), Surface.constant(500.0)
+    job = WarpJob(frame(), source, surface, GRID)
+    with pytest.raises(InputError, match="hides") as refused:
+        engine_of("gdal").rectify(job, Hiding(tmp_path / "ortho.tif", (400.0, 600.0)))
+    assert refused.value.field == "output.visibility"
+    assert not (tmp_path / "ortho.tif").exists()
 
 
 def has_homography() -> bool:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
+from orthos import rectify
 from osgeo import gdal
 
 from ortho_pipeline.files.process_limits import Resources
@@ -24,7 +25,7 @@ from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.warp.engine import WarpResult, rectify
+from ortho_pipeline.warp.job import WarpResult
 from ortho_pipeline.warp.lattice import Lattices, OutputBlock, Terrain
 
 UTM = pyproj.CRS.from_epsg(32651)

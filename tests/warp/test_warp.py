@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
+from orthos import rectify, rectify_gdal
 from osgeo import gdal, gdal_array
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import minimum_filter
@@ -28,7 +29,6 @@ from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp import engine as warp
 from ortho_pipeline.warp import kernels
-from ortho_pipeline.warp.engine import rectify, rectify_gdal
 
 UTM = pyproj.CRS.from_epsg(32735)
 WIDTH, HEIGHT, GSD = 700, 620, 0.5

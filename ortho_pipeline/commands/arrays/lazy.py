@@ -17,7 +17,7 @@ from ortho_pipeline.commands.placement import Placement, place_scene, source_of
 from ortho_pipeline.commands.scene_fit import open_adjustable
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.process_limits import one_blas_thread
+from ortho_pipeline.files.process_limits import Resources, one_blas_thread
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
@@ -127,14 +127,15 @@ class Tiles:
 
     def _ready(self) -> TileMaker:
         from ortho_pipeline.warp.engine import tile_maker
+        from ortho_pipeline.warp.job import WarpJob
 
         with self._lock:
             if self._maker is None:
                 model, _, surface, grid, output = self._parts
-                self._maker = tile_maker(
-                    model, self._source, surface, grid, profile=self.profile, resampling=output.resampling,
-                    dem_interpolation=output.dem_interpolation, tolerance=output.tolerance, memory=output.memory,
-                )  # fmt: skip
+                self._maker = tile_maker(WarpJob(
+                    model, self._source, surface, grid, output.resampling, output.dem_interpolation, output.tolerance,
+                    Resources(output.memory), profile=self.profile,
+                ))  # fmt: skip
             return self._maker
 
 

@@ -28,7 +28,7 @@ from ortho_pipeline.surface.dem import DemSurface
 
 if TYPE_CHECKING:
     from ortho_pipeline.raster.regridded import Regridded
-    from ortho_pipeline.warp.engine import WarpResult
+    from ortho_pipeline.warp.job import WarpResult
     from ortho_pipeline.warp.layers.accuracy import AccuracyResult, Budget
     from ortho_pipeline.warp.layers.hiding import Hiding
 

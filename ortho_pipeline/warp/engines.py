@@ -1,0 +1,35 @@
+"""The engines of the warp behind one protocol, and the way from a name to one."""
+
+from __future__ import annotations
+
+import os
+from typing import Protocol
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.warp import engine, gdal_engine
+from ortho_pipeline.warp.job import WarpJob, WarpResult
+from ortho_pipeline.warp.layers.hiding import Hiding
+
+
+class Engine(Protocol):
+    """What makes orthos; each engine is a module with this function."""
+
+    def rectify(self, job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpResult:
+        """Write an ortho; what the engine cannot do is an `InputError`."""
+
+
+#: Engines by the name on the command line.
+_ENGINES: dict[str, Engine] = {"ortho": engine, "gdal": gdal_engine}
+
+
+def engine_of(name: str) -> Engine:
+    """Return the engine of a name.
+
+    Raises
+    ------
+    InputError
+        If none has that name.
+    """
+    if name not in _ENGINES:
+        raise InputError(f"no engine is called {name!r}", field="output.engine", remedy=" or ".join(_ENGINES))
+    return _ENGINES[name]

@@ -1,0 +1,136 @@
+"""What an engine is asked for, and what it answers: a job of the warp, and its outcome."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.rpc_fit import RpcExport
+from ortho_pipeline.files.process_limits import Resources, require_memory, startable_threads
+from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.raster.ortho import Profile
+from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.warp import kernels
+
+#: The stage of a job that makes pixels, for its progress.
+WARPING = "Warping"
+#: Kernels by the name on the command line, with the source pixels that each reads around the one that holds the point
+#: ('average': plus half of its box).
+KERNELS = {
+    "nearest": (kernels.NEAREST, 0),
+    "bilinear": (kernels.BILINEAR, 1),
+    "cubic": (kernels.CUBIC, 2),
+    "lanczos": (kernels.LANCZOS, 3),
+    "average": (kernels.AVERAGE, 1),
+}
+#: What GDAL's warper takes for each pixel of an ortho whose image points are geolocation arrays: 1.4 GB for 13.7 Mpx.
+_ARRAYS_BYTES = 100
+
+
+@dataclass(frozen=True)
+class WarpJob:
+    """An ortho to be made: what an engine needs to know but where it is written.
+
+    Parameters
+    ----------
+    surface : Surface
+        The seam of a global DEM beside the grid (`Surface.around`).
+    resampling, dem_interpolation : str
+        How pixels and heights are interpolated.
+    tolerance : float
+        Bound on the geometric error in source pixels, for an engine that interpolates geometry.
+    profile : Profile, optional
+        What the ortho looks like; like its source without.
+    exported : RpcExport, optional
+        The RPC that stands for the model (`rpc.export_rpc`), where there is one, for an engine that knows no other.
+    """
+
+    model: SensorModel
+    source: RasterSource
+    surface: Surface
+    grid: Grid
+    resampling: str = "bilinear"
+    dem_interpolation: str = "bilinear"
+    tolerance: float = 0.01
+    resources: Resources = field(default_factory=Resources)
+    driver: str = "COG"
+    creation_options: Mapping[str, str] = field(default_factory=dict)
+    profile: Profile | None = None
+    exported: RpcExport | None = None
+
+    def look(self) -> Profile:
+        """Return what the ortho looks like."""
+        return self.profile or Profile.of(self.source)
+
+    def threads(self) -> int:
+        """Return how many threads there are for tiles, with as many again for GDAL, which waits for missing ones."""
+        wanted = self.resources.threads or os.cpu_count() or 1
+        require_memory(self.resources.memory, 2 * wanted)
+        return max(1, startable_threads(2 * wanted) // 2)
+
+    def check(self) -> None:
+        """Refuse an unknown kernel, and pixels that cannot be interpolated."""
+        if self.resampling not in KERNELS:
+            raise InputError(
+                f"no kernel is called {self.resampling!r}", field="resampling", remedy=f"one of {', '.join(KERNELS)}"
+            )
+        if self.dem_interpolation not in ("bilinear", "cubic"):
+            raise InputError(
+                f"DEMs are not interpolated by {self.dem_interpolation!r}",
+                field="dem-interpolation",
+                remedy="bilinear or cubic",
+            )
+        if self.source.dtype.kind in "iu" and self.source.dtype.itemsize == 8 and self.resampling != "nearest":
+            raise InputError(
+                "integers of 64 bits are not interpolated without loss",
+                file=self.source.path,
+                field="resampling",
+                remedy="use `output.resampling=nearest`, or convert the pixels first (gdal_translate -ot Float64)",
+            )
+        if self.source.palette and self.resampling != "nearest":
+            raise InputError(
+                "the pixels are indices into a palette, which cannot be averaged",
+                file=self.source.path,
+                field="resampling",
+                remedy="use `output.resampling=nearest`, or expand the palette first (gdal_translate -expand rgb)",
+            )
+
+
+@dataclass(frozen=True)
+class WarpResult:
+    """The outcome of a job.
+
+    `max_error_px` is a bound on the difference (source pixels) between the geometry used and the exact model at every
+    output pixel; `finest_spacing` the smallest lattice spacing that a block needed, 1 where every pixel was projected;
+    `valid_pixels` how many output pixels have a value. `transformer` names the one of GDAL's that stood for the model,
+    where GDAL's warper made the pixels: then the error is what was measured through it. `hidden_share` is that of the
+    pixels that the image reaches which terrain hides, where that was looked for, `filled_share` that of those which
+    another ortho filled, where one was given.
+    """
+
+    max_error_px: float
+    tolerance_px: float
+    finest_spacing: int
+    refined_blocks: int
+    blocks: int
+    pixels: int
+    valid_pixels: int
+    seconds: float
+    transformer: str | None = None
+    hidden_share: float | None = None
+    filled_share: float | None = None
+
+    def notes(self, memory: int) -> list[Notice]:
+        """Return a notice if GDAL's geolocation arrays took more memory (bytes) than was allowed, which they may."""
+        took = self.pixels * _ARRAYS_BYTES
+        if self.transformer != "GEOLOC_ARRAY" or took <= memory:
+            return []
+        text = (
+            f"GDAL's warper takes about {took / 1e6:.0f} MB for the arrays that stand for this model, beyond "
+            f"`output.memory` {memory / 1e6:.0f}: make a smaller extent, or leave out `output.engine=gdal`"
+        )
+        return [Notice("memory-exceeded", text, bytes=took)]
