@@ -93,10 +93,15 @@ def room_of(module: str) -> str:
     return module.partition(".")[0]
 
 
-def imports(tree: ast.AST) -> Iterator[tuple[str, bool]]:
-    """Yield each imported module (dotted) and whether it is imported at the top level of the file."""
-    top = set(ast.iter_child_nodes(tree))
-    for node in ast.walk(tree):
+@functools.cache
+def imports(path: Path) -> tuple[tuple[str, bool], ...]:
+    """Return each imported module (dotted) and whether it is imported at the top level of the file."""
+    return tuple(_imports(path))
+
+
+def _imports(path: Path) -> Iterator[tuple[str, bool]]:
+    top = set(ast.iter_child_nodes(parse(path)))
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield alias.name, node in top
@@ -118,23 +123,28 @@ def parse(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
+@functools.cache
+def nodes(path: Path) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(parse(path)))
+
+
 def test_what_a_user_may_choose_is_what_there_is() -> None:
     """`options` is read before NumPy is there, so it repeats these names."""
     assert CORRECTIONS == (*FREE, "model") == (*comparison.CORRECTIONS, "model")
     assert tuple(job.KERNELS) == RESAMPLING
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_imports_point_upwards(path: Path) -> None:
-    room = room_of(module_of(path))
-    if room in ("__init__", "__main__"):
-        return
-    assert room in LINE, f"{room} has no place in ROOMS: where does it belong?"
-    for imported, _ in imports(parse(path)):
-        parts = imported.split(".")
-        assert parts[0] not in PLUGINS, f"{path.name} imports {imported}: the host knows no plugin by name"
-        if parts[0] == "ortho_pipeline" and parts[1] != room:
-            assert LINE[parts[1]] < LINE[room], f"{module_of(path)} imports {imported}, which is not below {room}"
+def test_imports_point_upwards() -> None:
+    for path in FILES:
+        room = room_of(module_of(path))
+        if room in ("__init__", "__main__"):
+            continue
+        assert room in LINE, f"{room} has no place in ROOMS: where does it belong?"
+        for imported, _ in imports(path):
+            parts = imported.split(".")
+            assert parts[0] not in PLUGINS, f"{path.name} imports {imported}: the host knows no plugin by name"
+            if parts[0] == "ortho_pipeline" and parts[1] != room:
+                assert LINE[parts[1]] < LINE[room], f"{module_of(path)} imports {imported}, which is not below {room}"
 
 
 @pytest.mark.parametrize("room", sorted({room_of(module_of(path)) for path in FILES if path.parent != PACKAGE}))
@@ -142,14 +152,12 @@ def test_no_circle_in_a_room(room: str) -> None:
     graph: dict[str, set[str]] = {}
     for path in (PACKAGE / room).rglob("*.py"):
         module = f"ortho_pipeline.{module_of(path)}"
-        graph[module] = {name for name, at_top in imports(parse(path)) if at_top and name.startswith("ortho_pipeline.")}
+        graph[module] = {name for name, at_top in imports(path) if at_top and name.startswith("ortho_pipeline.")}
     graphlib.TopologicalSorter(graph).prepare()
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_heavy_libraries_stay_where_they_belong(path: Path) -> None:
-    name = module_of(path)
-    for imported, at_top in imports(parse(path)):
+def test_heavy_libraries_stay_where_they_belong() -> None:
+    for name, imported, at_top in ((module_of(path), *one) for path in FILES for one in imports(path)):
         library = imported.split(".")[0]
         if library == "osgeo":
             assert name in GDAL_MODULES, f"{name} imports GDAL"
@@ -167,27 +175,28 @@ def test_heavy_libraries_stay_where_they_belong(path: Path) -> None:
 
 def test_the_package_itself_imports_nothing_of_its_own() -> None:
     heavy = {"numpy", "scipy", "numba", "osgeo", "pyproj", "matplotlib", "ortho_pipeline"}
-    top = [name for name, at_top in imports(parse(PACKAGE / "__init__.py")) if at_top]
+    top = [name for name, at_top in imports(PACKAGE / "__init__.py") if at_top]
     assert not [name for name in top if name.split(".")[0] in heavy]
 
 
 def test_the_command_line_defers_heavy_imports() -> None:
     for path in (PACKAGE / "cli").glob("*.py"):
-        for imported, at_top in imports(parse(path)):
+        for imported, at_top in imports(path):
             if at_top and imported.startswith("ortho_pipeline"):
                 assert imported.split(".")[1] in ("cli", "errors", "options"), f"{path.name} imports {imported}"
 
 
-@pytest.mark.parametrize("path", FILES + PLUGIN_FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_nothing_grows_too_long(path: Path) -> None:
-    assert path.read_text(encoding="utf-8").count("\n") <= MAX_LINES, "split it"
-    for node in ast.walk(parse(path)):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            assert code_lines(node) <= MAX_FUNCTION, f"{node.name} has {code_lines(node)} lines"
-            assert parameters(node) <= MAX_PARAMETERS, f"{node.name} has {parameters(node)} parameters"
-        elif isinstance(node, ast.ClassDef):
-            lines = (node.end_lineno or 0) - node.lineno + 1
-            assert lines <= MAX_CLASS, f"{node.name} has {lines} lines"
+def test_nothing_grows_too_long() -> None:
+    for path in FILES + PLUGIN_FILES:
+        where = path.relative_to(ROOT)
+        assert path.read_text(encoding="utf-8").count("\n") <= MAX_LINES, f"{where}: split it"
+        for node in nodes(path):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                assert code_lines(node) <= MAX_FUNCTION, f"{where}: {node.name} has {code_lines(node)} lines"
+                assert parameters(node) <= MAX_PARAMETERS, f"{where}: {node.name} has {parameters(node)} parameters"
+            elif isinstance(node, ast.ClassDef):
+                lines = (node.end_lineno or 0) - node.lineno + 1
+                assert lines <= MAX_CLASS, f"{where}: {node.name} has {lines} lines"
 
 
 def parameters(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
@@ -256,9 +265,8 @@ COMMAND_LINE = re.compile(r"\b(ortho (adjust|doctor|fit|rectify|run)|pyproj sync
 
 def texts(path: Path) -> Iterator[str]:
     """Yield the strings of a module but docstrings; of a formatted one what is between its values, joined by blanks."""
-    tree = parse(path)
     skipped: set[ast.AST] = set()
-    for node in ast.walk(tree):
+    for node in nodes(path):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             skipped.add(node.value)
         if isinstance(node, ast.JoinedStr):
@@ -268,19 +276,15 @@ def texts(path: Path) -> Iterator[str]:
             yield node.value
 
 
-@pytest.mark.parametrize(
-    "path",
-    [path for path in FILES + PLUGIN_FILES if not {"cli", "options"} & set(path.relative_to(ROOT).parts)],
-    ids=lambda path: str(path.relative_to(ROOT)),
-)
-def test_messages_name_options_by_their_fields(path: Path) -> None:
-    for text in texts(path):
+def test_messages_name_options_by_their_fields() -> None:
+    paths = [path for path in FILES + PLUGIN_FILES if not {"cli", "options"} & set(path.relative_to(ROOT).parts)]
+    for where, text in ((path.relative_to(ROOT), text) for path in paths for text in texts(path)):
         typed = re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)
-        if path.name != "study.py":  # the switches of a study are its own to name
-            assert not typed or COMMAND_LINE.search(text), f"{typed}: a flag is the command line's (cli/flags.py)"
+        if where.name != "study.py":  # the switches of a study are its own to name
+            assert not typed or COMMAND_LINE.search(text), f"{where}, {typed}: a flag is the command line's"
         for group, name in re.findall(r"`(scene|points|surface|output)\.([a-z_]+)", text):
             known = {**options_of(GROUPS[group]), **(options_of(BlockOptions) if group == "points" else {})}
-            assert name in known, f"there is no option {group}.{name}"
+            assert name in known, f"{where}: there is no option {group}.{name}"
 
 
 def test_starting_a_command_loads_nothing_that_few_need() -> None:
