@@ -14,8 +14,8 @@ FAULTS = Path(__file__).parent / "attack" / "faults.py"
 @pytest.mark.parametrize(
     "words",
     [
-        ("--only", "export", "--limits", "8", "--kills", "4", "--disks", "1", "--memory", "0"),
-        ("--only", "rectify", "--limits", "2", "--kills", "2", "--disks", "1", "--memory", "0", "--changes", "1"),
+        ("--only", "export rpc-txt", "--limits", "4", "--kills", "5", "--disks", "1", "--memory", "0"),
+        ("--only", "rectify STAC", "--limits", "1", "--kills", "1", "--disks", "1", "--memory", "0", "--changes", "1"),
     ],
 )
 def test_no_fault_leaves_a_broken_or_mixed_set(words):
