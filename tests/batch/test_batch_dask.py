@@ -74,6 +74,7 @@ def digests(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
+@pytest.mark.slow
 def test_a_killed_worker_loses_nothing_and_nothing_is_done_twice(folder, cluster):
     address = cluster.scheduler_address
     with ThreadPoolExecutor(1) as pool, distributed.Client(address, set_as_default=False) as client:

@@ -111,7 +111,7 @@ def test_errors_of_the_ground_add_to_a_covariance_with_their_correlation(rpc: RP
     np.testing.assert_allclose(added, moved @ moved.transpose(0, 2, 1), rtol=0.01, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["shift", "affine"])
+@pytest.mark.parametrize("kind", ["affine", pytest.param("shift", marks=pytest.mark.slow)])
 def test_sigmas_cover_with_strongly_anisotropic_errors(rpc: RPC, kind: str) -> None:
     """Over 1,000 repeats (estimate - truth) / sigma has spread 1 (Student's t of 50 - P degrees of freedom)."""
     start = ImageCorrection.identity(rpc, kind, ORIGIN)

@@ -208,7 +208,7 @@ def test_truth_lies_within_the_claimed_sigma(name):
 @pytest.mark.parametrize(
     ("name", "repeats"),
     [
-        ("affine14-row", 200), ("rfm1", 200),
+        ("affine14-row", 100), ("rfm1", 100),
         *(pytest.param(one, 1000, marks=pytest.mark.slow)
           for one in ("affine14-row", "rfm1", "poly2", "projective", "dlt")),
     ],
@@ -287,7 +287,7 @@ def test_too_many_gross_errors_are_not_cleaned_up(name):
         fit_family(name, make_points(40, ground=points.ground, image=image), size=SIZE)
 
 
-@pytest.mark.parametrize(("sets", "most"), [(10, 1), pytest.param(40, 2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("sets", "most"), [(5, 0), pytest.param(40, 2, marks=pytest.mark.slow)])
 def test_good_points_are_kept(sets, most):
     lost = 0
     for seed in range(sets):
@@ -366,10 +366,12 @@ def test_collapse_without_normalisation_does_not_happen():
 # -- regularisation --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ridge", ["gcv", pytest.param("lcurve", marks=pytest.mark.slow)])
-def test_rfm3_with_40_points_is_no_catastrophe(ridge):
+@pytest.mark.parametrize(
+    ("ridge", "sets"), [("gcv", 4), *(pytest.param(one, 12, marks=pytest.mark.slow) for one in ("gcv", "lcurve"))]
+)
+def test_rfm3_with_40_points_is_no_catastrophe(ridge, sets):
     """Trap 20: 39 parameters an axis from 40 points; unregularised, the check error is hundreds of pixels."""
-    for seed in range(12):
+    for seed in range(sets):
         points = make_points(240, seed=seed)
         points = points.with_roles(np.where(np.arange(240) < 40, "control", "check"))
         dlt = fit_family("dlt", points, size=SIZE)

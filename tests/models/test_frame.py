@@ -251,7 +251,7 @@ def test_a_known_position_and_a_map_frame_start_as_well():
     np.testing.assert_allclose(found.exterior[3:], in_map.exterior[3:], atol=1e-10)
 
 
-@pytest.mark.parametrize("repeats", [250, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("repeats", [100, pytest.param(1000, marks=pytest.mark.slow)])
 def test_covariance_is_honest(repeats):
     truth = satellite(8, 12)
     exact = measured(truth, 44)

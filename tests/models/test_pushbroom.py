@@ -454,7 +454,7 @@ def test_honest_covariance(scenes: int) -> None:
     assert 0.9 < np.sqrt(np.mean(np.square(weights))) < 1.1
 
 
-@pytest.mark.parametrize("scenes", [8, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("scenes", [4, pytest.param(20, marks=pytest.mark.slow)])
 def test_honest_covariance_with_soft_constraints(scenes: int) -> None:
     """Predictions from metadata and 15 points are as uncertain as they say, although constraints were only guessed."""
     scaled, weights = [], []

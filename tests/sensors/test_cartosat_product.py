@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -180,8 +181,8 @@ def test_simulate_writes_a_pair_that_the_other_commands_take(tmp_path):
 
 
 def test_nine_points_and_soft_constraints_converge_from_the_metadata(rpcs):
-    """Four scenes, to be quick; when a hundred were run (``range(100)``), all converged."""
-    for seed in range(4):
+    """Two scenes, to be quick; when a hundred were run (``range(100)``), all converged."""
+    for seed in range(2):
         block = Block.make(seed, rpcs, jitter=0.3)
         # Metadata that are worse than those of the paper: corners some hundred metres off.
         random = np.random.default_rng(seed)
@@ -247,7 +248,7 @@ def test_table_3_has_the_signs_of_the_paper(document):
         assert abs(row["median"] - row["paper"]) < 5.0
 
 
-def test_reproduction_as_text_json_and_page(document, tmp_path):
+def test_reproduction_as_text_json_and_page(document, tmp_path, monkeypatch):
     lines = [row for table in document["tables"] for row in table["rows"]]
     assert text(document).count("\n!") == sum(is_missed(row) for row in lines) + sum(
         statement["verdict"] == "not reproduced" for statement in document["statements"]
@@ -256,6 +257,7 @@ def test_reproduction_as_text_json_and_page(document, tmp_path):
     html = page(document, vectors)
     assert "Table 6: Generic pushbroom model" in html
     assert "without a cause that we know of" not in html
+    monkeypatch.setattr(cartosat, "reproduce", partial(reproduce, counts=(9, 15)))
     said = json.loads(run("reproduce", "cartosat", "--realisations", 1, "-o", tmp_path, "--json"))
     assert said["realisations"] == 1
     assert json.loads((tmp_path / "cartosat.json").read_text())["tables"] == said["tables"]
