@@ -14,7 +14,7 @@ from typing import Any
 
 from ortho_pipeline.batch.plan import Job
 from ortho_pipeline.batch.records import Digests, FileState, Record, key_of, siblings
-from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import confined
 from ortho_pipeline.files.folders import listing
@@ -43,7 +43,7 @@ def inputs_as_recorded(record: Record, job: Job, checksums: bool = False) -> tup
     if not checksums:
         DIGESTS.learn(record.inputs)
     known = {one.path: one.role for one in record.inputs if os.path.isfile(one.path)}
-    found = inputs.files_read(job.image, job.scene, job.points, job.surface, job.match, output=job.ortho)
+    found = Ledger.of(job.request).roles
     read = (*_local_states(job, {**{str(path): role for path, role in found.items()}, **known}), *far_states(job))
     return read if record.key == key_of(read, job.configuration, job.versions) else None
 
@@ -81,9 +81,8 @@ def far_states(job: Job) -> tuple[FileState, ...]:
     StorageError
         If the store does not answer.
     """
-    given = inputs.given_files(job.image, job.scene, job.points, job.surface, job.match, job.ortho)
     found = []
-    for address in sorted({url_of(path) for path in given if is_far(path)}):
+    for address in sorted({url_of(path) for _, path in job.request.files if is_far(path)}):
         if not is_address(address):
             continue
         folder, _, name = address.rpartition("/")
@@ -97,9 +96,7 @@ def far_states(job: Job) -> tuple[FileState, ...]:
 
 def folders(job: Job) -> list[str | os.PathLike[str]]:
     """Return the files in whose folders a new name could change the scene."""
-    return [path for path in (job.image, inputs.point_file(job.points), job.surface.dem, *job.match.reference,
-                          *job.ortho.files.values(), *job.scene.files.values())
-            if path is not None and os.path.isabs(path) and not is_far(path)]  # fmt: skip
+    return [path for _, path in job.request.files if os.path.isabs(path) and not is_far(path)]
 
 
 def _local_states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:
@@ -143,7 +140,7 @@ def reads_the_same(record: Record, job: Job) -> bool:
         if not _files_untouched(near, job, record.inputs) or (far and far != far_states(job)):
             return False
         with confined(job.output):
-            found = inputs.files_read(job.image, job.scene, job.points, job.surface, job.match, output=job.ortho)
+            found = Ledger.of(job.request).roles
     except OrthoError:
         return False
     known = {one.path for one in record.inputs}

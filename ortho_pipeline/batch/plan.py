@@ -19,7 +19,7 @@ from ortho_pipeline import plugins
 from ortho_pipeline.batch.config import Config, Entry, Settings, merged, read_config
 from ortho_pipeline.batch.places import Place, Places
 from ortho_pipeline.commands.heights.automatic import AUTO
-from ortho_pipeline.commands.inputs import OWN_POINTS
+from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request
 from ortho_pipeline.commands.stac.given import heights_given, resolved
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files.locations import VsiPath, located, place
@@ -71,6 +71,11 @@ class Job:
     ortho: OutputOptions = OutputOptions()
     versions: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     run: str = ""
+
+    @property
+    def request(self) -> Request:
+        """What is asked of the scene."""
+        return Request(self.image, self.scene, self.points, self.surface, self.match, self.ortho)
 
     @property
     def folder(self) -> Path:

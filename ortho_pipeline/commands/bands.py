@@ -9,6 +9,7 @@ from typing import Any
 
 from ortho_pipeline import plugins
 from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.resolved.ledger import hashed, require_unchanged
 from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
@@ -87,9 +88,9 @@ def register(
             write_model_file(SavedModel(opened.model, opened.sensor, opened.model_source, size), files["model"])
         # Bands in an archive are those of the archive.
         read = {archive_of(str(path)) or Path(path): "band" for path in paths}
-        document = _document(opened, chosen, names, done, inputs.hashed(read))
+        document = _document(opened, chosen, names, done, hashed(read))
         write_json(files["table"], document)
-        inputs.refuse_changed(begun)
+        require_unchanged(begun)
     return Result(files, document, _text(chosen, done))
 
 

@@ -30,6 +30,8 @@ from ortho_pipeline.commands.control.block_points import (
     relative_to_reference,
     settled_scenes,
 )
+from ortho_pipeline.commands.resolved.ledger import Ledger, provenance
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import Result, attempted, to_store
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
@@ -234,7 +236,7 @@ def _check_paths(
         return
     for image, scene in zip(images, scenes, strict=True):
         for read in (options.points, options.gcps, *more):
-            inputs.check_paths(files, image, scene, PointOptions(gcps=read), surface, match)
+            inputs.check_paths(files, Request(image, scene, PointOptions(gcps=read), surface, match))
 
 
 def _record(
@@ -248,19 +250,16 @@ def _record(
     heights: Surface | None,
 ) -> dict[str, Any]:
     """Return what is needed to make the same result again."""
-    read: dict[Path, str] = {}
-    for image, scene, start in zip(images, scenes, starts.values(), strict=True):
-        for given in (options.points, options.gcps):
-            of_image = inputs.files_read(
-                image, scene, PointOptions(gcps=given), surface, match, start.scene, heights=heights
-            )
-            for path, role in of_image.items():
-                read.setdefault(path, role)
+    ledgers = [
+        Ledger.of(Request(image, scene, PointOptions(gcps=given), surface, match), start.scene, heights)
+        for image, scene, start in zip(images, scenes, starts.values(), strict=True)
+        for given in (options.points, options.gcps)
+    ]
     first = next(iter(starts.values())).scene
     matched = options.ties is not None or match.reference
     asked = {"match": match, "surface": surface} if matched else {}
-    whole = inputs.provenance(
-        first, PointOptions(), None, inputs.hashed(read), command,
+    whole = provenance(
+        Request(images[0]), first, None, ledgers[0].joined(*ledgers[1:]).hashed(), command,
         {"block": options, "scene": replace(scenes[0], model=None), **asked},
     )  # fmt: skip
     return {key: whole[key] for key in ("command", "inputs", "options", "software")}

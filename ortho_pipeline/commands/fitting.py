@@ -7,18 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from ortho_pipeline.commands import inputs
-from ortho_pipeline.commands.control.crops import open_by_evidence
-from ortho_pipeline.commands.control.points import control_of, has_control, match_asked
-from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
-from ortho_pipeline.commands.placement import source_of
+from ortho_pipeline.commands.control.points import control_of, refuse_contradictions
+from ortho_pipeline.commands.placement import open_rasters
+from ortho_pipeline.commands.resolved.ledger import provenance
+from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.resolved.resolving import resolve
 from ortho_pipeline.commands.results import ENDINGS, CompareResult, FitResult, outputs_together, write_report
 from ortho_pipeline.commands.scene_fit import (
     Adjusted,
     adjust,
+    adjustable,
     heights_around,
     heights_where_wanted,
-    on_surface,
-    open_adjustable,
     relative_to_reference,
 )
 from ortho_pipeline.commands.stac.given import with_items
@@ -28,7 +28,7 @@ from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import ridge_of
 from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models import families
-from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.report import document as report
 
 
@@ -48,12 +48,11 @@ def fit(
     InputError
         If there are no points, or a file is wrong (message names file, field and remedy).
     """
-    _require_points(points, match)
-    opened = open_adjustable(image, scene, points, match, surface)
-    heights = open_surface(surface, scene, under=[opened]) if has_surface(surface) else None
-    adjusted = adjust(opened, points, scene, heights, match)
+    request = Request(image, scene, points, surface, match)
+    _require_points(request)
+    adjusted = adjust(resolved := adjustable(request))
     return FitResult(
-        adjusted.scene, adjusted.fit, adjusted.warnings(heights), tuple(adjusted.removed_json()), points.near,
+        adjusted.scene, adjusted.fit, adjusted.warnings(resolved.surface), tuple(adjusted.removed_json()), points.near,
         adjusted.matched,
     )  # fmt: skip
 
@@ -87,7 +86,8 @@ def compare(
     InputError
         If there are no points, a model is unknown, or a file is wrong. A model that cannot be fitted is a row.
     """
-    _require_points(points, match)
+    request = Request(image, scene, points, surface, match)
+    _require_points(request)
     if points.correction is not None or points.fit_model is not None:
         raise InputError(
             "compare takes its models from `models`", remedy="for example `models=all`",
@@ -99,12 +99,12 @@ def compare(
             field="points.params" if points.params else "points.prune",
             remedy="take ortho fit",
         )
-    opened = open_by_evidence(lambda: inputs.open_image(image, scene, needs_model=False), scene, points, surface, match)
-    names = comparing.choose_models(models, opened.model if opened.models else None)
-    heights = open_surface(surface, scene, under=[opened]) if has_surface(surface) else None
-    opened = on_surface(opened, heights)
+    refuse_contradictions(points, match)
+    resolved = resolve(request, needs_model=False)
+    opened, heights = resolved.scene, resolved.surface
     own = opened.model if opened.models else None
-    given, matched = control_of(opened, points, match, scene, heights)
+    names = comparing.choose_models(models, own)
+    given, matched = control_of(resolved)
     if own is not None:
         refuse_swapped(own, given, opened.height)
     given = heights_where_wanted(given, heights, *names)
@@ -124,23 +124,22 @@ def compare(
     chosen = replace(best.fit, warnings=(*best.fit.warnings, *relative_to_reference(best.fit, match)))
     stem = Path(image).stem
     files = {name: Path(folder) / f"{stem}{ENDINGS[name]}" for name in ("residuals", "style", "report", "html")}
-    inputs.check_paths(files, image, scene, points, surface, match)
+    inputs.check_paths(files, request)
     if best.model in {family.name for family in families()}:
         opened = replace(opened, models={best.model: chosen.model}, model_source="control points")
     adjusted = Adjusted(opened, chosen, matched=matched)
-    hashed = inputs.hashed(inputs.files_read(image, scene, points, surface, match, opened, heights=heights))
-    asked = {"scene": scene, "surface": surface, **match_asked(match)}
-    record = inputs.provenance(opened, points, heights, hashed, command, asked)
+    asked = request.asked("scene", "surface", "match")
+    record = provenance(request, opened, heights, resolved.ledger.hashed(), command, asked)
     made = report.build_report(
         scene=opened, fit=chosen, surface=heights, comparison=document, near=points.near,
         provenance=record, warnings=adjusted.warnings(heights), matching=adjusted.matching,
     )  # fmt: skip
-    write_report(made, chosen, files, matched, source_of(opened, image, scene, OutputOptions()))
+    write_report(made, chosen, files, matched, open_rasters(opened, request))
     return replace(result, files=files)
 
 
-def _require_points(points: PointOptions, match: MatchOptions) -> None:
-    if not has_control(points, match):
+def _require_points(request: Request) -> None:
+    if not request.has_control:
         raise InputError(
             "there are no points to fit to", field="points.gcps",
             remedy="give a file of points with `points.gcps`, or an orthoimage to match with (`match.reference`)",

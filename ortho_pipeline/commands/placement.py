@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any, NamedTuple
 
+from ortho_pipeline.commands.resolved.request import Request, Resolved
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, completed, of_option
@@ -12,7 +13,6 @@ from ortho_pipeline.geodesy.crs import map_crs
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
-from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
@@ -30,11 +30,16 @@ class Placement(NamedTuple):
     surface: Surface
     footprint: Footprint
     grid: Grid
+    request: Request
 
     @property
     def scene(self) -> Scene:
         """The scene with the models that were adjusted."""
         return self.adjusted.scene
+
+    def open_source(self) -> RasterSource:
+        """Open the rasters of the scene with the bands and in the type that its ortho shall have."""
+        return open_rasters(self.scene, self.request)
 
     def sparse(self, valid_pixels: int) -> list[Notice]:
         """Return a warning if hardly any of the pixels of the ortho that the scene covers has a value."""
@@ -64,15 +69,8 @@ class Placement(NamedTuple):
         }  # fmt: skip
 
 
-def place_scene(
-    opened: Scene,
-    points: PointOptions,
-    scene: SceneOptions,
-    surface: Surface,
-    output: OutputOptions,
-    match: MatchOptions = MatchOptions(),
-) -> Placement:
-    """Adjust a scene to its points, lay it on the surface and choose the grid of its ortho.
+def place_scene(resolved: Resolved) -> Placement:
+    """Adjust a scene to its points, lay it on its surface and choose the grid of its ortho.
 
     No pixel is read, but those that are matched with a reference.
 
@@ -81,14 +79,15 @@ def place_scene(
     InputError
         For wrong points, a DEM that does not cover the scene, a grid that is none.
     """
-    adjusted = adjust(opened, points, scene, surface, match, output.threads, output.memory)
-    model, size = adjusted.model, (opened.width, opened.height)
+    adjusted, output, surface = adjust(resolved), resolved.request.output, resolved.surface
+    assert surface is not None, "who places a scene requires heights"
+    model, size = adjusted.model, (adjusted.scene.width, adjusted.scene.height)
     with completed(adjusted.scene.model_source, of="model"):
         found = lay(model, surface, *size)
         found.require_coverage()
         model = found.fitted(model)
         if output.like is not None:
-            grid = _grid_like(output, scene)
+            grid = _grid_like(resolved.request)
         else:
             with of_option("output.crs"):
                 crs = map_crs(output.crs) if output.crs else None
@@ -96,11 +95,12 @@ def place_scene(
                 model, found, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
             )
         scene_pixels(model, found, grid)
-    return Placement(adjusted, model, found.surface, found, grid)
+    return Placement(adjusted, model, found.surface, found, grid, resolved.request)
 
 
-def _grid_like(output: OutputOptions, scene: SceneOptions) -> Grid:
+def _grid_like(request: Request) -> Grid:
     """Return the grid of the raster that an ortho is to match."""
+    output = request.output
     given = [name for name in ("crs", "resolution", "extent", "align") if getattr(output, name)]
     if given:
         raise InputError(
@@ -109,13 +109,13 @@ def _grid_like(output: OutputOptions, scene: SceneOptions) -> Grid:
         )  # fmt: skip
     assert output.like is not None
     with completed(os.fspath(output.like), field="output.like"):
-        return grid_of(output.like, **scene.access)
+        return grid_of(output.like, **request.scene.access)
 
 
-def source_of(
-    scene: Scene, image: str | os.PathLike[str], options: SceneOptions, output: OutputOptions
-) -> RasterSource:
-    """Open the rasters of a scene with the bands and in the type that its ortho shall have."""
+def open_rasters(scene: Scene, request: Request) -> RasterSource:
+    """Open the rasters of a scene with the bands and in the type that a request says."""
+    image, output = request.image, request.output
     return RasterSource(
-        *(scene.rasters or (image,)), **options.access, bands=output.bands, dtype=output.dtype, memory=output.memory
-    )
+        *(scene.rasters or (image,)), **request.scene.access, bands=output.bands, dtype=output.dtype,
+        memory=output.memory,
+    )  # fmt: skip

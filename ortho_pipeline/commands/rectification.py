@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ortho_pipeline.commands import inputs
-from ortho_pipeline.commands.control.points import match_asked
-from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface, require_heights
+from ortho_pipeline.commands.heights.surfaces import require_heights
 from ortho_pipeline.commands.layers import budget as layers
 from ortho_pipeline.commands.layers.angles import sun_of, write_angles
 from ortho_pipeline.commands.layers.filling import other_of
-from ortho_pipeline.commands.placement import place_scene, source_of
+from ortho_pipeline.commands.placement import Placement, place_scene
+from ortho_pipeline.commands.resolved.ledger import RASTERS, provenance, read_since
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import (
     ENDINGS,
     OF_REPORT,
@@ -24,14 +25,14 @@ from ortho_pipeline.commands.results import (
     outputs_together,
     write_report,
 )
-from ortho_pipeline.commands.scene_fit import adjust, open_adjustable
+from ortho_pipeline.commands.scene_fit import adjust, adjustable
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, ReportError, completed
 from ortho_pipeline.exchange import export as formats_of_models
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
-from ortho_pipeline.files import retire, sha256, states
+from ortho_pipeline.files import retire, sha256
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.process_limits import Progress, Resources, one_blas_thread
 from ortho_pipeline.files.traffic import bytes_read
@@ -46,15 +47,10 @@ from ortho_pipeline.raster.output import checked_options, require_whole
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.records import SceneReport
 from ortho_pipeline.surface import footprint
-from ortho_pipeline.surface.base import Surface
 
 if TYPE_CHECKING:
     from ortho_pipeline.warp.job import WarpResult
     from ortho_pipeline.warp.layers.hiding import Hiding
-
-
-#: Roles of the files of `inputs.files_read` that have pixels.
-_RASTERS = ("image", "DEM", "DEM accuracy", "reference", "other ortho")
 
 
 # -- commands --------------------------------------------------------------------------------------------------------
@@ -101,40 +97,37 @@ def rectify(
         written, an old side-car that would attach to the ortho.
     """
     stem, before, stage = Path(image).stem, bytes_read(), progress or _unwatched
-    files, points = outputs(folder, stem, output), inputs.point_options(points)
-    inputs.check_paths(files, image, scene, points, surface, match, overwrite, output=output)
+    request = Request(image, scene, points, surface, match, output)  # type: ignore[arg-type]
+    files = outputs(folder, stem, output)
+    inputs.check_paths(files, request, overwrite)
     require_heights(surface)
-    begun = states(inputs.given_files(image, scene, points, surface, match, output))
     # Before the DEM is read: left alone, GDAL keeps blocks in a share of the machine's memory.
     limit_cache(output.memory, 1)
-    opened = open_adjustable(image, scene, points, match, surface)
-    heights = open_surface(surface, scene, output.memory, [opened])
-    acquired, sun = _acquired(opened.facts, output), sun_of(opened.facts, output)
-    read = inputs.files_read(image, scene, points, surface, match, opened, output, heights)
-    begun = states(read) | begun
-    with inputs.hashed_beside(read, digest) as hashing:
+    resolved = adjustable(request)
+    acquired, sun = _acquired(resolved.scene.facts, output), sun_of(resolved.scene.facts, output)
+    with resolved.ledger.hashed_beside(digest) as hashing:
         stage("Matching and adjusting" if match.reference else "Adjusting", 0.0)
-        placed = place_scene(opened, points, scene, heights, output, match)
-        adjusted, model, heights, found, grid = placed
-        opened = adjusted.scene
+        placed = place_scene(resolved)
+        adjusted, model, opened = placed.adjusted, placed.model, placed.scene
         exported, complaints = _as_rpc(model)
-        source = source_of(opened, image, scene, output)
-        budget, notes = layers.budget_of(placed, output)
-        path = layers.ortho_of(placed, files, output, other_of(placed, source, scene, output))
-        warped = _warp(model, exported, source, heights, grid, path, output, stage)
+        source = placed.open_source()
+        budget, notes = layers.budget_of(placed)
+        path = layers.ortho_of(placed, files, other_of(placed, source))
+        warped = _warp(placed, exported, source, path, stage)
         stage("Layers and report", 0.0)
-        accuracy = layers.write_layers(placed, budget, warped, files, output)
-        angles = write_angles(placed, sun, files, output)
-        asked = {"scene": scene, "surface": surface, "output": output, **match_asked(match)}
-        record = inputs.provenance(opened, points, heights, hashing.result(), command, asked)
-    _write_models(model, exported, opened, image, scene, files, {**record, "adjustment": adjusted.record()})
+        accuracy = layers.write_layers(placed, budget, warped, files)
+        angles = write_angles(placed, sun, files)
+        asked = request.asked("scene", "surface", "output", "match")
+        record = provenance(request, opened, placed.surface, hashing.result(), command, asked)
+    _write_models(placed, exported, files, {**record, "adjustment": adjusted.record()})
 
     def described() -> SceneReport:
         made = report.build_report(
-            scene=opened, fit=adjusted.fit, exported=exported, surface=heights, coverage=found.coverage, grid=grid,
-            warp=warped, near=points.near, provenance=record | inputs.read_since(before), matching=adjusted.matching,
-            warnings=[*adjusted.warnings(heights), *found.notes(), *placed.sparse(warped.valid_pixels), *complaints,
-                      *notes, *warped.notes(output.memory)],
+            scene=opened, fit=adjusted.fit, exported=exported, surface=placed.surface,
+            coverage=placed.footprint.coverage, grid=placed.grid, warp=warped, near=request.points.near,
+            provenance=record | read_since(before), matching=adjusted.matching,
+            warnings=[*adjusted.warnings(placed.surface), *placed.footprint.notes(),
+                      *placed.sparse(warped.valid_pixels), *complaints, *notes, *warped.notes(output.memory)],
         )  # fmt: skip
         made = report.with_layers(made, accuracy=accuracy, angles=angles)
         write_report(made, adjusted.fit, files, adjusted.matched, source)
@@ -145,7 +138,7 @@ def rectify(
         return made
 
     made = attempted(described, files, *OF_REPORT)
-    inputs.refuse_changed(begun)
+    resolved.ledger.require_unchanged()
     retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
     if isinstance(made, ReportError):
         return Result(files, {"report": None}, "Ortho and model are complete; there is no report.", made)
@@ -175,15 +168,15 @@ def check(
         As `rectify`, and for a raster whose file is truncated.
     """
     require_heights(surface)
-    opened = open_adjustable(image, scene, points, match, surface)
-    _acquired(opened.facts, output)
-    sun_of(opened.facts, output)
-    placed = place_scene(opened, points, scene, open_surface(surface, scene, output.memory, [opened]), output, match)
-    other_of(placed, source_of(placed.scene, image, scene, output), scene, output)
-    layers.budget_of(placed, output)
+    resolved = adjustable(Request(image, scene, points, surface, match, output))
+    _acquired(resolved.scene.facts, output)
+    sun_of(resolved.scene.facts, output)
+    placed = place_scene(resolved)
+    other_of(placed, placed.open_source())
+    layers.budget_of(placed)
     checked_options(output.format, dict(output.creation_options), 1)
-    for path, role in inputs.files_read(image, scene, points, surface, match, opened, output).items():
-        if role in _RASTERS:
+    for path, role in resolved.ledger.roles.items():
+        if role in RASTERS:
             require_whole(path, **scene.access)
     return placed.to_json()
 
@@ -224,12 +217,11 @@ def export(
     formats = formats_of_models.check_formats(formats)
     stem = Path(image).stem
     files = {name: Path(folder) / f"{stem}{formats_of_models.ENDINGS[name]}" for name in formats}
-    inputs.check_paths(files, image, scene, points, surface, match)
-    opened = open_adjustable(image, scene, points, match, surface)
-    heights = open_surface(surface, scene, under=[opened]) if has_surface(surface) else None
-    adjusted = adjust(opened, points, scene, heights, match)
+    request = Request(image, scene, points, surface, match)
+    inputs.check_paths(files, request)
+    adjusted, heights = adjust(resolved := adjustable(request)), resolved.surface
     dataset = raster.open_dataset(image, **scene.access)
-    size = opened.width, opened.height
+    size = adjusted.scene.width, adjusted.scene.height
     adjustment = adjusted.fit
     with completed(adjusted.scene.model_source, of="model"):
         if heights is not None:
@@ -286,41 +278,34 @@ def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[Notice]]:
 
 
 def _warp(
-    model: SensorModel,
+    placed: Placement,
     exported: rpc.RpcExport | None,
     source: raster.RasterSource,
-    surface: Surface,
-    grid: raster.Grid,
     path: Path | Hiding,
-    output: OutputOptions,
     progress: Progress,
 ) -> WarpResult:
     # The compiled kernels take a while to load: beside the checksums.
     from ortho_pipeline.warp.engines import engine_of
     from ortho_pipeline.warp.job import WarpJob
 
+    output = placed.request.output
     job = WarpJob(
-        model, source, surface, grid, output.resampling, output.dem_interpolation, output.tolerance,
-        Resources(output.memory, output.threads, progress), output.format, dict(output.creation_options),
-        Profile.of(source, output.dtype, output.nodata), exported,
+        placed.model, source, placed.surface, placed.grid, output.resampling, output.dem_interpolation,
+        output.tolerance, Resources(output.memory, output.threads, progress), output.format,
+        dict(output.creation_options), Profile.of(source, output.dtype, output.nodata), exported,
     )  # fmt: skip
     return engine_of(output.engine).rectify(job, path)
 
 
 def _write_models(
-    model: SensorModel,
-    exported: rpc.RpcExport | None,
-    opened: Scene,
-    image: str | os.PathLike[str],
-    scene: SceneOptions,
-    files: dict[str, Path],
-    provenance: Mapping[str, Any],
+    placed: Placement, exported: rpc.RpcExport | None, files: dict[str, Path], record: Mapping[str, Any]
 ) -> None:
     """Write the model in every format; what cannot be written is taken out of `files`."""
-    size = opened.width, opened.height
-    write_model_file(SavedModel(model, opened.sensor, opened.model_source, size, provenance), files["model"])
+    scene, request = placed.scene, placed.request
+    size = scene.width, scene.height
+    write_model_file(SavedModel(placed.model, scene.sensor, scene.model_source, size, record), files["model"])
     if exported is None:
         del files["rpc"], files["vrt"]
         return
     rpc.write_rpc_txt(exported.rpc, files["rpc"])
-    rpc.write_vrt(raster.open_dataset(image, **scene.access), exported.rpc, files["vrt"])
+    rpc.write_vrt(raster.open_dataset(request.image, **request.scene.access), exported.rpc, files["vrt"])

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import functools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.commands import inputs
-from ortho_pipeline.commands.control.crops import open_by_evidence
 from ortho_pipeline.commands.control.matching import Matched
-from ortho_pipeline.commands.control.points import control_of, has_control, with_heights
+from ortho_pipeline.commands.control.points import control_of, refuse_contradictions, with_heights
+from ortho_pipeline.commands.resolved.request import Request, Resolved
+from ortho_pipeline.commands.resolved.resolving import resolve
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
-from ortho_pipeline.errors import CoverageError, InputError, ModelError, counted
+from ortho_pipeline.errors import CoverageError, InputError, counted
 from ortho_pipeline.estimation import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import OWN, Removed, fit_family, fit_own, prune, restricted, ridge_of
@@ -26,12 +24,11 @@ from ortho_pipeline.estimation.ground_residuals import in_metres
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, PointOptions
 from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.points.control_hull import uncovered
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.surface.footprint import lay
 
 #: A delivered model that is so many image sizes off belongs to another place, or reads its metadata wrongly.
 _ELSEWHERE = 3.0
@@ -149,22 +146,16 @@ class Adjusted:
         return [Notice("model-elsewhere", text, image_sizes=sizes)]
 
 
-def open_adjustable(
-    image: Any,
-    scene: SceneOptions,
-    points: PointOptions,
-    match: MatchOptions = MatchOptions(),
-    surface: SurfaceOptions = SurfaceOptions(),
-) -> Scene:
-    """Open the scene; only where a model family is fitted may it be without a model of its own.
-
-    Points, heights and matches settle whether the model of a crop belongs to it.
+def adjustable(request: Request) -> Resolved:
+    """Resolve a request whose model is to be adjusted; where a model family is fitted, the image needs no model.
 
     Raises
     ------
     InputError
-        If options contradict each other, or the image has no model and none is fitted.
+        If options contradict each other, and as `resolve`.
     """
+    points, scene = request.points, request.scene
+    refuse_contradictions(points, request.match)
     if points.fit_model is None:
         if points.model_crs is not None:
             raise InputError(
@@ -176,8 +167,7 @@ def open_adjustable(
             raise InputError(
                 "`points.ridge` regularises a fitted model", field="points.ridge", remedy="give `points.fit_model`"
             )
-        opening = functools.partial(inputs.open_scene, image, scene)
-        return open_by_evidence(opening, scene, points, surface, match)
+        return resolve(request)
     if scene.model is not None or points.correction is not None:
         other = "scene.model" if scene.model is not None else "points.correction"
         raise InputError(
@@ -185,7 +175,7 @@ def open_adjustable(
             field="points.fit_model",
             remedy=f"leave out one of `points.fit_model` and `{other}`",
         )  # fmt: skip
-    if not has_control(points, match):
+    if not request.has_control:
         raise InputError(
             "a model is fitted to points", field="points.gcps", remedy="give a file of points with `points.gcps`"
         )
@@ -194,51 +184,29 @@ def open_adjustable(
             f"no model is called {points.fit_model!r}", field="points.fit_model",
             remedy=f"one of {', '.join(family.name for family in families())} (see `ortho models`)",
         )  # fmt: skip
-    opening = functools.partial(inputs.open_image, image, scene, needs_model=False)
-    return open_by_evidence(opening, scene, points, surface, match)
+    return resolve(request, needs_model=False)
 
 
-def on_surface(scene: Scene, surface: Surface | None) -> Scene:
-    """Return the scene with models that are meant for the heights under it, where their own range is but a guess."""
-    if surface is None:
-        return scene
-    models = dict(scene.models)
-    for name, model in models.items():
-        if model.with_heights(*model.height_range) is model:
-            continue
-        # A model that only starts an adjustment may look anywhere.
-        with contextlib.suppress(ModelError, InputError):
-            models[name] = lay(model, surface, scene.width, scene.height).fitted(model)
-    return dataclasses.replace(scene, models=models)
-
-
-def adjust(
-    scene: Scene,
-    options: PointOptions,
-    opened: SceneOptions,
-    surface: Surface | None,
-    match: MatchOptions = MatchOptions(),
-    threads: int | None = None,
-    memory: int = OutputOptions.memory,
-) -> Adjusted:
+def adjust(resolved: Resolved) -> Adjusted:
     """Adjust the model of a scene, or fit the family of the options to the points alone.
 
-    Without points nothing is adjusted, and the model is as it was delivered. `threads` match
-    with `memory` (bytes), if a reference is given.
+    Without points nothing is adjusted, and the model is as it was delivered.
 
     Raises
     ------
     InputError
         If points are missing or wrong, or do not determine the model.
     """
-    scene = on_surface(scene, surface)
-    points, matched = control_of(scene, options, match, opened, surface, threads, memory)
+    scene, request = resolved.scene, resolved.request
+    options, match, surface = request.points, request.match, resolved.surface
+    points, matched = control_of(resolved)
+    is_delivered = request.scene.model is None
     notes: tuple[Notice, ...] = ()
-    if matched is not None and options.correction is options.fit_model is opened.model is None:
+    if matched is not None and options.correction is options.fit_model is None and is_delivered:
         correction, note = by_matches(scene, matched.matches.points)
         options, notes = dataclasses.replace(options, correction=correction), (note,)
     done = _from_points(scene, options, points, surface) if options.fit_model else _corrected(
-        scene, options, opened, points, surface
+        scene, options, is_delivered, points, surface
     )  # fmt: skip
     warnings = *done.fit.warnings, *relative_to_reference(done.fit, match)
     adjusted = dataclasses.replace(done.fit, significance=options.significance, warnings=warnings)
@@ -324,7 +292,7 @@ def params_of(options: PointOptions) -> tuple[str, ...] | None:
 
 
 def _corrected(
-    scene: Scene, options: PointOptions, opened: SceneOptions, points: Points, surface: Surface | None
+    scene: Scene, options: PointOptions, is_delivered: bool, points: Points, surface: Surface | None
 ) -> Adjusted:
     if options.correction != OWN:
         # What adjusts its own parameters may start anywhere.
@@ -332,8 +300,8 @@ def _corrected(
     points = with_heights(points, surface)
     correction = options.correction
     if correction is None:
-        correction = "shift" if points.control.any() and opened.model is None else "none"
-    elif correction != "none" and opened.model is not None:
+        correction = "shift" if points.control.any() and is_delivered else "none"
+    elif correction != "none" and not is_delivered:
         raise InputError(
             "a model file is an adjusted model: adjusting it again would count points twice",
             field="points.correction",

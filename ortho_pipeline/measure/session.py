@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -17,8 +16,9 @@ from ortho_pipeline.commands.control.matching import open_reference_views, searc
 from ortho_pipeline.commands.control.points import read_control, with_heights
 from ortho_pipeline.commands.fitting import compare
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
+from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request
+from ortho_pipeline.commands.resolved.resolving import on_surface
 from ortho_pipeline.commands.results import Result
-from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import confined, sha256
 from ortho_pipeline.files.documents import json_position
@@ -50,28 +50,19 @@ class Session(Project):
         By the model as delivered.
     output : Path
         The GeoJSON of the points; its journal lies beside it.
-    options : PointOptions
-        What is adjusted, as for `ortho fit`.
-    opened : SceneOptions
-    match : MatchOptions
-        How far the model may be off.
-    surface : SurfaceOptions
-        The heights, as `ortho` opens them.
+    request : Request
+        How image and heights were opened, what is adjusted (as for `ortho fit`), and how far the model may be off.
     """
 
     _solution: Solution
     rendered: list[SensorModel]
 
-    def __init__(
-        self, scene: Scene, places: Places, output: Path, options: PointOptions,
-        opened: SceneOptions = SceneOptions(), match: MatchOptions = MatchOptions(),
-        surface: SurfaceOptions = SurfaceOptions(),
-    ) -> None:  # fmt: skip
+    def __init__(self, scene: Scene, places: Places, output: Path, request: Request) -> None:
         maps = [Sheet(one, places.surface) for one in places.references if isinstance(one, Reference)]
         super().__init__(output, places.surface, [places.view], maps)
         self.scene, self.places = scene, places
-        self._options, self._opened, self._surface = options, opened, surface
-        self.search = search_of(scene, match, metres_per_pixel(places.view))
+        self._request = request
+        self.search = search_of(scene, request.match, metres_per_pixel(places.view))
         self.grid = Grid.over(places)
         self.rendered = [places.model]
         self._solution = Solution(scene.model, None)
@@ -83,17 +74,17 @@ class Session(Project):
         return {"name": Path(self.scene.path).name, "size": [self.scene.width, self.scene.height]}
 
     def _source(self) -> dict[str, Any] | None:
-        path = inputs.point_file(self._options)
+        path = self._request.point_file
         if path is None:
             return None
-        if os.fspath(path) == inputs.OWN_POINTS:
-            return {"name": inputs.OWN_POINTS}
+        if os.fspath(path) == OWN_POINTS:
+            return {"name": OWN_POINTS}
         return {"name": Path(path).name, "sha256": sha256(path)}
 
     def _given(self) -> list[Mark] | None:
-        if self._options.gcps is None:
+        if self._request.points.gcps is None:
             return None
-        read = read_control(self.scene, replace(self._options, correction=None), self._opened)
+        read = read_control(self.scene, self._request)
         return marks_of(with_heights(read, self.places.surface), now())
 
     def _document(self) -> dict[str, Any]:
@@ -108,7 +99,7 @@ class Session(Project):
     def _solve(self) -> None:
         marks = self._history.marks
         self._solution = solve(
-            self.scene, marks.points(self._called), self._options, self._opened, self.places.surface, marks.correction
+            self.scene, marks.points(self._called), self._request, self.places.surface, marks.correction
         )  # fmt: skip
         if moved(self.rendered[-1], self._solution.model, self.grid.everywhere):
             self.rendered = [*self.rendered, self._solution.model]
@@ -128,7 +119,7 @@ class Session(Project):
 
     def _figures(self) -> dict[str, Any]:
         return {
-            "correction": self.marks.correction or self._options.correction,
+            "correction": self.marks.correction or self._request.points.correction,
             **figures(self._solution, self.places.surface),
         }
 
@@ -175,7 +166,7 @@ class Session(Project):
 
     def compared(self) -> dict[str, Any]:
         """Return the document of `ortho compare` for the points as they are now."""
-        asked = PointOptions(gcps=self.marks.points(self._called), significance=self._options.significance)
+        asked = PointOptions(gcps=self.marks.points(self._called), significance=self._request.points.significance)
         return compare(self.scene, asked).to_json()
 
     def ortho(self, progress: Progress, number: int = 0) -> Result:
@@ -184,16 +175,16 @@ class Session(Project):
 
         with self._lock:
             self.save()
-            correction = self.marks.correction or self._options.correction
+            correction = self.marks.correction or self._request.points.correction
         # The saved points say themselves where they are and which of them check.
         points = replace(
-            self._options, gcps=self.output, crs=None, vertical=None, pixel_origin="corner", check=None, select=None,
-            correction=correction,
+            self._request.points, gcps=self.output, crs=None, vertical=None, pixel_origin="corner", check=None,
+            select=None, correction=correction,
         )  # fmt: skip
         with confined(self.output.parent):
             return rectify(
-                self.scene.path, self.output.with_name(f"{self.output.stem}_ortho"), scene=self._opened, points=points,
-                surface=self._surface, progress=progress,
+                self.scene.path, self.output.with_name(f"{self.output.stem}_ortho"), scene=self._request.scene,
+                points=points, surface=self._request.surface, progress=progress,
             )  # fmt: skip
 
     def _radius(self, click: Array | None) -> float:
@@ -231,11 +222,11 @@ def open_session(
         raise InputError("the reference is shown by the scene's own model", field="points.fit_model",
                          remedy="leave it out, and fit the model to the saved points")  # fmt: skip
     require_heights(surface)
-    opening = functools.partial(inputs.open_scene, image, scene)
-    opened = open_by_evidence(opening, scene, points, surface, match)
+    request = Request(image, scene, points, surface, match)
+    opened = open_by_evidence(request)
     heights: Surface = open_surface(surface, scene, under=[opened])
     opened = on_surface(opened, heights)
     view, references = open_reference_views(opened, match, heights, scene)
-    inputs.check_paths({"points": path}, image, scene, PointOptions(), surface, match)
+    inputs.check_paths({"points": path}, replace(request, points=PointOptions()))
     places = Places(View(view.intensity, opened.model, heights), references)
-    return Session(opened, places, path, points, scene, match, surface)
+    return Session(opened, places, path, request)

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ortho_pipeline.commands.resolved.ledger import Ledger
+from ortho_pipeline.commands.resolved.request import Request, Resolved
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust
 from ortho_pipeline.errors import OrthoError, counted
 from ortho_pipeline.estimation.fit import Fit
@@ -16,7 +18,7 @@ from ortho_pipeline.estimation.problem import ImageErrors
 from ortho_pipeline.files.documents import json_position, json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options import PointOptions, SceneOptions
+from ortho_pipeline.options import MatchOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS
 from ortho_pipeline.surface.base import Surface
@@ -50,19 +52,19 @@ class Solution:
         return None if self.adjusted is None else self.adjusted.fit
 
 
-def solve(
-    scene: Scene, points: Points, options: PointOptions, opened: SceneOptions, surface: Surface, correction: str | None
-) -> Solution:
+def solve(scene: Scene, points: Points, request: Request, surface: Surface, correction: str | None) -> Solution:
     """Adjust the model of a scene to points as `ortho fit` does."""
     # The table says all of this itself, and which points check was said when it was begun.
+    options = request.points
     asked = replace(
         options, gcps=points, crs=None, vertical=None, pixel_origin="corner", select=None, check=None,
         correction=options.correction if correction is None else correction,
     )  # fmt: skip
     if not len(points):
         return Solution(scene.model, None)
+    alone = replace(request, points=asked, match=MatchOptions())
     try:
-        done = adjust(scene, asked, opened, surface)
+        done = adjust(Resolved(alone, scene, surface, points, Ledger({}, {})))
     except OrthoError as error:
         return Solution(scene.model, None, error.message)
     except np.linalg.LinAlgError as error:

@@ -10,6 +10,7 @@ import pytest
 from seeds import SIZE, rpc
 
 from ortho_pipeline.commands.control.points import read_control
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.hookspecs import Piece, Scene
 from ortho_pipeline.options import PointOptions
@@ -45,7 +46,7 @@ def measured(scene: Scene, tmp_path: Path, *, heights: bool = True) -> tuple[Poi
 def test_errors_are_taken_over_and_parallax_is_not(colours: Scene, tmp_path: Path, heights: bool) -> None:
     options, ground = measured(colours, tmp_path, heights=heights)
     surface = None if heights else FlatSurface(float(ground[0, 2]))
-    points = read_control(colours, options, surface=surface)
+    points = read_control(colours, Request(colours, points=options), surface)
     np.testing.assert_allclose(points.image, colours.model.ground_to_image(ground) + OFF / 4, atol=1e-6)
     np.testing.assert_allclose(points.sigma_image, 0.1)
     # What is added to the image plainly, as to a registered band, would be off by up to a pixel and a half.
@@ -61,7 +62,7 @@ def test_the_file_of_points_is_read_once(colours: Scene, tmp_path: Path, monkeyp
     read: list[object] = []
     load = formats.load_text
     monkeypatch.setattr(formats, "load_text", lambda path: (read.append(path), load(path))[1])
-    read_control(colours, options)
+    read_control(colours, Request(colours, points=options))
     assert read == [options.gcps]
 
 
@@ -69,4 +70,4 @@ def test_what_is_not_seen_is_refused(colours: Scene, tmp_path: Path) -> None:
     options, _ = measured(colours, tmp_path)
     elsewhere = replace(colours.model, lon_off=colours.model.lon_off + 20.0)
     with pytest.raises(InputError, match=r"measured in pan.tif, is not seen here"):
-        read_control(replace(colours, models={"rpc": elsewhere}), options)
+        read_control(replace(colours, models={"rpc": elsewhere}), Request(colours, points=options))

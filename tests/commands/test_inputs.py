@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from ortho_pipeline import commands, files
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import TooFewPoints
 from ortho_pipeline.options import PointOptions, SurfaceOptions
 
 # -- checksums beside the work ---------------------------------------------------------------------------------------
@@ -31,9 +31,12 @@ def test_no_thread_outlives_a_command_that_fails(tiny, tmp_path):
         assert stop.wait(60), "an error stops the checksums"
         raise CancelledError
 
-    with pytest.raises(InputError, match=r"nowhere\.csv"):
+    # Points that are read, and do not determine the correction.
+    (tmp_path / "one.csv").write_text("id,col,row,x,y,h\n1,20,20,20.0,-30.0,0\n")
+    with pytest.raises(TooFewPoints):
         commands.rectify(
-            tiny.image, tmp_path / "out", points=PointOptions(gcps=tmp_path / "nowhere.csv"),
+            tiny.image, tmp_path / "out",
+            points=PointOptions(gcps=tmp_path / "one.csv", crs="EPSG:4326", vertical="ellipsoid", correction="affine"),
             surface=SurfaceOptions(dem=tiny.dem, vertical="ellipsoid"), digest=slow,
         )  # fmt: skip
     assert len(began) == 1

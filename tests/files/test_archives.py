@@ -129,10 +129,11 @@ def test_the_ortho_from_an_archive_is_that_from_disk(sample, tmp_path):
     ],
 )  # fmt: skip
 def test_the_record_names_all_metadata_that_were_read(sample, sensor, beside):
-    from ortho_pipeline.commands.inputs import files_read
+    from ortho_pipeline.commands.resolved.ledger import Ledger
+    from ortho_pipeline.commands.resolved.request import Request
 
     image = sample / sensor / PRODUCTS[sensor]
-    read = {path.name for path in files_read(image, opened=open_scene(image))}
+    read = {path.name for path in Ledger.of(Request(image), open_scene(image)).roles}
     assert read == beside | {image.name}
 
 

@@ -26,6 +26,7 @@ from used import pixels, used
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.control import command
 from ortho_pipeline.commands.control.points import read_control
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpc_txt
@@ -663,7 +664,7 @@ def test_a_bundle_of_panchromatic_and_colours(tmp_path: Path, monkeypatch: pytes
     lon, lat, h = seed_rpc().image_to_ground([[100.0, 60.0]], 900.0)[0].tolist()
     (tmp_path / "p.csv").write_text(f"id,image,col,row,x,y,h\n1,{pan.name},104,58,{lon},{lat},{h}\n")
     options = PointOptions(gcps=tmp_path / "p.csv", crs="EPSG:4326", vertical="ellipsoid")
-    points = read_control(open_scene(colours), options)
+    points = read_control(open_scene(colours), Request(colours, points=options))
     np.testing.assert_allclose(points.image, [[104 / 4, 58 / 4]], atol=1e-6)
     # Matches say in which image they were measured, and so serve the other one as well.
     found = SimpleNamespace(matches=SimpleNamespace(points=points), to_json=dict, notices=(), summary=list)
@@ -672,9 +673,8 @@ def test_a_bundle_of_panchromatic_and_colours(tmp_path: Path, monkeypatch: pytes
     command.match(
         colours, tmp_path / "matches" / "m.csv", MatchOptions(reference=(pan,)), surface=SurfaceOptions(height=900.0)
     )
-    again = read_control(
-        open_scene(pan), replace(options, gcps=tmp_path / "matches" / "m.csv", crs=None, vertical=None)
-    )
+    matched = replace(options, gcps=tmp_path / "matches" / "m.csv", crs=None, vertical=None)
+    again = read_control(open_scene(pan), Request(pan, points=matched))
     np.testing.assert_allclose(again.image, [[104.0, 58.0]], atol=1e-4)
     survey = json.loads(CliRunner().invoke(cli, ["info", str(tmp_path), "--json"]).stdout)
     assert [one["path"] for one in survey["files"] if one["kind"] == "scene"] == [

@@ -9,7 +9,8 @@ import pytest
 from osgeo import gdal
 
 from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
-from ortho_pipeline.commands.inputs import files_read
+from ortho_pipeline.commands.resolved.ledger import Ledger
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import SurfaceOptions
 from ortho_pipeline.surface.accuracy import typical_sigma
@@ -49,8 +50,8 @@ def test_a_raster_is_read_where_it_lies_and_its_voids_are_unknown(tiny, quality)
     assert typical_sigma(surface) == pytest.approx(np.sqrt(5.0), rel=0.02)
     places = np.array([[20.015, -30.0], [19.985, -30.0]])
     np.testing.assert_allclose(surface.sigma.heights(places, "EPSG:4979"), [3.0, 1.0])
-    read = files_read(tiny.image, surface=options)
-    assert read[quality] == "DEM accuracy"
+    ledger = Ledger.of(Request(tiny.image, surface=options))
+    assert ledger.roles[quality] == "DEM accuracy"
 
 
 @pytest.mark.parametrize("sigma", [0.0, -3, "0", "nan", "inf", "1e308", "1e12", 1e12, 1e-200, "no_such_file.tif"])

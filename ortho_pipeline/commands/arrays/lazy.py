@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
-from ortho_pipeline.commands.placement import Placement, place_scene, source_of
-from ortho_pipeline.commands.scene_fit import open_adjustable
+from ortho_pipeline.commands.heights.surfaces import require_heights
+from ortho_pipeline.commands.placement import Placement, open_rasters, place_scene
+from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.scene_fit import adjustable
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.process_limits import Resources, one_blas_thread
@@ -78,12 +79,11 @@ def ortho_array(
         raise InputError("GDAL's warper makes files", field="output.engine", remedy="leave out `output.engine`")
     surface = dem if isinstance(dem, SurfaceOptions) else SurfaceOptions(dem=dem)
     require_heights(surface)
-    given = PointOptions(gcps=points) if isinstance(points, Points) else points
-    opened = open_adjustable(image, scene, given, match, surface)
-    heights = open_surface(surface, scene, output.memory, [opened])
-    placed = place_scene(opened, given, scene, heights, output, match)
-    path = opened.path if isinstance(image, Scene) else image
-    opening = functools.partial(source_of, placed.scene, path, scene, output)
+    request = Request(image, scene, points, surface, match, output)  # type: ignore[arg-type]
+    placed = place_scene(adjustable(request))
+    path = placed.scene.path if isinstance(image, Scene) else image
+    # What is sent to other processes holds no options but these.
+    opening = functools.partial(open_rasters, placed.scene, Request(path, scene, output=output))
     made = Tiles(placed.model, opening, placed.surface, placed.grid, dataclasses.replace(output, extent=None))
     return _array(placed, made, side)
 

@@ -9,17 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.commands import inputs
-from ortho_pipeline.commands.control.crops import open_by_evidence
 from ortho_pipeline.commands.control.matching import match_scene
-from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
+from ortho_pipeline.commands.heights.surfaces import require_heights
+from ortho_pipeline.commands.resolved.ledger import provenance
+from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.resolved.resolving import resolve
 from ortho_pipeline.commands.results import Result, attempted, to_store
-from ortho_pipeline.commands.scene_fit import Adjusted, adjust, on_surface
+from ortho_pipeline.commands.scene_fit import Adjusted, adjust
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import together
 from ortho_pipeline.files.process_limits import one_blas_thread
-from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import write_points
 from ortho_pipeline.report import document as reports
 from ortho_pipeline.surface.base import Surface
@@ -67,18 +69,16 @@ def match(
         )  # fmt: skip
     files |= _page(report)
     require_heights(surface)
-    inputs.check_paths(files, image, scene, PointOptions(), surface, match)
-    opening = functools.partial(inputs.open_scene, image, scene)
-    opened = open_by_evidence(opening, scene, surface=surface, match=match)
-    heights = open_surface(surface, scene, under=[opened])
-    adjusted = None if report is None else adjust(opened, PointOptions(), scene, heights, match)
+    request = Request(image, scene, surface=surface, match=match)
+    inputs.check_paths(files, request)
+    resolved = resolve(request)
+    opened, heights = resolved.scene, resolved.surface
+    adjusted = None if report is None else adjust(resolved)
     matched = None if adjusted is None else adjusted.matched
     if matched is None:
-        matched = match_scene(on_surface(opened, heights), match, heights, scene)
-    read = inputs.files_read(image, scene, PointOptions(), surface, match, opened, heights=heights)
-    record = inputs.provenance(
-        opened, PointOptions(), heights, inputs.hashed(read), None, {"scene": scene, "surface": surface, "match": match}
-    )  # fmt: skip
+        matched = match_scene(opened, match, heights, scene)
+    asked = request.asked("scene", "surface", "match")
+    record = provenance(request, opened, heights, resolved.ledger.hashed(), None, asked)
     points = matched.matches.points
     # Those of a bundle or a strip serve its other images too, if they say where they were measured.
     said = bool(opened.pieces) and files["points"].suffix.lower() != ".geojson"

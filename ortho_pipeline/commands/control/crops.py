@@ -16,13 +16,14 @@ from ortho_pipeline.commands.control.matching import match_scene
 from ortho_pipeline.commands.control.points import read_control
 from ortho_pipeline.commands.heights.automatic import is_automatic
 from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.stac.given import is_collected
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.crop import UndecidedCrop, nearer, noted_offset
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import open_dataset
 from ortho_pipeline.surface.dem import DemSurface
@@ -33,21 +34,8 @@ _GRID, _ON_DEM = 9, 0.5
 _WITHIN = 0.5
 
 
-def open_by_evidence(
-    opening: Callable[[], Scene],
-    options: SceneOptions,
-    points: PointOptions = PointOptions(),
-    surface: SurfaceOptions = SurfaceOptions(),
-    match: MatchOptions = MatchOptions(),
-) -> Scene:
-    """Open a scene; a crop whose model may be of the larger image is settled by points, heights or matches.
-
-    Parameters
-    ----------
-    opening : callable
-        Opens the scene.
-    options : SceneOptions
-        How it is opened.
+def open_by_evidence(request: Request, *, needs_model: bool = True) -> Scene:
+    """Open the scene of a request; a crop whose model may be of the larger image is settled by points, DEM or matches.
 
     Raises
     ------
@@ -57,12 +45,12 @@ def open_by_evidence(
         As opening the scene and reading the points do.
     """
     try:
-        return opening()
+        return inputs.open_image(request.image, request.scene, needs_model=needs_model)
     except UndecidedCrop as undecided:
         decided = (
-            _by_points(undecided, read_control(undecided.scene, replace(points, correction=None), options))
-            or _by_heights(undecided, surface, options)
-            or _by_matches(undecided, surface, match, options)
+            _by_points(undecided, read_control(undecided.scene, request))
+            or _by_heights(undecided, request.surface, request.scene)
+            or _by_matches(undecided, request)
         )
         if decided is None:
             raise
@@ -140,16 +128,14 @@ def _share_on(heights: DemSurface, scene: Scene) -> float:
     return heights.coverage(ground[seen, :2], "EPSG:4979") * float(seen.mean()) if seen.any() else 0.0
 
 
-def _by_matches(
-    undecided: UndecidedCrop, surface: SurfaceOptions, match: MatchOptions, options: SceneOptions
-) -> tuple[bool, str] | None:
+def _by_matches(undecided: UndecidedCrop, request: Request) -> tuple[bool, str] | None:
     """Return whether the model is to be moved, by where the reference shows the same."""
-    if not match.reference or not has_surface(surface):
+    if not request.match.reference or not has_surface(request.surface):
         return None
     for is_moved, scene in zip((False, True), undecided.both, strict=True):
         try:
-            heights = open_surface(surface, options, under=[scene])
-            shift = match_scene(scene, match, heights, options).shift
+            heights = open_surface(request.surface, request.scene, under=[scene])
+            shift = match_scene(scene, request.match, heights, request.scene).shift
         except InputError:
             continue
         # Measured minus predicted, by the model as it was read.

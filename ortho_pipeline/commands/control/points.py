@@ -11,12 +11,12 @@ import pyproj
 from numpy.typing import NDArray
 
 from ortho_pipeline.commands.control.matching import Matched, match_scene
-from ortho_pipeline.commands.inputs import OWN_POINTS, point_file
+from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request, Resolved
 from ortho_pipeline.errors import InputError, counted, of_option
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.hookspecs import Piece, Scene
-from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions
+from ortho_pipeline.options import MatchOptions, PointOptions
 from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, points_of
 from ortho_pipeline.points.formats import read_table
 from ortho_pipeline.points.rows import OWN_IMAGE
@@ -25,15 +25,7 @@ from ortho_pipeline.raster import source as raster
 from ortho_pipeline.surface.base import Surface
 
 
-def control_of(
-    scene: Scene,
-    options: PointOptions,
-    match: MatchOptions,
-    opened: SceneOptions,
-    surface: Surface | None,
-    threads: int | None = None,
-    memory: int = OutputOptions.memory,
-) -> tuple[Points, Matched | None]:
+def control_of(resolved: Resolved) -> tuple[Points, Matched | None]:
     """Return what a scene is adjusted to and held against: points of a file, matches with a reference, or both.
 
     Points of a file stay themselves beside matches: they check, or control as their file says if the user wants that.
@@ -41,13 +33,39 @@ def control_of(
     Raises
     ------
     InputError
-        As `read_control` and `match_scene`, and for options that contradict each other.
+        As `match_scene`, and for points without heights.
+    """
+    request, surveyed = resolved.request, resolved.points
+    match, output = request.match, request.output
+    if not match.reference:
+        return surveyed, None
+    matched = match_scene(resolved.scene, match, resolved.surface, request.scene, output.threads, output.memory)
+    points = matched.matches.points
+    if request.points.gcps is None:
+        return points, matched
+    if match.gcps_as == "check":
+        surveyed = surveyed.with_roles(np.where(surveyed.control, "check", surveyed.roles))
+    return _joined(with_heights(surveyed, resolved.surface), points), matched
+
+
+def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
+    """Refuse options of points and matching that contradict each other, or have no effect.
+
+    Raises
+    ------
+    InputError
+        With the option.
     """
     if not match.reference:
-        refuse_idle(match)
-        return read_control(scene, options, opened, surface), None
-    chosen = next((name for name in ("select", "check") if getattr(options, name) is not None), None)
-    if chosen is not None and options.gcps is None:
+        _refuse_idle(match)
+        if points.gcps is None and points.correction not in (None, "none"):
+            raise InputError(
+                f"the correction {points.correction!r} needs control points", field="points.gcps",
+                remedy="give a file of points",
+            )  # fmt: skip
+        return
+    chosen = next((name for name in ("select", "check") if getattr(points, name) is not None), None)
+    if chosen is not None and points.gcps is None:
         raise InputError(
             f"`points.{chosen}` chooses among `points.gcps`, and there are none", field=f"points.{chosen}",
             remedy="leave it out: every fifth cell of the matches checks",
@@ -57,27 +75,9 @@ def control_of(
             f"`points.{chosen}` chooses among points that all check", field=f"points.{chosen}",
             remedy="leave it out, or give `match.gcps_as=control`",
         )  # fmt: skip
-    surveyed = None if options.gcps is None else read_control(scene, replace(options, correction=None), opened, surface)
-    matched = match_scene(scene, match, surface, opened, threads, memory)
-    points = matched.matches.points
-    if surveyed is None:
-        return points, matched
-    if match.gcps_as == "check":
-        surveyed = surveyed.with_roles(np.where(surveyed.control, "check", surveyed.roles))
-    return _joined(with_heights(surveyed, surface), points), matched
 
 
-def has_control(points: PointOptions, match: MatchOptions) -> bool:
-    """Tell whether there is anything to adjust to."""
-    return points.gcps is not None or bool(match.reference)
-
-
-def match_asked(match: MatchOptions) -> dict[str, MatchOptions]:
-    """Return what the record of a result holds of matching: nothing where nothing was matched."""
-    return {"match": match} if match.reference else {}
-
-
-def refuse_idle(match: MatchOptions) -> None:
+def _refuse_idle(match: MatchOptions) -> None:
     """Refuse what is said of matching where there is no reference.
 
     Raises
@@ -113,10 +113,8 @@ def _joined(surveyed: Points, matches: Points) -> Points:
     )  # fmt: skip
 
 
-def read_control(
-    scene: Scene, options: PointOptions, opened: SceneOptions = SceneOptions(), surface: Surface | None = None
-) -> Points:
-    """Read the points of the options with their roles; none where none are given.
+def read_control(scene: Scene, request: Request, surface: Surface | None = None) -> Points:
+    """Read the points of a request with their roles; none where none are given.
 
     `surface` says at which height points lie that were measured in the other image of a bundle, where their file does
     not.
@@ -124,17 +122,12 @@ def read_control(
     Raises
     ------
     InputError
-        For a wrong file, roles that contradict each other, or an adjustment that has no points.
+        For a wrong file, and roles that contradict each other.
     """
+    options = request.points
     if options.gcps is None:
-        if options.correction not in (None, "none"):
-            raise InputError(
-                f"the correction {options.correction!r} needs control points",
-                field="points.gcps",
-                remedy="give a file of points",
-            )
         return no_points()
-    points = _given_points(scene, options, opened, surface)
+    points = _given_points(scene, request, surface)
     if options.select is not None and options.check is not None:
         raise InputError(
             "`points.select` and `points.check` both say which points check",
@@ -146,12 +139,12 @@ def read_control(
     return points if options.check is None else assign_roles(points, options.check)
 
 
-def _given_points(scene: Scene, options: PointOptions, opened: SceneOptions, surface: Surface | None) -> Points:
+def _given_points(scene: Scene, request: Request, surface: Surface | None) -> Points:
+    options, path = request.points, request.point_file
     with of_option("points.crs"):
         crs = None if options.crs is None else parse_crs(options.crs)
     with of_option("points.vertical"):
         vertical = None if options.vertical is None else Vertical.parse(options.vertical)
-    path = point_file(options)
     origin = options.pixel_origin
     if path is None or os.fspath(path) == OWN_POINTS:
         if origin != "corner" or (path is None and not (crs is vertical is None)):
@@ -162,11 +155,11 @@ def _given_points(scene: Scene, options: PointOptions, opened: SceneOptions, sur
             )  # fmt: skip
         if isinstance(options.gcps, Points):
             return options.gcps
-        return gcps_of_dataset(raster.open_dataset(scene.path, **opened.access), crs=crs, vertical=vertical)
+        return gcps_of_dataset(raster.open_dataset(scene.path, **request.scene.access), crs=crs, vertical=vertical)
     pieces = {
         Path(piece.path).name: OWN_IMAGE if piece.sees_apart else (*piece.offset, piece.scale) for piece in scene.pieces
     }
-    name, path = Path(scene.path).name, located(path, allow_network=opened.allow_network)
+    name, path = Path(scene.path).name, located(path, allow_network=request.scene.allow_network)
     table = read_table(path, name, pieces)
     points = points_of(path, table, crs, vertical, origin)
     # The same rows in the same order: the table says in which image each of them was measured.

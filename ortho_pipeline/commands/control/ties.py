@@ -19,8 +19,9 @@ from ortho_pipeline.commands.block_images import labels_of, scenes_of
 from ortho_pipeline.commands.control.crops import settled_options
 from ortho_pipeline.commands.control.matching import search_of
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
+from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.resolved.resolving import on_surface
 from ortho_pipeline.commands.results import Result, to_store
-from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import metres, px
@@ -29,7 +30,7 @@ from ortho_pipeline.files import write_text
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points.image_errors import sigma_of_covariance
 from ortho_pipeline.raster.block_cache import cache_restored
 from ortho_pipeline.raster.intensity import Intensity
@@ -218,7 +219,7 @@ def ties(
     require_heights(surface)
     given = scenes_of(images, scene)
     for image, own in zip(images, given, strict=True):
-        inputs.check_paths(files, image, own, PointOptions(), surface)
+        inputs.check_paths(files, Request(image, own, surface=surface))
     given, placed = settled_options(images, given, surface)
     opened = (inputs.open_scene(image, own) for image, own in zip(images, given, strict=True))
     scenes = dict(zip(names, opened, strict=True))

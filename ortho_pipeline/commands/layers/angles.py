@@ -43,13 +43,12 @@ def sun_of(facts: Mapping[str, Any], output: OutputOptions) -> Sun | None:
     return None
 
 
-def write_angles(
-    placed: Placement, sun: Sun | None, files: dict[str, Path], output: OutputOptions
-) -> AnglesLayer | None:
+def write_angles(placed: Placement, sun: Sun | None, files: dict[str, Path]) -> AnglesLayer | None:
     """Write the layers of angles and of shadows, if they were asked for, and return what the report says of them.
 
     Without a sun there are no shadows, and they are taken out of `files`.
     """
+    output = placed.request.output
     if not output.angles:
         return None
     from ortho_pipeline.warp.layers import angles

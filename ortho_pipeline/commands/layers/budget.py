@@ -20,7 +20,6 @@ from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import RPC, ImageCorrection, Pieces, SensorModel
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options import OutputOptions
 from ortho_pipeline.report.document import accuracy_style
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.surface.base import Surface
@@ -52,7 +51,7 @@ class Known:
     common: float = 0.0
 
 
-def budget_of(placed: Placement, output: OutputOptions) -> tuple[Known | None, list[Notice]]:
+def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
     """Return what is known of the errors of an ortho, None where nobody asks, and what there is to say about it.
 
     Raises
@@ -60,6 +59,7 @@ def budget_of(placed: Placement, output: OutputOptions) -> tuple[Known | None, l
     InputError
         If nothing is known of them.
     """
+    output = placed.request.output
     if not output.accuracy_raster:
         return None, []
     from ortho_pipeline.warp.layers.accuracy import Budget
@@ -181,11 +181,9 @@ def _assumptions(budget: Budget, surface: Surface) -> list[str]:
     return said
 
 
-def ortho_of(
-    placed: Placement, files: Mapping[str, Path], output: OutputOptions, other: Regridded | None = None
-) -> Path | Hiding:
+def ortho_of(placed: Placement, files: Mapping[str, Path], other: Regridded | None = None) -> Path | Hiding:
     """Return where the ortho is written, and what is done about pixels that terrain hides where somebody asks."""
-    if output.visibility is None:
+    if placed.request.output.visibility is None:
         return files["ortho"]
     from ortho_pipeline.warp.layers.hiding import Hiding
 
@@ -193,7 +191,7 @@ def ortho_of(
 
 
 def write_layers(
-    placed: Placement, known: Known | None, warped: WarpResult, files: Mapping[str, Path], output: OutputOptions
+    placed: Placement, known: Known | None, warped: WarpResult, files: Mapping[str, Path]
 ) -> AccuracyLayer | None:
     """Write the raster of accuracy and its style, if it was asked for, and return what the report says of it."""
     if known is None:
@@ -202,7 +200,7 @@ def write_layers(
     from ortho_pipeline.warp.layers.sight import Sight
 
     budget = dataclasses.replace(known.budget, interpolation_px=warped.max_error_px)
-    scene = placed.scene
+    scene, output = placed.scene, placed.request.output
     found = write_accuracy(
         budget, Sight(placed.model, placed.grid), placed.surface, (scene.width, scene.height), files["accuracy"],
         heights=placed.footprint.heights, step=output.layer_step, resources=Resources(output.memory, output.threads),

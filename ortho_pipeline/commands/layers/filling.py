@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from ortho_pipeline.commands.placement import Placement
 from ortho_pipeline.errors import InputError, completed
-from ortho_pipeline.options import OutputOptions, SceneOptions
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.regridded import Regridded
 from ortho_pipeline.raster.source import RasterSource
 
 
-def other_of(placed: Placement, source: RasterSource, scene: SceneOptions, output: OutputOptions) -> Regridded | None:
+def other_of(placed: Placement, source: RasterSource) -> Regridded | None:
     """Return the ortho that fills hidden pixels; None where none is given.
 
     Raises
@@ -19,6 +18,7 @@ def other_of(placed: Placement, source: RasterSource, scene: SceneOptions, outpu
         If it lies elsewhere, has other bands or another type, or nothing would be left empty; and if the ortho cannot
         be of the type that is asked for.
     """
+    output = placed.request.output
     profile = Profile.of(source, output.dtype, output.nodata)
     if output.fill_from is None:
         return None
@@ -28,8 +28,7 @@ def other_of(placed: Placement, source: RasterSource, scene: SceneOptions, outpu
             remedy="give `output.visibility=nodata` too, or leave it out",
         )  # fmt: skip
     with completed(field="output.fill_from"):
-        other = Regridded(
-            output.fill_from, placed.grid, resampling=output.resampling, memory=output.memory, **scene.access
-        )
+        access = placed.request.scene.access
+        other = Regridded(output.fill_from, placed.grid, resampling=output.resampling, memory=output.memory, **access)
         other.require(profile)
     return other

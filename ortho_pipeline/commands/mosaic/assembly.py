@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.commands.inputs import refuse_changed
+from ortho_pipeline.commands.resolved.ledger import require_unchanged
 from ortho_pipeline.commands.results import ENDINGS, Result, attempted, to_store
 from ortho_pipeline.errors import InputError, ReportError
 from ortho_pipeline.files import allowed, states, together, write_json
@@ -72,7 +72,7 @@ def mosaic(
     with together(path.parent, path.stem):
         document, failure = assemble(layers, files, options, resources=resources)
         write_json(files["seams"], document)
-        refuse_changed(begun)
+        require_unchanged(begun)
     return Result(files, {"mosaic": document}, summary_text(document), failure)
 
 

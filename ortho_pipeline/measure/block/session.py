@@ -17,8 +17,9 @@ from ortho_pipeline.commands.control.block_points import read_points, settled_sc
 from ortho_pipeline.commands.control.matching import search_of
 from ortho_pipeline.commands.control.ties import DEM_SIGMA, FLAT_SIGMA, names_of
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
+from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.resolved.resolving import on_surface
 from ortho_pipeline.commands.results import Result
-from ortho_pipeline.commands.scene_fit import on_surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import confined, sha256
 from ortho_pipeline.files.process_limits import Progress
@@ -36,7 +37,7 @@ from ortho_pipeline.measure.places import Geometry, Places, Sheet
 from ortho_pipeline.measure.planning import Next
 from ortho_pipeline.measure.project import Project, moved, now, points_file
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options import CORRECTIONS, BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import CORRECTIONS, BlockOptions, MatchOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
@@ -303,7 +304,7 @@ def open_block_session(
     labels, names = labels_of(images), names_of(images)
     given = scenes_of(images, scene)
     for image, own in zip(images, given, strict=True):
-        inputs.check_paths({"points": path}, image, own, PointOptions(), surface, match)
+        inputs.check_paths({"points": path}, Request(image, own, surface=surface, match=match))
     given, _ = settled_scenes(images, labels, given, points, surface)
     alone = [inputs.open_scene(image, own) for image, own in zip(images, given, strict=True)]
     access = given[0].access

@@ -1,0 +1,1 @@
+"""What a command is asked, resolved: the request, its files opened once, and the ledger of them."""

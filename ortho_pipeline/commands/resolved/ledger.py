@@ -1,0 +1,219 @@
+"""The files that a result was made from: one list for its record, for changes meanwhile, and for the next run."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pyproj
+
+from ortho_pipeline.commands.stac.given import is_collected
+from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.exchange.rpc import files_of
+from ortho_pipeline.files import sha256, states
+from ortho_pipeline.files.documents import software_version
+from ortho_pipeline.files.locations import archive_of, is_far
+from ortho_pipeline.files.process_limits import startable_threads
+from ortho_pipeline.files.traffic import bytes_read
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.points import Points
+from ortho_pipeline.raster import source as raster
+from ortho_pipeline.surface.base import Surface
+
+if TYPE_CHECKING:
+    from ortho_pipeline.commands.resolved.request import Request
+
+#: Roles of files that have pixels, and of those among them whose side-cars are entered too.
+RASTERS = ("image", "DEM", "DEM accuracy", "reference", "other ortho")
+_ATTACHING = ("image", "DEM", "reference", "other ortho", "grid")
+#: The order of a record, by role; files that open a scene have roles of their sensor's and follow its image.
+_ORDER = {"image": 0, "metadata": 2, "points": 3, "DEM": 4, "geoid": 5, "DEM accuracy": 6, "reference": 7,
+          "other ortho": 8, "grid": 9}  # fmt: skip
+#: Options that stand in a record only where they were given: without them, files of the same job keep their bytes.
+_IF_GIVEN = ("like", "reference_bands", "search_rotation")
+#: Size, time of change and inode of files.
+State = Mapping[str, tuple[int, int, int]]
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """The files that were read, and how they were when the work began.
+
+    Parameters
+    ----------
+    roles : mapping of Path to str
+        Every file and its role, side-cars and sources of a VRT included. Of what is in an archive, the archive.
+    begun : mapping
+        From `files.states`.
+    """
+
+    roles: Mapping[Path, str]
+    begun: State
+
+    @classmethod
+    def of(
+        cls, request: Request, scene: Scene | None = None, surface: Surface | None = None, begun: State | None = None
+    ) -> Ledger:
+        """Return the files of a request, and those that the scene and the surface say they were read from.
+
+        Parameters
+        ----------
+        begun : mapping, optional
+            The states of the files that the user named, when the work began; those of now without.
+        """
+        found: dict[Path, str] = {}
+
+        def enter(role: str, paths: Iterable[str | os.PathLike[str] | None], *, attached: bool = False) -> None:
+            for name in (name for name in paths if name is not None):
+                path = archive_of(os.fspath(name)) or Path(name)
+                if path.is_file():
+                    found.setdefault(path, role)
+                if attached:
+                    enter(role, _files_of(name, request.scene))
+
+        for role, path in request.files:
+            enter(role, [path], attached=role in _ATTACHING and not (role == "DEM" and is_collected(path)))
+        if scene is not None:
+            enter("image", [scene.path, *scene.rasters])
+            if scene.path != Path(request.image):
+                enter("image", _files_of(scene.path, request.scene))
+            enter("metadata", [*scene.sources, scene.model_source])
+        if surface is not None:
+            # Of heights that were found: what led to them, and the files.
+            enter("DEM", surface.provenance.get("documents", ()))
+            enter("DEM", (one for one in surface.files if Path(one) not in found and not is_far(one)), attached=True)
+        roles = dict(sorted(found.items(), key=lambda entry: _ORDER.get(entry[1], 1)))
+        return cls(roles, {**states(roles), **(begun or {})})
+
+    def joined(self, *others: Ledger) -> Ledger:
+        """Return the files of several ledgers as one; of a file in several, what the first one says."""
+        roles, begun = dict(self.roles), dict(self.begun)
+        for other in others:
+            for path, role in other.roles.items():
+                roles.setdefault(path, role)
+            begun = {**other.begun, **begun}
+        return Ledger(roles, begun)
+
+    def require_unchanged(self) -> None:
+        """Refuse a result whose inputs changed meanwhile: its pixels, model and checksums may be of two files.
+
+        Raises
+        ------
+        InputError
+            With the file.
+        """
+        require_unchanged(self.begun)
+
+    def hashed(self, digest: Callable[..., str] = sha256, stop: threading.Event | None = None) -> list[dict[str, Any]]:
+        """Return role, path, bytes and SHA-256 of each file.
+
+        Parameters
+        ----------
+        digest : callable (path, stop) -> str
+            May know checksums that were taken before.
+        """
+        return hashed(self.roles, digest, stop)
+
+    @contextlib.contextmanager
+    def hashed_beside(self, digest: Callable[..., str] = sha256) -> Iterator[Future[list[dict[str, Any]]]]:
+        """Take the checksums in a thread while the block runs; an error in the block does not wait for them.
+
+        The thread ends with the block, whatever happens, and never calls GDAL: the interpreter cannot exit while a
+        thread is inside of a GDAL function (its binding's destructor takes the lock of the interpreter, and the process
+        aborts).
+        """
+        startable_threads(1)
+        stop = threading.Event()
+        with ThreadPoolExecutor(1, thread_name_prefix="checksums") as pool:
+            future = pool.submit(self.hashed, digest, stop)
+            try:
+                yield future
+            finally:
+                stop.set()
+
+
+def require_unchanged(before: State) -> None:
+    """Raise an `InputError` for the first file whose state (`files.states`) is not what it was."""
+    now = states(before)
+    for path, state in before.items():
+        if now.get(path) != state:
+            raise InputError("this file changed while it was being used", file=path, remedy="run again")
+
+
+def hashed(
+    roles: Mapping[Path, str], digest: Callable[..., str] = sha256, stop: threading.Event | None = None
+) -> list[dict[str, Any]]:
+    """Return role, path, bytes and SHA-256 of files: see `Ledger.hashed`."""
+    return [
+        {"role": role, "path": str(path), "bytes": path.stat().st_size, "sha256": digest(path, stop)}
+        for path, role in roles.items()
+    ]
+
+
+def _files_of(path: str | os.PathLike[str], scene: SceneOptions) -> list[str]:
+    try:
+        return files_of(raster.open_dataset(path, **scene.access))
+    except OrthoError:
+        return []
+
+
+def provenance(
+    request: Request,
+    scene: Scene,
+    surface: Surface | None,
+    inputs: list[dict[str, Any]],
+    command: str | None,
+    asked: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return what is needed to make the same result again: files with checksums, options, versions, the command.
+
+    Parameters
+    ----------
+    inputs : list
+        From `Ledger.hashed`.
+    asked : mapping of str to dataclass
+        The groups of options that the result depends on besides its points, by name (`Request.asked`).
+    """
+    return {
+        "command": command,
+        "inputs": inputs,
+        "image": {"path": str(scene.path), "size": [scene.width, scene.height]},
+        "sensor": scene.sensor,
+        "model_source": scene.model_source,
+        "points": None if request.points.gcps is None else _as_asked(request.points),
+        "surface": None if surface is None else dict(surface.provenance),
+        "options": {name: _as_asked(value) for name, value in asked.items()},
+        "software": {
+            "ortho-pipeline": software_version(),
+            "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
+            "proj": pyproj.proj_version_str,
+        },
+    }
+
+
+def read_since(before: int) -> dict[str, Any]:
+    """Return how much was read over the network since `before` (`bytes_read`), for the provenance; nothing if none."""
+    read = bytes_read() - before
+    return {"network_bytes": read} if read else {}
+
+
+def _as_asked(options: Any) -> dict[str, Any]:
+    """Return options as JSON values, without the budget of the machine, on which no result depends."""
+    given = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+    left_out = {"memory", "threads", *(key for key in _IF_GIVEN if given.get(key) is None)}
+    return {key: _text_of(value) for key, value in given.items() if key not in left_out}
+
+
+def _text_of(value: Any) -> Any:
+    """Return points and paths as text, anything else as it is."""
+    if isinstance(value, tuple):
+        return tuple(map(_text_of, value))
+    return str(value) if isinstance(value, Points) else os.fspath(value) if isinstance(value, os.PathLike) else value

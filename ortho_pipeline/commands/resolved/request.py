@@ -1,0 +1,90 @@
+"""What a command is asked for one scene, and the same once its files are open: nothing is opened twice."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+from ortho_pipeline.commands.heights.surfaces import dem_files, sigma_file
+from ortho_pipeline.commands.resolved.ledger import Ledger
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.points import Points
+from ortho_pipeline.surface.base import Surface
+
+#: In place of a file of points: the ground control points that the image itself holds.
+OWN_POINTS = "own"
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """What is asked of one scene: its image, and the options as the user gave them.
+
+    Parameters
+    ----------
+    image : path or Scene
+        A scene is open already.
+    points : PointOptions or Points
+        A table is used as it is.
+    """
+
+    image: Any
+    scene: SceneOptions = SceneOptions()
+    points: PointOptions = PointOptions()
+    surface: SurfaceOptions = SurfaceOptions()
+    match: MatchOptions = MatchOptions()
+    output: OutputOptions = OutputOptions()
+
+    def __post_init__(self) -> None:
+        if isinstance(self.points, Points):
+            object.__setattr__(self, "points", PointOptions(gcps=self.points))
+
+    @property
+    def has_control(self) -> bool:
+        """Whether there is anything to adjust to."""
+        return self.points.gcps is not None or bool(self.match.reference)
+
+    @property
+    def point_file(self) -> str | os.PathLike[str] | None:
+        """The file of points; None where there is none, or they are read already."""
+        gcps = self.points.gcps
+        return gcps if isinstance(gcps, str | os.PathLike) else None
+
+    @property
+    def files(self) -> list[tuple[str, str | os.PathLike[str]]]:
+        """The files that the user named, each with its role."""
+        named: list[tuple[str, Any]] = [
+            ("image", self.image), *self.scene.files.items(), ("points", self.point_file),
+            *(("DEM", path) for path in dem_files(self.surface)), ("geoid", self.surface.vertical),
+            ("DEM accuracy", sigma_file(self.surface)), *(("reference", path) for path in self.match.reference),
+            *self.output.files.items(),
+        ]  # fmt: skip
+        return [(role, path) for role, path in named if path is not None]
+
+    def asked(self, *groups: str) -> dict[str, Any]:
+        """Return those of the named groups of options that say something, for the record of a result."""
+        return {name: getattr(self, name) for name in groups if name != "match" or self.match.reference}
+
+
+@dataclass(frozen=True, eq=False)
+class Resolved:
+    """A request whose files are open: what is made from here on reads no option that names a file.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its models are meant for the surface.
+    surface : Surface, optional
+        None where no heights are given.
+    points : Points
+        As they were read, with their roles; matches are not among them.
+    ledger : Ledger
+        The files that were read, as they were when the work began.
+    """
+
+    request: Request
+    scene: Scene
+    surface: Surface | None
+    points: Points
+    ledger: Ledger

@@ -1,0 +1,56 @@
+"""A request resolved: its files are opened here, once, and entered in its ledger."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+
+from ortho_pipeline.commands.control.crops import open_by_evidence
+from ortho_pipeline.commands.control.points import read_control
+from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
+from ortho_pipeline.commands.resolved.ledger import Ledger
+from ortho_pipeline.commands.resolved.request import Request, Resolved
+from ortho_pipeline.errors import InputError, ModelError
+from ortho_pipeline.files import states
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.footprint import lay
+
+
+def resolve(request: Request, *, needs_model: bool = True) -> Resolved:
+    """Open the scene of a request, its heights and its points.
+
+    Points, heights and matches settle whether the model of a crop belongs to it.
+
+    Parameters
+    ----------
+    needs_model : bool
+        Whether an image without a model of its own is an error.
+
+    Raises
+    ------
+    InputError
+        For whatever cannot be opened, or is not what an option says.
+    """
+    begun = states(path for _, path in request.files)
+    scene = open_by_evidence(request, needs_model=needs_model)
+    surface = None
+    if has_surface(request.surface):
+        surface = open_surface(request.surface, request.scene, request.output.memory, [scene])
+    ledger = Ledger.of(request, scene, surface, begun)
+    scene = on_surface(scene, surface)
+    return Resolved(request, scene, surface, read_control(scene, request, surface), ledger)
+
+
+def on_surface(scene: Scene, surface: Surface | None) -> Scene:
+    """Return the scene with models that are meant for the heights under it, where their own range is but a guess."""
+    if surface is None:
+        return scene
+    models = dict(scene.models)
+    for name, model in models.items():
+        if model.with_heights(*model.height_range) is model:
+            continue
+        # A model that only starts an adjustment may look anywhere.
+        with contextlib.suppress(ModelError, InputError):
+            models[name] = lay(model, surface, scene.width, scene.height).fitted(model)
+    return dataclasses.replace(scene, models=models)
