@@ -8,12 +8,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, OrthoError, counted
+from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, OrthoError
 from ortho_pipeline.estimation.fit import Fit, Prior, fit, gross_errors
-from ortho_pipeline.estimation.problem import Problem
-from ortho_pipeline.estimation.regularisation import METHODS, regularised
+from ortho_pipeline.estimation.regularisation import METHODS
 from ortho_pipeline.models import family_of, start_model
-from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.options import number_of
 from ortho_pipeline.points import Points
 
@@ -255,37 +254,3 @@ def _again(found: Fit, without: str) -> Fit:
 
 
 # -- cross-validation ------------------------------------------------------------------------------------------------
-
-
-def k_fold(found: Fit, k: int = 10, seed: int = 0) -> Array:
-    """Return the residuals ``(N, 2)`` px that points would have had, had their part of one k-th taken no part.
-
-    From the hat matrix, so exact for models that are linear in their parameters, and to first order for the others.
-    Points that took no part in the fit, and groups without which it is not determined, are NaN.
-
-    Parameters
-    ----------
-    k : int
-        Number of groups, at least 2; as many as there are points is leave-one-out.
-    seed : int
-        Chooses the groups.
-    """
-    rows = np.flatnonzero(found.used)
-    if not 2 <= k <= len(rows):
-        raise InputError(f"{counted(len(rows), 'point')} cannot be divided into {counted(k, 'group')}", field="k")
-    problem = Problem.of(found.model, found.points, found.used, found.priors)
-    if found.ridge is not None:
-        problem, _ = regularised(problem, np.ones(len(rows), dtype=bool), found.ridge)
-    solution = problem.solve(np.ones(len(rows), dtype=bool))
-    # Points that share errors stay together; without any, each is a unit of its own.
-    names = np.where(problem.points.groups >= 0, problem.points.groups, -1 - np.arange(len(rows)))
-    units = list(dict.fromkeys(names.tolist()))
-    if len(units) < k:
-        raise InputError(f"{counted(len(units), 'group')} of points cannot be divided into {k}", field="k")
-    order = np.random.default_rng(seed).permutation(len(units))
-    left = np.full((len(found.points), 2), np.nan)
-    parts = np.array_split(order, k)
-    left[rows] = solution.leave_out(
-        [np.concatenate([np.flatnonzero(names == units[i]) for i in part]) for part in parts]
-    )
-    return left

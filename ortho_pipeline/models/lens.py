@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -76,11 +76,6 @@ class Interior:
                 raise InputError(f"{getattr(self, name)} is not positive", field=name)
         if self.width != int(self.width) or self.height != int(self.height):
             raise InputError("a frame has whole numbers of columns and rows", field="width, height")
-
-    @classmethod
-    def of_square_pixels(cls, width: int, height: int, focal_length_px: float, **others: float) -> Self:
-        """Return a camera of which only the focal length in pixels is known; its pixels are 1 µm wide."""
-        return cls(width, height, focal_length_px * 1e-6, 1e-6, 1e-6, **others)
 
     @property
     def field_of_view(self) -> float:

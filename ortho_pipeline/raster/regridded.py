@@ -75,11 +75,6 @@ class Regridded:
         self._offset = _offset(grid, self._own)
 
     @property
-    def is_resampled(self) -> bool:
-        """Whether its pixels lie on another grid."""
-        return self._offset is None
-
-    @property
     def block(self) -> int:
         """Bytes of the blocks that are held to read a pixel."""
         return self._source.block

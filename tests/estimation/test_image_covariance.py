@@ -8,7 +8,6 @@ import numpy as np
 import pyproj
 import pytest
 
-from ortho_pipeline.estimation.family_fit import k_fold
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.estimation.problem import ImageErrors, Problem
 from ortho_pipeline.models import RPC, ImageCorrection
@@ -168,12 +167,6 @@ def test_a_model_without_parameters_is_held_against_points_of_groups(rpc: RPC) -
     points = measured(rpc, "shift", 12, 9, groups=np.repeat(np.arange(6), 2))
     found = fit(ImageCorrection.identity(rpc, "none", (0.0, 0.0)), points)
     np.testing.assert_allclose(found.loo_residuals, found.residuals)
-
-
-def test_parts_of_a_cross_validation_keep_groups_together(rpc: RPC) -> None:
-    points = measured(rpc, "shift", 12, 9, groups=np.repeat(np.arange(6), 2))
-    found = fit(ImageCorrection.identity(rpc, "shift", ORIGIN), points, robust=False)
-    np.testing.assert_allclose(k_fold(found, 6), found.loo_residuals, atol=1e-9)
 
 
 def test_a_group_without_which_nothing_is_determined_has_no_residual(rpc: RPC) -> None:

@@ -9,7 +9,7 @@ import pyproj
 import pytest
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
-from ortho_pipeline.estimation.family_fit import fit_family, k_fold, prune
+from ortho_pipeline.estimation.family_fit import fit_family, prune
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.models import (
     ImageCorrection,
@@ -409,17 +409,13 @@ def test_strength_of_a_regularisation():
 
 
 @pytest.mark.parametrize("name", ["poly2", "affine12", "dlt"])
-def test_leave_one_out_and_k_fold_are_what_refits_give(name):
+def test_leave_one_out_is_what_refits_give(name):
     points = make_points(24)
     found = fit_family(name, points, robust=False)
-    folds = k_fold(found, 6, seed=3)
-    for group in np.array_split(np.random.default_rng(3).permutation(24), 6):
-        refit = fit(found.model, points.select(np.setdiff1d(np.arange(24), group)), robust=False)
-        expected = points.image[group] - refit.model.ground_to_image(points.ground[group])
-        np.testing.assert_allclose(folds[group], expected, atol=1e-7 if name != "dlt" else 1e-3)
-    np.testing.assert_allclose(k_fold(found, 24), found.loo_residuals, atol=1e-9)
-    with pytest.raises(InputError):
-        k_fold(found, 25)
+    for k in (0, 7, 23):
+        refit = fit(found.model, points.select(np.arange(24) != k), robust=False)
+        expected = points.image[[k]] - refit.model.ground_to_image(points.ground[[k]])
+        np.testing.assert_allclose(found.loo_residuals[[k]], expected, atol=1e-7 if name != "dlt" else 1e-3)
 
 
 def test_prune_takes_out_what_is_not_there():

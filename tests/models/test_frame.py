@@ -121,7 +121,7 @@ def test_points_behind_the_camera_or_the_earth_have_no_image():
 
 
 def test_a_lens_that_folds_over_gives_no_second_image():
-    interior = Interior.of_square_pixels(1000, 1000, 900, k1=-0.3)
+    interior = Interior(1000, 1000, 900e-6, 1e-6, 1e-6, k1=-0.3)
     fold = 1 / np.sqrt(3 * 0.3)
     assert np.isnan(interior.image_of(np.array([[fold * 1.01, 0.0]]))).all()
     inside = np.array([[fold * 0.99, 0.0], [0.3, -0.4]])

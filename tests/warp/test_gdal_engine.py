@@ -45,7 +45,7 @@ ROUNDING = 2e-4
 
 def frame(**lens: float) -> FrameCamera:
     """A camera 100 m above the ground, 0.2 rad off nadir, with pixels of about 0.4 m."""
-    interior = Interior.of_square_pixels(WIDTH, HEIGHT, 260.0, **lens)
+    interior = Interior(WIDTH, HEIGHT, 260e-6, 1e-6, 1e-6, **lens)
     return FrameCamera(
         interior, np.array([EAST, NORTH, 180.0, 0.2, 0.05, 0.3]), frame="map", ground_crs="EPSG:32651",
         heights=(60.0, 100.0),

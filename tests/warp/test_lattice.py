@@ -88,7 +88,7 @@ def compare(
 
 
 def drone(focal: float, omega: float = 0.0, **distortion: float) -> FrameCamera:
-    interior = Interior.of_square_pixels(5472, 3648, focal, **distortion)
+    interior = Interior(5472, 3648, focal * 1e-6, 1e-6, 1e-6, **distortion)
     exterior = np.array([EAST, NORTH, 180.0, omega, 0.02, 0.3])
     return FrameCamera(interior, exterior, frame="map", ground_crs="EPSG:32651", heights=(55.0, 115.0))
 

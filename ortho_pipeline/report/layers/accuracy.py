@@ -41,11 +41,6 @@ class AccuracyLayer:
     cells: tuple[tuple[float | None, ...], ...]
 
     @property
-    def dominant(self) -> str:
-        """The largest part of the variance."""
-        return max(self.shares, key=lambda name: self.shares[name])
-
-    @property
     def statement(self) -> str:
         """Return what the layer comes to in words."""
         ordered = sorted(((part, name) for name, part in self.shares.items() if part >= 0.01), reverse=True)
