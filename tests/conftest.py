@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import os
 import signal
 import sys
 from collections.abc import Iterable
@@ -23,6 +25,10 @@ for _number, _action in (
     if signal.getsignal(_number) == signal.SIG_IGN:
         signal.signal(_number, _action)
 
+# Tests start hundreds of processes: each would compile all modules again where the environment forbids to keep them.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 ROOT = Path(__file__).resolve().parent.parent
 REAL = ROOT.parent / "shared" / "data"
 SAMPLE = ROOT / "sample_data"
@@ -37,7 +43,7 @@ _QUIET = {
         hypothesis.HealthCheck.too_slow,
     ],
 }
-hypothesis.settings.register_profile("tests", derandomize=True, max_examples=25, **_QUIET)
+hypothesis.settings.register_profile("tests", derandomize=True, max_examples=10, **_QUIET)
 hypothesis.settings.register_profile("search", max_examples=2000, **_QUIET)
 hypothesis.settings.load_profile("tests")
 
@@ -53,6 +59,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "realdata" in item.keywords:
             item.add_marker(skip)
+
+
+def pytest_collection_finish() -> None:
+    """Exempt modules and tests, which stay anyway, from every later search for garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
