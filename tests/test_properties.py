@@ -255,7 +255,7 @@ def test_crop_and_scale_of_an_rpc(model: RPC, columns: float, rows: float, facto
 
 @EVERY_KIND
 @given(data=st.data())
-@settings(max_examples=5)
+@settings(max_examples=3)
 def test_a_fit_does_not_depend_on_the_order_of_points(kind: type[SensorModel], data: st.DataObject) -> None:
     model = data.draw(MODELS[kind]())
     points = seen(model, 60, data.draw(SEEDS), noise=0.3)

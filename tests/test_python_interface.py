@@ -8,6 +8,7 @@ import json
 import re
 import subprocess
 import sys
+import typing
 from importlib.resources import files
 from pathlib import Path
 
@@ -60,6 +61,17 @@ op.rectify("scene.tif", "out", pionts=points)
 """
 
 
+def test_public_functions_say_what_they_return() -> None:
+    returned = {
+        name: str(typing.get_type_hints(getattr(op, name))["return"])
+        for name in ("open_scene", "read_points", "fit", "rectify")
+    }
+    assert {name: text.rpartition(".")[2].strip("'>") for name, text in returned.items()} == {
+        "open_scene": "Scene", "read_points": "Points", "fit": "Fit", "rectify": "Result",
+    }  # fmt: skip
+
+
+@pytest.mark.slow
 def test_mypy_knows_what_the_public_names_are(tmp_path: Path) -> None:
     script = tmp_path / "user.py"
     script.write_text(USER_SCRIPT)

@@ -30,6 +30,22 @@ def run(*command, **options) -> str:
     return done.stdout
 
 
+#: Runs the command lines that it is given, in one process, and prints how each ended.
+SEVERAL = """
+import json, sys
+from click.testing import CliRunner
+from ortho_pipeline.cli.program import cli
+ended = [CliRunner().invoke(cli, words) for words in json.loads(sys.argv[1])]
+print(json.dumps([(one.exit_code, one.stdout) for one in ended]))
+"""
+
+
+def several(fresh: Path, *lines: list[object]) -> list[tuple[int, str]]:
+    """Return exit code and output of command lines of the fresh environment."""
+    words = json.dumps([[str(word) for word in line] for line in lines])
+    return [(code, told) for code, told in json.loads(run(fresh / "python", "-c", SEVERAL, words))]
+
+
 @pytest.fixture(scope="module")
 def fresh(tmp_path_factory):
     """Return the folder of the programs of a new environment that has host and plugin, both from wheels."""
@@ -73,27 +89,13 @@ def test_the_command_line_has_the_sensor(fresh, tinysat):
     listed = json.loads(run(fresh / "ortho", "sensors", "--json"))["sensors"]
     (sensor,) = [sensor for sensor in listed if sensor["name"] == "tinysat"]
     assert sensor["distribution"] == "ortho-tinysat"
-    found = json.loads(run(fresh / "ortho", "info", tinysat, "--json"))
+    # GDAL's engine needs no kernels, which are compiled once more for an environment of its own.
+    rectify = ["rectify", tinysat, "--height", "0", "-r", "nearest", "--engine", "gdal", "-o", tinysat.parent / "out"]
+    (code, told), (made_code, made_told) = several(fresh, ["info", tinysat, "--json"], [*rectify, "--json"])
+    assert (code, made_code) == (0, 0), (told, made_told)
+    found, made = json.loads(told), json.loads(made_told)
     assert found["sensor"] == "tinysat"
     assert found["gsd_m"] == pytest.approx(10, rel=0.01)
-    # GDAL's engine needs no kernels, which are compiled once more for an environment of its own.
-    out = tinysat.parent / "out"
-    made = json.loads(
-        run(
-            fresh / "ortho",
-            "rectify",
-            tinysat,
-            "--height",
-            "0",
-            "-r",
-            "nearest",
-            "--engine",
-            "gdal",
-            "-o",
-            out,
-            "--json",
-        )
-    )
     ortho = gdal.Open(made["files"]["ortho"])
     assert (ortho.ReadAsArray() == 100).sum() == pytest.approx(120 * 90, rel=0.02)
 
@@ -118,20 +120,26 @@ def test_the_test_of_the_tutorial_runs_as_it_is_printed(fresh, tinysat, tmp_path
 
 
 def test_its_study_is_a_command_of_simulate_and_reproduce(fresh, tmp_path):
-    assert "A TinySat-1 scene over Rome" in run(fresh / "ortho", "simulate", "--help")
-    made = json.loads(run(fresh / "ortho", "simulate", "tinysat", "-o", tmp_path, "--noise", "0.1", "--json"))["files"]
-    fit = json.loads(
-        run(fresh / "ortho", "fit", made["image"], "--gcps", made["gcps"], "--correction", "model", "--json")
+    helped, simulated, refused = several(
+        fresh,
+        ["simulate", "--help"],
+        ["simulate", "tinysat", "-o", tmp_path, "--noise", "0.1", "--json"],
+        ["simulate", "tinysat", "-o", tmp_path, "--noise", "-1"],
     )
-    roll = fit["parameters"]["roll"]
+    assert "A TinySat-1 scene over Rome" in helped[1]
+    assert refused[0] == 2
+    made = json.loads(simulated[1])["files"]
+    fitted, reproduced = several(
+        fresh,
+        ["fit", made["image"], "--gcps", made["gcps"], "--correction", "model", "--json"],
+        ["reproduce", "tinysat", "--realisations", "20", "-o", tmp_path / "page", "--json"],
+    )
+    roll = json.loads(fitted[1])["parameters"]["roll"]
     assert roll["value"] == pytest.approx(1e-4, abs=4 * roll["sigma"])
-    found = run(fresh / "ortho", "reproduce", "tinysat", "--realisations", "20", "-o", tmp_path / "page", "--json")
+    found = reproduced[1]
     # Student's t with ten degrees of freedom has a spread of 1.12; 20 draws of it scatter by 0.2.
     assert json.loads(found)["spread"]["roll"] == pytest.approx(1.12, abs=0.5)
     assert (tmp_path / "page" / "tinysat.html").read_text().startswith("<!doctype html>")
-    refused = subprocess.run([fresh / "ortho", "simulate", "tinysat", "-o", tmp_path, "--noise", "-1"],
-                             check=False, capture_output=True, text=True)  # fmt: skip
-    assert refused.returncode == 2
 
 
 # -- the tutorial ----------------------------------------------------------------------------------------------------

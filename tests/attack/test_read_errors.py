@@ -48,7 +48,7 @@ def ended(
 
 @pytest.mark.parametrize(
     ("name", "share"),
-    [("scene.tif", 0.9), ("dem.tif", 0.5), ("scene_RPC.TXT", 0.5)],
+    [("scene.tif", 0.9), *(pytest.param(name, 0.5, marks=pytest.mark.slow) for name in ("dem.tif", "scene_RPC.TXT"))],
 )
 def test_a_bad_block_is_an_error_that_names_the_file(bad_blocks, tmp_path, name, share):
     folder = copied(tmp_path / "in")

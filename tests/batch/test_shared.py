@@ -266,7 +266,10 @@ def bucket_run(store: str, tiny: Any) -> Any:
     raw.mkdir()
     gdal.Translate(str(raw / "s0.tif"), str(tiny.image))
     file = tiny.folder / "p.yaml"
-    file.write_text(FILE + f"    points: {{gcps: {tiny.gcps.name}, crs: 'EPSG:4979', vertical: ellipsoid}}\n")
+    file.write_text(
+        FILE.replace("GTiff}", "GTiff, resolution: 40}")
+        + f"    points: {{gcps: {tiny.gcps.name}, crs: 'EPSG:4979', vertical: ellipsoid}}\n"
+    )
 
     def run(*more: str) -> tuple[str, int]:
         done = CliRunner().invoke(
@@ -304,7 +307,7 @@ def test_a_run_in_a_store_notices_what_changed(bucket_run: Any, store: str, tiny
         "image changed": lambda: gdal.Open(str(image), gdal.GA_Update).WriteRaster(0, 0, 1, 1, b"\0\0"),
         "points changed": lambda: tiny.write(tiny.gcps, tiny.points(11)),
         "a model beside the image": lambda: (image.parent / "s0_notes.txt").write_text("new"),
-        "settings changed": lambda: file.write_text(file.read_text().replace("GTiff}", "GTiff, resolution: 20}")),
+        "settings changed": lambda: file.write_text(file.read_text().replace("resolution: 40", "resolution: 20")),
         "empty record": lambda: objects.put(result, b"{}"),
         "record that is no JSON": lambda: objects.put(result, b"\xff{"),
         "record without outputs": lambda: tampered(outputs=[]),

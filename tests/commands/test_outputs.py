@@ -154,7 +154,9 @@ def test_a_side_car_of_nothing_would_attach_to_the_ortho(tiny, tmp_path, ending)
         rectify(tiny, out)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow), signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, *(pytest.param(one, marks=pytest.mark.slow) for one in (signal.SIGHUP, signal.SIGINT))]
+)
 def test_a_signal_ends_the_command_and_leaves_nothing(tiny, tmp_path, number):
     out = tmp_path / "out"
     code = """

@@ -438,7 +438,7 @@ def test_mutated_files_give_typed_errors_or_finite_models(tmp_path):
     ]
     corners = np.array([rpc.domain[0] + np.array(s) * rpc.domain[1] for s in ((-1, -1, -1), (0, 0, 0), (1, 1, 1))])
     accepted = 0
-    for number in range(4000):
+    for number in range(1000):
         suffix = list(seeds)[number % 3]
         path = tmp_path / f"m{suffix}"
         path.write_bytes(mutate(seeds[suffix], rng, splices))
@@ -452,7 +452,7 @@ def test_mutated_files_give_typed_errors_or_finite_models(tmp_path):
         numbers = [v for value in model.to_dict().values() for v in np.atleast_1d(value) if not isinstance(v, str)]
         assert all(v is None or math.isfinite(v) for v in numbers)
         assert image.shape == (3, 2)
-    assert 100 < accepted < 3000
+    assert 25 < accepted < 750
 
 
 def mutate(data: bytes, rng: np.random.Generator, splices: list[bytes]) -> bytes:

@@ -68,7 +68,7 @@ def test_threads_that_are_tried_are_gone_afterwards():
     assert threading.active_count() == before[0]
 
 
-@pytest.mark.parametrize("megabytes", [90, 170, pytest.param(150, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("megabytes", [90, *(pytest.param(one, marks=pytest.mark.slow) for one in (150, 170))])
 def test_a_run_with_little_memory_ends_within_seconds(tmp_path, megabytes):
     # Beside what is loaded already: GDAL and Python's threads waited for each other with 151 and 170 MB.
     line = (

@@ -79,7 +79,9 @@ def test_system_grids_are_found_in_a_fresh_process_and_other_threads() -> None:
     assert seen == [pytest.approx(28.208, abs=0.01)]
 
 
-@pytest.mark.parametrize("name", ["egm2008", "EPSG:3855", "EPSG:5703", "EPSG:5613"])
+@pytest.mark.parametrize(
+    "name", ["egm2008", "EPSG:3855", pytest.param("EPSG:5703", marks=pytest.mark.slow), "EPSG:5613"]
+)
 def test_a_missing_grid_is_an_error_that_names_it_and_the_remedy(name: str) -> None:
     grid = {"EPSG:5703": "us_noaa", "EPSG:5613": "se_lantmateriet"}.get(name, "us_nga_egm08_25.tif")
     if any(list(Path(folder).glob(f"{grid}*")) for folder in module.add_system_grids()):

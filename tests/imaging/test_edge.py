@@ -267,6 +267,7 @@ def test_an_image_without_edges_is_an_error(tmp_path):
             resolution.measure(write(tmp_path / "flat.tif", pixels))
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 def test_a_pleiades_crop_is_resolved_to_two_of_its_pixels(real):
     """Pleiades Pan is delivered at 0.5 m and resolves some 0.7 m at best; edges of houses are not all sharp."""

@@ -77,7 +77,7 @@ def along(surface: Surface, x: np.ndarray, y: np.ndarray, east: float, north: fl
     return most
 
 
-@pytest.mark.parametrize(("off_nadir", "azimuth"), [(10, 75), (45, 128)])
+@pytest.mark.parametrize(("off_nadir", "azimuth"), [(10, 75), pytest.param(45, 128, marks=pytest.mark.slow)])
 def test_where_the_mask_is_not_that_of_the_boxes_their_samples_are_not_the_boxes(off_nadir, azimuth, tmp_path):
     """Of the surface between the samples it is the shadow, by a walk along each ray that differs."""
     east, north = towards(off_nadir, azimuth)

@@ -349,7 +349,7 @@ def test_a_run_matches_each_scene(case: Case, tmp_path: Path) -> None:
         "  match: {reference: reference.tif, search: 30, points: 60}\nscenes:\n  - image: scene.tif\n"
     )
     root = ("--root", Path("/"))
-    done = ortho("run", pipeline, *root, "--workers", 1)
+    done = ortho("run", pipeline, *root, "--executor", "sequential")
     assert done.exit_code == 0, done.output
     report = json.loads((tmp_path / "out" / "scene" / "scene_report.json").read_text())
     assert report["matching"]["search_m"] == 30

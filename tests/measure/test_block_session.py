@@ -149,6 +149,7 @@ def test_without_a_reference_ties_alone_hold_the_images_together(
     assert [one["id"] for one in json.loads(session.output.read_text())["left_out"]] == ["half"]
 
 
+@pytest.mark.slow
 def test_three_images_are_measured_judged_and_planned_together(
     stereo: Any, third: Any, truth: Any, features: np.ndarray, tmp_path: Path
 ) -> None:

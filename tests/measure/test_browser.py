@@ -115,14 +115,18 @@ LISTEN = """() => { const said = document.getElementById('said'); window.told = 
 
 def test_a_person_clicks_two_points(serve, reference: Path, truth, features: np.ndarray) -> None:
     served = serve(reference)
+    panes = _panes(served.page)
     served.page.evaluate(LISTEN)
     for number, feature in enumerate(features[[2, 3]]):
         served.click("scene", feature + np.array([2, -2]))
         served.accept(f"P{number + 1}")
+        assert _panes(served.page) == panes
     served.says("#what", "left out in turn, relative to the reference")
     # Whoever waits reads for what.
     told = served.page.evaluate("() => window.told")
     assert [text for text in told if "…" in text] == ["Matching …", "Saving P1 …", "Matching …", "Saving P2 …"]
+    _say_much(served.page)
+    assert _panes(served.page) == panes
     assert served.page.locator("#table tbody tr").count() == 2
     # Loaded anew, the page shows the points that there are.
     served.page.reload()
@@ -379,18 +383,23 @@ def _panes(page: playwright.Page) -> list:
     return [page.locator(f"#{pane}").bounding_box() for pane in ("scene", "reference")]
 
 
-@pytest.mark.parametrize("width", [1400, pytest.param(1000, marks=pytest.mark.slow)])
-def test_panes_stay_where_they_are_whatever_is_said(serve, reference: Path, features: np.ndarray, width: int) -> None:
-    served = serve(reference, viewport={"width": width, "height": 860})
+def _say_much(page: playwright.Page) -> None:
+    """Let every text of the page be long."""
+    page.evaluate("() => { document.getElementById('what').textContent = 'A long headline. '.repeat(60); }")
+    page.evaluate("() => { document.getElementById('said').textContent = 'A long message. '.repeat(60); }")
+    page.evaluate("() => { document.getElementById('reference-title').textContent = 'A long title. '.repeat(60); }")
+    page.evaluate("() => { document.getElementById('banner').hidden = false; }")
+
+
+@pytest.mark.slow
+def test_panes_of_a_narrow_window_stay_where_they_are(serve, reference: Path, features: np.ndarray) -> None:
+    served = serve(reference, viewport={"width": 1000, "height": 860})
     page, before = served.page, _panes(served.page)
     for number, feature in enumerate(features[[2, 3]]):
         served.click("scene", feature)
         served.accept(f"P{number + 1}")
         assert _panes(page) == before
-    page.evaluate("() => { document.getElementById('what').textContent = 'A long headline. '.repeat(60); }")
-    page.evaluate("() => { document.getElementById('said').textContent = 'A long message. '.repeat(60); }")
-    page.evaluate("() => { document.getElementById('reference-title').textContent = 'A long title. '.repeat(60); }")
-    page.evaluate("() => { document.getElementById('banner').hidden = false; }")
+    _say_much(page)
     assert _panes(page) == before
     assert not served.faults
 
@@ -431,9 +440,11 @@ def test_the_wheel_zooms_whichever_pane_is_under_the_pointer(serve, reference: P
     assert zooms("scene")
 
 
-def test_a_dragged_point_stays_where_it_was_put(serve, reference: Path, features: np.ndarray) -> None:
+def test_a_click_outside_is_said_and_a_dragged_point_stays(serve, reference: Path, features: np.ndarray) -> None:
     served = serve(reference)
     page = served.page
+    served.click("scene", np.array([500.0, -60.0]))
+    served.says("#said", "^You clicked outside the image.$")
     served.click("scene", features[2])
     served.accept("P1")
     page.keyboard.press("j")
@@ -451,10 +462,4 @@ def test_a_dragged_point_stays_where_it_was_put(serve, reference: Path, features
     (point,) = served.end()
     moved = np.array(point["properties"]["ji"]) + 0.5 - features[2]
     assert np.allclose(moved, [30, 20], atol=1.5), moved
-
-
-def test_a_click_outside_is_said_plainly(serve, reference: Path) -> None:
-    served = serve(reference)
-    served.click("scene", np.array([500.0, -60.0]))
-    served.says("#said", "^You clicked outside the image.$")
     assert not served.faults

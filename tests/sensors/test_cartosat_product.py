@@ -65,6 +65,7 @@ def truth_of(folder: Path) -> dict[str, np.ndarray]:
 # -- the delivery ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_sample_is_made_again_the_same(sample, tmp_path):
     kept = sample / "cartosat"
     files = write_product(tmp_path, seed=1, size=400, dem_step=120.0)

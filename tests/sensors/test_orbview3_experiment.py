@@ -188,6 +188,7 @@ def test_edges_show_the_staggered_lines_until_they_are_enhanced():
     assert max(enhanced["blur"]) < 0.6 * min(raw["blur"])
 
 
+@pytest.mark.slow
 def test_an_edge_of_the_rendered_image_has_that_width(monkeypatch):
     camera = replace(simulated.scanner("471890", shrink=40), height=200)
 

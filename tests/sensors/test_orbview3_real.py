@@ -21,7 +21,7 @@ from ortho_pipeline.testing import check_sensor
 
 pytestmark = pytest.mark.realdata
 NAME = "3v050905p0000880351a520001100172m_001659557"
-MUTATIONS = 2000
+MUTATIONS = 600
 
 
 @pytest.fixture
