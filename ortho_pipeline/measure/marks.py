@@ -177,7 +177,7 @@ def mark_of(document: Any) -> Mark:
     try:
         return checked(record_of(Mark, document))
     except DocumentError as error:
-        raise InputError(f"not a mark: {error.fault}", field=error.place) from error
+        raise InputError(f"not a mark: {error.fault}", field=error.place or "mark") from error
 
 
 @dataclass(frozen=True)

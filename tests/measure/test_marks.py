@@ -10,7 +10,7 @@ import pytest
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import write_json
-from ortho_pipeline.measure.marks import History, Mark, marks_of
+from ortho_pipeline.measure.marks import History, Mark, mark_of, marks_of
 from ortho_pipeline.points import read_points
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
@@ -105,3 +105,10 @@ def test_points_of_a_file_stay_what_they_are() -> None:
     np.testing.assert_allclose(found.ground, points.ground, rtol=0, atol=1e-9)
     assert isinstance(marks[0], Mark)
     assert marks[0].ground_from == "file"
+
+
+@pytest.mark.parametrize("document", [[], "P1", None, 7])
+def test_what_is_no_object_is_refused_by_name(document):
+    with pytest.raises(InputError, match="not a mark") as caught:
+        mark_of(document)
+    assert caught.value.field == "mark"
