@@ -113,7 +113,7 @@ def test_a_layer_of_a_mosaic_that_is_no_ortho_is_named(tmp_path):
         assert caught.value.remedy
 
 
-@pytest.mark.parametrize("kind", ["VRT", "COG"])
+@pytest.mark.parametrize("kind", ["VRT", pytest.param("COG", marks=pytest.mark.slow)])
 def test_a_run_of_hostile_scenes_and_its_mosaic(trap, tiny, kind):
     """Scenes whose images are hostile, all with a sound RPC: neither their orthos nor the mosaic hold it."""
     files = next(parent for parent in Path(trap.rasters["vrt-absolute"]).parents if parent.name == "files")

@@ -21,7 +21,7 @@ from ortho_pipeline.files import parse_json
 from ortho_pipeline.report.stac import acquisition_time
 
 #: Mutants of each reader, those of the default run first; fewer where a file takes more than some milliseconds.
-FEW, MANY = 40, 5000
+FEW, MANY = 25, 5000
 DEAR = {
     "project": 1,
     "cartosat-met": 8,

@@ -112,6 +112,7 @@ def killed(nursery: Nursery, address: str, moment: float) -> bool:
     return at_work
 
 
+@pytest.mark.slow
 def test_two_runs_on_one_bucket_make_every_scene_once(nursery: Nursery) -> None:
     """Two runs of all scenes, begun together, neither of a part."""
     workers = [nursery.fork("s3://kills/both", None) for _ in range(2)]

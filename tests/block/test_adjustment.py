@@ -573,7 +573,7 @@ def coverage(
     return float(np.mean(orientation)), float(np.mean(places_)), refused, dropped
 
 
-@pytest.mark.parametrize(("control", "error"), [(4, 0.5), (9, 1.0)])
+@pytest.mark.parametrize(("control", "error"), [(4, 0.5), pytest.param(9, 1.0, marks=pytest.mark.slow)])
 def test_control_without_sigmas_is_not_refused_and_intervals_hold(
     rpcs: dict[str, RPC], control: int, error: float
 ) -> None:

@@ -88,7 +88,7 @@ def normalised(found: BlockFit, ground: Array) -> Array:
 
 @pytest.mark.parametrize(
     ("images", "control", "errors"),
-    [(2, 4, WORSE_HEIGHTS), (3, 7, WORSE_HEIGHTS), (2, 4, WORSE_PLAN)],
+    [(2, 4, WORSE_HEIGHTS), pytest.param(3, 7, WORSE_HEIGHTS, marks=pytest.mark.slow), (2, 4, WORSE_PLAN)],
     ids=["pair, worse heights", "triplet, worse heights", "pair, worse plan"],
 )
 def test_plan_and_height_get_the_sigmas_that_they_have(

@@ -428,6 +428,7 @@ def test_twenty_parameters_on_fourteen_points_do_not_win_by_chance():
     assert f"poly3d2 has {left_out['poly3d2']:.3g} px with 20 parameters, and " in done.reason
 
 
+@pytest.mark.slow
 def test_few_even_points_mostly_choose_about_the_best_model():
     # One of these six (10 points; no model follows the scene by less than 4 px) takes one that is 2.7 times the best.
     ratios = []

@@ -26,7 +26,7 @@ def chips(ground: str, noise: float, count: int) -> tuple[np.ndarray, np.ndarray
     return made[0], made[1], shift
 
 
-@pytest.mark.parametrize("noise", [0.005, 0.05])
+@pytest.mark.parametrize("noise", [pytest.param(0.005, marks=pytest.mark.slow), 0.05])
 def test_shifts_are_as_long_as_they_are_however_noisy_the_images(noise: float) -> None:
     """Weighted by the target's gradients they are a tenth to a quarter too long, near whole pixels twice as long."""
     scene, target, shift = chips("country", noise, 120)

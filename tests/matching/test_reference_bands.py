@@ -121,6 +121,7 @@ def test_bands_of_a_reference_that_is_not_given_are_refused(case: Case, tmp_path
     assert (done.exit_code, json.loads(done.stdout)["error"]["field"]) == (2, "--reference-bands")
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 def test_landsat_as_it_is_delivered(real: Path) -> None:
     """24 bands, those of quality without any value: bands 4, 3 and 2 alone give 367 of 405 matches."""

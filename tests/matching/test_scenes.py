@@ -188,6 +188,7 @@ def test_another_place_has_nothing_in_common(tmp_path):
     assert peak < 0.5
 
 
+@pytest.mark.slow
 def test_grounds_repeat_only_at_their_rims():
     tone = landscape.land("country").tones["a"]
     assert tone.shape == (SIZE, SIZE)
@@ -201,7 +202,7 @@ def test_grounds_repeat_only_at_their_rims():
 @pytest.mark.parametrize(
     "ground",
     ["country", *(pytest.param(one, marks=pytest.mark.slow) for one in ("woods", "town")),
-     pytest.param("real", marks=pytest.mark.realdata)],
+     pytest.param("real", marks=[pytest.mark.slow, pytest.mark.realdata])],
 )  # fmt: skip
 def test_scene_and_reference_show_the_same_ground(tmp_path, ground):
     setting = replace(SMALL, ground=ground, scene=View(noise=0.02), reference=View(noise=0.02))

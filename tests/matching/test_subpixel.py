@@ -83,6 +83,7 @@ def check(fit: Fit, shift: tuple[float, float], exact: float = 0.005) -> None:
 LANDSAT, EAST, WEST = "landsat8_byte.tif", "ngi_rgb_byte_1.tif", "ngi_rgb_byte_2.tif"
 
 
+@pytest.mark.slow
 def test_a_quarter_of_a_pixel_is_a_quarter(real: Path, tmp_path: Path) -> None:
     """By cubic convolution it was 0.267 ± 0.001."""
     pixels = band(real, LANDSAT, 4)

@@ -147,6 +147,7 @@ def test_a_track_goes_on_where_its_home_cannot_be_matched(tmp_path, monkeypatch)
     assert rms(across) < 0.2
 
 
+@pytest.mark.slow
 def test_ties_of_scenes_of_different_resolution(tmp_path):
     fine = looks(tmp_path, [-14.0], side=420, dem_sigma=2.0)
     (coarse,) = [Look(Setting(off_nadir_deg=10.0, side=210, gsd=2.0, fine=4.0, relief=3.0, error=3.0), tmp_path, 1)]

@@ -81,6 +81,7 @@ def test_ngi_camera_stands_where_it_is_said_to(real, tmp_path, strip):
     assert np.abs(other - image)[2].max() < 0.02
 
 
+@pytest.mark.slow
 def test_ngi_orthos_of_side_lapping_frames_agree(real, tmp_path):
     folder = real / "orthority"
     surface = Surface.open(folder / "ngi" / "dem.tif", "egm96", override=True)

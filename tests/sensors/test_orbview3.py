@@ -101,6 +101,7 @@ def test_both_scenes_see_the_same_points_and_their_truth(delivery):
         assert 0.7 < np.hypot(*np.sqrt((in_metres(affine, affine.residuals) ** 2).mean(axis=0))) < 4
 
 
+@pytest.mark.slow
 def test_sample_is_made_again_the_same(delivery, tmp_path):
     files = write_product(tmp_path, seed=1, pixel=24, dem_step=150.0)
     for path in files.values():
@@ -344,7 +345,7 @@ def test_files_that_are_no_labels(tmp_path):
 
 def test_hostile_labels_are_answered_at_once(tmp_path, calls):
     path = tmp_path / "a.pvl"
-    for content in ("".join(f"/*{k}=1;" for k in range(20_000)), "a = (" + "1," * 90_000, '"' * 199_999, "<" * 199_999):
+    for content in ("".join(f"/*{k}=1;" for k in range(8_000)), "a = (" + "1," * 30_000, '"' * 69_999, "<" * 69_999):
         path.write_text(content)
         with pytest.raises(InputError), calls:
             read_label(path)

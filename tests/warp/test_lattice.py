@@ -236,7 +236,11 @@ def test_a_cubic_in_height_takes_a_height_more_and_all_blocks_of_a_tile_at_once(
     assert model.calls == [4 * 25 * 3, 4 * 24, 4 * 25 * 4, 4 * 24]
 
 
-@pytest.mark.parametrize(("amplitude", "power"), [(1.0, 3), (100.0, 8)], ids=["a height more", "closer nodes"])
+@pytest.mark.parametrize(
+    ("amplitude", "power"),
+    [(1.0, 3), pytest.param(100.0, 8, marks=pytest.mark.slow)],
+    ids=["a height more", "closer nodes"],
+)
 def test_refined_blocks_are_the_same_for_any_memory_and_threads(tmp_path, amplitude, power):
     """They are evaluated together, with whatever other blocks of their tile lack."""
     surface, found = mountains(tmp_path), []

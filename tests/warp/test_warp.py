@@ -954,7 +954,7 @@ def test_a_crop_of_the_image_gives_a_crop_of_the_ortho(scene, tmp_path):
     assert np.quantile(np.abs(whole - part)[0][use], 0.99) < 1e-3
 
 
-@pytest.mark.parametrize("options", [{}, {"COMPRESS": "DEFLATE", "TILED": "NO"}])
+@pytest.mark.parametrize("options", [{}, pytest.param({"COMPRESS": "DEFLATE", "TILED": "NO"}, marks=pytest.mark.slow)])
 def test_equal_orthos_are_equal_files_whatever_the_number_of_threads(scene, tmp_path, options):
     """Blocks used to be written in the order in which the threads came to an end."""
     source, found = RasterSource(scene.write(texture())), set()
