@@ -38,7 +38,7 @@ class OrthoError(Exception):
     Parameters
     ----------
     message : str
-        What is wrong, in one sentence.
+        What is wrong, in one sentence; a `Text` where it names options, as in `remedy`.
     file : path, optional
         The file that it was found in.
     field : str, optional
@@ -48,11 +48,11 @@ class OrthoError(Exception):
 
     Attributes
     ----------
-    choices : tuple of (str, str)
+    choices : tuple of (Setting, str)
         Options of which one decides, each with what it says; the command line prints a command of each.
     """
 
-    choices: tuple[tuple[str, str], ...] = ()
+    choices: tuple[tuple[Any, str], ...] = ()
 
     def __init__(
         self,

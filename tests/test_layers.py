@@ -282,7 +282,12 @@ def test_messages_name_options_by_their_fields() -> None:
         typed = re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)
         if where.name != "study.py":  # the switches of a study are its own to name
             assert not typed or COMMAND_LINE.search(text), f"{where}, {typed}: a flag is the command line's"
-        for group, name in re.findall(r"`(scene|points|surface|output)\.([a-z_]+)", text):
+        assert not re.search(r"`(scene|points|surface|match|output)\.", text), f"{where}: {text!r}, not a Setting"
+    for where, call in ((path.relative_to(ROOT), node) for path in paths for node in ast.walk(parse(path))):
+        if not isinstance(call, ast.Call) or ast.unparse(call.func) != "Setting":
+            continue
+        group, _, name = str(getattr(call.args[0], "value", "")).partition(".")
+        if name:
             known = {**options_of(GROUPS[group]), **(options_of(BlockOptions) if group == "points" else {})}
             assert name in known, f"{where}: there is no option {group}.{name}"
 

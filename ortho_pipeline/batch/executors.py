@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 from ortho_pipeline.errors import InputError, OrthoError, print_no_error_twice
 from ortho_pipeline.files.process_limits import require_memory, startable_threads
 from ortho_pipeline.options import EXECUTORS
+from ortho_pipeline.options.texts import Setting, Text
 
 #: Jobs that are handed over before their turn, so that no worker waits for the next one.
 _AHEAD = 256
@@ -301,7 +302,10 @@ def _died(future: Future[Outcome]) -> Future[Outcome]:
         return future
     told: Future[Outcome] = Future()
     told.set_exception(
-        WorkerDied("the process that made this scene was killed", remedy="give it more memory, or `workers=1`")
+        WorkerDied(
+            "the process that made this scene was killed",
+            remedy=Text("give it more memory, or ", Setting("workers", "1")),
+        )
     )
     return told
 
@@ -336,7 +340,11 @@ def crew_of(
 ) -> Iterator[tuple[Crew, int | None]]:
     """Yield who does the work, and the threads of each scene."""
     if scheduler is not None and executor not in ("dask", None):
-        raise InputError("a scheduler is for dask", field="scheduler", remedy="leave out `executor`, or say dask")
+        raise InputError(
+            "a scheduler is for dask",
+            field="scheduler",
+            remedy=Text("leave out ", Setting("executor"), ", or say dask"),
+        )
     if isinstance(executor, Executor):
         yield executor, threads or 1
     elif executor == "dask" or scheduler is not None:  # a scheduler alone means dask

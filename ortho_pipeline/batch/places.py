@@ -13,6 +13,7 @@ from typing import TypeAlias
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.locations import VsiPath, is_far, located, url_of
 from ortho_pipeline.files.storage.objects import Objects, is_address
+from ortho_pipeline.options.texts import Setting, Text
 
 _WALKS, _PATTERN_BYTES = 2, 1000
 #: No store has more objects behind a pattern.
@@ -58,7 +59,10 @@ class Places:
         if not resolved.is_relative_to(self.root):
             raise InputError(
                 f"{text} lies outside of the root {self.root}", file=self.file, field=field,
-                remedy=f"move it there, or allow a folder that holds both with `root={self._common(path.resolve())}`",
+                remedy=Text(
+                    "move it there, or allow a folder that holds both with ",
+                    Setting("root", str(self._common(path.resolve())))
+                ),
             )  # fmt: skip
         return path
 
@@ -97,7 +101,7 @@ class Places:
         if not self.allow_network:
             raise InputError(
                 f"{address!r} lies on another machine, of which nothing is opened unasked", file=self.file, field=field,
-                remedy="allow it with `scene.allow_network`, or give a file",
+                remedy=Text("allow it with ", Setting("scene.allow_network"), ", or give a file"),
             )  # fmt: skip
         place = located(address, allow_network=self.allow_network)
         assert isinstance(place, VsiPath)

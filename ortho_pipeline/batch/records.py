@@ -17,7 +17,7 @@ import os
 import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ import pydantic
 from ortho_pipeline import files
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.folders import listing
+from ortho_pipeline.options.texts import Text
 from ortho_pipeline.report.wording import refuted
 
 SCHEMA_VERSION = 1
@@ -148,6 +149,8 @@ class Record:
                 refuted(record.facts["notices"])  # what a page says of them needs their members
             if record.error is not None:
                 _error().validate_python(record.error)
+                told = {key: text if text is None else Text.read(text) for key, text in record.error.items()}
+                record = replace(record, error=told)
         except (InputError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return None
         # What is outside of the scene's folder is not ours to judge, or to remove.

@@ -247,5 +247,5 @@ def _mosaic_text(mosaic: Mapping[str, Any]) -> str:
 
 def _error_text(error: Mapping[str, Any]) -> str:
     where = ": ".join(part for part in (error["file"], error["field"]) if part)
-    text = f"{where}: {error['message']}" if where else error["message"]
-    return as_typed(f"{text}\n  Remedy: {error['remedy']}" if error["remedy"] else text)
+    text = f"{where}: {as_typed(error['message'])}" if where else as_typed(error["message"])
+    return f"{text}\n  Remedy: {as_typed(error['remedy'])}" if error["remedy"] else text

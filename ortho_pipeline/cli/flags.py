@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from collections.abc import Mapping
+from dataclasses import replace
 
 import click
 
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.options import GROUPS, MosaicOptions, options_of
+from ortho_pipeline.options.texts import Setting, Text
 
-_NAMED = re.compile(r"`([a-z_]+(?:\.[a-z_]+)?)(?:\.(\w+))?(?:=([^`]*))?`")
 #: Those of a scene, and of a mosaic.
 _GROUPS = {**GROUPS, "mosaic": MosaicOptions}
 #: Name of an option in messages -> its flag, where a command has it under that flag.
@@ -43,15 +43,17 @@ def flags_of(command: click.Command) -> dict[str, str]:
 
 def with_flags(text: str, flags: Mapping[str, str]) -> str:
     """Return a text with the options that it names as they are typed; names without a flag stay as they are."""
+    if not isinstance(text, Text):
+        return text
+    return "".join(part if isinstance(part, str) else _typed(part, flags) for part in text.parts)
 
-    def typed(match: re.Match[str]) -> str:
-        name, key, value = match.groups()
-        if name not in flags:
-            return match[0]
-        given = "=".join(part for part in (key, value) if part is not None)
-        return f"{flags[name]} {given}".strip()
 
-    return _NAMED.sub(typed, text)
+def _typed(setting: Setting, flags: Mapping[str, str]) -> str:
+    return f"{flags[setting.name]} {_value(setting)}".strip() if setting.name in flags else str(setting)
+
+
+def _value(setting: Setting) -> str:
+    return "=".join(part for part in (setting.key, setting.value) if part is not None)
 
 
 def as_typed(text: str) -> str:
@@ -75,16 +77,15 @@ def _offer(error: OrthoError, command: click.Command, flags: Mapping[str, str]) 
     """Add the command that was typed with each of the options that an error offers, ready to be pasted."""
     of_each = {f"scene.{one.name[6:]}" for one in command.params if one.multiple and str(one.name).startswith("scene_")}
 
-    def of_image(text: str) -> str:
+    def of_image(setting: Setting) -> Setting:
         # Of several images, an option names the one that it is of.
-        for name in of_each:
-            text = text.replace(f"`{name}=", f"`{name}={error.file}=")
-        return text
+        return replace(setting, value=f"{error.file}={setting.value}") if setting.name in of_each else setting
 
-    error.remedy = of_image(error.remedy or "")
+    parts = Text(error.remedy or "").parts
+    remedy = Text(*(part if isinstance(part, str) else of_image(part) for part in parts))
     typed = click.get_current_context().meta.get("command")
-    if typed is None or not all(name in flags for name in (error.field or "").split(", ")):
-        return
-    for option, meaning in error.choices:
-        flag, value = with_flags(of_image(option), flags).split(" ", 1)
-        error.remedy += f"\n    {typed} {flag} {shlex.quote(value)}  # {meaning}"
+    if typed is not None and all(name in flags for name in (error.field or "").split(", ")):
+        for setting, meaning in error.choices:
+            given = shlex.quote(_value(of_image(setting)))
+            remedy = Text(remedy, f"\n    {typed} {flags[setting.name]} {given}  # {meaning}")
+    error.remedy = remedy

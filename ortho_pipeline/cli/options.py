@@ -26,6 +26,7 @@ from ortho_pipeline.options import (
     SurfaceOptions,
     options_of,
 )
+from ortho_pipeline.options.texts import Setting, Text
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -85,12 +86,12 @@ def click_options(group: str, options: type, *names: str) -> Decorator:
 
 
 def _help(option: Option) -> str | None:
-    text = option.help
+    text = with_flags(option.help, FLAGS)
     if option.kind in ("integers", "files", "folders", "keys"):
         text = f"{text.removesuffix('.')}; may be repeated."
     if option.unset:
         text = f"{text.removesuffix('.')}  [default: {option.unset}]".strip()
-    return with_flags(text, FLAGS) or None
+    return text or None
 
 
 def _said(option: Option, default: Any) -> dict[str, Any]:
@@ -236,7 +237,7 @@ def _scenes(
             elif not equals:
                 raise InputError(
                     f"{text} is said of one image, and there are {len(images)}", field=f"scene.{field}",
-                    remedy=f"name the image: `scene.{field}={Path(images[0]).name}={text}`",
+                    remedy=Text("name the image: ", Setting(f"scene.{field}", f"{Path(images[0]).name}={text}")),
                 )  # fmt: skip
             number = image_named(name, images, f"scene.{field}")
             changed: dict[str, Any] = {field: value if field == "rpc" else _numbers(value, "COL,ROW")}

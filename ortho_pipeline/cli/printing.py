@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ortho_pipeline.cli.flags import as_typed
+from ortho_pipeline.cli.flags import as_typed, name_as_typed
 from ortho_pipeline.cli.machine.terminal import printable_json, say
 from ortho_pipeline.errors import counted
 
@@ -35,7 +35,7 @@ def print_json(document: Any) -> None:
 def print_warnings(warnings: Any) -> None:
     """Print warnings on stderr."""
     for warning in warnings:
-        say(f"Warning: {as_typed(str(warning))}", err=True)
+        say(f"Warning: {as_typed(warning)}", err=True)
 
 
 def print_result(result: Result, as_json: bool) -> None:
@@ -50,7 +50,8 @@ def print_result(result: Result, as_json: bool) -> None:
         context = click.get_current_context()
         if context.meta.get("debug"):
             say("".join(traceback.format_exception(result.failure)), err=True)
-        say(f"Error: {as_typed(str(result.failure))}", err=True)
+        name_as_typed(result.failure, context.command)
+        say(f"Error: {result.failure}", err=True)
         context.exit(PARTLY_DONE)
 
 
@@ -63,7 +64,7 @@ def checked_text(name: str, checked: Mapping[str, Any]) -> str:
         f"DEM covers {100 * checked['coverage']:.1f} %",
         f"{grid['size'][0]} x {grid['size'][1]} px of {grid['resolution'][0]:g} in {grid['crs']}",
     ]
-    warnings = (f"  Warning: {as_typed(str(text))}" for text in checked["warnings"])
+    warnings = (f"  Warning: {as_typed(text)}" for text in checked["warnings"])
     return "\n".join([f"{name}: {'; '.join(parts)}", *warnings])
 
 
@@ -206,7 +207,7 @@ def print_comparison(result: CompareResult, units: str) -> None:
     for row in rows:
         mark = "*" if row["model"] == document["recommendation"]["model"] else " "
         if row["error"]:
-            say(f"{row['model']:<{wide}}{mark} {row['parameters']:>6}    not fitted: {as_typed(str(row['error']))}")
+            say(f"{row['model']:<{wide}}{mark} {row['parameters']:>6}    not fitted: {as_typed(row['error'])}")
             continue
         rmse = row["rmse" if units == "px" else "rmse_m"]
         loo = _error(rmse["loo"]["total"] if rmse["loo"] else None)

@@ -19,6 +19,7 @@ from ortho_pipeline.estimation.family_fit import OWN, fit_family
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, families, family_of, start_model
 from ortho_pipeline.options import BlockOptions, SceneOptions
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 
 
@@ -172,8 +173,8 @@ def start_of(
         return _family_start(opened, str(name), options, table, heights)
     if options.model_crs is not None:
         raise InputError(
-            "`points.model_crs` is the ground CRS of a fitted model", field="points.model_crs",
-            remedy=f"give `points.model` with one of {', '.join(sorted(named))}",
+            Text(Setting("points.model_crs"), " is the ground CRS of a fitted model"), field="points.model_crs",
+            remedy=Text("give ", Setting("points.model"), f" with one of {', '.join(sorted(named))}"),
         )  # fmt: skip
     if name is not None and name not in opened.models:
         raise InputError(
@@ -205,7 +206,7 @@ def _family_start(
         raise InputError(
             f"the model {name!r} is fitted as a whole",
             field="points.correction",
-            remedy="leave out `points.correction`",
+            remedy=Text("leave out ", Setting("points.correction")),
         )
     size = opened.width, opened.height
     if family_of(name).variants:

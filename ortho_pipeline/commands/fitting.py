@@ -29,6 +29,7 @@ from ortho_pipeline.estimation.family_fit import ridge_of
 from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models import families
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.report import document as report
 
 
@@ -89,10 +90,9 @@ def compare(
     request = Request(image, scene, points, surface, match)
     _require_points(request)
     if points.correction is not None or points.fit_model is not None:
-        raise InputError(
-            "compare takes its models from `models`", remedy="for example `models=all`",
-            field="points.fit_model" if points.correction is None else "points.correction",
-        )  # fmt: skip
+        raise InputError(Text("compare takes its models from ", Setting("models")),
+                         remedy=Text("for example ", Setting("models", "all")),
+                         field="points.fit_model" if points.correction is None else "points.correction")  # fmt: skip
     if points.params is not None or points.prune:
         raise InputError(
             "compare fits whole models",
@@ -142,5 +142,8 @@ def _require_points(request: Request) -> None:
     if not request.has_control:
         raise InputError(
             "there are no points to fit to", field="points.gcps",
-            remedy="give a file of points with `points.gcps`, or an orthoimage to match with (`match.reference`)",
+            remedy=Text(
+                "give a file of points with ", Setting("points.gcps"), ", or an orthoimage to match with (",
+                Setting("match.reference"), ")"
+            ),
         )  # fmt: skip

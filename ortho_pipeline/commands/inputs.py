@@ -17,6 +17,7 @@ from ortho_pipeline.files import allowed
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster import source as raster
 
 #: Side-cars that GDAL would attach to an image of this stem, whatever the image itself says.
@@ -49,16 +50,18 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
         given: dict[str, Any] = dict(options.sensor_options)
         if options.rpc is not None:
             if "rpc" in given:
-                raise InputError(
-                    "the RPC is chosen twice", field="scene.rpc", remedy="leave out `scene.sensor_options.rpc=...`"
-                )
+                raise InputError("the RPC is chosen twice", field="scene.rpc",
+                                 remedy=Text("leave out ", Setting("scene.sensor_options", "...", "rpc")))  # fmt: skip
             given["rpc"] = options.rpc
         given = {name: _perhaps_elsewhere(value, options.allow_network) for name, value in given.items()}
         return plugins.open_scene(image, options.sensor, given, crop_offset=options.crop_offset, **options.access)
     if options.rpc is not None or options.sensor is not None or options.sensor_options:
         raise InputError(
             "a model file takes the place of the image's model", field="scene.model",
-            remedy="leave out `scene.rpc`, `scene.sensor` and `scene.sensor_options`",
+            remedy=Text(
+                "leave out ", Setting("scene.rpc"), ", ", Setting("scene.sensor"), " and ",
+                Setting("scene.sensor_options")
+            ),
         )  # fmt: skip
     dataset = raster.open_dataset(image, **options.access)
     plugins.Host.discover()  # model families of plugins, which the file may name
@@ -73,7 +76,11 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
             f"{size[0]} x {size[1]}",
             file=options.model,
             field="size",
-            remedy="give the model file of this image, or `scene.crop_offset=COL,ROW` if it is a crop of that one",
+            remedy=Text(
+                "give the model file of this image, or ",
+                Setting("scene.crop_offset", "COL,ROW"),
+                " if it is a crop of that one",
+            ),
         )
     scene = Scene(
         sensor=saved.sensor or "model file", path=image, width=size[0], height=size[1],
@@ -153,7 +160,7 @@ def check_paths(files: Mapping[str, Path], request: Request, overwrite: bool = F
             if stale.name.endswith(SIDE_CARS) or not files["ortho"].exists():
                 raise InputError(
                     "an old side-car lies here that GDAL would attach to the ortho", file=stale,
-                    remedy="remove it (`overwrite` does), or choose another output folder",
+                    remedy=Text("remove it (", Setting("overwrite"), " does), or choose another output folder"),
                 )  # fmt: skip
 
 

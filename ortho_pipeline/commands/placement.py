@@ -13,6 +13,7 @@ from ortho_pipeline.geodesy.crs import map_crs
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
@@ -104,7 +105,8 @@ def _grid_like(request: Request) -> Grid:
     given = [name for name in ("crs", "resolution", "extent", "align") if getattr(output, name)]
     if given:
         raise InputError(
-            f"`output.like` gives the grid, and `output.{given[0]}` would change it", field=f"output.{given[0]}",
+            Text(Setting("output.like"), " gives the grid, and ", Setting(f"output.{given[0]}"), " would change it"),
+            field=f"output.{given[0]}",
             remedy="leave out one of the two",
         )  # fmt: skip
     assert output.like is not None

@@ -39,6 +39,7 @@ from ortho_pipeline.files.traffic import bytes_read
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.raster.block_cache import cache_restored, limit_cache
@@ -264,7 +265,7 @@ def _acquired(facts: Mapping[str, Any], output: OutputOptions) -> Any:
         return acquisition_time(facts, output.acquired)
     if output.acquired is not None:
         raise InputError("only a STAC item says when", field="output.acquired",
-                         remedy="give `output.stac` too, or leave it out")  # fmt: skip
+                         remedy=Text("give ", Setting("output.stac"), " too, or leave it out"))  # fmt: skip
     return None
 
 

@@ -24,6 +24,7 @@ from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.storage.delivery import address_of, delivered
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import OutputOptions, SceneOptions
+from ortho_pipeline.options.texts import Text
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.map_scale import map_scale
@@ -249,7 +250,9 @@ def attempted(make: Callable[[], _R], files: dict[str, Path], *of_report: str) -
         remedy = "this is a fault of ortho-pipeline: please report it with the traceback"
         if isinstance(error, OrthoError):
             why, remedy = error.message, error.remedy or remedy
-        failure = ReportError(f"the report could not be made ({why}); the other outputs are complete", remedy=remedy)
+        failure = ReportError(
+            Text("the report could not be made (", why, "); the other outputs are complete"), remedy=remedy
+        )
         failure.__cause__ = error
         return failure
 

@@ -25,6 +25,7 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, PointOptions
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.points.control_hull import uncovered
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
@@ -159,25 +160,32 @@ def adjustable(request: Request) -> Resolved:
     if points.fit_model is None:
         if points.model_crs is not None:
             raise InputError(
-                "`points.model_crs` is the ground CRS of a fitted model",
+                Text(Setting("points.model_crs"), " is the ground CRS of a fitted model"),
                 field="points.model_crs",
-                remedy="give `points.fit_model`",
+                remedy=Text("give ", Setting("points.fit_model")),
             )
         if points.ridge != "auto":
             raise InputError(
-                "`points.ridge` regularises a fitted model", field="points.ridge", remedy="give `points.fit_model`"
+                Text(Setting("points.ridge"), " regularises a fitted model"),
+                field="points.ridge",
+                remedy=Text("give ", Setting("points.fit_model")),
             )
         return resolve(request)
     if scene.model is not None or points.correction is not None:
         other = "scene.model" if scene.model is not None else "points.correction"
         raise InputError(
-            f"`points.fit_model` takes the place of the image's own model, `{other}` starts from it",
+            Text(
+                Setting("points.fit_model"), " takes the place of the image's own model, ", Setting(other),
+                " starts from it"
+            ),
             field="points.fit_model",
-            remedy=f"leave out one of `points.fit_model` and `{other}`",
+            remedy=Text("leave out one of ", Setting("points.fit_model"), " and ", Setting(other)),
         )  # fmt: skip
     if not request.has_control:
         raise InputError(
-            "a model is fitted to points", field="points.gcps", remedy="give a file of points with `points.gcps`"
+            "a model is fitted to points",
+            field="points.gcps",
+            remedy=Text("give a file of points with ", Setting("points.gcps")),
         )
     if points.fit_model not in {family.name for family in families()}:
         raise InputError(
@@ -280,7 +288,11 @@ def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:
         points, tuple(names), own=own, priors=scene.priors, size=(scene.width, scene.height)
     )  # fmt: skip
     chosen = "shift" if compared.recommended is None else names[compared.recommended]
-    text = f"the correction was chosen by the matches (`points.correction` chooses another): {compared.reason}"
+    text = Text(
+        "the correction was chosen by the matches (",
+        Setting("points.correction"),
+        f" chooses another): {compared.reason}",
+    )
     return chosen, Notice("correction-by-matches", text, correction=chosen)
 
 
@@ -305,7 +317,7 @@ def _corrected(
         raise InputError(
             "a model file is an adjusted model: adjusting it again would count points twice",
             field="points.correction",
-            remedy="adjust the scene's own model with all points (leave out `scene.model`)",
+            remedy=Text("adjust the scene's own model with all points (leave out ", Setting("scene.model"), ")"),
         )
     if correction == OWN:
         scene = _by_own_parameters(scene)

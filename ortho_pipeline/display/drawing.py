@@ -14,6 +14,7 @@ from html import escape
 from typing import Any
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.options.texts import Setting, Text
 
 #: Variables of the page and what they are outside of it.
 _COLOURS = {"control": "#2563a8", "check": "#b4500b", "paper": "#ffffff", "ink": "#1b1f24", "stop": "#b3261e"}
@@ -173,7 +174,7 @@ class Drawing:
         except ImportError as error:
             raise InputError(
                 "PNG needs matplotlib, which is not installed", field="kind",
-                remedy="pip install 'ortho-pipeline[plots]', or take `kind=svg`",
+                remedy=Text("pip install 'ortho-pipeline[plots]', or take ", Setting("kind", "svg")),
             ) from error  # fmt: skip
         figure = Figure(figsize=(self.width / 100, self.height / 100), dpi=100 * scale, facecolor=_COLOURS["paper"])
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))

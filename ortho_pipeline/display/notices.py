@@ -12,13 +12,14 @@ from types import MappingProxyType
 from typing import Any, NoReturn
 
 from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.options.texts import Text
 
 _CODE = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 #: Code of a warning of a sensor that came as text alone.
 FROM_SENSOR = "from-sensor"
 
 
-class Notice(str):
+class Notice(Text):
     """A warning: the text itself, and with it a code and what it is about.
 
     What only shows warnings treats it as the text that it is; two notices of one text are equal.
@@ -52,15 +53,15 @@ class Notice(str):
         raise AttributeError(f"a notice cannot be changed: {name}")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuilt, (self.code, str(self), dict(self.fields))
+        return _rebuilt, (self.code, Text(self), dict(self.fields))
 
     def in_image(self, label: str) -> Notice:
         """Return the notice as one of an image among several."""
-        return Notice(self.code, f"image {label}: {self}", **{**self.fields, "image": label})
+        return Notice(self.code, Text(f"image {label}: ", self), **{**self.fields, "image": label})
 
     def to_json(self) -> dict[str, Any]:
         """Return code, text and fields as JSON values."""
-        return {"code": self.code, "text": str(self), **json_value(self.fields)}
+        return {"code": self.code, "text": Text(self), **json_value(self.fields)}
 
 
 def _rebuilt(code: str, text: str, fields: Mapping[str, Any]) -> Notice:
@@ -75,7 +76,7 @@ def with_code(texts: Iterable[str], code: str) -> tuple[Notice, ...]:
 def to_document(notices: Iterable[Notice]) -> dict[str, Any]:
     """Return the members `warnings` (texts) and `notices` (with codes) of a JSON document, in one order."""
     found = list(notices)
-    return {"warnings": [str(one) for one in found], "notices": [one.to_json() for one in found]}
+    return {"warnings": [Text(one) for one in found], "notices": [one.to_json() for one in found]}
 
 
 def doubted(notices: Sequence[Mapping[str, Any]]) -> frozenset[str]:

@@ -28,6 +28,7 @@ from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models import ImageCorrection, SensorModel, families, family_of
 from ortho_pipeline.models.correction import FREE
+from ortho_pipeline.options.texts import Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.control_hull import uncovered
 
@@ -258,7 +259,7 @@ class _Job:
                 name, points, crs=self.crs, size=self.size, heights=self.heights, ridge=ridge, robust=robust
             )
         except OrthoError as error:
-            return f"{error.message}{f' ({error.remedy})' if error.remedy else ''}"
+            return Text(error.message, " (", error.remedy, ")") if error.remedy else error.message
 
     def _correct(self, own: SensorModel, correction: str, points: Points, robust: bool) -> Fit:
         width, height = self.size or (0, 0)

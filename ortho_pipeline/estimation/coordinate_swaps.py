@@ -14,6 +14,7 @@ import numpy as np
 
 from ortho_pipeline.errors import CrsError, InputError
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 
 #: Residuals (px, median) above this are absurd: no vendor's model is so far off.
@@ -100,7 +101,11 @@ def refuse_swapped(model: SensorModel, points: Points, rows: int) -> None:
             "most points lie outside of the model's domain",
             file=points.source,
             field="CRS",
-            remedy="check the coordinate system of the points (`points.crs`) and that they belong to this scene",
+            remedy=Text(
+                "check the coordinate system of the points (",
+                Setting("points.crs"),
+                ") and that they belong to this scene",
+            ),
         )
 
 

@@ -14,6 +14,7 @@ from ortho_pipeline.estimation.regularisation import METHODS
 from ortho_pipeline.models import family_of, start_model
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.options import number_of
+from ortho_pipeline.options.texts import Text
 from ortho_pipeline.points import Points
 
 SensorModelT = TypeVar("SensorModelT", bound=SensorModel)
@@ -106,7 +107,7 @@ def fit_family(
             f"{family}: {error.message}",
             file=error.file,
             field=error.field,
-            remedy=f"{error.remedy}; these points do determine {simpler}",
+            remedy=Text(error.remedy or "", f"; these points do determine {simpler}"),
         ) from error
 
 

@@ -26,6 +26,7 @@ from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC, Cropped, ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options.texts import Setting, Text
 
 #: Below this part of the size for which an RPC is meant, an image is remarkably small.
 _SMALL = 0.5
@@ -50,13 +51,15 @@ class UndecidedCrop(InputError):
 
     def __init__(self, scene: Scene, offset: tuple[float, float]) -> None:
         self.scene, self.offset = scene, offset
-        moved, kept = f"`scene.crop_offset={offset[0]:g},{offset[1]:g}`", "`scene.crop_offset=0,0`"
+        moved, kept = (Setting("scene.crop_offset", f"{column:g},{row:g}") for column, row in (offset, (0, 0)))
         super().__init__(
             f"this image is a crop that begins at {_text(offset)} of a larger image, and nothing shows whether its RPC "
             "belongs to the crop or to the larger image",
             file=scene.path, field="scene.crop_offset",
-            remedy=f"give {moved} if the RPC belongs to the larger image, or {kept} if it belongs to this crop; "
-            "control points, a DEM of the crop alone, or a reference decide it too",
+            remedy=Text(
+                "give ", moved, " if the RPC belongs to the larger image, or ", kept, " if it belongs to this crop; "
+                "control points, a DEM of the crop alone, or a reference decide it too",
+            ),
         )  # fmt: skip
         self.choices = ((moved, "the RPC belongs to the larger image"), (kept, "the RPC belongs to this crop"))
 
@@ -194,10 +197,15 @@ def _with_models_moved(scene: Scene, offset: tuple[float, float]) -> Scene:
 def _settled(scene: Scene, offset: tuple[float, float], is_moved: bool, why: str) -> Scene:
     where = f"this image is a crop that begins at {_text(offset)} of a larger image"
     if is_moved:
-        text = f"{where}, and its model was moved there ({why}); if it belongs to the crop: `scene.crop_offset=0,0`"
+        text = Text(
+            f"{where}, and its model was moved there ({why}); if it belongs to the crop: ",
+            Setting("scene.crop_offset", "0,0"),
+        )
         return _moved(scene, offset, Notice("crop-noted", text, offset=offset))
-    other = f"`scene.crop_offset={offset[0]:g},{offset[1]:g}`"
-    text = f"{where}, and its model belongs to the crop ({why}); if it belongs to the larger image: {other}"
+    text = Text(
+        f"{where}, and its model belongs to the crop ({why}); if it belongs to the larger image: ",
+        Setting("scene.crop_offset", f"{offset[0]:g},{offset[1]:g}"),
+    )
     return replace(scene, warnings=(*scene.warnings, Notice("crop-kept", text, offset=offset)))
 
 
@@ -277,10 +285,11 @@ def _elsewhere(scene: Scene) -> Notice | None:
     if all(first <= side and last >= 0 for (first, last), side in zip(ranges, size, strict=True)):
         return None
     (left, right), (top, bottom) = ranges
-    text = (
+    text = Text(
         f"the RPC is for columns {left:.0f} to {right:.0f} and rows {top:.0f} to {bottom:.0f}, which does not meet "
         f"this image of {scene.width} x {scene.height} pixels: is it a crop with the RPC of the whole? Say where "
-        "it lies with `scene.crop_offset=COL,ROW`"
+        "it lies with ",
+        Setting("scene.crop_offset", "COL,ROW"),
     )
     return Notice("rpc-elsewhere", text, **dict(zip(("columns", "rows"), ranges.tolist(), strict=True)))
 
@@ -295,10 +304,11 @@ def _small(scene: Scene) -> Notice | None:
     small = scene.width < _SMALL * sizes[0] or scene.height < _SMALL * sizes[1]
     if not (begins and small):
         return None
-    text = (
+    text = Text(
         f"the image has {scene.width} x {scene.height} pixels, its RPC is for about {sizes[0]:.0f} x {sizes[1]:.0f}: "
         "if it was cut out of that image, the RPC is right for it only if both begin at the same corner; say where it "
-        "lies with `scene.crop_offset=COL,ROW`"
+        "lies with ",
+        Setting("scene.crop_offset", "COL,ROW"),
     )
     return Notice("maybe-a-crop", text, rpc_size=sizes)
 

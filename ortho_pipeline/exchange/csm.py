@@ -21,6 +21,7 @@ from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import parse_json, read_bounded
 from ortho_pipeline.geodesy.ellipsoid import SEMI_MAJOR
 from ortho_pipeline.models.base import Array, SensorModel, ground_of_grid
+from ortho_pipeline.options.texts import Setting, Text
 
 LINE_SCANNER, FRAME = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL", "USGS_ASTRO_FRAME_SENSOR_MODEL"
 _NAMES = (LINE_SCANNER, FRAME)
@@ -161,7 +162,10 @@ def csm_text(model: SensorModel, *, force: bool = False) -> tuple[str, float]:
     else:
         raise InputError(
             f"a model of kind {model.kind!r} has no CSM state: line scanners and frames have one", field="formats",
-            remedy="take a rigorous model, adjusted by its own parameters (`fit.correction=model`), or another format",
+            remedy=Text(
+                "take a rigorous model, adjusted by its own parameters (", Setting("points.correction", "model"),
+                "), or another format"
+            ),
         )  # fmt: skip
     # What refraction does at other heights a state cannot have: stated, but no reason to refuse it.
     middle = _apart(model, again, size, (model.reference_height - 1.0, model.reference_height + 1.0))
@@ -169,7 +173,7 @@ def csm_text(model: SensorModel, *, force: bool = False) -> tuple[str, float]:
     if not middle <= CLOSE and not force:
         raise InputError(
             f"the state would be {middle:.2g} px off the model, whose lens it cannot have", field="formats",
-            remedy="accept it with `force`, or write an RPC",
+            remedy=Text("accept it with ", Setting("force"), ", or write an RPC"),
         )  # fmt: skip
     return f"{name}\n{json.dumps({'m_modelName': name, **fields}, indent=2, sort_keys=True)}\n", worst
 

@@ -16,6 +16,7 @@ from ortho_pipeline.exchange.rpc import (
 )
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.output import close, raster_output, written
 from ortho_pipeline.surface.base import Surface
@@ -56,7 +57,9 @@ def gcps_of_model(
     if len(gcps) < 4:
         raise InputError(
             "the rays of the image do not meet the ground: there is no grid of control points", field="model",
-            remedy="give the metadata of this very image, and a DEM or `surface.height` that lies under it",
+            remedy=Text(
+                "give the metadata of this very image, and a DEM or ", Setting("surface.height"), " that lies under it"
+            ),
         )  # fmt: skip
     return gcps
 
@@ -149,7 +152,10 @@ def write_geolocation(
         raise InputError(
             "some rays of the image do not meet the ground: geolocation arrays would have holes",
             field="model" if surface is None else "surface.dem",
-            remedy="give the metadata of this very image, and a DEM that covers the whole scene, or `surface.height`",
+            remedy=Text(
+                "give the metadata of this very image, and a DEM that covers the whole scene, or ",
+                Setting("surface.height")
+            ),
         )  # fmt: skip
     arrays = path.parent.resolve() / f"{path.stem}.tif"
     with raster_output(arrays) as temporary:

@@ -12,6 +12,7 @@ from ortho_pipeline.files import read_json, write_json
 from ortho_pipeline.files.documents import software_version
 from ortho_pipeline.models import model_from_dict, require_view
 from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.options.texts import Setting, Text
 
 SCHEMA_VERSION = 1
 DOCUMENT = "ortho-pipeline model"
@@ -101,7 +102,7 @@ def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
         raise InputError(
             "this is not a model file of ortho-pipeline",
             file=path,
-            remedy="give a <stem>_model.json; RPC files go to `scene.rpc`",
+            remedy=Text("give a <stem>_model.json; RPC files go to ", Setting("scene.rpc")),
         )
     if version != SCHEMA_VERSION:
         raise InputError(

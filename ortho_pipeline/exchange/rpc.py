@@ -31,6 +31,7 @@ from ortho_pipeline.files.locations import VsiPath, place
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.output import close, raster_output, written
 from ortho_pipeline.raster.source import open_dataset
 
@@ -118,7 +119,7 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
     damaged = ", ".join(_unreadable_beside(place(name))) if choice != "tag" else ""
     raise InputError(
         f"there is no {what}" + (f" that can be read: {damaged} is damaged or encrypted" if damaged else ""),
-        file=name, field="scene.rpc", remedy="give the RPC file with `scene.rpc=FILE`",
+        file=name, field="scene.rpc", remedy=Text("give the RPC file with ", Setting("scene.rpc", "FILE")),
     )  # fmt: skip
 
 
@@ -142,7 +143,10 @@ def _refuse_unread_sidecar(dataset: gdal.Dataset) -> None:
         if file.is_file():
             files.read_bounded(
                 file, 1_000_000, field="scene.rpc",
-                remedy="copy it again from the delivery, or choose another RPC: `scene.rpc=tag`, `scene.rpc=FILE`",
+                remedy=Text(
+                    "copy it again from the delivery, or choose another RPC: ", Setting("scene.rpc", "tag"), ", ",
+                    Setting("scene.rpc", "FILE")
+                ),
             )  # fmt: skip
 
 
@@ -209,7 +213,14 @@ def _check_agreement(sidecar: RPC, tag: RPC, sidecar_name: str, name: str) -> No
             f"the RPC of the file and that of {sidecar_name} differ {apart} at the centre of the scene",
             file=name,
             field="scene.rpc",
-            remedy="choose one: `scene.rpc=tag`, `scene.rpc=sidecar`, or `scene.rpc=FILE`",
+            remedy=Text(
+                "choose one: ",
+                Setting("scene.rpc", "tag"),
+                ", ",
+                Setting("scene.rpc", "sidecar"),
+                ", or ",
+                Setting("scene.rpc", "FILE"),
+            ),
         )
 
 

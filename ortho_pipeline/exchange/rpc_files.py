@@ -26,6 +26,7 @@ from ortho_pipeline import files
 from ortho_pipeline.errors import InputError, completed, reads
 from ortho_pipeline.files.locations import VsiPath
 from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.options.texts import Setting, Text
 
 #: Files of more bytes are refused unread: XML, and the other formats, of which 20 kB are usual.
 MAX_SIZE, MAX_PLAIN = 5_000_000, 1_000_000
@@ -74,7 +75,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
 # Bounded, so that no hostile file makes it slow.
 _RPB_ITEM = re.compile(r"(\w{1,40})[ \t]*=[ \t]*(?:\(([^()]{0,8000})\)|\"([^\"\n]{0,200})\"|([^;\n(\"]{0,200}))\s*;")
 _CENTRE = 0.5
-_REMEDY = "give the RPC file as the vendor delivers it, or another one (`scene.rpc=FILE`)"
+_REMEDY = Text("give the RPC file as the vendor delivers it, or another one (", Setting("scene.rpc", "FILE"), ")")
 
 
 # -- reading ---------------------------------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from urllib.parse import unquote
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.traffic import COUNTING
+from ortho_pipeline.options.texts import Setting, Text
 
 #: Kinds of URL and GDAL's name for the file system that reads them.
 SCHEMES = {"http": "/vsicurl/http://", "https": "/vsicurl/https://", "s3": "/vsis3/", "gs": "/vsigs/", "az": "/vsiaz/"}
@@ -332,7 +333,7 @@ def require_network(address: str, allowed: bool, *, paged: bool = False) -> None
     if not allowed:
         raise InputError(
             "files of the network are not opened unasked", file=address,
-            remedy="allow them with `scene.allow_network`",
+            remedy=Text("allow them with ", Setting("scene.allow_network")),
         )  # fmt: skip
     _open_network()
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.options.texts import Setting, Text
 
 #: Bytes of address space that any command needs beside its windows: libraries, compiled kernels, grids of PROJ.
 LEAST = 256 << 20
@@ -81,7 +82,13 @@ def require_memory(size: int = LEAST, threads: int = 0) -> None:
             f"there is not enough memory: a limit on this process leaves {max(0, limit - used) >> 20} MB of address "
             f"space, and the work takes {needed >> 20} MB",
             field="ulimit -v",
-            remedy="raise the limit, or give less work at once (`output.memory=MB`, `output.threads=1`)",
+            remedy=Text(
+                "raise the limit, or give less work at once (",
+                Setting("output.memory", "MB"),
+                ", ",
+                Setting("output.threads", "1"),
+                ")",
+            ),
         )
 
 
@@ -134,7 +141,9 @@ def claim_gdal_threads() -> None:
     if _Pool.process != os.getpid():
         raise OrthoError(
             "this process was forked from one in which GDAL's threads were running, and they do not run here",
-            remedy="start processes with multiprocessing.get_context('spawn'), or give `output.threads=1`",
+            remedy=Text(
+                "start processes with multiprocessing.get_context('spawn'), or give ", Setting("output.threads", "1")
+            ),
         )
 
 

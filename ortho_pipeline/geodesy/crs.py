@@ -30,6 +30,7 @@ from pyproj.transformer import AreaOfInterest, Transformer, TransformerGroup
 from ortho_pipeline.errors import CrsError, DatumError, OrthoError
 from ortho_pipeline.geodesy.crs_gate import refuse_files
 from ortho_pipeline.geodesy.geoid_grid import header_fault, refuse_absurd, refuse_unread
+from ortho_pipeline.options.texts import Setting, Text
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -195,7 +196,7 @@ class Vertical:
         if not _BARE_NAME.fullmatch(name):
             raise DatumError(
                 f"{name[:80]!r} is the path of a grid, which is not opened because a file names it", field="vertical",
-                remedy="give the grid as `points.vertical=FILE`",
+                remedy=Text("give the grid as ", Setting("points.vertical", "FILE")),
             )  # fmt: skip
         vertical_transformer(name)
         return cls(name)

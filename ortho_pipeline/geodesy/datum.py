@@ -6,6 +6,7 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DatumError
 from ortho_pipeline.geodesy.crs import VERTICAL_FORMS, Vertical
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical
+from ortho_pipeline.options.texts import Setting, Text
 
 _SURVEY_FOOT = 1200 / 3937
 #: Length in metres of the units of heights, by name without blanks and punctuation.
@@ -19,8 +20,8 @@ UNITS = (
 
 def dem_vertical_remedy(first: str = "") -> str:
     """Return the advice to state the height datum by option, after another advice if there is one."""
-    option = f"say what the heights are measured above with `surface.vertical` ({VERTICAL_FORMS})"
-    return f"{first}; or {option}" if first else option
+    option = Text("say what the heights are measured above with ", Setting("surface.vertical"), f" ({VERTICAL_FORMS})")
+    return Text(first, "; or ", option) if first else option
 
 
 def dem_vertical(
@@ -67,21 +68,20 @@ def dem_vertical(
         return declared.vertical, [] if declared.certain else [by_name]
     if option == declared.vertical:
         return option, []
-    warning = Notice(
-        "dem-datum-overridden",
-        f"the DEM declares its heights as {declared.name!r}; {option.label} was used as `surface.vertical` says",
-        declared=declared.name,
-        used=option.name,
-    )
+    told, asked = f"the DEM declares its heights as {declared.name!r}", Setting("surface.vertical")
+    used = Text(f"{told}; {option.label} was used as ", asked, " says")
+    warning = Notice("dem-datum-overridden", used, declared=declared.name, used=option.name)
     # A grid file is how a user brings the geoid of a declared datum whose own grid is not installed.
     realises = declared.vertical is not None and not declared.vertical.is_ellipsoid and ":" not in option.name[:5]
     realises = realises and not option.is_ellipsoid
     if declared.certain and not override and not realises:
         raise DatumError(
-            f"the DEM declares its heights as {declared.name!r}, `surface.vertical` says {option.label}",
+            Text(f"{told}, ", asked, f" says {option.label}"),
             file=path,
             field="surface.vertical",
-            remedy="leave the option out, or override what the file declares with `surface.override_vertical`",
+            remedy=Text(
+                "leave the option out, or override what the file declares with ", Setting("surface.override_vertical")
+            ),
         )
     return option, [warning]
 

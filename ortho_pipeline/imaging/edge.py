@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.options.texts import Setting, Text
 
 Array = NDArray[np.float64]
 Segment = tuple[tuple[float, float], tuple[float, float]]
@@ -34,7 +35,7 @@ BIN = 0.25
 APERTURE = math.sqrt(1 / 12)
 #: Least step of an edge, in standard deviations of the pixels beside it.
 _CONTRAST = 5.0
-_NO_EDGE_REMEDY = "give an edge between two even areas with `edge=x1,y1,x2,y2`"
+_NO_EDGE_REMEDY = Text("give an edge between two even areas with ", Setting("edge", "x1,y1,x2,y2"))
 
 
 @dataclass(frozen=True, eq=False)

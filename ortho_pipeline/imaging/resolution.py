@@ -20,6 +20,7 @@ from ortho_pipeline.display.drawing import Axes, Drawing
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.imaging.edge import HALF_WIDTH, Array, Edge, Segment, analyse_edge, said
 from ortho_pipeline.options import numbers_of
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.source import RasterSource
 
 SCHEMA_VERSION = 1
@@ -157,7 +158,7 @@ def measure(
         raise InputError(
             "no straight edge between even areas, turned against the pixel axes, was found",
             file=source.path,
-            remedy="give one with `edge=x1,y1,x2,y2`",
+            remedy=Text("give one with ", Setting("edge", "x1,y1,x2,y2")),
         )
     return _distinct(found, _MOST)
 

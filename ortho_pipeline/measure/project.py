@@ -25,6 +25,7 @@ from ortho_pipeline.measure.marks import GROUND_CRS, History, Mark, Marks, Writt
 from ortho_pipeline.measure.places import Geometry, Places, Sheet, ground_typed, linked
 from ortho_pipeline.measure.planning import Next
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.surface.base import Surface
 
 #: What is appended to the name of the points for their journal.
@@ -248,7 +249,8 @@ class Project(_Shown):
             elif source is not None and source != self.journal.actions[0].get("source"):
                 raise InputError(
                     "there is a journal of these points, which began with others", file=self.journal.path,
-                    field="points.gcps", remedy="leave out `points.gcps` to go on, or choose another output",
+                    field="points.gcps",
+                    remedy=Text("leave out ", Setting("points.gcps"), " to go on, or choose another output"),
                 )  # fmt: skip
             with completed(self.journal.path, remedy=JOURNAL_REMEDY):
                 count = self._take(self.journal.actions)
@@ -285,7 +287,8 @@ class Project(_Shown):
         given = self._given()
         if given is None and self.output.exists():
             raise InputError("there are points here, and no journal of them", file=self.output, field="output",
-                             remedy="give them as `points.gcps` to go on, or choose another output")  # fmt: skip
+                             remedy=Text("give them as ", Setting("points.gcps"), " to go on, or choose another "
+                                         "output"))  # fmt: skip
         return {"do": "begin", "marks": [json_value(mark) for mark in given or ()], "source": self._source(),
                 "image": self._identity(), "at": now()}  # fmt: skip
 

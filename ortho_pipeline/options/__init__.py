@@ -1,9 +1,8 @@
 """Options of a user, grouped as the pipeline takes them.
 
 Each option is stated here, once: its field and default, and in an `Option` what the command line and the pipeline file
-make their own options from. Messages name an option as ``group.field`` between backticks, with a value after an equals
-sign where one is meant (``surface.height=500``): so it is called in Python and in the pipeline file, and the command
-line shows its flag.
+make their own options from. Messages name an option by a `texts.Setting`: as ``group.field``, which it is called in
+Python and in the pipeline file, and of which the command line shows the flag.
 
 Imports nothing but `errors`. A new option is a field in `groups`.
 """

@@ -15,6 +15,7 @@ from ortho_pipeline.options.option import (
     PathLike,
     documented,
 )
+from ortho_pipeline.options.texts import Setting, Text
 
 
 @documented
@@ -184,8 +185,9 @@ class BlockOptions:
     ] = None
     ties: Annotated[
         str | None,
-        Option("--ties", "Find tie points between the images by matching, besides those of `points.points`.",
-               choices=("auto",)),
+        Option("--ties", Text(
+            "Find tie points between the images by matching, besides those of ", Setting("points.points"), "."
+        ), choices=("auto",)),
     ] = None  # fmt: skip
     gcps: Annotated[
         PathLike | None, Option("--gcps", "Ground of the points: CSV (id,x,y,h,...) or GeoJSON.", "FILE")
@@ -248,7 +250,10 @@ class SurfaceOptions:
     ] = None
     override_vertical: Annotated[
         bool,
-        Option("--override-dem-vertical", "Believe `surface.vertical` even where the DEM declares another datum."),
+        Option(
+            "--override-dem-vertical",
+            Text("Believe ", Setting("surface.vertical"), " even where the DEM declares another datum."),
+        ),
     ] = False
     fill: Annotated[
         str,
@@ -272,8 +277,10 @@ class SurfaceOptions:
     source: Annotated[
         PathLike | None,
         Option(
-            "--dem-source", "Where `surface.dem=auto` finds cells: a folder of them, or an address (https, s3, gs, "
-            "az).", "DIR|URL", unset="the environment variable ORTHO_DEM_SOURCE, or the public bucket",
+            "--dem-source", Text(
+                "Where ", Setting("surface.dem", "auto"),
+                " finds cells: a folder of them, or an address (https, s3, gs, az)."
+            ), "DIR|URL", unset="the environment variable ORTHO_DEM_SOURCE, or the public bucket",
         ),
     ] = None  # fmt: skip
 
@@ -309,7 +316,7 @@ class OutputOptions:
         ),
     ] = None  # fmt: skip
     align: Annotated[
-        bool, Option("--align -tap", "Widen `output.extent` to whole multiples of the resolution.")
+        bool, Option("--align -tap", Text("Widen ", Setting("output.extent"), " to whole multiples of the resolution."))
     ] = False  # fmt: skip
     resampling: Annotated[str, Option("--resampling -r", choices=RESAMPLING)] = "bilinear"
     bands: Annotated[
@@ -366,8 +373,10 @@ class OutputOptions:
     accuracy_raster: Annotated[
         bool,
         Option(
-            "--accuracy-raster", "Write a raster of how accurate the ortho is at each place; `surface.sigma` says how "
-            "good the heights are.",
+            "--accuracy-raster", Text(
+                "Write a raster of how accurate the ortho is at each place; ", Setting("surface.sigma"),
+                " says how good the heights are."
+            ),
         ),
     ] = False  # fmt: skip
     visibility: Annotated[
@@ -380,7 +389,9 @@ class OutputOptions:
     fill_from: Annotated[
         PathLike | None,
         Option(
-            "--fill-from", "Fill what `output.visibility` leaves empty from this ortho, on any grid.",
+            "--fill-from", Text(
+                "Fill what ", Setting("output.visibility"), " leaves empty from this ortho, on any grid."
+            ),
             "ORTHO", kind="file",
         ),
     ] = None  # fmt: skip
@@ -394,8 +405,8 @@ class OutputOptions:
     sun: Annotated[
         Sequence[float] | None,
         Option(
-            "--sun", "Azimuth and elevation of the sun, degrees, for `output.angles`.", "AZ,EL", kind="pair",
-            unset="that of the metadata",
+            "--sun", Text("Azimuth and elevation of the sun, degrees, for ", Setting("output.angles"), "."), "AZ,EL",
+            kind="pair", unset="that of the metadata",
         ),
     ] = None  # fmt: skip
     layer_step: Annotated[
@@ -472,7 +483,9 @@ class MatchOptions:
     gcps_as: Annotated[
         str,
         Option(
-            "--gcps-as", "What `points.gcps` are beside matches: a test that takes no part, or control too.",
+            "--gcps-as", Text(
+                "What ", Setting("points.gcps"), " are beside matches: a test that takes no part, or control too."
+            ),
             choices=("check", "control"),
         ),
     ] = "check"  # fmt: skip

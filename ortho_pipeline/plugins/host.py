@@ -15,13 +15,20 @@ from ortho_pipeline.errors import InputError, OrthoError, PluginError, Terminate
 from ortho_pipeline.exchange.crop import placed
 from ortho_pipeline.hookspecs import Scene, Sensor, Study
 from ortho_pipeline.models import KINDS
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.plugins.contract import described, scene_faults
 from ortho_pipeline.plugins.registry import Broken, Provenance, Registry
 from ortho_pipeline.plugins.unread import unread
 from ortho_pipeline.raster.source import open_dataset
 
 _COPY_IT = "correct what the file says there, or copy it again from the delivery"
-_COPY_AGAIN = "copy the metadata again from the delivery, or give a sound model (`scene.rpc=FILE`, `scene.model=FILE`)"
+_COPY_AGAIN = Text(
+    "copy the metadata again from the delivery, or give a sound model (",
+    Setting("scene.rpc", "FILE"),
+    ", ",
+    Setting("scene.model", "FILE"),
+    ")",
+)
 _TEST_IT = "its author: run ortho_pipeline.testing.check_sensor on this file"
 log = logging.getLogger(__name__)
 
@@ -173,7 +180,7 @@ class Host:
                     f"the sensor {chosen.name!r} has no option {name!r} (its options: {declared})",
                     file=path,
                     field=name,
-                    remedy="see `ortho sensors`, or choose another sensor with `scene.sensor=NAME`",
+                    remedy=Text("see `ortho sensors`, or choose another sensor with ", Setting("scene.sensor", "NAME")),
                 )
         try:
             with completed(path, remedy=_COPY_IT):
@@ -206,7 +213,9 @@ class Host:
             raise PluginError(
                 f"{self._name(sensor)} failed while looking at the dataset ({described(error, sensor.recognises)})",
                 file=dataset.GetDescription(),
-                remedy="choose the sensor yourself with `scene.sensor=NAME`, or uninstall that plugin",
+                remedy=Text(
+                    "choose the sensor yourself with ", Setting("scene.sensor", "NAME"), ", or uninstall that plugin"
+                ),
             ) from error
 
     def _name(self, sensor: Sensor) -> str:
@@ -271,7 +280,9 @@ def _not_one(found: list[Sensor], sensors: Iterable[Sensor], dataset: Any) -> In
     if found:
         names = ", ".join(item.name for item in found)
         return InputError(
-            f"several sensors recognise it: {names}", file=path, remedy="choose one with `scene.sensor=NAME`"
+            f"several sensors recognise it: {names}",
+            file=path,
+            remedy=Text("choose one with ", Setting("scene.sensor", "NAME")),
         )
     if beside := unread(dataset):
         return InputError(
@@ -283,6 +294,10 @@ def _not_one(found: list[Sensor], sensors: Iterable[Sensor], dataset: Any) -> In
     return InputError(
         f"no sensor recognises it (installed: {names})",
         file=path,
-        remedy=f"choose one with `scene.sensor=NAME`, which says what it needs{hint}, or give the RPC file with "
-        "`scene.rpc=FILE`",
+        remedy=Text(
+            "choose one with ",
+            Setting("scene.sensor", "NAME"),
+            f", which says what it needs{hint}, or give the RPC file with ",
+            Setting("scene.rpc", "FILE"),
+        ),
     )

@@ -12,16 +12,21 @@ from typing import Any, NamedTuple
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import place
+from ortho_pipeline.options.texts import Setting, Text
 
 _RECONSTRUCTIONS = ("reconstruction.json", "opensfm/reconstruction.json")
 #: Names of orthority's files of cameras and of orientations.
 _INTERIOR, _EXTERIOR = re.compile(r"int_param.*\.ya?ml$", re.I), re.compile(r"ext_param.*\.(geojson|csv)$", re.I)
 _NUMBERS = r"(?:[\s,;]+[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?){6}"
 _TABLE_BYTES = 1_000_000
-_BY_HAND = (
-    "this version reads a camera file (JSON) and a table of orientations (CSV): write them as docs/formats/frame.md "
-    "shows, and give `scene.sensor_options.camera=FILE` `scene.sensor_options.exterior=FILE` "
-    "`scene.sensor_options.vertical=DATUM`"
+_BY_HAND = Text(
+    "this version reads a camera file (JSON) and a table of orientations (CSV): write them as ",
+    "docs/formats/frame.md shows, and give ",
+    Setting("scene.sensor_options", "FILE", key="camera"),
+    " ",
+    Setting("scene.sensor_options", "FILE", key="exterior"),
+    " ",
+    Setting("scene.sensor_options", "DATUM", key="vertical"),
 )
 
 
@@ -38,10 +43,14 @@ def unread(dataset: Any) -> Unread | None:
     if isinstance(image, Path):
         for file in (folder / name for folder in (image.parent, image.parent.parent) for name in _RECONSTRUCTIONS):
             if file.is_file():
-                options = f"`scene.sensor_options.exterior={file}` `scene.sensor_options.vertical=ellipsoid`"
+                options = Text(
+                    Setting("scene.sensor_options", str(file), key="exterior"),
+                    " ",
+                    Setting("scene.sensor_options", "ellipsoid", key="vertical"),
+                )
                 return Unread(
                     f"it lies in an OpenDroneMap or OpenSfM project ({file})",
-                    f"name the reconstruction: {options}, or the datum of its altitudes in place of ellipsoid",
+                    Text("name the reconstruction: ", options, ", or the datum of its altitudes in place of ellipsoid"),
                 )
         if files := list(_of_orthority(image.parent)):
             return Unread(f"it lies in an orthority project ({', '.join(files)})", _BY_HAND)

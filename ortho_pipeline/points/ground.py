@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.geodesy.crs import VERTICAL_FORMS, Vertical, ground_transform, horizontal, parse_crs, same_crs
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points.rows import Table
 
 Array = NDArray[np.float64]
@@ -57,13 +58,16 @@ def _crs_of(path: str | os.PathLike[str], table: Table, option: str | pyproj.CRS
     given = None if option is None else parse_crs(option)
     if stated is None and given is None:
         raise CrsError(
-            "the CRS of these points is not known", file=path, field="points.crs", remedy="give `points.crs=EPSG:n`"
+            "the CRS of these points is not known",
+            file=path,
+            field="points.crs",
+            remedy=Text("give ", Setting("points.crs", "EPSG:n")),
         )
     if stated is None or given is None:
         return given if stated is None else stated  # type: ignore[return-value]
     if not same_crs(_plan(stated), _plan(given)):
         raise CrsError(
-            f"the file says {stated.name!r}, `points.crs` says {given.name!r}",
+            Text(f"the file says {stated.name!r}, ", Setting("points.crs"), f" says {given.name!r}"),
             file=path,
             field="points.crs",
             remedy="leave the option out",
@@ -98,7 +102,9 @@ def _from_geocentric(
         x, y, z = ground[first]
         raise InputError(
             f"X {x:.12g}, Y {y:.12g}, Z {z:.12g} is not on Earth", file=path, field=wheres[first],
-            remedy="geocentric points need x, y and h (Z) in metres; other coordinates another `points.crs`",
+            remedy=Text(
+                "geocentric points need x, y and h (Z) in metres; other coordinates another ", Setting("points.crs")
+            ),
         )  # fmt: skip
     return placed, pyproj.CRS.from_epsg(4326)
 
@@ -123,7 +129,11 @@ def _vertical_of(
     certain = stated or said
     if given is not None and certain is not None and given != certain:
         raise DatumError(
-            f"the heights of these points are in {certain.label}, `points.vertical` says {given.label}",
+            Text(
+                f"the heights of these points are in {certain.label}, ",
+                Setting("points.vertical"),
+                f" says {given.label}",
+            ),
             file=path,
             field="points.vertical",
             remedy="leave the option out",
@@ -138,7 +148,7 @@ def _vertical_of(
             "it is not known what the heights of these points are measured above",
             file=path,
             field="points.vertical",
-            remedy=f"say it with `points.vertical` ({VERTICAL_FORMS})",
+            remedy=Text("say it with ", Setting("points.vertical"), f" ({VERTICAL_FORMS})"),
         )
     return found, unit
 
@@ -165,7 +175,7 @@ def _ellipsoidal(
             f"the geoid of {vertical.label} does not reach this point",
             file=path,
             field=wheres[int(np.flatnonzero(outside)[0])],
-            remedy="check its coordinates and `points.crs`",
+            remedy=Text("check its coordinates and ", Setting("points.crs")),
         )
     out = ground.copy()
     out[given, 2] += undulation[given]
@@ -193,5 +203,7 @@ def _check_places(path: str | os.PathLike[str], crs: pyproj.CRS, wheres: Sequenc
                     f"longitude {x}, latitude {y} is not on Earth",
                     file=path,
                     field=where,
-                    remedy="x is longitude and y latitude; projected coordinates need another `points.crs`",
+                    remedy=Text(
+                        "x is longitude and y latitude; projected coordinates need another ", Setting("points.crs")
+                    ),
                 )

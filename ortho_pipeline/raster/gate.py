@@ -27,6 +27,7 @@ from ortho_pipeline.files.beside import ask_beside
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, VsiPath, in_local_archive, network_is_closed, place, within
 from ortho_pipeline.geodesy.crs_gate import refuse_files
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.references import NAMES_OF, PLAIN_VRT, Named, crs_texts, products_of_volume
 
 gdal.UseExceptions()
@@ -59,10 +60,7 @@ _ENDINGS = {".til": "TIL", ".hgt": "SRTMHGT", ".ers": "ERS", ".pix": "PCIDSK"}
 _BEGINNING = 4096
 _MANY = 10_000
 _OVERVIEWS = "OVERVIEWS"
-_OUTSIDE = (
-    "name a folder that holds both with `scene.roots={root}`, put the files into one folder, or make one file of them "
-    "(gdal_translate in out.tif)"
-)
+_OUTSIDE = ", put the files into one folder, or make one file of them (gdal_translate in out.tif)"
 
 
 def open_seen(
@@ -323,7 +321,8 @@ class _Gate:
         root = "DIR" if path is None else os.path.commonpath([path.parent, Path(by).resolve().parent])
         raise InputError(
             f"this file reads {name[:200]!r}, which is outside of its own folder",
-            file=by, field=field, remedy=_OUTSIDE.format(root=root),
+            file=by, field=field,
+            remedy=Text("name a folder that holds both with ", Setting("scene.roots", root), _OUTSIDE),
         )  # fmt: skip
 
     @staticmethod

@@ -18,6 +18,7 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.files.process_limits import Progress, claim_gdal_threads
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.output import abandon, check_written, checked_options, close, gdal_errors
 from ortho_pipeline.raster.source import Grid, RasterSource, holds, pixel_type
 
@@ -89,12 +90,14 @@ def _given_nodata(value: float, dtype: np.dtype[Any], source: RasterSource) -> f
     if source.validity == "alpha":
         raise InputError(
             "the image says by its alpha band which pixels are valid", file=source.path, field="output.nodata",
-            remedy="leave out `output.nodata`, or choose the other bands with `output.bands`",
+            remedy=Text(
+                "leave out ", Setting("output.nodata"), ", or choose the other bands with ", Setting("output.bands")
+            ),
         )  # fmt: skip
     if not holds(dtype, value):
         raise InputError(
             f"pixels of the type {dtype} cannot have the value {value:g}", field="output.nodata",
-            remedy="give another value, or another type with `output.dtype`",
+            remedy=Text("give another value, or another type with ", Setting("output.dtype")),
         )  # fmt: skip
     return value
 
@@ -103,7 +106,7 @@ def _kept_nodata(value: float | None, dtype: np.dtype[Any], source: RasterSource
     if value is not None and not holds(dtype, value):
         raise InputError(
             f"the image's nodata value {value:g} does not fit into {dtype}", file=source.path, field="output.dtype",
-            remedy="say with `output.nodata` what pixels without an image shall be",
+            remedy=Text("say with ", Setting("output.nodata"), " what pixels without an image shall be"),
         )  # fmt: skip
     return value
 
@@ -175,8 +178,10 @@ def refuse_empty(valid_pixels: int, path: str | os.PathLike[str]) -> None:
     if not valid_pixels:
         raise InputError(
             "no pixel of this ortho has a value", file=path,
-            remedy="check the extent, the heights (`surface.height`, or the DEM's place, datum and unit), and the "
-            "nodata value and mask of the image",
+            remedy=Text(
+                "check the extent, the heights (", Setting("surface.height"),
+                ", or the DEM's place, datum and unit), and the nodata value and mask of the image"
+            ),
         )  # fmt: skip
 
 

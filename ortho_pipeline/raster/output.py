@@ -24,6 +24,7 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.files.locations import VsiPath
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.source import first_line, open_dataset
 
 #: Blocks of a file that are read again before it gets its name.
@@ -272,7 +273,10 @@ def checked_options(driver: str, given: dict[str, str], threads: int, side: int 
         if key not in _LAYOUT:
             raise InputError(
                 f"the creation option {key} is not taken: it does more than lay out the file", field="creation option",
-                remedy="grid and CRS of an ortho are options of their own (`output.crs`, `output.resolution`)",
+                remedy=Text(
+                    "grid and CRS of an ortho are options of their own (", Setting("output.crs"), ", ",
+                    Setting("output.resolution"), ")"
+                ),
             )  # fmt: skip
         if not _PLAIN_VALUE.fullmatch(value) or not _fits(known[key], value):
             values = ", ".join(choice.text or "" for choice in known[key].findall("Value")) or known[key].get("type")

@@ -21,6 +21,7 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError, counted, reads
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.naming import crs_text
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import MEMORY, Grid, RasterSource, first_line, open_dataset
 
@@ -86,7 +87,9 @@ class Regridded:
         if own != wanted:
             raise InputError(
                 f"this ortho has {own}, where {wanted} would be filled", file=self.path,
-                remedy="make it of the same bands and type (`output.bands`, `output.dtype`)",
+                remedy=Text(
+                    "make it of the same bands and type (", Setting("output.bands"), ", ", Setting("output.dtype"), ")"
+                ),
             )  # fmt: skip
 
     def read(self, left: int, top: int, width: int, height: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:

@@ -28,6 +28,7 @@ from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, VsiPath, archive_of, check_path, in_local_archive, located, members
 from ortho_pipeline.files.process_limits import require_memory
 from ortho_pipeline.options import PIXEL_TYPES
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.block_cache import keep_blocks
 from ortho_pipeline.raster.gate import DRIVERS, DecodedUnit, open_seen
 
@@ -95,10 +96,9 @@ def open_pixels(
     if block.size > memory:
         raise InputError(
             f"one block of this raster is {block.size / 1e6:,.0f} MB when it is unpacked, which is beyond the "
-            f"{memory / 1e6:,.0f} MB of memory allowed",
-            file=block.path, field="block size",
-            remedy="tile it (gdal_translate -co TILED=YES in.tif out.tif), or for an image give a larger "
-            "`output.memory=MB`",
+            f"{memory / 1e6:,.0f} MB of memory allowed", file=block.path, field="block size",
+            remedy=Text("tile it (gdal_translate -co TILED=YES in.tif out.tif), or for an image give a larger ",
+                        Setting("output.memory", "MB")),
         )  # fmt: skip
     keep_blocks(block.size)
     return dataset, block.size

@@ -16,6 +16,7 @@ from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import counted
 from ortho_pipeline.estimation.blunders import contradicting
 from ortho_pipeline.files.documents import json_value, made_of
+from ortho_pipeline.options.texts import Text
 from ortho_pipeline.points.rows import ROLES
 from ortho_pipeline.report.adjustment_records import Rmse, is_known
 from ortho_pipeline.report.block_records import (
@@ -214,7 +215,7 @@ def summary_text(report: BlockReport) -> str:
     )
     height = f", height {head.height}" if head.height else ""
     lines += [f"{head.figure}{height}: {head.what}", *head.notes]
-    return "\n".join([*lines, *(f"Warning: {text}" for text in report.warnings)])
+    return Text.joined("\n", [*lines, *(Text("Warning: ", text) for text in report.warnings)])
 
 
 def variance_lines(variances: VariancesRecord) -> list[str]:

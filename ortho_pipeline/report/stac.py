@@ -19,6 +19,7 @@ import shapely
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import sha256, staged, whole_or_nothing, write_json
 from ortho_pipeline.geodesy.distortion import metres_of_steps
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import RasterSource
@@ -78,7 +79,7 @@ def acquisition_time(facts: Mapping[str, Any], given: str | None = None) -> date
         raise InputError(
             "a STAC item needs the time of acquisition, and the metadata of this scene have none",
             field="output.acquired",
-            remedy="give it, for example `output.acquired=2005-08-03T08:12:31Z`",
+            remedy=Text("give it, for example ", Setting("output.acquired", "2005-08-03T08:12:31Z")),
         )  # fmt: skip
     try:
         time = datetime.fromisoformat(str(text).strip())

@@ -11,6 +11,7 @@ from ortho_pipeline.display.notices import Notice, texts_but
 from ortho_pipeline.display.numbers import class_size, metres, plain_size, px, share, short, signed, size_m, size_text
 from ortho_pipeline.errors import counted
 from ortho_pipeline.estimation.blunders import contradicting
+from ortho_pipeline.options.texts import Text
 from ortho_pipeline.report.adjustment_records import Adjustment, Bias, Parameter, Rmse, RmseOnGround, RmsesOnGround
 from ortho_pipeline.report.map_scale import PIXEL, POSITION, scale_text, usual_scale
 from ortho_pipeline.report.matching import MatchingRecord, Tested, is_relative
@@ -313,7 +314,7 @@ def summary_text(report: SceneReport) -> str:
     # The headline and the rows above have said these already.
     others = texts_but(report.warnings, report.notices, "left-out", "no-redundancy", "few-check-points")
     rows += [("warning", text) for text in others]
-    return "\n".join(f"{key:<10}{value}" for key, value in rows)
+    return Text.joined("\n", (Text(f"{key:<10}", value) for key, value in rows))
 
 
 def _bias(raw: Bias) -> str:

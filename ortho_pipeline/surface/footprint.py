@@ -21,6 +21,7 @@ from ortho_pipeline.display.numbers import share
 from ortho_pipeline.errors import CoverageError, InputError, counted
 from ortho_pipeline.geodesy.crs import ground_transform, utm_crs
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
@@ -34,9 +35,12 @@ _BORDER_SIDE = 65
 _BLOCK = 1024
 #: A model is meant for the heights under its scene and this part of their range beyond, or so many metres.
 _MARGIN, _LEAST_MARGIN = 0.1, 10.0
-_SOUND = (
-    "give the metadata of this very image (`scene.rpc=FILE`, `scene.model=FILE`), and points that were measured in it; "
-    "if they are, its plugin reads them wrongly (docs/plugins.md)"
+_SOUND = Text(
+    "give the metadata of this very image (",
+    Setting("scene.rpc", "FILE"),
+    ", ",
+    Setting("scene.model", "FILE"),
+    "), and points that were measured in it; if they are, its plugin reads them wrongly (docs/plugins.md)",
 )
 
 
@@ -123,19 +127,23 @@ class Footprint:
         surface = self.surface
         if not isinstance(surface, DemSurface):
             return  # flat ground is everywhere
-        file, wanted = (
-            surface.provenance.get("path"),
-            "say what the rest shall be: `surface.fill=mask` (no pixels there)",
-        )
+        file = surface.provenance.get("path")
+        wanted = Text("say what the rest shall be: ", Setting("surface.fill", "mask"), " (no pixels there)")
         if self.beyond and ((surface.fill == "error" and not self.complete) or not self.coverage):
             raise CoverageError(
                 self.beyond, file=file, field="surface.dem",
-                remedy=f"check datum and unit of the DEM (`surface.vertical`) and the place of the scene, or {wanted}",
+                remedy=Text(
+                    "check datum and unit of the DEM (", Setting("surface.vertical"),
+                    ") and the place of the scene, or ", wanted
+                ),
             )  # fmt: skip
         if not self.complete and surface.fill == "error":
             raise CoverageError(
                 f"the DEM covers {share(self.coverage)} of the scene", file=file,
-                remedy=f"give a DEM that covers it all, or {wanted}, nearest, or an ellipsoidal height in metres",
+
+                remedy=Text(
+                    "give a DEM that covers it all, or ", wanted, ", nearest, or an ellipsoidal height in metres"
+                ),
             )  # fmt: skip
         if self.coverage == 0.0 and surface.fill == "mask":
             raise CoverageError(
@@ -146,7 +154,8 @@ class Footprint:
             raise CoverageError(
                 f"parts of the scene are more than {surface.nearest_reach * surface.sample_size / 1000:.3g} km from "
                 "the next height of the DEM",
-                file=file, field="surface.fill", remedy=f"give a DEM that reaches farther, or {wanted}",
+                file=file, field="surface.fill",
+                remedy=Text("give a DEM that reaches farther, or ", wanted),
             )  # fmt: skip
 
     def notes(self) -> list[Notice]:
@@ -386,7 +395,7 @@ def choose_grid(
         usual = f"{two_digits(ground_sample_distance(model, crs, width, height, found.middle)):.12f}".rstrip("0")
         raise InputError(
             f"the scene is smaller than one pixel of {step[0]:g} {unit}s, which is the unit of {crs.name!r}",
-            field="output.resolution", remedy=f"did you mean `output.resolution={usual}`?",
+            field="output.resolution", remedy=Text("did you mean ", Setting("output.resolution", usual), "?"),
         )  # fmt: skip
     return Grid.of_extent(crs, (low[0], low[1], high[0], high[1]), step, align=True)
 
@@ -411,7 +420,9 @@ def scene_pixels(model: SensorModel, found: Footprint, grid: Grid) -> float:
         place = " ".join(f"{value:.10g}" for value in hull.bounds) if len(ground) else "outside of this CRS"
         raise InputError(
             f"the extent lies beside the scene, which reaches over {place}", field="output.extent",
-            remedy="give xmin ymin xmax ymax in units of the output CRS, or leave `output.extent` out",
+            remedy=Text(
+                "give xmin ymin xmax ymax in units of the output CRS, or leave ", Setting("output.extent"), " out"
+            ),
         )  # fmt: skip
     return float(hull.intersection(shapely.box(xmin, ymin, xmax, ymax)).area) / (grid.dx * grid.dy)
 

@@ -35,6 +35,7 @@ from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.exchange.rpc_fit import REFUSE_ERROR, RpcExport
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
 from ortho_pipeline.raster.output import gdal_errors, written
@@ -163,7 +164,7 @@ def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpResult:
     if isinstance(path, Hiding):
         raise InputError(
             "GDAL's warper does not look for what terrain hides", field="output.visibility",
-            remedy="leave out `output.visibility` or `output.engine=gdal`",
+            remedy=Text("leave out ", Setting("output.visibility"), " or ", Setting("output.engine", "gdal")),
         )  # fmt: skip
     _check(job)
     source, profile, grid, threads = job.source, job.look(), job.grid, job.threads()
@@ -204,7 +205,7 @@ def _check(job: WarpJob) -> None:
     if job.dem_interpolation != "bilinear":
         raise InputError(
             "with GDAL's warper heights of the DEM are interpolated bilinearly", field="output.dem_interpolation",
-            remedy="leave out `output.dem_interpolation` or `output.engine=gdal`",
+            remedy=Text("leave out ", Setting("output.dem_interpolation"), " or ", Setting("output.engine", "gdal")),
         )  # fmt: skip
     if len(job.source.paths) > 1:
         raise InputError(
@@ -231,7 +232,7 @@ def _standing(
         tried.append(f"{candidate.method}: {error:.3g} px off")
     raise InputError(
         f"no transformer of GDAL stands for this model ({'; '.join(tried)})", field="output.engine",
-        remedy="take our own engine (`output.engine=ortho`)",
+        remedy=Text("take our own engine (", Setting("output.engine", "ortho"), ")"),
     )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc_fit import RpcExport
 from ortho_pipeline.files.process_limits import Resources, require_memory, startable_threads
 from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
@@ -89,14 +90,22 @@ class WarpJob:
                 "integers of 64 bits are not interpolated without loss",
                 file=self.source.path,
                 field="resampling",
-                remedy="use `output.resampling=nearest`, or convert the pixels first (gdal_translate -ot Float64)",
+                remedy=Text(
+                    "use ",
+                    Setting("output.resampling", "nearest"),
+                    ", or convert the pixels first (gdal_translate -ot Float64)",
+                ),
             )
         if self.source.palette and self.resampling != "nearest":
             raise InputError(
                 "the pixels are indices into a palette, which cannot be averaged",
                 file=self.source.path,
                 field="resampling",
-                remedy="use `output.resampling=nearest`, or expand the palette first (gdal_translate -expand rgb)",
+                remedy=Text(
+                    "use ",
+                    Setting("output.resampling", "nearest"),
+                    ", or expand the palette first (gdal_translate -expand rgb)",
+                ),
             )
 
 
@@ -129,8 +138,10 @@ class WarpResult:
         took = self.pixels * _ARRAYS_BYTES
         if self.transformer != "GEOLOC_ARRAY" or took <= memory:
             return []
-        text = (
-            f"GDAL's warper takes about {took / 1e6:.0f} MB for the arrays that stand for this model, beyond "
-            f"`output.memory` {memory / 1e6:.0f}: make a smaller extent, or leave out `output.engine=gdal`"
+        text = Text(
+            f"GDAL's warper takes about {took / 1e6:.0f} MB for the arrays that stand for this model, beyond ",
+            Setting("output.memory"),
+            f" {memory / 1e6:.0f}: make a smaller extent, or leave out ",
+            Setting("output.engine", "gdal"),
         )
         return [Notice("memory-exceeded", text, bytes=took)]

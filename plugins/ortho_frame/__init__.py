@@ -22,6 +22,7 @@ from ortho_pipeline.models.frame.orientation import exterior_sigmas
 from ortho_pipeline.models.frame.working_frame import TOPOCENTRIC
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.options import numbers_of
+from ortho_pipeline.options.texts import Setting, Text
 
 OPTIONS = {
     "camera": "camera file: JSON (docs/formats/frame.md) or OpenSfM's cameras.json or reconstruction.json",
@@ -70,7 +71,9 @@ def open_scene(
         missing = [key for key, value in given.items() if not value]
         raise InputError(
             f"a frame image needs {', '.join(missing)}", file=name, field=missing[0],
-            remedy="; ".join(f"`scene.sensor_options.{key}=...` ({OPTIONS[key]})" for key in missing),
+            remedy=Text.joined("; ", (
+                Text(Setting("scene.sensor_options", "...", key=key), f" ({OPTIONS[key]})") for key in missing
+            )),
         )  # fmt: skip
     if refraction not in ("yes", "no"):
         raise InputError(f"{refraction!r} is neither yes nor no", field="refraction")

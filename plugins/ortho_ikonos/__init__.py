@@ -26,6 +26,7 @@ from ortho_pipeline.hookspecs import Piece, Scene, Sensor, Study, hookimpl
 from ortho_pipeline.models import MapPlane, SensorModel
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.options import numbers_of
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.source import open_dataset
 
 OPTIONS = {
@@ -106,8 +107,11 @@ def open_scene(
     if contradiction and vendor is not None and rpc is None and geometry is None:
         raise InputError(
             contradiction[0], file=vendor[1], field="rpc",
-            remedy="choose one: the RPC with `scene.rpc=tag`, `scene.rpc=sidecar` or `scene.rpc=FILE`, or the metadata "
-            "with `scene.sensor_options.geometry=geo`",
+            remedy=Text(
+                "choose one: the RPC with ", Setting("scene.rpc", "tag"), ", ", Setting("scene.rpc", "sidecar"),
+                " or ", Setting("scene.rpc", "FILE"), ", or the metadata with ",
+                Setting("scene.sensor_options", "geo", key="geometry")
+            ),
         )  # fmt: skip
     return Scene(
         sensor="ikonos",
@@ -176,12 +180,20 @@ def _first(
         raise InputError(f"{geometry!r} is not a geometry", field="geometry", remedy="rpc or geo")
     first = geometry or next(iter(models), "geo")
     if first == "rpc" and "rpc" not in models:
-        raise InputError("there is no RPC", file=file, field="geometry", remedy="give it with `scene.rpc`, or take geo")
+        raise InputError(
+            "there is no RPC",
+            file=file,
+            field="geometry",
+            remedy=Text("give it with ", Setting("scene.rpc"), ", or take geo"),
+        )
     if first not in models:
         raise InputError(
             f"there is no plane of Reference Height without {'; '.join(lacking)}", file=file,
             field=f"component {component.component}: {lacking[0]}",
-            remedy="give the whole metadata file, an RPC (`scene.rpc`), or fit a model to points (`points.fit_model`)",
+            remedy=Text(
+                "give the whole metadata file, an RPC (", Setting("scene.rpc"), "), or fit a model to points (",
+                Setting("points.fit_model"), ")"
+            ),
         )  # fmt: skip
     return first
 

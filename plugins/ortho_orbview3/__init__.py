@@ -17,6 +17,7 @@ from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Scene, Sensor, Study, hookimpl
 from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.options.texts import Setting, Text
 
 #: Names of the USGS: 3v, year, month, day, and p for panchromatic or m for multispectral.
 _NAME = re.compile(r"3v(\d{6})([pm])\d", re.IGNORECASE)
@@ -87,7 +88,11 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None, label: str | No
             f"the label is for {product.columns} x {product.rows} pixels, the image has {size[0]} x {size[1]}",
             file=path,
             field="productInfo.pixelsPerScanLine, productInfo.numScanLines",
-            remedy="give the whole scene and its own label, or an image with an RPC of its own (`scene.sensor=rpc`)",
+            remedy=Text(
+                "give the whole scene and its own label, or an image with an RPC of its own (",
+                Setting("scene.sensor", "rpc"),
+                ")",
+            ),
         )
     model, source, warnings = choose_rpc(product, rpc_text_of(name), rpc)
     return Scene(

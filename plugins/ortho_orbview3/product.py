@@ -19,6 +19,7 @@ from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.options.texts import Setting, Text
 
 #: Keys of the label by the names that RPC text has for them.
 SCALAR_KEYS = {
@@ -155,7 +156,11 @@ def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple
         return read_rpc(choice), str(choice), ()
     if text is None:
         if choice is not None:
-            raise InputError("there is no RPC text beside the image", field="rpc", remedy="take `scene.rpc=label`")
+            raise InputError(
+                "there is no RPC text beside the image",
+                field="rpc",
+                remedy=Text("take ", Setting("scene.rpc", "label")),
+            )
         text_missing = "there is no RPC text beside the label, whose own RPC is taken"
         return product.rpc, product.file, (Notice("no-rpc-text", text_missing),)
     rpc = read_rpc_text(text)
@@ -165,7 +170,11 @@ def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple
     if not difference <= CONTRADICTORY:
         raise InputError(
             f"the RPC in this file and that of {Path(product.file).name} differ by {difference:.3g} px",
-            file=text, field="rpc", remedy="choose one: `scene.rpc=label`, `scene.rpc=text`, or `scene.rpc=FILE`",
+            file=text, field="rpc",
+            remedy=Text(
+                "choose one: ", Setting("scene.rpc", "label"), ", ", Setting("scene.rpc", "text"), ", or ",
+                Setting("scene.rpc", "FILE")
+            ),
         )  # fmt: skip
     differ = f"the RPCs of label and text differ by {difference:.2g} px; that of the text is taken"
     return rpc, str(text), (Notice("rpcs-differ", differ, difference_px=difference),)

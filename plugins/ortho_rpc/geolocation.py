@@ -22,6 +22,7 @@ from ortho_pipeline.files.locations import place
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import open_dataset
 
@@ -73,9 +74,10 @@ def open_scene(dataset: gdal.Dataset, *, lon: str | None = None, lat: str | None
         model, family, worst = _fitted(image, ground, size)
     except OrthoError as error:
         raise InputError(error.message, file=name, field="GEOLOCATION", remedy=_REMEDY) from error
-    text = (
-        "geolocation arrays know no height: they are a start for `match.reference`, and what rises is displaced; the"
-        f" model {family} stands for them to {worst:.2g} px"
+    text = Text(
+        "geolocation arrays know no height: they are a start for ",
+        Setting("match.reference"),
+        f", and what rises is displaced; the model {family} stands for them to {worst:.2g} px",
     )
     facts: dict[str, Any] = {"arrays": [Path(one).name for one in files], "max_error_px": round(worst, 3)}
     return Scene(

@@ -13,6 +13,7 @@ from ortho_pipeline.files.folders import listing
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.pushbroom.scanner import Pushbroom
 from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.options.texts import Text
 from ortho_rpc.bundle import DIMAP
 from ortho_rpc.dimap import has_dimap_pushbroom, images_of, read_dimap_pushbroom
 from ortho_rpc.dimap_file import DimapFile
@@ -101,7 +102,8 @@ def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:
 
 
 def _reason(error: InputError) -> str:
-    return "; ".join(filter(None, [f"{error.field}: {error.message}" if error.field else error.message, error.remedy]))
+    what = Text(error.field, ": ", error.message) if error.field else error.message
+    return Text(what, "; ", error.remedy) if error.remedy else what
 
 
 def _apart(model: Pushbroom, rpc: RPC, places: Array) -> float:

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import pickle
 
 import click
 import pytest
 from click.testing import CliRunner
 
 from ortho_pipeline import commands
+from ortho_pipeline.batch.records import Record
 from ortho_pipeline.cli.flags import FLAGS, flags_of, with_flags
 from ortho_pipeline.cli.program import COMMANDS, cli
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.errors import InputError, error_document
+from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.options import GROUPS, BlockOptions, SurfaceOptions, options_of
+from ortho_pipeline.options.texts import Setting, Text
 
 
 def command_of(name: str) -> click.Command:
@@ -63,12 +68,30 @@ def test_a_key_that_is_given_twice_is_refused(tmp_path) -> None:
 
 def test_names_of_options_are_shown_as_flags() -> None:
     flags = {"surface.height": "--height", "scene.sensor_options": "--sensor-option", "workers": "--workers"}
-    text = (
-        "give `surface.height=500`, `scene.sensor_options.rpc=tag`, `workers=1` or `surface.dem=FILE`; see `ortho fit`"
-    )
-    assert with_flags(text, flags) == (
-        "give --height 500, --sensor-option rpc=tag, --workers 1 or `surface.dem=FILE`; see `ortho fit`"
-    )
+    named = Setting("surface.height", "500"), Setting("scene.sensor_options", "tag", key="rpc"), Setting("workers", "1")
+    text = Text("give ", named[0], ", ", Text(named[1], ", ", named[2]), " or ", Setting("surface.dem", "FILE"))
+    told = "give `surface.height=500`, `scene.sensor_options.rpc=tag`, `workers=1` or `surface.dem=FILE`"
+    assert (text, json.dumps(text), Text.joined("; ", [text])) == (told, json.dumps(told), told)
+    typed = "give --height 500, --sensor-option rpc=tag, --workers 1 or `surface.dem=FILE`"
+    notice = Notice("a-code", text).in_image("left")
+    error = InputError("wrong", remedy=text)
+    for again in (text, *pickle.loads(pickle.dumps([text, error.remedy])), Text.read(told), Text.joined("", [text])):
+        assert with_flags(again, flags) == typed
+    for again in (notice, pickle.loads(pickle.dumps(notice)), json_value(notice.to_json())["text"]):
+        assert with_flags(again, flags) == f"image left: {typed}"
+    assert pickle.loads(pickle.dumps(error)).remedy.parts == error.remedy.parts
+    # What a file says is no option of ours.
+    assert with_flags(told, flags) == told
+
+
+def test_errors_that_come_back_from_a_record_name_options_as_they_are_typed(tmp_path) -> None:
+    refused = error_document(InputError("far away", remedy=Text("allow it with ", Setting("scene.allow_network"))))
+    Record("scene", "", "failed", error=refused).write(tmp_path / "record.json")
+    found = Record.read(tmp_path / "record.json")
+    assert found is not None
+    assert found.error == refused
+    assert found.error is not None
+    assert with_flags(found.error["remedy"], flags_of(command_of("run"))) == "allow it with --allow-network"
 
 
 def test_an_error_names_options_as_the_caller_knows_them(tiny, tmp_path) -> None:

@@ -28,6 +28,7 @@ from ortho_pipeline.errors import DegeneratePoints, counted
 from ortho_pipeline.estimation.blunders import BLUNDER_RISK, REJECTED_LIMIT
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options.texts import Setting, Text
 
 _ROBUST_ROUNDS, _TEST_ROUNDS = 6, 8
 #: Robust weights that change less than this on average decide no more about who is a suspect.
@@ -223,6 +224,10 @@ def _refuse_many(problem: BlockProblem, selection: Selection, rejected: list[int
                 f"{len(names)} of {counted(int(mask.sum()), what)} contradict the others ({some}): which of "
                 "them are wrong cannot be decided",
                 file=problem.points.source or None,
-                remedy="measure these points again, remove the wrong ones, or state sigmas as large as their errors "
-                "(sigma_image, sigma_xy, sigma_h; `points.ground_sigma=XY,H` for ground that states none)",
+                remedy=Text(
+                    "measure these points again, remove the wrong ones, or state sigmas as large as their errors ",
+                    "(sigma_image, sigma_xy, sigma_h; ",
+                    Setting("points.ground_sigma", "XY,H"),
+                    " for ground that states none)",
+                ),
             )

@@ -15,6 +15,7 @@ from ortho_pipeline.block.points import Index
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import counted
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options.texts import Setting, Text
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,18 +96,20 @@ class Variances:
         number = max(self.unstated)
         if not number:
             return []
-        remedy = "state sigmas (sigma_xy, sigma_h, or `points.ground_sigma=XY,H`) if they are known"
+        remedy = Text(
+            "state sigmas (sigma_xy, sigma_h, or ", Setting("points.ground_sigma", "XY,H"), ") if they are known"
+        )
         who = f"{counted(number, 'control point')} without a stated sigma"
         if not self.separable:
-            text = f"{who}: their errors cannot be told from errors of measurement here, and count as such; {remedy}"
-            return [Notice("unstated-sigma", text, count=number)]
+            text = f"{who}: their errors cannot be told from errors of measurement here, and count as such; "
+            return [Notice("unstated-sigma", Text(text, remedy), count=number)]
         found = []
         sigmas = self.sigma_xy, self.sigma_h
         for what, sigma, part in zip(("in plan", "in height"), sigmas, self.redundancy[1:], strict=True):
             if sigma is not None:
                 weak = ", hardly determined" if part < 2.0 else ""
                 found.append(f"{sigma:.2g} m {what} (redundancy {part:.1f}{weak})")
-        text = f"{who}: estimated as {' and '.join(found)}; {remedy}"
+        text = Text(f"{who}: estimated as {' and '.join(found)}; ", remedy)
         return [Notice("unstated-sigma", text, count=number, sigma_xy=self.sigma_xy, sigma_h=self.sigma_h)]
 
     def to_json(self) -> dict[str, Any]:

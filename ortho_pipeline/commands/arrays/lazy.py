@@ -22,6 +22,7 @@ from ortho_pipeline.files.process_limits import Resources, one_blas_thread
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import Grid, RasterSource
@@ -76,7 +77,9 @@ def ortho_array(
         if getattr(output, field) != getattr(OutputOptions(), field):
             raise InputError("an array is the ortho alone", field=f"output.{field}", remedy="leave it out")
     if output.engine != "ortho":
-        raise InputError("GDAL's warper makes files", field="output.engine", remedy="leave out `output.engine`")
+        raise InputError(
+            "GDAL's warper makes files", field="output.engine", remedy=Text("leave out ", Setting("output.engine"))
+        )
     surface = dem if isinstance(dem, SurfaceOptions) else SurfaceOptions(dem=dem)
     require_heights(surface)
     request = Request(image, scene, points, surface, match, output)  # type: ignore[arg-type]

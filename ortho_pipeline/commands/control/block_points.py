@@ -25,6 +25,7 @@ from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import Vertical, parse_crs
 from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, SurfaceOptions, numbers_of
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points, assign_roles
 from ortho_pipeline.surface.base import Surface
 
@@ -126,33 +127,37 @@ def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: S
     if options.points is None and options.ties is None:
         raise InputError(
             "the images have no points in common", field="points.points",
-            remedy="give measured points with `points.points=FILE`, or `points.ties=auto` to find ties",
+            remedy=Text(
+                "give measured points with ", Setting("points.points", "FILE"), ", or ",
+                Setting("points.ties", "auto"), " to find ties"
+            ),
         )  # fmt: skip
     if options.points is None:
         for name in ("gcps", "check", "ground_sigma"):
             if getattr(options, name) is not None:
                 raise InputError(
-                    f"`points.{name}` is said of points of a file, and there are none", field=f"points.{name}",
-                    remedy="leave it out, or give `points.points`",
+                    Text(Setting(f"points.{name}"), " is said of points of a file, and there are none"),
+                    field=f"points.{name}",
+                    remedy=Text("leave it out, or give ", Setting("points.points")),
                 )  # fmt: skip
     if options.ties is None and not match.reference:
         for name in ("search", "points"):
             if getattr(match, name) != getattr(MatchOptions, name):
                 raise InputError(
                     "this is said of matching, and nothing is matched", field=f"match.{name}",
-                    remedy="leave it out, or give `points.ties=auto`",
+                    remedy=Text("leave it out, or give ", Setting("points.ties", "auto")),
                 )  # fmt: skip
         if has_surface(surface):
             raise InputError(
                 "heights serve matching, and nothing is matched",
                 field="surface.dem" if surface.dem is not None else "surface.height",
-                remedy="leave them out, or give `points.ties=auto`",
+                remedy=Text("leave them out, or give ", Setting("points.ties", "auto")),
             )  # fmt: skip
     for name in ("reference_bands", "search_rotation", "reference_sigma"):
         if getattr(match, name) is not None and not match.reference:
             raise InputError(
                 "this is said of a reference, and there is none", field=f"match.{name}",
-                remedy="leave it out, or give `match.reference`",
+                remedy=Text("leave it out, or give ", Setting("match.reference")),
             )  # fmt: skip
     if options.ties is not None or match.reference:
         require_heights(surface)

@@ -21,6 +21,7 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.block_cache import cache_restored
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
@@ -248,12 +249,15 @@ def open_reference_views(
     if surface is None:
         raise InputError(
             "matching needs heights", field="surface.dem",
-            remedy="give `surface.dem=FILE`, or `surface.height=METRES` above the ellipsoid for flat ground",
+            remedy=Text(
+                "give ", Setting("surface.dem", "FILE"), ", or ", Setting("surface.height", "METRES"),
+                " above the ellipsoid for flat ground"
+            ),
         )  # fmt: skip
     if not scene.models:
         raise InputError(
             "this image has no model of its own to begin matching with", file=scene.path, field="match.reference",
-            remedy="give control points by hand with `points.gcps`",
+            remedy=Text("give control points by hand with ", Setting("points.gcps")),
         )  # fmt: skip
     with _of_references():
         references = open_references(options.reference, options.reference_bands or (), **opened.access)
@@ -332,9 +336,10 @@ def _stated(scene: Scene, pixel: float) -> tuple[float, str] | None:
 def _default_search(search: Search) -> list[Notice]:
     if search.known:
         return []
-    text = (
-        f"the scene does not say how accurate its model is: it was looked for within {metres(search.distance)} "
-        "(`match.search`)"
+    text = Text(
+        f"the scene does not say how accurate its model is: it was looked for within {metres(search.distance)} (",
+        Setting("match.search"),
+        ")",
     )
     return [Notice("search-by-default", text, search_m=search.distance)]
 
@@ -359,11 +364,11 @@ def _bands_apart(matches: Matches) -> list[Notice]:
         f"band {one.band} by {one.shift[0]:+.2f} ± {one.sigma[0]:.2f}, {one.shift[1]:+.2f} ± {one.sigma[1]:.2f}"
         for one in bands
     )
-    text = (
-        "bands of the reference disagree about the place of the scene. Compared with the result, single bands move it "
-        f"(column, row, px): {said}. The result is not known better than {spread(bands):.1f} px. "
-        "Choose bands that agree and look like the scene: "
-        f"`match.reference_bands={','.join(str(number) for number in agree)}`"
+    text = Text(
+        "bands of the reference disagree about the place of the scene. Compared with the result, single ",
+        f"bands move it (column, row, px): {said}. The result is not known better than {spread(bands):.1f} px. ",
+        "Choose bands that agree and look like the scene: ",
+        Setting("match.reference_bands", ",".join(map(str, agree))),
     )
     found = [{"band": one.band, "shift_px": list(one.shift), "sigma_px": list(one.sigma)} for one in bands]
     return [Notice("bands-disagree", text, bands=found, agreeing=list(agree), spread_px=spread(bands))]

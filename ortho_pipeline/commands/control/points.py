@@ -17,6 +17,7 @@ from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.hookspecs import Piece, Scene
 from ortho_pipeline.options import MatchOptions, PointOptions
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, points_of
 from ortho_pipeline.points.formats import read_table
 from ortho_pipeline.points.rows import OWN_IMAGE
@@ -67,13 +68,14 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
     chosen = next((name for name in ("select", "check") if getattr(points, name) is not None), None)
     if chosen is not None and points.gcps is None:
         raise InputError(
-            f"`points.{chosen}` chooses among `points.gcps`, and there are none", field=f"points.{chosen}",
+            Text(Setting(f"points.{chosen}"), " chooses among ", Setting("points.gcps"), ", and there are none"),
+            field=f"points.{chosen}",
             remedy="leave it out: every fifth cell of the matches checks",
         )  # fmt: skip
     if chosen is not None and match.gcps_as == "check":
         raise InputError(
-            f"`points.{chosen}` chooses among points that all check", field=f"points.{chosen}",
-            remedy="leave it out, or give `match.gcps_as=control`",
+            Text(Setting(f"points.{chosen}"), " chooses among points that all check"), field=f"points.{chosen}",
+            remedy=Text("leave it out, or give ", Setting("match.gcps_as", "control")),
         )  # fmt: skip
 
 
@@ -89,7 +91,7 @@ def _refuse_idle(match: MatchOptions) -> None:
         if getattr(match, name) != getattr(MatchOptions, name):
             raise InputError(
                 "this is said of matching, and there is no reference", field=f"match.{name}",
-                remedy="leave it out, or give `match.reference`",
+                remedy=Text("leave it out, or give ", Setting("match.reference")),
             )  # fmt: skip
 
 
@@ -130,7 +132,7 @@ def read_control(scene: Scene, request: Request, surface: Surface | None = None)
     points = _given_points(scene, request, surface)
     if options.select is not None and options.check is not None:
         raise InputError(
-            "`points.select` and `points.check` both say which points check",
+            Text(Setting("points.select"), " and ", Setting("points.check"), " both say which points check"),
             field="points.select",
             remedy="give one of them",
         )
@@ -150,8 +152,10 @@ def _given_points(scene: Scene, request: Request, surface: Surface | None) -> Po
         if origin != "corner" or (path is None and not (crs is vertical is None)):
             raise InputError(
                 "these points say themselves what their coordinates are", field="points.pixel_origin",
-                remedy="leave `points.pixel_origin` out, and of points that are read already `points.crs` and "
-                "`points.vertical`",
+                remedy=Text(
+                    "leave ", Setting("points.pixel_origin"), " out, and of points that are read already ",
+                    Setting("points.crs"), " and ", Setting("points.vertical")
+                ),
             )  # fmt: skip
         if isinstance(options.gcps, Points):
             return options.gcps
@@ -217,7 +221,7 @@ def with_heights(points: Points, surface: Surface | None) -> Points:
         raise InputError(
             f"{int(missing.sum())} of {counted(len(points), 'point')} without a height "
             f"({names})", file=points.source, field="h",
-            remedy="give heights in the file, or a DEM with `surface.dem` to take them from",
+            remedy=Text("give heights in the file, or a DEM with ", Setting("surface.dem"), " to take them from"),
         )  # fmt: skip
     ground = points.ground.copy()
     ground[missing, 2] = surface.heights(ground[missing, :2], points.crs)

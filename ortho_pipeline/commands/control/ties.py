@@ -31,6 +31,7 @@ from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points.image_errors import sigma_of_covariance
 from ortho_pipeline.raster.block_cache import cache_restored
 from ortho_pipeline.raster.intensity import Intensity
@@ -156,7 +157,11 @@ def tie_scenes(
     found = tie(views, TieSettings(search, options.points, sigma, threads or os.cpu_count() or 1))
     notices = [*_few(found, tuple(scenes))]
     if stated is None:
-        text = f"nobody says how accurate the heights are: taken to be within {metres(sigma)} (`surface.sigma`)"
+        text = Text(
+            f"nobody says how accurate the heights are: taken to be within {metres(sigma)} (",
+            Setting("surface.sigma"),
+            ")",
+        )
         notices.append(Notice("dem-sigma-by-default", text, dem_sigma_m=sigma))
     return Tied(_points(found, tuple(scenes)), found, search, sigma, tuple(notices))
 

@@ -11,6 +11,7 @@ from ortho_pipeline.geodesy.crs import Vertical, ground_transform
 from ortho_pipeline.geodesy.proj_grids import fetch_grid, missing_grid
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.surface.cells.assembled import open_cells
 from ortho_pipeline.surface.cells.copernicus import Extent, extent_of
 from ortho_pipeline.surface.cells.sources import source_of
@@ -54,7 +55,11 @@ def extents_under(scenes: Iterable[Scene]) -> list[Extent]:
     """
     extents = [extent_under(scene) for scene in scenes]
     if not extents:
-        raise InputError("heights are only found under a scene", field="surface.dem", remedy="give `surface.dem=FILE`")
+        raise InputError(
+            "heights are only found under a scene",
+            field="surface.dem",
+            remedy=Text("give ", Setting("surface.dem", "FILE")),
+        )
     return extents
 
 
@@ -69,7 +74,7 @@ def extent_under(scene: Scene) -> Extent:
     if not scene.models:
         raise InputError(
             "an image without a model of its own does not say where it lies", file=scene.path, field="surface.dem",
-            remedy="give `surface.dem=FILE`",
+            remedy=Text("give ", Setting("surface.dem", "FILE")),
         )  # fmt: skip
     model = scene.model
     ring = border(scene.width, scene.height)
@@ -93,8 +98,11 @@ def _require_geoid(allow_network: bool) -> None:
     if not allow_network:
         raise DatumError(
             f"the cells' heights are above EGM2008, whose geoid grid {grid} is not installed", field="surface.dem",
-            remedy="fetch it once with `ortho doctor --fetch-grids`, allow the network with `scene.allow_network`, or "
-            f"give the file with `surface.vertical=FOLDER/{grid}`",
+            remedy=Text(
+                "fetch it once with `ortho doctor --fetch-grids`, allow the network with ",
+                Setting("scene.allow_network"), ", or give the file with ",
+                Setting("surface.vertical", f"FOLDER/{grid}")
+            ),
         )  # fmt: skip
     try:
         fetch_grid(grid)
@@ -102,5 +110,8 @@ def _require_geoid(allow_network: bool) -> None:
         raise DatumError(
             f"the cells' heights are above EGM2008, and its geoid grid cannot be fetched: {error.message}",
             file=error.file, field="surface.dem",
-            remedy=f"{error.remedy or 'try again later'}; or give the file with `surface.vertical=FOLDER/{grid}`",
+            remedy=Text(
+                error.remedy or "try again later", "; or give the file with ",
+                Setting("surface.vertical", f"FOLDER/{grid}")
+            ),
         ) from error  # fmt: skip

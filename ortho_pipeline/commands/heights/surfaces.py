@@ -13,6 +13,7 @@ from ortho_pipeline.files.stac.item import split
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions, number_of
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.cells.collected import open_collected
 from ortho_pipeline.surface.cells.copernicus import Extent
@@ -45,7 +46,9 @@ def open_surface(
     """
     if options.dem is not None and options.height is not None:
         raise InputError(
-            "`surface.dem` and `surface.height` exclude each other", field="surface.height", remedy="give one of them"
+            Text(Setting("surface.dem"), " and ", Setting("surface.height"), " exclude each other"),
+            field="surface.height",
+            remedy="give one of them",
         )
     require_heights(options)
     sigma = open_sigma(options, scene, memory)
@@ -103,7 +106,7 @@ def open_dem(
     if options.source is not None:
         raise InputError(
             "this says where heights are found, and the DEM is given", field="surface.source",
-            remedy="leave it out, or give `surface.dem=auto`",
+            remedy=Text("leave it out, or give ", Setting("surface.dem", "auto")),
         )  # fmt: skip
     with of_option("surface.vertical"):
         vertical = None if options.vertical is None else Vertical.parse(options.vertical)
@@ -131,7 +134,10 @@ def require_heights(options: SurfaceOptions) -> None:
     if not has_surface(options):
         raise InputError(
             "there are no heights of the ground", field="surface.dem",
-            remedy="give `surface.dem=FILE`, or `surface.height=METRES` above the ellipsoid for flat ground",
+            remedy=Text(
+                "give ", Setting("surface.dem", "FILE"), ", or ", Setting("surface.height", "METRES"),
+                " above the ellipsoid for flat ground"
+            ),
         )  # fmt: skip
 
 
@@ -152,7 +158,7 @@ def has_surface(options: SurfaceOptions) -> bool:
     }
     for field in (field for field, given in idle.items() if given and options.dem is None):
         raise InputError("this is said of a DEM, and there is none", field=field,
-                         remedy="leave it out, or give `surface.dem`")  # fmt: skip
+                         remedy=Text("leave it out, or give ", Setting("surface.dem")))  # fmt: skip
     return options.dem is not None or options.height is not None
 
 

@@ -12,6 +12,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import write_text
 from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.options import OutputOptions
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.report.layers.angles import AnglesLayer, angles_style
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ def sun_of(facts: Mapping[str, Any], output: OutputOptions) -> Sun | None:
     if not output.angles:
         if output.sun is not None:
             raise InputError("only the angles depend on the sun", field="output.sun",
-                             remedy="give `output.angles` too, or leave it out")  # fmt: skip
+                             remedy=Text("give ", Setting("output.angles"), " too, or leave it out"))  # fmt: skip
         return None
     from ortho_pipeline.warp.layers.angles import Sun
 

@@ -20,6 +20,7 @@ from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import RPC, ImageCorrection, Pieces, SensorModel
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.report.document import accuracy_style
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.surface.base import Surface
@@ -76,7 +77,10 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
         raise InputError(
             "nothing is known of the errors of this ortho: its model has no stated accuracy, and the heights have none",
             field="output.accuracy_raster",
-            remedy="give `surface.sigma`, or control points with `points.gcps`, or leave it out",
+            remedy=Text(
+                "give ", Setting("surface.sigma"), ", or control points with ", Setting("points.gcps"),
+                ", or leave it out"
+            ),
         )  # fmt: skip
     assumed = _assumptions(budget, surface)
     if output.fill_from is not None:
@@ -86,10 +90,12 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
     known = Known(budget, tuple(unknown), tuple(assumed), covariance is not None, _common(placed))
     if not unknown:
         return known, []
-    names = {"model": "the model", "heights": "the heights (`surface.sigma`)",
-             "reference": "the reference (`match.reference_sigma`)"}  # fmt: skip
-    said = " and of ".join(names[name] for name in unknown)
-    text = f"the raster of accuracy knows nothing of the errors of {said}: its figures are the least that there is"
+    names = {"model": "the model", "heights": Text("the heights (", Setting("surface.sigma"), ")"),
+             "reference": Text("the reference (", Setting("match.reference_sigma"), ")")}  # fmt: skip
+    said = Text.joined(" and of ", (names[name] for name in unknown))
+    text = Text(
+        "the raster of accuracy knows nothing of the errors of ", said, ": its figures are the least that there is"
+    )
     return known, [Notice("accuracy-in-part", text, unknown=unknown)]
 
 

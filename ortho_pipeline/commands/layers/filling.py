@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ortho_pipeline.commands.placement import Placement
 from ortho_pipeline.errors import InputError, completed
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.regridded import Regridded
 from ortho_pipeline.raster.source import RasterSource
@@ -25,7 +26,7 @@ def other_of(placed: Placement, source: RasterSource) -> Regridded | None:
     if output.visibility != "nodata":
         raise InputError(
             "another ortho fills what terrain hides, and hidden pixels are not left empty", field="output.fill_from",
-            remedy="give `output.visibility=nodata` too, or leave it out",
+            remedy=Text("give ", Setting("output.visibility", "nodata"), " too, or leave it out"),
         )  # fmt: skip
     with completed(field="output.fill_from"):
         access = placed.request.scene.access

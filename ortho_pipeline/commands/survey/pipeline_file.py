@@ -12,6 +12,7 @@ from ortho_pipeline.commands.survey.folder import Kind, Survey, survey
 from ortho_pipeline.errors import InputError, counted
 from ortho_pipeline.files import allowed, write_text
 from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.options.texts import Setting, Text
 
 NAME = "pipeline.yaml"
 #: What belongs to a scene, and where it stands in the file.
@@ -42,7 +43,9 @@ def init(
     target = Path(folder) / NAME if path is None else Path(path)
     allowed(target)
     if target.exists() and not overwrite:
-        raise InputError("this file is there already", file=target, remedy="give another name, or allow `overwrite`")
+        raise InputError(
+            "this file is there already", file=target, remedy=Text("give another name, or allow ", Setting("overwrite"))
+        )
     if not seen.of("scene"):
         raise InputError(
             "no image with a model lies here", file=folder, remedy="put the metadata (RPC, DIMAP, .IMD ...) beside it"

@@ -13,6 +13,7 @@ from ortho_pipeline.files.locations import AnyPath, require_network, url_of, wit
 from ortho_pipeline.files.reading import parse_json, read_json
 from ortho_pipeline.files.storage.objects import Objects, is_address
 from ortho_pipeline.files.traffic import count
+from ortho_pipeline.options.texts import Setting, Text
 
 #: Types of documents that hold items, or lead to them.
 COLLECTIONS = ("Collection", "Catalog", "FeatureCollection")
@@ -110,6 +111,6 @@ def target(href: str, base: AnyPath, roots: tuple[AnyPath, ...] = ()) -> str:
     if not within(path, [Path(here).resolve().parent, Path(here).parent, *roots]):
         raise InputError(
             f"this names {text[:200]!r}, which is outside of its own folder", file=base, field="href",
-            remedy="put the files into one folder, or allow another one with `scene.roots=DIR`",
+            remedy=Text("put the files into one folder, or allow another one with ", Setting("scene.roots", "DIR")),
         )  # fmt: skip
     return os.fspath(path)

@@ -17,6 +17,7 @@ from ortho_pipeline.files.locations import AnyPath, url_of
 from ortho_pipeline.files.stac.documents import COLLECTIONS, REMEDY, read_document, target
 from ortho_pipeline.files.stac.places import Box, boxes_of
 from ortho_pipeline.files.storage.objects import is_address
+from ortho_pipeline.options.texts import Setting, Text
 
 #: Roles of what an image or a DEM is read from, the first first.
 _ROLES = ("data", "visual")
@@ -128,7 +129,7 @@ class Item:
                 raise InputError(
                     f"several assets may be the RPC of {image.key!r}: {self._keys(named or found)}",
                     file=self.address, field="assets",
-                    remedy="name one as `scene.rpc`, or give the address of the image itself",
+                    remedy=Text("name one as ", Setting("scene.rpc"), ", or give the address of the image itself"),
                 )  # fmt: skip
             found = named
         if not found:

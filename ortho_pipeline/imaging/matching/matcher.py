@@ -42,6 +42,7 @@ from ortho_pipeline.imaging.matching.weights import Components, components, unex
 from ortho_pipeline.imaging.turns import orientations
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.image_errors import sigma_of_covariance
 from ortho_pipeline.raster.block_cache import limit_cache
@@ -398,8 +399,10 @@ class _Tried:
             raise InputError(
                 f"the scene and the reference do not agree: {len(residuals)} of {counted(seen, 'chip')} fit together, "
                 f"and those only within {scatter:.1f} px", file=self.targets[0].path, field=self.targets[0].field,
-                remedy="check that the reference shows this place, search farther (`match.search`) if the model may be "
-                "off by more, or give better heights",
+                remedy=Text(
+                    "check that the reference shows this place, search farther (", Setting("match.search"),
+                    ") if the model may be off by more, or give better heights"
+                ),
             )  # fmt: skip
 
     def _too_few(self) -> InputError:

@@ -32,6 +32,7 @@ from ortho_pipeline.imaging.matching.targets import Target, View, metres_per_pix
 from ortho_pipeline.imaging.turns import Turn, margin, renderings, votes
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options.texts import Setting, Text
 
 #: Left, top, right and bottom, px.
 Region = tuple[int, int, int, int]
@@ -348,10 +349,13 @@ def _standing_out(
             f"no place within {reach:.0f} px stands out: the best two of {len(compared)} are too much alike "
             f"(correlation {means[best]:.2f} and {means[other]:.2f} in the mean of {counted(len(common), 'chip')})",
             file=targets[0].path, field=targets[0].field,
-            remedy=f"check that {targets[0].called} shows this place, search farther (`match.search`) if the model "
-            "may be off by more, and for rotations (`match.search_rotation=5`) if it may be turned; state how wrong "
-            "heights may be (`surface.sigma=20`) if the DEM is coarse and the view oblique; measure points by hand "
-            "where the ground is uniform or repeats itself",
+            remedy=Text(
+                f"check that {targets[0].called} shows this place, search farther (", Setting("match.search"),
+                ") if the model may be off by more, and for rotations (", Setting("match.search_rotation", "5"),
+                ") if it may be turned; state how wrong heights may be (", Setting("surface.sigma", "20"),
+                ") if the DEM is coarse and the view oblique; measure points by hand where the ground is ",
+                "uniform or repeats itself"
+            ),
         )  # fmt: skip
     return best
 
@@ -461,9 +465,11 @@ def refuse_accident(
             f"the scene and {targets[0].called} do not agree: {agreeing} of {counted(chips, 'chip')} fit together "
             f"within {reach:.0f} px of where the model puts them, which chance does as well",
             file=targets[0].path, field=targets[0].field,
-            remedy=f"check that {targets[0].called} shows this place, search farther (`match.search`) if the model "
-            "may be off by more, for rotations (`match.search_rotation=5`) if it may be turned, or measure points "
-            "by hand",
+            remedy=Text(
+                f"check that {targets[0].called} shows this place, search farther (", Setting("match.search"),
+                ") if the model may be off by more, for rotations (", Setting("match.search_rotation", "5"),
+                ") if it may be turned, or measure points by hand"
+            ),
         )  # fmt: skip
 
 
@@ -473,6 +479,8 @@ def _no_overlap(targets: Sequence[Target], count: int) -> InputError:
         why = "where it covers the scene, it has no values or there are no heights"
     return InputError(
         f"{targets[0].called} shows too little of the scene: {why}", file=targets[0].path, field=targets[0].field,
-        remedy="give images that overlap more, bands that have values (`match.reference_bands`), and heights that "
-        "cover the overlap",
+        remedy=Text(
+            "give images that overlap more, bands that have values (", Setting("match.reference_bands"),
+            "), and heights that cover the overlap"
+        ),
     )  # fmt: skip

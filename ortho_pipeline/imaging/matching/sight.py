@@ -26,6 +26,7 @@ from ortho_pipeline.imaging.matching.search import Level
 from ortho_pipeline.imaging.matching.targets import Target, View
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options.texts import Text
 from ortho_pipeline.surface.rays import meet_surface
 
 #: Chips bear heights that displace them by so many chip px (standard deviation).
@@ -190,7 +191,7 @@ def placed_along_sight(
         raise InputError(
             f"{refused.message}; nor do chips agree across the line of sight, along which wrong heights displace them "
             f"by {displaced:.0f} px", file=refused.file, field=refused.field,
-            remedy=f"give better heights, or: {refused.remedy}",
+            remedy=Text("give better heights, or: ", refused.remedy or ""),
         ) from None  # fmt: skip
     correction, chips, agreeing = found
     shift = correction.coefficients[[0, 3]]

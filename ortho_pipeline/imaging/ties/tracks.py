@@ -20,6 +20,7 @@ from ortho_pipeline.imaging.matching.chip_search import FEWEST, SIDE
 from ortho_pipeline.imaging.matching.targets import SAMPLES, OtherScene, View, metres_per_pixel
 from ortho_pipeline.imaging.ties.pairs import Matched, Pair, PairSummary, TieSettings, shared, shows
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.block_cache import limit_cache
 
 #: Cells of a scene are at most so many times those wanted of its smallest overlap.
@@ -87,8 +88,11 @@ def tie(views: Sequence[View], settings: TieSettings) -> Ties:
         )
         raise InputError(
             f"there are no ties: {said}", file=views[0].intensity.source.path, field="images",
-            remedy="search farther (`match.search`) if the models may be off by more, state how wrong the heights may "
-            "be (`surface.sigma`), or measure tie points by hand",
+            remedy=Text(
+                "search farther (", Setting("match.search"),
+                ") if the models may be off by more, state how wrong the heights may be (", Setting("surface.sigma"),
+                "), or measure tie points by hand"
+            ),
         )  # fmt: skip
     return block.ties()
 

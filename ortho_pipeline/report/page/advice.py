@@ -6,11 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from ortho_pipeline.options.texts import Setting, Text
+
 Level = Literal["stop", "look", "know"]
 
 _STOP: dict[str, str] = {
-    "reference-displaced": "Let the measured points control beside the matches (`match.gcps_as=control`), and state "
-    "how accurate the reference is (`match.reference_sigma`).",
+    "reference-displaced": Text(
+        "Let the measured points control beside the matches (",
+        Setting("match.gcps_as", "control"),
+        "), and state how accurate the reference is (",
+        Setting("match.reference_sigma"),
+        ").",
+    ),
     "heights-disagree": "Find out which height datum points and DEM have, state both, and make it again.",
     "model-elsewhere": "Check that image, points and their CRS belong together, and that columns and rows are not "
     "swapped.",
@@ -27,8 +34,11 @@ _STOP: dict[str, str] = {
 _LOOK: dict[str, str] = {
     "reference-covers-part": "Add references or measured points in the rest of the scene, or do not use the "
     "ortho there.",
-    "bands-disagree": "Match again with bands that agree and look like the scene (`match.reference_bands`): visible "
-    "bands for a panchromatic scene.",
+    "bands-disagree": Text(
+        "Match again with bands that agree and look like the scene (",
+        Setting("match.reference_bands"),
+        "): visible bands for a panchromatic scene.",
+    ),
     "left-out": "Look at it in the image and at its coordinates: measure it again, or delete it from the file of "
     "points.",
     "more-left-out": "So many gross errors mean that the points or the model do not suit the scene: see both.",

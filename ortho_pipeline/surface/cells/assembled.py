@@ -12,6 +12,7 @@ import pyproj
 from ortho_pipeline.errors import CoverageError, DatumError, InputError
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.surface.base import Array, parse_fill
 from ortho_pipeline.surface.cells.copernicus import LIST, Cell, Extent, crs_of_cells
 from ortho_pipeline.surface.cells.sources import Source, misplaced
@@ -122,7 +123,8 @@ def _file_of(cell: Cell, path: str) -> tuple[Samples, pyproj.CRS, SampleGrid, st
     if declared is not None and declared.vertical != Vertical("EPSG:3855"):
         raise DatumError(
             f"this cell says that its heights are in {declared.name!r}, and those of this DEM are above EGM2008",
-            file=path, field="surface.dem", remedy="give the cells as a DEM of their own: `surface.dem=FOLDER/*.tif`",
+            file=path, field="surface.dem",
+            remedy=Text("give the cells as a DEM of their own: ", Setting("surface.dem", "FOLDER/*.tif")),
         )  # fmt: skip
     wrong = misplaced(cell, grid.shape, grid.crs_from_pixel)
     if wrong:
@@ -141,8 +143,11 @@ def _lost(source: Source, lost: list[Cell], *, known: bool) -> CoverageError:
         f"there are no public heights of this land: {names}" if known
         else f"{names} are not there, and without {LIST} nobody says whether that is sea"
     )  # fmt: skip
+    otherwise = "" if known else f"; or put the list {LIST} beside the cells"
     return CoverageError(
         what, file=source.address, field="surface.dem",
-        remedy=f"give a DEM of this place; or say what such places shall be: `surface.fill=mask` (no pixels), nearest, "
-        f"or an ellipsoidal height in metres{'' if known else f'; or put the list {LIST} beside the cells'}",
+        remedy=Text(
+            "give a DEM of this place; or say what such places shall be: ", Setting("surface.fill", "mask"),
+            f" (no pixels), nearest, or an ellipsoidal height in metres{otherwise}"
+        ),
     )  # fmt: skip

@@ -17,6 +17,7 @@ from ortho_pipeline.files.stac.collection import Collection
 from ortho_pipeline.files.stac.item import Asset, split
 from ortho_pipeline.geodesy.crs import Vertical, horizontal, parse_crs
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.surface.base import parse_fill
 from ortho_pipeline.surface.cells.copernicus import Extent
 from ortho_pipeline.surface.dem import DemSurface, dem_of
@@ -110,7 +111,10 @@ def _placed(asset: Asset, access: Mapping[str, Any], override: bool) -> tuple[Pl
         raise DatumError(
             f"this file declares its heights as {own.name!r}, and its STAC item says {declared.name!r}", file=file.path,
             field="surface.vertical",
-            remedy="say which is true: `surface.vertical` together with `surface.override_vertical`",
+            remedy=Text(
+                "say which is true: ", Setting("surface.vertical"), " together with ",
+                Setting("surface.override_vertical")
+            ),
         )  # fmt: skip
     return (file, crs, grid, unit), False
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid, RasterSource
 
@@ -71,7 +72,7 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
     if order == "most-accurate" and without:
         raise InputError(
             f"nobody says how accurate {without[0].name} is at each place", file=without[0].path, field="mosaic.order",
-            remedy="give all scenes `output.accuracy_raster`, or order them by best-view",
+            remedy=Text("give all scenes ", Setting("output.accuracy_raster"), ", or order them by best-view"),
         )  # fmt: skip
     if order != "first-on-top":
         orthos = sorted(

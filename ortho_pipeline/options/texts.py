@@ -1,0 +1,75 @@
+"""Texts that name options: in Python and in the pipeline file by field, on the command line by flag.
+
+What is said of an option is written as ``Text("give ", Setting("surface.dem", "FILE"), " too")``. Such a text is the
+string "give `surface.dem=FILE` too", and still knows its parts; a formatted string that contains it does not.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Self
+
+_NOTATION = re.compile(r"`([a-z_]+(?:\.[a-z_]+)?)(?:\.(\w+))?(?:=([^`]*))?`")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """An option in a text, with the value that it is given there, if any.
+
+    Parameters
+    ----------
+    name : str
+        ``group.field``, or the name of an argument.
+    value : str, optional
+        The value, or a word in its place (FILE).
+    key : str, optional
+        Of an option that holds several: which of them.
+    """
+
+    name: str
+    value: str | None = None
+    key: str | None = None
+
+    def __str__(self) -> str:
+        name = self.name if self.key is None else f"{self.name}.{self.key}"
+        return f"`{name}`" if self.value is None else f"`{name}={self.value}`"
+
+
+class Text(str):
+    """A text for people that knows which options it names, made of strings, other texts and settings.
+
+    A string for all that need no more, also in JSON.
+    """
+
+    __slots__ = ("parts",)
+
+    parts: tuple[str | Setting, ...]
+
+    def __new__(cls, *parts: str | Setting) -> Self:
+        """Join parts; the options that texts among them name stay known."""
+        text = super().__new__(cls, "".join(map(str, parts)))
+        inner = (part.parts if isinstance(part, Text) else (part,) for part in parts)
+        object.__setattr__(text, "parts", tuple(part for some in inner for part in some))
+        return text
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), self.parts
+
+    @classmethod
+    def joined(cls, between: str, texts: Iterable[str]) -> Text:
+        """Return texts with a string between each two."""
+        parts = [part for text in texts for part in (between, text)]
+        return cls(*parts[1:])
+
+    @classmethod
+    def read(cls, text: str) -> Text:
+        """Return a text that another process has written into a JSON document, where it is a string alone."""
+        parts: list[str | Setting] = []
+        end = 0
+        for found in _NOTATION.finditer(text):
+            name, key, value = found.groups()
+            parts += [text[end : found.start()], Setting(name, value, key)]
+            end = found.end()
+        return Text(*parts, text[end:])
