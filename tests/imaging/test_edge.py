@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from pathlib import Path
@@ -35,20 +36,27 @@ def edge_image(
 
     Each pixel is the mean of 16 x 16 places in a square of the side `pixel`, blurred by a Gaussian.
     """
-    x, y = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
     turn, centre = math.radians(angle_deg), size / 2 + 0.13
+    pixels = levels[0] + (levels[1] - levels[0]) * _seen(sigma, turn, size, pixel)
+    pixels += np.random.default_rng(seed).normal(0.0, noise, pixels.shape)
+    along = np.array([-math.sin(turn), math.cos(turn)])
+    along *= (size / 2 - margin) / np.abs(along).max()
+    first, last = (centre - along).tolist(), (centre + along).tolist()
+    return pixels, ((first[0], first[1]), (last[0], last[1]))
+
+
+@functools.cache
+def _seen(sigma: float, turn: float, size: int, pixel: float) -> Array:
+    """Return the share of each pixel that lies on the bright side."""
+    x, y = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
+    centre = size / 2 + 0.13
     places = ((np.arange(16) + 0.5) / 16 - 0.5) * pixel
     seen = np.zeros((size, size))
     for dx in places:
         for dy in places:
             distance = (x + dx - centre) * math.cos(turn) + (y + dy - centre) * math.sin(turn)
             seen += ndtr(distance / sigma) if sigma > 0 else distance > 0
-    pixels = levels[0] + (levels[1] - levels[0]) * seen / 256
-    pixels += np.random.default_rng(seed).normal(0.0, noise, pixels.shape)
-    along = np.array([-math.sin(turn), math.cos(turn)])
-    along *= (size / 2 - margin) / np.abs(along).max()
-    first, last = (centre - along).tolist(), (centre + along).tolist()
-    return pixels, ((first[0], first[1]), (last[0], last[1]))
+    return seen / 256
 
 
 def nudged(segment: Segment, by: float = 1.5) -> Segment:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,6 +15,7 @@ from osgeo import gdal, osr
 from ortho_pipeline.exchange.rpc import write_rpc_txt
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.measure import planning
 from ortho_pipeline.measure.block.session import open_block_session
 from ortho_pipeline.measure.project import Project
 from ortho_pipeline.measure.session import open_session
@@ -44,6 +45,23 @@ class Truth:
             ground = ground_transform(self.camera.crs, "EPSG:4979")(self.camera.image_to_ground(image, height))
             height = self.terrain(ground[:, 0], ground[:, 1])
         return np.column_stack([ground[:, :2], height])
+
+
+@pytest.fixture(scope="session", autouse=True)
+def structure_is_found_once() -> Iterator[None]:
+    """Look for the structure of an image once, and not for every session that is opened on it."""
+    found, first = planning.candidates, {}
+
+    def candidates(view, region, cells, size, factor, inside):
+        path = Path(view.intensity.source.path)
+        key = (path, path.stat().st_mtime_ns, view.intensity.bands, region, cells, size, factor, inside.tobytes())
+        if key not in first:
+            first[key] = found(view, region, cells, size, factor, inside)
+        return first[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(planning, "candidates", candidates)
+        yield
 
 
 @pytest.fixture(scope="session")
