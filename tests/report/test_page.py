@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import functools
 import itertools
 import json
 import math
@@ -18,7 +19,7 @@ from osgeo import gdal
 
 from ortho_pipeline.display.drawing import Drawing
 from ortho_pipeline.display.numbers import class_size
-from ortho_pipeline.estimation.fit import fit
+from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.points import Points
@@ -40,13 +41,19 @@ CAMERA = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(650.
 TERRAIN = Terrain("EPSG:32636", 531100.0, 4122700.0)
 
 
+@functools.cache
 def measured(control: int = 12, check: int = 6, **noise: float) -> Points:
     return simulate_points(CAMERA, TERRAIN, control=control, check=check, seed=5, **noise).measured
 
 
+@functools.cache
+def adjusted(points: Points, correction: str) -> Fit:
+    return fit(ImageCorrection(CAMERA, correction, (500.0, 500.0), np.zeros(6)), points)
+
+
 def made(points: Points, crs: str = "EPSG:32636", correction: str = "shift") -> SceneReport:
     """Return the report of a scene whose ortho lies in a CRS."""
-    result = fit(ImageCorrection(CAMERA, correction, (500.0, 500.0), np.zeros(6)), points)
+    result = adjusted(points, correction)
     scene = Scene("simulated", "scene.tif", 1000, 1000, {"camera": result.model}, "from a seed", {})
     x, y = pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(*points.ground[:, :2].T)
     margin = 0.1 * (max(x) - min(x)) or 100.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import functools
 import hashlib
 import html
 import json
@@ -39,11 +40,13 @@ BIAS = np.array([6.3, -4.1])
 HOSTILE = '<script>alert("x")</script>'
 
 
+@functools.cache
 def points(control: int = 12, check: int = 6, **noise: float) -> Points:
     made = simulate_points(CAMERA, TERRAIN, control=control, check=check, seed=5, **noise).measured
     return dataclasses.replace(made, image=made.image + BIAS)
 
 
+@functools.cache
 def adjusted(measured: Points, correction: str = "shift") -> Fit:
     return fit(ImageCorrection(CAMERA, correction, (500.0, 500.0), np.zeros(6)), measured, name=f"camera+{correction}")
 
