@@ -1,10 +1,10 @@
 """Band-to-band registration: bands of several cameras brought onto one of them.
 
-Tie points are measured by sub-pixel phase correlation (scikit-image, Guizar-Sicairos et al. 2008) of patches on a
-regular grid, twice: around the coarse shift of the whole frames, and again around the transformation that fits the
-first pass, so that the patches overlap to a pixel. A similarity, affine, projective or second-order polynomial
-transformation is fitted by least squares without the tie points that contradict the others, and the band is resampled
-once, by cubic splines.
+Tie points are patches on a regular grid. Phase correlation (scikit-image) finds each to the pixel, and least squares
+(`matching.least_squares`) to its parts. Patches are measured twice: around the coarse shift of the whole frames, and
+again around the transformation that fits the first pass, so that they overlap to a pixel. A similarity, affine,
+projective or second-order polynomial transformation is fitted by least squares without the tie points that contradict
+the others, and the band is resampled once, by cubic splines.
 
 Source: Ok and Turker, section 2.2; Yuksel et al. 2004 (the four cameras of BILSAT-1 onto the red one).
 """
@@ -24,8 +24,8 @@ from ortho_pipeline.models.base import Array, as_image
 
 #: Number of parameters by the name of the transformation.
 TRANSFORMS = {"similarity": 4, "affine": 6, "projective": 8, "poly2": 12}
-#: Correlated patches are found to this part of a pixel.
-_UPSAMPLING = 50
+#: Pixels around a patch in which least squares look for it.
+_REACH = 6
 #: A tie point is dropped beyond this many robust standard deviations, and never below this many pixels.
 _REJECT_SIGMAS, _REJECT_FLOOR = 3.5, 0.02
 #: Patches with less than this part of the band's usual contrast carry nothing to correlate.
@@ -167,7 +167,7 @@ def resample(band: Array, transform: Transform) -> Array:
 
 
 def measure(fixed: Array, moving: Array, guess: Any, *, patch: int, spacing: int) -> tuple[Array, Array]:
-    """Measure tie points by phase correlation.
+    """Measure tie points: by phase correlation to the pixel, by least squares to its parts.
 
     Parameters
     ----------
@@ -195,9 +195,26 @@ def measure(fixed: Array, moving: Array, guess: Any, *, patch: int, spacing: int
             continue
         shift, likeness = _shift(first, second, window)
         if np.abs(shift).max() < patch / 4 and likeness > _LIKENESS:
-            found.append((*centre, left + half + shift[0], top + half + shift[1]))
+            found.append((*centre, *(np.array([left, top]) + half + np.rint(shift))))
     table = np.array(found, dtype=np.float64).reshape(-1, 4)
-    return table[:, :2], table[:, 2:]
+    return _refined(fixed, moving, table[:, :2], table[:, 2:], half)
+
+
+def _refined(fixed: Array, moving: Array, reference: Array, there: Array, half: int) -> tuple[Array, Array]:
+    """Return tie points whose places in `moving` are known to the pixel, measured to its parts; few drop out."""
+    from ortho_pipeline.imaging.matching import least_squares
+
+    rim = half + _REACH
+    around = np.pad(moving, _REACH, constant_values=np.nan)
+    chips = [fixed[y - half : y + half, x - half : x + half] for x, y in reference.astype(int)]
+    wide = [around[y - half : y + rim + _REACH, x - half : x + rim + _REACH] for x, y in there.astype(int)]
+    if not chips:
+        return reference, there
+    measured = least_squares.measure(
+        np.array(chips, dtype=np.float32), np.array(wide, dtype=np.float32), np.zeros((len(chips), 2))
+    )
+    good = np.isfinite(measured.shift).all(axis=1)
+    return reference[good], (there + measured.shift)[good]
 
 
 def _register_band(fixed: Array, moving: Array, name: str, transform: str, patch: int, spacing: int) -> Registration:
@@ -226,7 +243,6 @@ def _shift(first: Array, second: Array, window: Array) -> tuple[Array, float]:
     rows_columns, error, _ = phase_cross_correlation(
         (first - first.mean()) * window,
         (second - second.mean()) * window,
-        upsample_factor=_UPSAMPLING,
         normalization=None,
     )
     likeness = math.sqrt(max(0.0, 1.0 - min(float(error), 1.0) ** 2))
