@@ -439,13 +439,16 @@ class Attack:
             wrong.append("exit code 0, but not the whole new set")
         else:
             wrong += [text for text in [untyped(ended)] if text is not None]
-        left = [name for name in now if ".part" in name]
+        # What is left among the records of a run goes with the next one.
+        left = [name for name in now if ".part" in name and not name.startswith(".run/")]
         wrong += [f"left: {', '.join(left)}"] if left else []
         if not self.one_set(case, before, new, {name: now[name] for name in now if ".part" not in name}):
             wrong.append(f"broken or mixed set: {sorted(set(now.items()) - set(new.items()) - set(before.items()))}")
         outcome = "new" if now == new else "old" if now == before else "parts"
         if again:
             next_one = run(case.words, self.work)
+            left = [name for name in content(self.out) if ".part" in name]
+            wrong += [f"the next run leaves: {', '.join(left)}"] if left else []
             if next_one.code != 0 or content(self.out) != new:
                 differs = sorted(set(content(self.out).items()) ^ set(new.items()))
                 wrong.append(f"the next run ends with {next_one.code}: {next_one.said[-300:]} {differs[:6]}")
