@@ -204,10 +204,12 @@ def _refined(fixed: Array, moving: Array, reference: Array, there: Array, half: 
     """Return tie points whose places in `moving` are known to the pixel, measured to its parts; few drop out."""
     from ortho_pipeline.imaging.matching import least_squares
 
+    # A patch may have moved over the rim of the other band.
     rim = half + _REACH
-    around = np.pad(moving, _REACH, constant_values=np.nan)
+    around = np.pad(moving, rim, constant_values=np.nan)
     chips = [fixed[y - half : y + half, x - half : x + half] for x, y in reference.astype(int)]
-    wide = [around[y - half : y + rim + _REACH, x - half : x + rim + _REACH] for x, y in there.astype(int)]
+    # Moved by `rim`, the window of a place begins at the place itself.
+    wide = [around[y : y + 2 * rim, x : x + 2 * rim] for x, y in there.astype(int)]
     if not chips:
         return reference, there
     measured = least_squares.measure(
