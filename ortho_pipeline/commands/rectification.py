@@ -15,7 +15,7 @@ from ortho_pipeline.commands.layers.angles import sun_of, write_angles
 from ortho_pipeline.commands.layers.filling import other_of
 from ortho_pipeline.commands.placement import Placement, place_scene
 from ortho_pipeline.commands.resolved.ledger import RASTERS, provenance, read_since
-from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.resolved.request import Request, point_options
 from ortho_pipeline.commands.results import (
     ENDINGS,
     OF_REPORT,
@@ -98,7 +98,7 @@ def rectify(
         written, an old side-car that would attach to the ortho.
     """
     stem, before, stage = Path(image).stem, bytes_read(), progress or _unwatched
-    request = Request(image, scene, points, surface, match, output)  # type: ignore[arg-type]
+    request = Request(image, scene, point_options(points), surface, match, output)
     files = outputs(folder, stem, output)
     inputs.check_paths(files, request, overwrite)
     require_heights(surface)

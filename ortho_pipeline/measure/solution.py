@@ -64,7 +64,7 @@ def solve(scene: Scene, points: Points, request: Request, surface: Surface, corr
         return Solution(scene.model, None)
     alone = replace(request, points=asked, match=MatchOptions())
     try:
-        done = adjust(Resolved(alone, scene, surface, points, Ledger({}, {})))
+        done = adjust(Resolved(alone, scene, surface, points, Ledger()))
     except OrthoError as error:
         return Solution(scene.model, None, error.message)
     except np.linalg.LinAlgError as error:

@@ -8,7 +8,7 @@ import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,8 +55,8 @@ class Ledger:
         From `files.states`.
     """
 
-    roles: Mapping[Path, str]
-    begun: State
+    roles: Mapping[Path, str] = field(default_factory=dict)
+    begun: State = field(default_factory=dict)
 
     @classmethod
     def of(

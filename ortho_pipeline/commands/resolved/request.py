@@ -1,4 +1,4 @@
-"""What a command is asked for one scene, and the same once its files are open: nothing is opened twice."""
+"""What a command is asked for one scene, and the same once its scene, heights and points are open."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ from ortho_pipeline.surface.base import Surface
 OWN_POINTS = "own"
 
 
+def point_options(points: PointOptions | Points) -> PointOptions:
+    """Return options; points that are read already are used as they are."""
+    return PointOptions(gcps=points) if isinstance(points, Points) else points
+
+
 @dataclass(frozen=True, eq=False)
 class Request:
     """What is asked of one scene: its image, and the options as the user gave them.
@@ -25,8 +30,6 @@ class Request:
     ----------
     image : path or Scene
         A scene is open already.
-    points : PointOptions or Points
-        A table is used as it is.
     """
 
     image: Any
@@ -35,10 +38,6 @@ class Request:
     surface: SurfaceOptions = SurfaceOptions()
     match: MatchOptions = MatchOptions()
     output: OutputOptions = OutputOptions()
-
-    def __post_init__(self) -> None:
-        if isinstance(self.points, Points):
-            object.__setattr__(self, "points", PointOptions(gcps=self.points))
 
     @property
     def has_control(self) -> bool:
@@ -69,7 +68,9 @@ class Request:
 
 @dataclass(frozen=True, eq=False)
 class Resolved:
-    """A request whose files are open: what is made from here on reads no option that names a file.
+    """A request whose scene, heights and points are open.
+
+    References, the raster of the grid and another ortho are opened where they are used.
 
     Parameters
     ----------
