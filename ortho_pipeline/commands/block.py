@@ -44,6 +44,7 @@ from ortho_pipeline.files.locations import located
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options.texts import Text
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report import block as block_report
 from ortho_pipeline.report.block_records import BlockReport
@@ -120,7 +121,7 @@ def adjust(
             exported[label] = rpc.export_rpc(_plain(fit.models[label]))
             notes += [notice.in_image(label) for notice in exported[label].warnings]
         except InputError as error:
-            notes.append(Notice("no-rpc", f"no RPC is written ({error.message})").in_image(label))
+            notes.append(Notice("no-rpc", Text("no RPC is written (", error.message, ")")).in_image(label))
             del files[f"{label} rpc"]
     record = _record(images, points, scenes, starts, command, match, surface, gathered.heights)
     made = block_report.build_report(
@@ -130,7 +131,7 @@ def adjust(
     with together(folder, "block"):
         _write(files, made, fit, starts, exported, record)
         failure = attempted(lambda: _write_report(files, made, pictures), files, "report", "html")
-    text = "\n".join([*gathered.text, block_report.summary_text(made)])
+    text = Text.joined("\n", [*gathered.text, block_report.summary_text(made)])
     return Result(files, {"report": json_value(made), **gathered.document}, text, failure)
 
 

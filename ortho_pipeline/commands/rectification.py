@@ -274,7 +274,7 @@ def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[Notice]]:
     try:
         exported = rpc.export_rpc(model)
     except InputError as error:
-        return None, [Notice("no-rpc", f"no RPC files were written: {error.message}")]
+        return None, [Notice("no-rpc", Text("no RPC files were written: ", error.message))]
     return exported, list(exported.warnings)
 
 

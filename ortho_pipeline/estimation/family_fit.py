@@ -104,7 +104,7 @@ def fit_family(
         if simpler is None:
             raise
         raise DegeneratePoints(
-            f"{family}: {error.message}",
+            Text(f"{family}: ", error.message),
             file=error.file,
             field=error.field,
             remedy=Text(error.remedy or "", f"; these points do determine {simpler}"),

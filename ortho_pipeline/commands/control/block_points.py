@@ -197,7 +197,9 @@ def _matches(scenes: Any, match: MatchOptions, surface: Any, opened: SceneOption
             found = match_scene(scene, match, surface, opened)
         except InputError as error:
             first = first or error
-            notices.append(Notice("no-matches", f"not matched with the reference: {error.message}").in_image(label))
+            notices.append(
+                Notice("no-matches", Text("not matched with the reference: ", error.message)).in_image(label)
+            )
             continue
         points = found.matches.points
         tables[label] = replace(

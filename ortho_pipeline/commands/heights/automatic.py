@@ -108,7 +108,7 @@ def _require_geoid(allow_network: bool) -> None:
         fetch_grid(grid)
     except OrthoError as error:
         raise DatumError(
-            f"the cells' heights are above EGM2008, and its geoid grid cannot be fetched: {error.message}",
+            Text("the cells' heights are above EGM2008, and its geoid grid cannot be fetched: ", error.message),
             file=error.file, field="surface.dem",
             remedy=Text(
                 error.remedy or "try again later", "; or give the file with ",
