@@ -332,8 +332,9 @@ def test_the_state_of_a_worldview_3_is_explained_effect_by_effect(real: Path) ->
 
 @pytest.mark.realdata
 @pytest.mark.parametrize(
-    "name", ["1040010074793300.json", "1040010074793300.adjusted_state.json",
-             "../jitter/uyuni/csm-1040010014761800.r100.adjusted_state.json"],
+    "name",
+    ["1040010074793300.json", "1040010074793300.adjusted_state.json",
+     pytest.param("../jitter/uyuni/csm-1040010014761800.r100.adjusted_state.json", marks=pytest.mark.slow)],
     ids=["as made", "adjusted", "with solved jitter"],
 )  # fmt: skip
 def test_real_states_in_the_library_and_there_and_back(real: Path, tmp_path: Path, name: str) -> None:

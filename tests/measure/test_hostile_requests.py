@@ -96,7 +96,7 @@ def test_who_only_reads_stops_there_too_and_changes_nothing(projects: list[Any])
     writer.close()
 
 
-@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("number", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_hostile_requests_are_answered_and_what_they_store_opens(projects: list[Any], number: int) -> None:
     answered = check(projects[number], 120, 11 + number, 120)
     assert answered[200] > 20
@@ -104,6 +104,6 @@ def test_hostile_requests_are_answered_and_what_they_store_opens(projects: list[
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("number", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_ten_thousand_hostile_requests(projects: list[Any], number: int) -> None:
     assert check(projects[number], 10_000, 1 + number, 500).total() == 10_000

@@ -217,7 +217,7 @@ def test_control_and_check_are_never_mixed():
 @pytest.fixture(scope="module")
 def reproduced(tmp_path_factory):
     folder = tmp_path_factory.mktemp("ikonos")
-    done = CliRunner().invoke(cli, ["reproduce", "ikonos", "--realisations", "3", "-o", str(folder), "--json"])
+    done = CliRunner().invoke(cli, ["reproduce", "ikonos", "--realisations", "2", "-o", str(folder), "--json"])
     assert done.exit_code == 0, done.output
     return folder, json.loads(done.stdout)
 
