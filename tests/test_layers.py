@@ -283,13 +283,13 @@ def test_messages_name_options_by_their_fields() -> None:
         if where.name != "study.py":  # the switches of a study are its own to name
             assert not typed or COMMAND_LINE.search(text), f"{where}, {typed}: a flag is the command line's"
         assert not re.search(r"`(scene|points|surface|match|output)\.", text), f"{where}: {text!r}, not a Setting"
-    for path, call in ((path, node) for path in paths for node in nodes(path)):
+    for where, call in ((path, node) for path in paths for node in nodes(path)):
         if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Setting"):
             continue
         group, _, name = str(getattr(call.args[0], "value", "")).partition(".")
         if name:
             known = {**options_of(GROUPS[group]), **(options_of(BlockOptions) if group == "points" else {})}
-            assert name in known, f"{path}: there is no option {group}.{name}"
+            assert name in known, f"{where}: there is no option {group}.{name}"
 
 
 def test_starting_a_command_loads_nothing_that_few_need() -> None:
