@@ -124,17 +124,6 @@ def reads(remedy: str, field: str | None = None) -> Callable[[Callable[_P, _R]],
     return decorate
 
 
-def counted(number: int, what: str, plural: str | None = None) -> str:
-    """Return a number and what it counts, as ``1 point`` and ``2 points``.
-
-    Parameters
-    ----------
-    plural : str, optional
-        Where it is not formed with an s, or a verb follows: ``counted(n, "point does", "points do")``.
-    """
-    return f"{number} {what if number == 1 else plural or f'{what}s'}"
-
-
 def is_told_already(lost: Any) -> bool:
     """Tell whether what a destructor cannot raise is of a dataset that GDAL's binding dropped because a copy failed.
 

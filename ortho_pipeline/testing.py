@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_pipeline.errors import counted
+from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.hookspecs import Scene, Sensor
 from ortho_pipeline.models import KINDS, SensorModel, model_from_dict
 from ortho_pipeline.models.base import as_ground

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ortho_pipeline.errors import InputError, TooFewPoints, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.estimation.comparison import compare
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.fit import fit

@@ -32,7 +32,8 @@ from ortho_pipeline.block.variances.components import Posterior
 from ortho_pipeline.block.variances.grid import estimate, posterior, reweighed
 from ortho_pipeline.block.variances.shared_errors import SharedByImage
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged
 from ortho_pipeline.estimation.problem import Prior
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
 from ortho_pipeline.files.process_limits import one_blas_thread

@@ -17,7 +17,8 @@ import numpy as np
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.block.projection.rays import linearised
-from ortho_pipeline.errors import InputError, TooFewPoints, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 

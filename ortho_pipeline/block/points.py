@@ -17,7 +17,8 @@ import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs, same_crs
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import is_usable

@@ -11,7 +11,8 @@ from ortho_pipeline import plugins
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.resolved.ledger import hashed, require_unchanged
 from ortho_pipeline.commands.results import Result, to_store
-from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import allowed, states, together, whole_or_nothing, write_json
 from ortho_pipeline.files.locations import archive_of, located, place

@@ -35,7 +35,8 @@ from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import Result, attempted, to_store
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
-from ortho_pipeline.errors import InputError, OrthoError, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
 from ortho_pipeline.files import json_text, together, write_json, write_text

@@ -17,7 +17,8 @@ from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION, Result, out
 from ortho_pipeline.commands.stac.given import heights_given, with_items
 from ortho_pipeline.commands.survey.map_raster import described, is_upright, kind_of
 from ortho_pipeline.display.notices import to_document
-from ortho_pipeline.errors import InputError, completed, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files import write_json, write_text
 from ortho_pipeline.files.documents import json_value

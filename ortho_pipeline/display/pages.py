@@ -10,8 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.display.numbers import fixed, metres, plain_size, px, share, short, signed
-from ortho_pipeline.errors import counted
+from ortho_pipeline.display.numbers import counted, fixed, metres, plain_size, px, share, short, signed
 
 
 def render(template: str, **values: Any) -> str:

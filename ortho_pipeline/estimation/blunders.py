@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
 from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.statistics import squared_distances

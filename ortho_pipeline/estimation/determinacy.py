@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import DegeneratePoints, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import DegeneratePoints
 from ortho_pipeline.estimation.problem import Solution
 from ortho_pipeline.estimation.statistics import correlation_of
 from ortho_pipeline.models.base import SensorModel

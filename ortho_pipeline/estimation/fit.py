@@ -16,7 +16,8 @@ import numpy as np
 from ortho_pipeline.display.charts import residual_axes
 from ortho_pipeline.display.notebook import fit_html
 from ortho_pipeline.display.notices import Notice, to_document
-from ortho_pipeline.errors import DegeneratePoints, InputError, ModelError, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import DegeneratePoints, InputError, ModelError
 from ortho_pipeline.estimation.blunders import REJECTED_LIMIT, Outlying, checks_apart, find_blunders, outlying
 from ortho_pipeline.estimation.determinacy import (
     EXTRAPOLATION_WARNING,

@@ -8,7 +8,7 @@ import re
 from datetime import datetime
 from xml.etree.ElementTree import Element
 
-from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.reading import read_bounded
 
 MAX_SIZE = 5_000_000
@@ -95,7 +95,7 @@ class XmlFields:
         """Return the finite numbers in a text of a field."""
         tokens = text.split(maxsplit=MOST_TERMS)
         if len(tokens) > MOST_TERMS or (count is not None and len(tokens) != count):
-            wanted = counted(count, "number belongs", "numbers belong") if count else "a few numbers belong"
+            wanted = f"{count} numbers belong" if count > 1 else "1 number belongs" if count else "a few numbers belong"
             raise self.error(f"{wanted} here", field)
         values = []
         for token in tokens:

@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.options.texts import Setting, Text
 
 Array = NDArray[np.float64]

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_pipeline.errors import InputError, TooFewPoints, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.models.base import Array, as_image
 
 #: Number of parameters by the name of the transformation.

@@ -13,7 +13,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.documents import DocumentError, json_value, record, record_of
 from ortho_pipeline.geodesy.crs import horizontal, parse_crs
 from ortho_pipeline.options import CORRECTIONS

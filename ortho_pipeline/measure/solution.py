@@ -11,7 +11,8 @@ import numpy as np
 from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.resolved.request import Request, Resolved
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust
-from ortho_pipeline.errors import OrthoError, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres, rmse_metres
 from ortho_pipeline.estimation.problem import ImageErrors

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pyproj
 
-from ortho_pipeline.errors import TooFewPoints, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import TooFewPoints
 from ortho_pipeline.geodesy.crs import parse_crs, utm_crs
 from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
 from ortho_pipeline.geodesy.naming import crs_definition

@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.errors import OrthoError, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.estimation.problem import Prior
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.distortion import metres_of_steps

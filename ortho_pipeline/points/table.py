@@ -20,7 +20,8 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.display.notebook import points_html
-from ortho_pipeline.errors import InputError, counted, reads
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import json_text, write_text
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, parse_crs
 from ortho_pipeline.geodesy.naming import crs_definition

@@ -11,9 +11,8 @@ import numpy as np
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, doubted, to_document
-from ortho_pipeline.display.numbers import flat, metres, px
+from ortho_pipeline.display.numbers import counted, flat, metres, px
 from ortho_pipeline.display.pages import render
-from ortho_pipeline.errors import counted
 from ortho_pipeline.estimation.blunders import contradicting
 from ortho_pipeline.files.documents import json_value, made_of
 from ortho_pipeline.options.texts import Text

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.display.numbers import px
-from ortho_pipeline.errors import counted
+from ortho_pipeline.display.numbers import counted, px
 from ortho_pipeline.files.documents import record_of
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC

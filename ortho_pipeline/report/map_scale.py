@@ -22,8 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.display.numbers import class_size
-from ortho_pipeline.errors import counted
+from ortho_pipeline.display.numbers import class_size, counted
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres
 from ortho_pipeline.models.base import Array

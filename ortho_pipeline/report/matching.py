@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.display.numbers import metres, px, share
-from ortho_pipeline.errors import counted
+from ortho_pipeline.display.numbers import counted, metres, px, share
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres
 from ortho_pipeline.files.documents import json_value, made_of, record

@@ -8,8 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.display.notices import Notice, texts_but
-from ortho_pipeline.display.numbers import class_size, metres, plain_size, px, share, short, signed, size_m, size_text
-from ortho_pipeline.errors import counted
+from ortho_pipeline.display.numbers import (
+    class_size,
+    counted,
+    metres,
+    plain_size,
+    px,
+    share,
+    short,
+    signed,
+    size_m,
+    size_text,
+)
 from ortho_pipeline.estimation.blunders import contradicting
 from ortho_pipeline.options.texts import Text
 from ortho_pipeline.report.adjustment_records import Adjustment, Bias, Parameter, Rmse, RmseOnGround, RmsesOnGround

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, round_down, style_sheet
+from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.display.pages import render
-from ortho_pipeline.errors import counted
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.simulation.tables import VERDICTS, is_covered, is_missed
 

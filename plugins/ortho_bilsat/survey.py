@@ -8,7 +8,8 @@ import re
 from dataclasses import dataclass
 from os import PathLike
 
-from ortho_pipeline.errors import InputError, counted, reads
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import read_bounded, write_text
 from ortho_pipeline.models.lens import Interior
 

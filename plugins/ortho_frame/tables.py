@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.errors import InputError, counted, reads
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import read_bounded, read_json
 from ortho_pipeline.geodesy.ellipsoid import angles_of_rotation
 from ortho_pipeline.models.base import Array

@@ -28,7 +28,8 @@ from ortho_ikonos.truth import (
     GeoScene,
     VendorModel,
 )
-from ortho_pipeline.errors import OrthoError, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.estimation.family_fit import fit_family, fit_own, prune
 from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.exchange.rpc_fit import fit_rpc

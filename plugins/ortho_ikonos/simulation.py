@@ -15,7 +15,8 @@ from osgeo import gdal, osr
 from ortho_ikonos import rendering
 from ortho_ikonos import truth as simulated
 from ortho_ikonos.truth import GeoScene, VendorModel
-from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import write_rpc_txt
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.files import write_text

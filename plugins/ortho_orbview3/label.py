@@ -17,7 +17,8 @@ from dataclasses import dataclass, field
 from os import PathLike
 from typing import NamedTuple
 
-from ortho_pipeline.errors import InputError, counted, reads
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import decoded, read_bounded
 
 #: Real labels have 6 kB and three levels of groups.

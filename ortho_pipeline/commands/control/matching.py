@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.display.numbers import metres, px
-from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.display.numbers import counted, metres, px
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.hookspecs import Scene

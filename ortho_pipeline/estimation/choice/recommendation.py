@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ortho_pipeline.errors import counted
+from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.estimation.choice.expected_error import Expectation, expectation, supported
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.statistics import student_of

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import InputError, TooFewPoints, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.imaging.band_shifts import BandShift, spread

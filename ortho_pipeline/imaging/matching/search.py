@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, stats
 
-from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
 from ortho_pipeline.imaging.matching.targets import Target, View, metres_per_pixel

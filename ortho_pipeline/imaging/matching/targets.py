@@ -12,7 +12,8 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import CrsError, InputError, completed, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import CrsError, InputError, completed
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.intensity import Intensity

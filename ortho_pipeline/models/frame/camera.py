@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import (
     Array,
     SensorModel,

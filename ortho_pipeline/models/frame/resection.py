@@ -18,7 +18,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
 from ortho_pipeline.geodesy.ellipsoid import angles_of_rotation, rotation_between
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.frame.camera import FrameCamera

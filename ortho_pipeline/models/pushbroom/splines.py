@@ -10,7 +10,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ortho_pipeline.errors import InputError, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import Array
 
 

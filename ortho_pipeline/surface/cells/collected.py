@@ -10,7 +10,8 @@ from typing import Any
 import pyproj
 
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import CoverageError, CrsError, DatumError, completed, counted
+from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.errors import CoverageError, CrsError, DatumError, completed
 from ortho_pipeline.files.beside import ask_beside
 from ortho_pipeline.files.locations import is_far
 from ortho_pipeline.files.stac.collection import Collection
