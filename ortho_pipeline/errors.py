@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import sys
 import traceback
 from collections.abc import Callable, Iterator
 from os import PathLike, fspath
@@ -122,26 +121,6 @@ def reads(remedy: str, field: str | None = None) -> Callable[[Callable[_P, _R]],
         return reading
 
     return decorate
-
-
-def is_told_already(lost: Any) -> bool:
-    """Tell whether what a destructor cannot raise is of a dataset that GDAL's binding dropped because a copy failed.
-
-    The binding raises what stops a copy and drops what there is of it, whose destructor complains once more. All other
-    datasets that are written are closed by `raster.output`, which raises.
-    """
-    return getattr(lost.object, "__name__", "") == "delete_Dataset"
-
-
-def print_no_error_twice() -> None:
-    """Let this process print, of what destructors cannot raise, only what is not told already."""
-    before = sys.unraisablehook
-
-    def said(lost: Any) -> None:
-        if not is_told_already(lost):
-            before(lost)
-
-    sys.unraisablehook = said
 
 
 class Terminated(SystemExit):

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.estimation.comparison import compare
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.imaging.registration import Transform
 from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points, read_points
 from ortho_pipeline.points.selection import select_control
 from ortho_pipeline.simulation.scanner import LineScanner, simulate_points

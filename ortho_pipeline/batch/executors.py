@@ -18,8 +18,8 @@ from multiprocessing import connection
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, TypeVar
 
-from ortho_pipeline.errors import InputError, OrthoError, print_no_error_twice
-from ortho_pipeline.files.process_limits import require_memory, startable_threads
+from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.files.process_limits import print_no_error_twice, require_memory, startable_threads
 from ortho_pipeline.options import EXECUTORS
 from ortho_pipeline.options.texts import Setting, Text
 

@@ -32,13 +32,13 @@ from ortho_pipeline.block.variances.components import Posterior
 from ortho_pipeline.block.variances.grid import estimate, posterior, reweighed
 from ortho_pipeline.block.variances.shared_errors import SharedByImage
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged
 from ortho_pipeline.estimation.problem import Prior
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
 from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import marks_warning
 
 #: Parameters that move by more than this part of their sigma with the sigmas that were found are solved for again.

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from ortho_pipeline.errors import Terminated, is_told_already
+from ortho_pipeline.errors import Terminated
 
 #: Seconds after which an end that was lost is asked for again.
 _AGAIN = 0.01
@@ -46,6 +46,8 @@ def _ask_again(lost: Any) -> None:
     """Raise the exception of a signal a moment later once more; say what else a destructor cannot raise."""
     error = lost.exc_value
     if not isinstance(error, KeyboardInterrupt | Terminated):
+        from ortho_pipeline.files.process_limits import is_told_already
+
         if not is_told_already(lost):
             sys.__unraisablehook__(lost)
         return

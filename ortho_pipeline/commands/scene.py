@@ -17,7 +17,6 @@ from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION, Result, out
 from ortho_pipeline.commands.stac.given import heights_given, with_items
 from ortho_pipeline.commands.survey.map_raster import described, is_upright, kind_of
 from ortho_pipeline.display.notices import to_document
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files import write_json, write_text
@@ -31,6 +30,7 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging import resolution
 from ortho_pipeline.models import families
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.plugins.unread import unread
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.report import document as report

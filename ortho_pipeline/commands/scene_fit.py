@@ -14,7 +14,7 @@ from ortho_pipeline.commands.control.points import control_of, refuse_contradict
 from ortho_pipeline.commands.resolved.request import Request, Resolved
 from ortho_pipeline.commands.resolved.resolving import resolve
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.display.numbers import counted, metres
+from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import CoverageError, InputError
 from ortho_pipeline.estimation import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
@@ -25,7 +25,7 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, PointOptions
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.points.control_hull import uncovered
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points

@@ -7,8 +7,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.display.pages import render
+from ortho_pipeline.options.texts import counted
 
 #: In a notebook, pages of reports are this high (CSS pixels).
 _PAGE_HEIGHT = 640

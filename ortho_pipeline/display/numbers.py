@@ -7,17 +7,6 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 
-def counted(number: int, what: str, plural: str | None = None) -> str:
-    """Return a number and what it counts, as ``1 point`` and ``2 points``.
-
-    Parameters
-    ----------
-    plural : str, optional
-        Where it is not formed with an s, or a verb follows: ``counted(n, "point does", "points do")``.
-    """
-    return f"{number} {what if number == 1 else plural or f'{what}s'}"
-
-
 def flat(value: Any, name: str = "") -> Iterable[tuple[str, str]]:
     """Yield the leaves of nested values as (path of keys, text); what is None or empty is left out."""
     if isinstance(value, Mapping):

@@ -10,7 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.display.numbers import counted, fixed, metres, plain_size, px, share, short, signed
+from ortho_pipeline.display.numbers import fixed, metres, plain_size, px, share, short, signed
+from ortho_pipeline.options.texts import counted
 
 
 def render(template: str, **values: Any) -> str:

@@ -16,7 +16,6 @@ import numpy as np
 from ortho_pipeline.display.charts import residual_axes
 from ortho_pipeline.display.notebook import fit_html
 from ortho_pipeline.display.notices import Notice, to_document
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import DegeneratePoints, InputError, ModelError
 from ortho_pipeline.estimation.blunders import REJECTED_LIMIT, Outlying, checks_apart, find_blunders, outlying
 from ortho_pipeline.estimation.determinacy import (
@@ -35,6 +34,7 @@ from ortho_pipeline.estimation.statistics import correlation_of, student_of, tot
 from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 
 __all__ = ["Fit", "Prior", "fit", "root_mean_square"]

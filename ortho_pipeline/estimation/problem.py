@@ -27,11 +27,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
 from ortho_pipeline.estimation.least_squares import condition_of, minimise, solve_linear
 from ortho_pipeline.geodesy.distortion import map_from_enu
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.image_errors import says_more
 

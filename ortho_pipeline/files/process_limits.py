@@ -1,4 +1,4 @@
-"""Limits that the system sets to this process: address space and threads.
+"""Limits that the system sets to this process, address space and threads, and what it prints of destructors.
 
 Libraries do badly without: a thread of Python's that fails before its first line, and a pool of GDAL's that gets fewer
 threads than it asked for, are waited for without end; PROJ and GDAL end the process. So what a job needs is asked for
@@ -232,3 +232,23 @@ def _blas_libraries(scipy: bool) -> Any:
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
+
+
+def is_told_already(lost: Any) -> bool:
+    """Tell whether what a destructor cannot raise is of a dataset that GDAL's binding dropped because a copy failed.
+
+    The binding raises what stops a copy and drops what there is of it, whose destructor complains once more. All other
+    datasets that are written are closed by `raster.output`, which raises.
+    """
+    return getattr(lost.object, "__name__", "") == "delete_Dataset"
+
+
+def print_no_error_twice() -> None:
+    """Let this process print, of what destructors cannot raise, only what is not told already."""
+    before = sys.unraisablehook
+
+    def said(lost: Any) -> None:
+        if not is_told_already(lost):
+            before(lost)
+
+    sys.unraisablehook = said

@@ -10,6 +10,7 @@ from xml.etree.ElementTree import Element
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.reading import read_bounded
+from ortho_pipeline.options.texts import counted
 
 MAX_SIZE = 5_000_000
 #: Numbers in one field, and elements of one name, that a scene may have.
@@ -95,7 +96,7 @@ class XmlFields:
         """Return the finite numbers in a text of a field."""
         tokens = text.split(maxsplit=MOST_TERMS)
         if len(tokens) > MOST_TERMS or (count is not None and len(tokens) != count):
-            wanted = f"{count} numbers belong" if count > 1 else "1 number belongs" if count else "a few numbers belong"
+            wanted = counted(count, "number belongs", "numbers belong") if count else "a few numbers belong"
             raise self.error(f"{wanted} here", field)
         values = []
         for token in tokens:

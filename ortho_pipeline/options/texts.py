@@ -73,3 +73,14 @@ class Text(str):
             parts += [text[end : found.start()], Setting(name, value, key)]
             end = found.end()
         return Text(*parts, text[end:])
+
+
+def counted(number: int, what: str, plural: str | None = None) -> str:
+    """Return a number and what it counts, as ``1 point`` and ``2 points``.
+
+    Parameters
+    ----------
+    plural : str, optional
+        Where it is not formed with an s, or a verb follows: ``counted(n, "point does", "points do")``.
+    """
+    return f"{number} {what if number == 1 else plural or f'{what}s'}"

@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.estimation.problem import Prior
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.distortion import metres_of_steps
 from ortho_pipeline.hookspecs import Piece, Scene, Sensor
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.options.texts import counted
 
 #: No image has smaller pixels (m), and no scene is narrower: its ground is in other units than its CRS.
 SMALLEST_PIXEL, NARROWEST = 1e-3, 1.0

@@ -6,8 +6,8 @@ import math
 import os
 import re
 
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import CrsError, InputError
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.rows import Line, Row, Table, cells_of, lines_of, number, short, sigma_of
 
 # -- QGIS ------------------------------------------------------------------------------------------------------------

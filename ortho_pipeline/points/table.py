@@ -20,11 +20,11 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.display.notebook import points_html
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import json_text, write_text
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, parse_crs
 from ortho_pipeline.geodesy.naming import crs_definition
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.dataframes.geodataframe import frame_of, table_of
 from ortho_pipeline.points.formats import read_table
 from ortho_pipeline.points.geojson import feature_of
@@ -456,11 +456,9 @@ def _csv_text(points: Points, suffix: str, images: Sequence[str] | None = None) 
     # An id that starts with '#' would read as a comment without quotation marks.
     hidden = any(name.startswith("#") for name in points.ids)
     writer = csv.writer(
-        out,
-        delimiter="\t" if suffix == ".tsv" else ",",
-        lineterminator="\n",
+        out, delimiter="\t" if suffix == ".tsv" else ",", lineterminator="\n",
         quoting=csv.QUOTE_ALL if hidden else csv.QUOTE_MINIMAL,
-    )
+    )  # fmt: skip
     extra = _error_columns(points)
     writer.writerow([*CSV_COLUMNS, *extra, *([] if images is None else ["image"])])
     # One column holds both plan components: the larger one is the careful choice.

@@ -11,11 +11,11 @@ import numpy as np
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, doubted, to_document
-from ortho_pipeline.display.numbers import counted, flat, metres, px
+from ortho_pipeline.display.numbers import flat, metres, px
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.estimation.blunders import contradicting
 from ortho_pipeline.files.documents import json_value, made_of
-from ortho_pipeline.options.texts import Text
+from ortho_pipeline.options.texts import Text, counted
 from ortho_pipeline.points.rows import ROLES
 from ortho_pipeline.report.adjustment_records import Rmse, is_known
 from ortho_pipeline.report.block_records import (

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.display.numbers import counted, px
+from ortho_pipeline.display.numbers import px
 from ortho_pipeline.files.documents import record_of
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.report.adjustment_records import Adjustment
 from ortho_pipeline.report.records import NOT_TESTED, Headline
 from ortho_pipeline.report.wording import headline

@@ -22,10 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.display.numbers import class_size, counted
+from ortho_pipeline.display.numbers import class_size
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options.texts import counted
 
 #: Denominators of the usual scales of maps.
 SCALES = tuple(int(step * 10**power) for power in range(2, 7) for step in (1, 2, 2.5, 5))

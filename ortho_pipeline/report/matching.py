@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.display.numbers import counted, metres, px, share
+from ortho_pipeline.display.numbers import metres, px, share
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres
 from ortho_pipeline.files.documents import json_value, made_of, record
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.report.adjustment_records import Adjustment, Count, Pair
 
 #: Code of the notice of an adjustment to matches: its figures are no absolute ones.

@@ -12,7 +12,7 @@ import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, number, round_down
 from ortho_pipeline.display.notices import doubted
-from ortho_pipeline.display.numbers import counted
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.report.adjustment_records import Pair, Point, is_known
 from ortho_pipeline.report.gallery.plots import plot_match_histograms, plot_matches
 from ortho_pipeline.report.layers.accuracy import plot_accuracy

@@ -10,7 +10,6 @@ from typing import Any
 from ortho_pipeline.display.notices import Notice, texts_but
 from ortho_pipeline.display.numbers import (
     class_size,
-    counted,
     metres,
     plain_size,
     px,
@@ -21,7 +20,7 @@ from ortho_pipeline.display.numbers import (
     size_text,
 )
 from ortho_pipeline.estimation.blunders import contradicting
-from ortho_pipeline.options.texts import Text
+from ortho_pipeline.options.texts import Text, counted
 from ortho_pipeline.report.adjustment_records import Adjustment, Bias, Parameter, Rmse, RmseOnGround, RmsesOnGround
 from ortho_pipeline.report.map_scale import PIXEL, POSITION, scale_text, usual_scale
 from ortho_pipeline.report.matching import MatchingRecord, Tested, is_relative

@@ -23,10 +23,10 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.files.stac.item import split
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.surface.base import Array
 from ortho_pipeline.surface.dem_file import DemFile, SampleGrid
 

@@ -28,7 +28,6 @@ from ortho_ikonos.truth import (
     GeoScene,
     VendorModel,
 )
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.estimation.family_fit import fit_family, fit_own, prune
 from ortho_pipeline.estimation.fit import Fit, fit
@@ -37,6 +36,7 @@ from ortho_pipeline.models import family_of
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.map_plane import MapPlane
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.selection import select_control
 from ortho_pipeline.simulation.tables import Curve, Knob, Number, Statement, make_document

@@ -15,12 +15,12 @@ from osgeo import gdal, osr
 from ortho_ikonos import rendering
 from ortho_ikonos import truth as simulated
 from ortho_ikonos.truth import GeoScene, VendorModel
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import write_rpc_txt
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points, write_points
 from ortho_pipeline.raster.output import raster_output, written
 from ortho_pipeline.surface.writing import write_terrain

@@ -13,9 +13,8 @@ from ortho_pipeline.block.equations.problem import PERFECT_GROUND, BlockProblem
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.options.texts import Setting, Text, counted
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,11 +9,10 @@ from pathlib import Path
 
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.survey.folder import Kind, Survey, survey
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import allowed, write_text
 from ortho_pipeline.options import SceneOptions
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.options.texts import Setting, Text, counted
 
 NAME = "pipeline.yaml"
 #: What belongs to a scene, and where it stands in the file.

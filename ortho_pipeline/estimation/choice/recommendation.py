@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.estimation.choice.expected_error import Expectation, expectation, supported
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.statistics import student_of
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options.texts import counted
 
 if TYPE_CHECKING:
     from ortho_pipeline.estimation.comparison import Row

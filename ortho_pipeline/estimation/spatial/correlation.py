@@ -28,7 +28,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres, metre_partials, with_reference_height
@@ -36,6 +35,7 @@ from ortho_pipeline.estimation.statistics import student_of
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options.texts import counted
 
 Pair = tuple[float, float]
 

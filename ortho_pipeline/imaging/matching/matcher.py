@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.geodesy.crs import parse_crs
@@ -43,7 +42,7 @@ from ortho_pipeline.imaging.matching.weights import Components, components, unex
 from ortho_pipeline.imaging.turns import orientations
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.image_errors import sigma_of_covariance
 from ortho_pipeline.raster.block_cache import limit_cache

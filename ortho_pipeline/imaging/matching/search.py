@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, stats
 
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
@@ -33,7 +32,7 @@ from ortho_pipeline.imaging.matching.targets import Target, View, metres_per_pix
 from ortho_pipeline.imaging.turns import Turn, margin, renderings, votes
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.options.texts import Setting, Text, counted
 
 #: Left, top, right and bottom, px.
 Region = tuple[int, int, int, int]

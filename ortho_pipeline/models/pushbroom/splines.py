@@ -10,9 +10,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options.texts import counted
 
 
 @dataclass(frozen=True, eq=False)

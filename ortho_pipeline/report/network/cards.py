@@ -7,7 +7,8 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from ortho_pipeline.display.numbers import counted, px
+from ortho_pipeline.display.numbers import px
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.rows import ROLES
 from ortho_pipeline.report.adjustment_records import is_known
 from ortho_pipeline.report.block_records import BlockReport, Ray

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.display.numbers import counted
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid, RasterSource
 
