@@ -42,12 +42,16 @@ def refuse_files(text: str) -> None:
     Raises
     ------
     CrsError
-        If it names a path, an address, or what the working folder has and PROJ's folders have not.
+        If it names a path, an address, or what the working folder has and PROJ's folders have not; or has a percent
+        sign.
     """
     if len(text) > _LONGEST:
         raise CrsError(f"a coordinate system of {len(text)} characters is not read", field="CRS", remedy=_REMEDY)
     if text.lstrip().startswith("{"):
         text = _unescaped(text)
+    if "%" in text:
+        # PROJ 9.5 takes the name of a missing grid for a format: %s and %n there end the process.
+        raise CrsError("a coordinate system with a percent sign is not read", field="CRS", remedy=_REMEDY)
     if any(match["path"] is not None for match in _LEADS.finditer(text)):
         raise CrsError("a coordinate system names a file by its path; it is not opened", field="CRS", remedy=_REMEDY)
     for match in _VALUE.finditer(text):

@@ -305,6 +305,22 @@ def test_systems_of_the_database_are_taken_in_every_form() -> None:
             refuse_files(crs.name)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "+proj=longlat +ellps=bessel +nadgrids=@missing.gsb,%s%n +type=crs",
+        'GEOGCS["x",DATUM["y",SPHEROID["z",6377397,299],EXTENSION["PROJ4_GRIDS","%s%n%s%s"]],PRIMEM["Greenwich",0],'
+        'UNIT["degree",0.0174532925199433]]',
+        '{"type": "GeographicCRS", "name": "\\u0025n"}',
+    ],
+    ids=["PROJ", "WKT", "PROJJSON"],
+)
+def test_formats_in_place_of_names_never_reach_proj(text: str) -> None:
+    """PROJ 9.5 prints the name of a missing grid as a format, and the process ends."""
+    with pytest.raises(CrsError, match="percent sign"):
+        parse_crs(text)
+
+
 def test_a_refusal_says_what_to_do() -> None:
     with pytest.raises(CrsError, match="names a file by its path") as caught:
         parse_crs("+proj=longlat +ellps=bessel +nadgrids=/data/grid.gsb")
