@@ -15,7 +15,23 @@ FAULTS = Path(__file__).parent / "attack" / "faults.py"
     "words",
     [
         ("--only", "export rpc-txt", "--limits", "4", "--kills", "5", "--disks", "1", "--memory", "0"),
-        ("--only", "rectify STAC", "--limits", "1", "--kills", "1", "--disks", "1", "--memory", "0", "--changes", "1"),
+        pytest.param(
+            (
+                "--only",
+                "rectify STAC",
+                "--limits",
+                "1",
+                "--kills",
+                "1",
+                "--disks",
+                "1",
+                "--memory",
+                "0",
+                "--changes",
+                "1",
+            ),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_no_fault_leaves_a_broken_or_mixed_set(words):

@@ -119,6 +119,7 @@ def test_the_test_of_the_tutorial_runs_as_it_is_printed(fresh, tinysat, tmp_path
     run(fresh / "python", "-m", "pytest", "-q", "-p", "no:cacheprovider", folder, cwd=tmp_path)
 
 
+@pytest.mark.slow
 def test_its_study_is_a_command_of_simulate_and_reproduce(fresh, tmp_path):
     helped, simulated, refused = several(
         fresh,

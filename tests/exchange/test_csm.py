@@ -333,7 +333,8 @@ def test_the_state_of_a_worldview_3_is_explained_effect_by_effect(real: Path) ->
 @pytest.mark.realdata
 @pytest.mark.parametrize(
     "name",
-    ["1040010074793300.json", "1040010074793300.adjusted_state.json",
+    ["1040010074793300.json",
+     pytest.param("1040010074793300.adjusted_state.json", marks=pytest.mark.slow),
      pytest.param("../jitter/uyuni/csm-1040010014761800.r100.adjusted_state.json", marks=pytest.mark.slow)],
     ids=["as made", "adjusted", "with solved jitter"],
 )  # fmt: skip

@@ -211,7 +211,7 @@ def test_sigmas_cover_where_the_reference_lies_anywhere_within_its_own():
     assert 0.85 < trials.spread(rows) < 1.15, told(rows)
 
 
-@pytest.mark.parametrize("what", ["place", "roofs"])
+@pytest.mark.parametrize("what", ["place", pytest.param("roofs", marks=pytest.mark.slow)])
 def test_what_cannot_be_matched_is_refused(what):
     rows = refusals(what, 1)
     assert all(row["refused"] for row in rows), told(rows)

@@ -185,6 +185,7 @@ def test_opensfm_poses_open_by_the_option_exterior(real):
             np.testing.assert_allclose(found.ground_to_image(ground), image, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_drone_scene_is_usable_by_default(real, tmp_path):
     folder = real / "orthority" / "odm"
     name = "100_0005_0142"
