@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 from typing import Any, NamedTuple
 
-from ortho_pipeline.commands.resolved.request import Request, Resolved
+from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, completed, of_option

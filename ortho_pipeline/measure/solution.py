@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.commands.resolved.ledger import Ledger
-from ortho_pipeline.commands.resolved.request import Request, Resolved
+from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.estimation.fit import Fit

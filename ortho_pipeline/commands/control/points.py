@@ -11,7 +11,8 @@ import pyproj
 from numpy.typing import NDArray
 
 from ortho_pipeline.commands.control.matching import Matched, match_scene
-from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request, Resolved
+from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request
+from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.errors import InputError, of_option
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs

@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pyproj
 
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.stac.given import is_collected
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange.rpc import files_of
@@ -27,9 +28,6 @@ from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.surface.base import Surface
-
-if TYPE_CHECKING:
-    from ortho_pipeline.commands.resolved.request import Request
 
 #: Roles of files that have pixels, and of those among them whose side-cars are entered too.
 RASTERS = ("image", "DEM", "DEM accuracy", "reference", "other ortho")

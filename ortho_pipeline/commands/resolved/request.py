@@ -1,4 +1,4 @@
-"""What a command is asked for one scene, and the same once its scene, heights and points are open."""
+"""What a command is asked for one scene."""
 
 from __future__ import annotations
 
@@ -7,11 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ortho_pipeline.commands.heights.surfaces import dem_files, sigma_file
-from ortho_pipeline.commands.resolved.ledger import Ledger
-from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
-from ortho_pipeline.surface.base import Surface
 
 #: In place of a file of points: the ground control points that the image itself holds.
 OWN_POINTS = "own"
@@ -64,28 +61,3 @@ class Request:
     def asked(self, *groups: str) -> dict[str, Any]:
         """Return those of the named groups of options that say something, for the record of a result."""
         return {name: getattr(self, name) for name in groups if name != "match" or self.match.reference}
-
-
-@dataclass(frozen=True, eq=False)
-class Resolved:
-    """A request whose scene, heights and points are open.
-
-    References, the raster of the grid and another ortho are opened where they are used.
-
-    Parameters
-    ----------
-    scene : Scene
-        Its models are meant for the surface.
-    surface : Surface, optional
-        None where no heights are given.
-    points : Points
-        As they were read, with their roles; matches are not among them.
-    ledger : Ledger
-        The files that were read, as they were when the work began.
-    """
-
-    request: Request
-    scene: Scene
-    surface: Surface | None
-    points: Points
-    ledger: Ledger

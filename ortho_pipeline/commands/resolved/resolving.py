@@ -9,7 +9,8 @@ from ortho_pipeline.commands.control.crops import open_by_evidence
 from ortho_pipeline.commands.control.points import read_control
 from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
 from ortho_pipeline.commands.resolved.ledger import Ledger
-from ortho_pipeline.commands.resolved.request import Request, Resolved
+from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.errors import InputError, ModelError
 from ortho_pipeline.files import states
 from ortho_pipeline.hookspecs import Scene
