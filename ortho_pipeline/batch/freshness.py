@@ -18,8 +18,8 @@ from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import confined
 from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import is_far, url_of
-from ortho_pipeline.files.storage.objects import Objects, is_address
+from ortho_pipeline.files.locations import is_address, is_far, url_of
+from ortho_pipeline.files.storage.objects import Objects
 
 #: Larger files beside an image are not metadata.
 _COMPANION_BYTES = 5_000_000

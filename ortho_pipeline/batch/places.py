@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TypeAlias
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.locations import VsiPath, is_far, located, url_of
-from ortho_pipeline.files.storage.objects import Objects, is_address
+from ortho_pipeline.files.locations import VsiPath, is_address, is_far, is_on_web, located, url_of
+from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.options.texts import Setting, Text
 
 _WALKS, _PATTERN_BYTES = 2, 1000
@@ -124,7 +124,7 @@ class Places:
         scheme, _, rest = pattern.partition("://")
         parts = rest.split("/")
         fixed = list(itertools.takewhile(lambda part: not glob.has_magic(part), parts))
-        if scheme in ("http", "https") or not fixed:
+        if is_on_web(pattern) or not fixed:
             raise InputError(
                 "a web server is not searched", file=self.file, field=field,
                 remedy="name the images one by one, or by a pattern in a store (s3, gs, az)",

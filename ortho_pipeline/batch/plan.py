@@ -22,9 +22,8 @@ from ortho_pipeline.commands.heights.automatic import AUTO
 from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request
 from ortho_pipeline.commands.stac.given import heights_given, resolved
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files.locations import VsiPath, located, place
+from ortho_pipeline.files.locations import VsiPath, is_address, located, place
 from ortho_pipeline.files.stac.item import is_item
-from ortho_pipeline.files.storage.objects import is_address
 from ortho_pipeline.options import (
     MatchOptions,
     MosaicOptions,

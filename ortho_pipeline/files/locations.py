@@ -23,10 +23,16 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.traffic import COUNTING
 from ortho_pipeline.options.texts import Setting, Text
 
-#: Kinds of URL and GDAL's name for the file system that reads them.
-SCHEMES = {"http": "/vsicurl/http://", "https": "/vsicurl/https://", "s3": "/vsis3/", "gs": "/vsigs/", "az": "/vsiaz/"}
+#: Schemes of web servers, which give files and neither list nor take any, and GDAL's file systems that read them.
+WEB = {"https": "/vsicurl/https://", "http": "/vsicurl/http://"}
+#: Schemes of stores, whose objects are also listed and written.
+STORES = {"s3": "/vsis3/", "gs": "/vsigs/", "az": "/vsiaz/"}
+#: All schemes of URLs that are read.
+SCHEMES = WEB | STORES
 _ARCHIVES = ("/vsizip", "/vsitar", "/vsigzip", "/vsi7z", "/vsirar")
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
+#: An address of a folder or an object.
+_ADDRESS = re.compile(rf"({'|'.join(SCHEMES)})://[^/]")
 #: What opens a door and stands in an address itself: a name with a password, or what a query calls so.
 _NAMED = re.compile(r"(?<=://)[^/?#@]*@")
 _SIGNED = re.compile(
@@ -383,6 +389,16 @@ def is_far(name: AnyPath) -> bool:
     if url is not None:
         return url[1].lower() in SCHEMES
     return text.startswith("/vsi") and not in_local_archive(text) and not text.startswith("/vsimem")
+
+
+def is_address(text: AnyPath) -> bool:
+    """Tell whether a text is an address of one of `SCHEMES`."""
+    return bool(_ADDRESS.match(os.fspath(text)))
+
+
+def is_on_web(address: str) -> bool:
+    """Tell whether an address is of a web server."""
+    return address.startswith(tuple(f"{scheme}://" for scheme in WEB))
 
 
 def url_of(name: AnyPath) -> str:

@@ -10,12 +10,11 @@ from typing import Any
 from urllib.parse import urlencode
 
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files.locations import AnyPath, url_of
+from ortho_pipeline.files.locations import AnyPath, is_address, url_of
 from ortho_pipeline.files.process_limits import startable_threads
 from ortho_pipeline.files.stac.documents import COLLECTIONS, read_document, target
 from ortho_pipeline.files.stac.item import Item, item_of, read_item
 from ortho_pipeline.files.stac.places import Box, any_meet, extent_boxes, questions
-from ortho_pipeline.files.storage.objects import is_address
 
 _REMEDY = "give a STAC collection: its JSON file, or its address in an API (…/collections/NAME)"
 _OF_API = re.compile(r"https?://[^?#]*/collections/[^/?#]+/?$")

@@ -9,9 +9,9 @@ from typing import Any
 from urllib.parse import urljoin
 
 from ortho_pipeline.errors import InputError, StorageError
-from ortho_pipeline.files.locations import AnyPath, require_network, url_of, within
+from ortho_pipeline.files.locations import AnyPath, is_address, is_on_web, require_network, url_of, within
 from ortho_pipeline.files.reading import parse_json, read_json
-from ortho_pipeline.files.storage.objects import Objects, is_address
+from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.files.traffic import count
 from ortho_pipeline.options.texts import Setting, Text
 
@@ -35,7 +35,7 @@ def read_document(address: AnyPath, *, allow_network: bool, paged: bool = False)
         If a server does not answer.
     """
     text = url_of(address)
-    if text.startswith(("http://", "https://")):
+    if is_on_web(text):
         require_network(text, allow_network, paged=paged)
         found = parse_json(_answer(text), text, REMEDY)
     elif is_address(text):
@@ -60,8 +60,7 @@ def _answer(url: str) -> bytes:
         """Follows to web servers only."""
 
         def redirect_request(self, req: Any, fp: Any, code: Any, msg: Any, headers: Any, newurl: str) -> Any:
-            web = newurl.startswith(("http://", "https://"))
-            return super().redirect_request(req, fp, code, msg, headers, newurl) if web else None
+            return super().redirect_request(req, fp, code, msg, headers, newurl) if is_on_web(newurl) else None
 
     opener = urllib.request.build_opener(WebOnly)
     request = urllib.request.Request(url, headers={"User-Agent": "ortho-pipeline", "Accept": "application/json"})
@@ -103,7 +102,7 @@ def target(href: str, base: AnyPath, roots: tuple[AnyPath, ...] = ()) -> str:
     if not text or "\0" in text or text.startswith("/vsi") or (":" in text.partition("/")[0] and "://" in text):
         raise InputError(f"{text[:200]!r} is no place of a file", file=base, field="href", remedy=REMEDY)
     if is_address(here):
-        if here.startswith("http"):
+        if is_on_web(here):
             return urljoin(here, text)
         scheme, _, rest = here.partition("://")
         return f"{scheme}://{os.path.normpath(os.path.join(os.path.dirname(rest), text.lstrip('/')))}"

@@ -13,10 +13,9 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files.locations import AnyPath, url_of
+from ortho_pipeline.files.locations import AnyPath, is_address, url_of
 from ortho_pipeline.files.stac.documents import COLLECTIONS, REMEDY, read_document, target
 from ortho_pipeline.files.stac.places import Box, boxes_of
-from ortho_pipeline.files.storage.objects import is_address
 from ortho_pipeline.options.texts import Setting, Text
 
 #: Roles of what an image or a DEM is read from, the first first.

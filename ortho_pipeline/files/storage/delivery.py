@@ -17,16 +17,15 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.locations import STORES, is_address
 from ortho_pipeline.files.process_limits import startable_threads
-from ortho_pipeline.files.storage.objects import Content, Objects, is_address
+from ortho_pipeline.files.storage.objects import Content, Objects
 from ortho_pipeline.files.whole import json_text
 
 DOCUMENT, SCHEMA_VERSION = "ortho-pipeline delivery", 1
 _RECORD = "_delivery.json"
 #: Files that are uploaded at a time.
 _AT_ONCE = 4
-#: Schemes of stores that take files.
-_WRITABLE = ("s3", "gs", "az")
 
 
 @dataclass(frozen=True)
@@ -55,10 +54,10 @@ def delivered(address: str, name: str, *, allow_network: bool, keep: Callable[[P
     StorageError
         If the store fails; there is no record then.
     """
-    if address.partition("://")[0] not in _WRITABLE:
+    if address.partition("://")[0] not in STORES:
         raise InputError(
             "nothing is written to such an address", file=address, field="folder",
-            remedy=f"one of {', '.join(_WRITABLE)}, or a folder",
+            remedy=f"one of {', '.join(STORES)}, or a folder",
         )  # fmt: skip
     store = Objects(address, allow_network=allow_network)
     with tempfile.TemporaryDirectory(prefix="ortho_") as folder:

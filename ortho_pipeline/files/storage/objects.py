@@ -21,13 +21,9 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError, OrthoError, StorageError
-from ortho_pipeline.files.locations import require_network
+from ortho_pipeline.files.locations import SCHEMES, is_address, require_network
 from ortho_pipeline.files.traffic import count
 
-#: Kinds of address.
-SCHEMES = ("https", "http", "s3", "gs", "az")
-#: An address of a folder or an object.
-_ADDRESS = re.compile(rf"({'|'.join(SCHEMES)})://[^/]")
 #: How often a request is repeated, and for how long, before it has failed.
 RETRIES: dict[str, Any] = {
     "max_retries": 8, "retry_timeout": timedelta(minutes=3),
@@ -45,11 +41,6 @@ _SHA256 = "sha256"
 PART = 8 << 20
 #: The ETag of an object that was stored at once is the MD5 of its content; of one in parts see `Content`.
 _TAG = re.compile(r'"?([0-9a-f]{32}(?:-([0-9]+))?)"?')
-
-
-def is_address(text: str | os.PathLike[str]) -> bool:
-    """Tell whether a text is an address of one of `SCHEMES`."""
-    return bool(_ADDRESS.match(os.fspath(text)))
 
 
 @dataclass(frozen=True)
@@ -387,13 +378,7 @@ def _store_of(address: str) -> Any:
     scheme = address.partition("://")[0]
     if scheme == "http" or os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes"):
         options["allow_http"] = True
-    given: dict[str, Any] = {}
-    if scheme == "s3":
-        given = _s3_settings()
-    elif scheme == "az":
-        given = _azure_settings()
-    elif scheme == "gs":
-        given = _google_settings()
+    given = _SETTINGS[scheme]() if scheme in _SETTINGS else {}
     if given.get("endpoint", given.get("base_url", "")).startswith("http://"):
         options["allow_http"] = True
     make: Any = store.from_url  # one signature for each kind of store
@@ -435,6 +420,10 @@ def _google_settings() -> dict[str, Any]:
     if os.environ.get("GS_NO_SIGN_REQUEST", "").upper() in ("YES", "TRUE", "1"):
         given["skip_signature"] = True
     return given
+
+
+#: What is said to the clients of stores, by the scheme.
+_SETTINGS = {"s3": _s3_settings, "az": _azure_settings, "gs": _google_settings}
 
 
 def _key_management() -> str | None:

@@ -12,10 +12,11 @@ import numpy as np
 
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import read_bounded
+from ortho_pipeline.files.locations import is_address
 from ortho_pipeline.files.process_limits import startable_threads
 from ortho_pipeline.files.stac.collection import Collection, is_collection
 from ortho_pipeline.files.storage.kept import kept
-from ortho_pipeline.files.storage.objects import Objects, is_address
+from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.raster.source import open_pixels
 from ortho_pipeline.surface.cells.copernicus import LARGEST, LIST, PUBLIC, PUBLIC_LAND, Cell, cells_of_list
 from ortho_pipeline.surface.dem_file import Affine
