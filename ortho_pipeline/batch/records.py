@@ -8,7 +8,6 @@ Checksums are taken again only of files whose size or time of change differ from
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import functools
 import hashlib
 import json
@@ -276,28 +275,22 @@ def locked(path: Path, *, shared: bool = False, wait: bool = False, owner: str =
     path = files.allowed(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        lock = files.Lock(path, shared=shared, wait=wait)
+    except BlockingIOError as error:
+        with path.open("rb") as file:
+            holder = file.read(500).decode(errors="replace").strip() or "another run"
+        raise InputError(
+            f"{holder} works in this output folder", file=path.parent.parent, field="output",
+            remedy="wait for its end, or choose another output folder",
+        ) from error  # fmt: skip
     except OSError as error:
         raise InputError(
-            f"cannot write here ({error.strerror})", file=path.parent, remedy="choose a folder that you may write to"
-        ) from error
-    try:
-        try:
-            fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError as error:
-            holder = os.pread(descriptor, 500, 0).decode(errors="replace").strip() or "another run"
-            raise InputError(
-                f"{holder} works in this output folder", file=path.parent.parent, field="output",
-                remedy="wait for its end, or choose another output folder",
-            ) from error  # fmt: skip
-        except OSError as error:
-            raise InputError(
-                f"this file system has no locks ({error.strerror})", file=path, field="output",
-                remedy="choose an output folder on another one",
-            ) from error  # fmt: skip
+            f"cannot write here ({error.strerror})", file=path.parent, field="output",
+            remedy="choose a folder that you may write to, on a file system that has locks",
+        ) from error  # fmt: skip
+    with contextlib.closing(lock):
         if not wait:
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, f"{owner} (process {os.getpid()} on {socket.gethostname()})".strip().encode(), 0)
+            owner = f"{owner} (process {os.getpid()} on {socket.gethostname()})".strip()
+            os.ftruncate(lock.descriptor, 0)
+            os.pwrite(lock.descriptor, owner.encode(), 0)
         yield
-    finally:
-        os.close(descriptor)

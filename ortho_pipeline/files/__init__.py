@@ -5,6 +5,7 @@ Also where compiled kernels are kept. Imports nothing above `errors`.
 
 from __future__ import annotations
 
+from ortho_pipeline.files.locks import Lock
 from ortho_pipeline.files.reading import decoded, parse_json, read_bounded, read_json, sha256, states
 from ortho_pipeline.files.whole import (
     Outputs,
@@ -24,6 +25,7 @@ from ortho_pipeline.files.whole import (
 )
 
 __all__ = [
+    "Lock",
     "Outputs",
     "allowed",
     "append_line",

@@ -8,7 +8,6 @@ command for the same outputs completes what a killed one had begun, and removes 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import json
 import os
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.locks import Lock
 from ortho_pipeline.files.reading import read_bounded
 
 #: What a temporary name has between its random part and its suffix.
@@ -46,7 +46,7 @@ class Outputs:
         #: Whether something else than plain text was written, beside which a driver may have put files of its own.
         self.side_cars = False
         self._made: list[Path] = []
-        self._lock: int | None = None
+        self._lock: Lock | None = None
 
     @property
     def journal(self) -> Path:
@@ -83,37 +83,32 @@ class Outputs:
                 if failed or self.side_cars:
                     self._clear()
                 self.lock_path.unlink(missing_ok=True)
-            os.close(self._lock)
+            self._lock.close()
             self._lock = None
         for path in self._made:
             with contextlib.suppress(OSError):
                 path.rmdir()
 
-    def _locked(self) -> tuple[int, bool]:
-        """Return a descriptor that holds the lock of this name, and whether a killed command has left its own.
-
-        The system releases a lock however the process ends; its file stays when the process is killed.
-        """
+    def _locked(self) -> tuple[Lock, bool]:
+        """Return the lock of this name, and whether a killed command has left its file."""
         path = self.lock_path
         while True:
             killed = os.path.lexists(path)
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
             try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock = Lock(path, wait=False, needed=False)
             except BlockingIOError as error:
-                os.close(descriptor)
                 raise InputError(
                     f"another command is writing {self.name!r} in this folder", file=self.folder, field="folder",
                     remedy="wait for its end, or choose another output folder",
                 ) from error  # fmt: skip
-            except OSError:
+            if not lock.held:
                 # A file system without locks: two commands on one folder do not notice each other there.
-                return descriptor, False
+                return lock, False
             # The one that held it may have removed the file between our opening and our locking.
             with contextlib.suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(descriptor), os.stat(path, follow_symlinks=False)):
-                    return descriptor, killed
-            os.close(descriptor)
+                if os.path.samestat(os.fstat(lock.descriptor), os.stat(path, follow_symlinks=False)):
+                    return lock, killed
+            lock.close()
 
     def _recover(self) -> None:
         """Complete the renames that a killed command had begun, and remove its other temporary files."""
@@ -433,18 +428,14 @@ def append_line(path: str | os.PathLike[str], line: str) -> None:
     path = allowed(path)
     data = (line + "\n").encode("utf-8", errors="backslashreplace")
     try:
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-            size = os.fstat(descriptor).st_size
+        with contextlib.closing(Lock(path)) as lock:
+            size = os.lseek(lock.descriptor, 0, os.SEEK_END)
             try:
                 while data:
-                    data = data[os.write(descriptor, data) :]
+                    data = data[os.write(lock.descriptor, data) :]
             except OSError:
-                os.ftruncate(descriptor, size)
+                os.ftruncate(lock.descriptor, size)
                 raise
-        finally:
-            os.close(descriptor)
     except OSError as error:
         raise _unwritable(path, error) from error
 

@@ -7,7 +7,6 @@ One process holds the lock and writes; another one reads.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import zlib
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import allowed, parse_json, sync_folder
+from ortho_pipeline.files import Lock, allowed, parse_json, sync_folder
 
 #: Beyond this many bytes it is no journal of hands.
 MAX_BYTES = 256_000_000
@@ -51,8 +50,10 @@ class Journal:
     def __init__(self, path: Path) -> None:
         self.path = allowed(path)
         try:
-            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
-            self.read_only = not _locked(self._file)
+            try:
+                self._file, self.read_only = Lock(path, wait=False).descriptor, False
+            except BlockingIOError:
+                self._file, self.read_only = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), True
             data = _whole(self._file, path)
         except OSError as error:
             raise _unwritable(path, error) from error
@@ -139,14 +140,6 @@ class Journal:
 def _line(action: Mapping[str, Any]) -> bytes:
     text = json.dumps(action, allow_nan=False, separators=(",", ":"))
     return f'{{"crc":"{zlib.crc32(text.encode()):08x}","action":{text}}}\n'.encode()
-
-
-def _locked(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def _whole(descriptor: int, path: Path) -> bytes:

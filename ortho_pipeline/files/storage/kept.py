@@ -8,7 +8,6 @@ folder; who needs a file that another one is fetching waits for it.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import glob
 import hashlib
 import json
@@ -22,6 +21,7 @@ from pathlib import Path
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.folders import cache_folder
+from ortho_pipeline.files.locks import Lock
 from ortho_pipeline.files.reading import parse_json, read_bounded, sha256
 from ortho_pipeline.files.storage.objects import Content
 
@@ -180,16 +180,9 @@ def _read(path: Path) -> Record | None:
     return record if kinds and record.bytes >= 0 else None
 
 
-@contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Wait for others who are at this file; the system releases the lock however a process ends."""
-    descriptor = os.open(path.with_name(path.name + _LOCK), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-    try:
-        with contextlib.suppress(OSError):  # a file system without locks: the same file is fetched twice
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
+def _locked(path: Path) -> contextlib.closing[Lock]:
+    """Wait for others who are at this file. On a file system without locks the same file is fetched twice."""
+    return contextlib.closing(Lock(path.with_name(path.name + _LOCK), needed=False))
 
 
 def _record_of(path: Path) -> Path:
