@@ -123,10 +123,6 @@ def reads(remedy: str, field: str | None = None) -> Callable[[Callable[_P, _R]],
     return decorate
 
 
-class Terminated(SystemExit):
-    """A signal ends the process; what is caught in the name of plugins, which may not end it, lets this pass."""
-
-
 def _rebuild(kind, message, file, field, remedy):
     return kind(message, file=file, field=field, remedy=remedy)
 

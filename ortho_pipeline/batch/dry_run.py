@@ -24,10 +24,12 @@ def check_scenes(
     planned = config if isinstance(config, Plan) else plan(config)
     checked: list[dict[str, Any]] = []
     for job in planned.chosen(only, shard):
+        asked = job.request
         one: dict[str, Any] = {"name": job.name, "image": str(job.image)}
         try:
             one |= commands.check(
-                job.image, scene=job.scene, points=job.points, surface=job.surface, match=job.match, output=job.ortho
+                asked.image, scene=asked.scene, points=asked.points, surface=asked.surface, match=asked.match,
+                output=asked.output,
             )  # fmt: skip
         except OrthoError as error:
             one["error"] = error_document(error)

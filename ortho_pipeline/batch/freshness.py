@@ -87,7 +87,7 @@ def far_states(job: Job) -> tuple[FileState, ...]:
             continue
         folder, _, name = address.rpartition("/")
         try:
-            size, tag = Objects(folder, allow_network=job.scene.allow_network).stated(name)
+            size, tag = Objects(folder, allow_network=job.request.scene.allow_network).stated(name)
         except FileNotFoundError as error:
             raise InputError("there is no such object", file=address, remedy="check the address") from error
         found.append(FileState("far input", address, size, 0, "", tag))
@@ -96,7 +96,7 @@ def far_states(job: Job) -> tuple[FileState, ...]:
 
 def folders(job: Job) -> list[str | os.PathLike[str]]:
     """Return the files in whose folders a new name could change the scene."""
-    return [path for _, path in job.request.files if os.path.isabs(path) and not is_far(path)]
+    return [path for _, path in job.request.named if os.path.isabs(path) and not is_far(path)]
 
 
 def _local_states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:

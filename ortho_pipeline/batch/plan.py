@@ -61,20 +61,16 @@ class Job:
     """
 
     name: str
-    image: Place
+    request: Request
     output: Path
-    scene: SceneOptions = SceneOptions()
-    points: PointOptions = PointOptions()
-    surface: SurfaceOptions = SurfaceOptions()
-    match: MatchOptions = MatchOptions()
-    ortho: OutputOptions = OutputOptions()
     versions: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     run: str = ""
 
     @property
-    def request(self) -> Request:
-        """What is asked of the scene."""
-        return Request(self.image, self.scene, self.points, self.surface, self.match, self.ortho)
+    def image(self) -> Place:
+        """The image of the scene."""
+        image: Place = self.request.image
+        return image
 
     @property
     def folder(self) -> Path:
@@ -94,12 +90,13 @@ class Job:
     @property
     def configuration(self) -> dict[str, Any]:
         """The request as JSON values, without the budget of the machine."""
-        options = {name: dataclasses.asdict(getattr(self, name)) for name in ("scene", "points", "surface", "ortho")}
+        groups = {"scene": "scene", "points": "points", "surface": "surface", "ortho": "output"}
+        options = {name: dataclasses.asdict(getattr(self.request, group)) for name, group in groups.items()}
         for budget in ("memory", "threads"):
             del options["ortho"][budget]
         options["scene"]["allow_network"] = False  # leave to reach a file is no part of what is made of it
-        if self.match.reference:
-            options["match"] = dataclasses.asdict(self.match)
+        if self.request.match.reference:
+            options["match"] = dataclasses.asdict(self.request.match)
         # Files on this machine are known by their content; of others there is the size.
         far = {"image_bytes": self.image.size()} if isinstance(self.image, VsiPath) else {}
         return {"name": self.name, "image": str(self.image), **far, **options}
@@ -231,11 +228,12 @@ class _Planner:
         if isinstance(image, Path) and is_item(image):
             asset, scene = resolved(image, scene)
             shown = self.places.of(str(asset), f"{where}.image")
-        return Job(
-            name=self._checked_name(name, image, where), image=shown, output=self.output, scene=scene,
-            points=self._points(settings, image, where), surface=self._surface(settings, image, where, scene),
-            match=self._match(settings, image, where), ortho=self._ortho(settings, image, where), versions=versions(),
+        request = Request(
+            shown, scene, points=self._points(settings, image, where),
+            surface=self._surface(settings, image, where, scene), match=self._match(settings, image, where),
+            output=self._ortho(settings, image, where),
         )  # fmt: skip
+        return Job(self._checked_name(name, image, where), request, self.output, versions())
 
     def _scene(self, settings: Settings, image: Place, where: str) -> SceneOptions:
         given: Any = settings.scene
@@ -357,7 +355,7 @@ class _Planner:
             return
         for job in jobs:
             for field in ("crs", "resolution"):
-                if getattr(job.ortho, field) is None:
+                if getattr(job.request.output, field) is None:
                     raise InputError(
                         "the scenes of a mosaic share a grid", file=self.path, field=f"defaults.output.{field}",
                         remedy="say it under defaults: output: (such as crs: EPSG:32635 and resolution: 2.5)",
@@ -368,13 +366,14 @@ def for_run(
     jobs: Sequence[Job], run: str, memory: int, threads: int | None, *, allow_network: bool = False
 ) -> list[Job]:
     """Return the jobs of a run, with the bytes and threads that each may use, and leave to use the network."""
-    return [
-        replace(
-            job, run=run, ortho=replace(job.ortho, memory=memory, threads=threads),
-            scene=replace(job.scene, allow_network=allow_network),
-        )
-        for job in jobs
-    ]  # fmt: skip
+    return [replace(job, run=run, request=_within(job.request, memory, threads, allow_network)) for job in jobs]
+
+
+def _within(request: Request, memory: int, threads: int | None, allow_network: bool) -> Request:
+    return replace(
+        request, output=replace(request.output, memory=memory, threads=threads),
+        scene=replace(request.scene, allow_network=allow_network),
+    )  # fmt: skip
 
 
 def _exists(path: Path) -> bool:

@@ -88,9 +88,10 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
             return Outcome(job.name, "done" if mine else "unchanged", seconds, paths_of(good, job), good.facts)
         if record is not None:
             Record(job.name, "", "started", outputs=before).write(job.record)
+        asked = job.request
         result = commands.rectify(
-            job.image, job.folder, scene=job.scene, points=job.points, surface=job.surface, match=job.match,
-            output=job.ortho, name=job.name, digest=DIGESTS,
+            asked.image, job.folder, scene=asked.scene, points=asked.points, surface=asked.surface, match=asked.match,
+            output=asked.output, name=job.name, digest=DIGESTS,
         )  # fmt: skip
         made = tuple(FileState.of(role, path, name=path.name) for role, path in result.files.items())
         _remove(job.folder, {one.path for one in before} - {one.path for one in made})

@@ -14,8 +14,8 @@ from typing import Any
 import click
 
 from ortho_pipeline.cli.machine.terminal import PrintableLog, say
-from ortho_pipeline.cli.signals import ended_by_signals
-from ortho_pipeline.errors import InputError, OrthoError, Terminated, error_document
+from ortho_pipeline.cli.signals import Terminated, ended_by_signals
+from ortho_pipeline.errors import InputError, OrthoError, error_document
 
 FAILED, CORRECTABLE, INTERRUPTED = 1, 2, 130
 #: Every command: the module of this room that holds it, and the first sentence of its help.
@@ -123,7 +123,7 @@ class _Commands(click.Group):
         except click.UsageError as error:
             _print_usage_error(ctx.meta["command"], error)
             raise
-        except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError, Terminated):
+        except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
             raise
         except (Exception, SystemExit) as error:
             # A library or a plugin that exits by itself would say that all is well.
@@ -188,6 +188,8 @@ def main() -> None:
             # Before a command has begun; later `_Commands` says so.
             say("Interrupted.", err=True)
             raise SystemExit(INTERRUPTED) from None
+        except Terminated as ended:
+            raise SystemExit(ended.code) from None
 
 
 def _begin() -> None:

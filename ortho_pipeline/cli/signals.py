@@ -8,10 +8,16 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from ortho_pipeline.errors import Terminated
-
 #: Seconds after which an end that was lost is asked for again.
 _AGAIN = 0.01
+
+
+class Terminated(BaseException):
+    """A signal ends the process. Like `KeyboardInterrupt` it is no `Exception`, and no `SystemExit` of a plugin."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
 
 
 @contextlib.contextmanager

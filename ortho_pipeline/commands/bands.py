@@ -9,7 +9,7 @@ from typing import Any
 
 from ortho_pipeline import plugins
 from ortho_pipeline.commands import inputs
-from ortho_pipeline.commands.resolved.ledger import hashed, require_unchanged
+from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
@@ -76,7 +76,9 @@ def register(
             raise InputError(
                 "this path would be read and written", file=path, field="folder", remedy="choose another folder"
             )
-    begun = states([*paths, opened.model_source])
+    # Bands in an archive are those of the archive.
+    read = {archive_of(str(path)) or Path(path): "band" for path in paths}
+    ledger = Ledger(read, states([*paths, opened.model_source]))
     with together(folder, files["image"].stem):
         if beside is not None:
             with whole_or_nothing(beside, side_cars=False) as temporary:
@@ -87,11 +89,9 @@ def register(
         if "model" in files:
             size = opened.width, opened.height
             write_model_file(SavedModel(opened.model, opened.sensor, opened.model_source, size), files["model"])
-        # Bands in an archive are those of the archive.
-        read = {archive_of(str(path)) or Path(path): "band" for path in paths}
-        document = _document(opened, chosen, names, done, hashed(read))
+        document = _document(opened, chosen, names, done, ledger.hashed())
         write_json(files["table"], document)
-        require_unchanged(begun)
+        ledger.require_unchanged()
     return Result(files, document, _text(chosen, done))
 
 

@@ -39,10 +39,6 @@ class Placement(NamedTuple):
         """The scene with the models that were adjusted."""
         return self.adjusted.scene
 
-    def open_source(self) -> RasterSource:
-        """Open the rasters of the scene with the bands and in the type that its ortho shall have."""
-        return open_rasters(self.scene, self.request)
-
     def sparse(self, valid_pixels: int) -> list[Notice]:
         """Return a warning if hardly any of the pixels of the ortho that the scene covers has a value."""
         part = valid_pixels / max(scene_pixels(self.model, self.footprint, self.grid), 1.0)

@@ -13,7 +13,7 @@ from ortho_pipeline.commands.heights.surfaces import require_heights
 from ortho_pipeline.commands.layers import budget as layers
 from ortho_pipeline.commands.layers.angles import sun_of, write_angles
 from ortho_pipeline.commands.layers.filling import other_of
-from ortho_pipeline.commands.placement import Placement, place_scene
+from ortho_pipeline.commands.placement import Placement, open_rasters, place_scene
 from ortho_pipeline.commands.resolved.ledger import RASTERS, provenance, read_since
 from ortho_pipeline.commands.resolved.request import Request, point_options
 from ortho_pipeline.commands.results import (
@@ -111,7 +111,7 @@ def rectify(
         placed = place_scene(resolved)
         adjusted, model, opened = placed.adjusted, placed.model, placed.scene
         exported, complaints = _as_rpc(model)
-        source = placed.open_source()
+        source = open_rasters(placed.scene, request)
         budget, notes = layers.budget_of(placed)
         path = layers.ortho_of(placed, files, other_of(placed, source))
         warped = _warp(placed, exported, source, path, stage)
@@ -169,11 +169,12 @@ def check(
         As `rectify`, and for a raster whose file is truncated.
     """
     require_heights(surface)
-    resolved = adjustable(Request(image, scene, points, surface, match, output))
+    request = Request(image, scene, points, surface, match, output)
+    resolved = adjustable(request)
     _acquired(resolved.scene.facts, output)
     sun_of(resolved.scene.facts, output)
     placed = place_scene(resolved)
-    other_of(placed, placed.open_source())
+    other_of(placed, open_rasters(placed.scene, request))
     layers.budget_of(placed)
     checked_options(output.format, dict(output.creation_options), 1)
     for path, role in resolved.ledger.roles.items():

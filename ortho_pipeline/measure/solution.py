@@ -56,15 +56,10 @@ class Solution:
 
 def solve(scene: Scene, points: Points, request: Request, surface: Surface, correction: str | None) -> Solution:
     """Adjust the model of a scene to points as `ortho fit` does."""
-    # The table says all of this itself, and which points check was said when it was begun.
-    options = request.points
-    asked = replace(
-        options, gcps=points, crs=None, vertical=None, pixel_origin="corner", select=None, check=None,
-        correction=options.correction if correction is None else correction,
-    )  # fmt: skip
     if not len(points):
         return Solution(scene.model, None)
-    alone = replace(request, points=asked, match=MatchOptions())
+    chosen = request.points.correction if correction is None else correction
+    alone = replace(request, points=replace(request.points, correction=chosen), match=MatchOptions())
     try:
         done = adjust(Resolved(alone, scene, surface, points, Ledger()))
     except OrthoError as error:

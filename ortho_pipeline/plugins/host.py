@@ -11,7 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ortho_pipeline.errors import InputError, OrthoError, PluginError, Terminated, completed
+from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed
 from ortho_pipeline.exchange.crop import placed
 from ortho_pipeline.hookspecs import Scene, Sensor, Study
 from ortho_pipeline.models import KINDS
@@ -189,8 +189,6 @@ class Host:
                 fault = next(scene_faults(chosen, scene, size, {*KINDS, *self.models}), None)
         except OrthoError:
             raise
-        except Terminated:
-            raise
         except (Exception, SystemExit) as error:
             text = described(error, chosen.open_scene)
             raise PluginError(f"{self._name(chosen)} failed to open it ({text})", file=path) from error
@@ -207,8 +205,6 @@ class Host:
     def _recognises(self, sensor: Sensor, dataset: Any) -> bool:
         try:
             return bool(sensor.recognises(dataset))
-        except Terminated:
-            raise
         except (Exception, SystemExit) as error:
             raise PluginError(
                 f"{self._name(sensor)} failed while looking at the dataset ({described(error, sensor.recognises)})",

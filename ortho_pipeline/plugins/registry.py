@@ -18,7 +18,7 @@ from typing import Any
 import pluggy
 
 from ortho_pipeline import hookspecs
-from ortho_pipeline.errors import PluginError, Terminated
+from ortho_pipeline.errors import PluginError
 from ortho_pipeline.hookspecs import PROJECT_NAME, Sensor, Study
 from ortho_pipeline.models import KINDS, SensorModel
 from ortho_pipeline.plugins.contract import described, sensor_faults
@@ -112,8 +112,6 @@ class Registry:
                 self._reserved.add(entry.name)
             try:
                 plugin = entry.load()
-            except Terminated:
-                raise
             except (Exception, SystemExit) as error:
                 # A plugin is somebody else's code: whatever its import does wrong, the others go on.
                 self._leave_out(Broken(entry.name, distribution, version, described(error, entry.module)))
@@ -216,8 +214,6 @@ class Registry:
                 try:
                     offered = implementation.function()
                     returned = collect(offered) if isinstance(offered, wanted) else None
-                except Terminated:
-                    raise
                 except (Exception, SystemExit) as error:
                     text = described(error, implementation.function)
                     raise PluginError(f"plugin {plugin}: {hook} failed ({text})") from error

@@ -222,11 +222,15 @@ def test_later_entries_override_field_by_field(block):
     jobs = {job.name: job for job in batch_plan.plan(block.file).jobs}
     assert list(jobs) == ["s0", "special", "s2"]
     special = jobs["special"]
-    assert special.surface == SurfaceOptions(None, "ellipsoid", fill="nearest", height=1.0)
-    assert (special.ortho.resampling, special.ortho.resolution, special.ortho.crs) == ("cubic", 4.0, "EPSG:32734")
-    assert special.ortho.creation_options == {"LEVEL": "9", "COMPRESS": "ZSTD"}
-    assert jobs["s0"].surface.dem == str(block.folder / "dem.tif")
-    assert jobs["s0"].ortho.resampling == "bilinear"
+    assert special.request.surface == SurfaceOptions(None, "ellipsoid", fill="nearest", height=1.0)
+    assert (special.request.output.resampling, special.request.output.resolution, special.request.output.crs) == (
+        "cubic",
+        4.0,
+        "EPSG:32734",
+    )
+    assert special.request.output.creation_options == {"LEVEL": "9", "COMPRESS": "ZSTD"}
+    assert jobs["s0"].request.surface.dem == str(block.folder / "dem.tif")
+    assert jobs["s0"].request.output.resampling == "bilinear"
 
 
 def test_placeholders_and_exclusions(block):
@@ -235,7 +239,7 @@ def test_placeholders_and_exclusions(block):
     )
     jobs = batch_plan.plan(block.file).jobs
     assert [job.name for job in jobs] == ["raw_s0", "raw_s1"]
-    assert jobs[1].points.gcps == str(block.folder / "points" / "raw" / "s1.csv")
+    assert jobs[1].request.points.gcps == str(block.folder / "points" / "raw" / "s1.csv")
     block.write(FILE + "    name: '{stem.__class__}{sensor}'\n")
     with pytest.raises(InputError, match=r"\{sensor\} is not known"):
         batch_plan.plan(block.file)
@@ -289,7 +293,7 @@ def test_the_user_widens_the_root_and_the_file_only_narrows_it(block):
         batch_plan.plan(block.file, block.folder.parent)
     for root in ("", "root: ..\n"):
         block.write(root + widened)
-        assert batch_plan.plan(block.file, block.folder.parent).jobs[0].surface.dem == str(block.tiny.dem)
+        assert batch_plan.plan(block.file, block.folder.parent).jobs[0].request.surface.dem == str(block.tiny.dem)
     block.write("root: raw\n" + FILE)
     with pytest.raises(InputError, match="outside of the root"):
         batch_plan.plan(block.file)
@@ -329,7 +333,7 @@ def test_a_file_of_the_current_folder_is_not_meant(block, tmp_path, monkeypatch)
     with pytest.raises(InputError, match="relative to the pipeline file"):
         batch_plan.plan(block.file)
     (block.folder / "camera.json").write_text("{}")
-    options = batch_plan.plan(block.file).jobs[0].scene.sensor_options
+    options = batch_plan.plan(block.file).jobs[0].request.scene.sensor_options
     assert options == {"camera": str(block.folder / "camera.json"), "band": "2", "all": "true"}
 
 

@@ -30,6 +30,7 @@ from ortho_pipeline.batch.shared.arrays import part_of_array
 from ortho_pipeline.batch.shared.leases import Leases
 from ortho_pipeline.batch.shared.run import SharedFolder, run_shared, summary_of
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError, error_document
 from ortho_pipeline.files.storage import objects
 from ortho_pipeline.files.storage.objects import Objects
@@ -98,7 +99,7 @@ def test_an_environment_that_does_not_say_it_is_refused(environment: dict[str, s
 
 
 def test_parts_of_all_workers_are_all_scenes_once() -> None:
-    jobs = tuple(Job(f"s{k}", Path(f"s{k}.tif"), Path("out")) for k in range(23))
+    jobs = tuple(Job(f"s{k}", Request(Path(f"s{k}.tif")), Path("out"), {}) for k in range(23))
     planned = Plan(Path("p.yaml"), Path("out"), jobs)
     parts = (part_of_array({"JOB_COMPLETION_INDEX": str(k), "ORTHO_SHARDS": "5"}) for k in range(5))
     made = [job.name for part in parts for job in planned.chosen(shard=part)]
@@ -144,7 +145,7 @@ def done_record(job: Job) -> Record:
 
 def work_together(address: str, count: int, scenes: int, patience: float, dying: int | None = None) -> Counter[str]:
     """Let some workers make the scenes of one plan at once, each beginning with its own; return how often each was."""
-    jobs = tuple(Job(f"s{k:03}", Path(f"s{k}.tif"), Path("out")) for k in range(scenes))
+    jobs = tuple(Job(f"s{k:03}", Request(Path(f"s{k}.tif")), Path("out"), {}) for k in range(scenes))
     planned = Plan(Path("p.yaml"), Path("out"), jobs)
     made: list[str] = []
     where = SharedFolder(address, allow_network=True, patience=patience)

@@ -241,7 +241,7 @@ def test_the_root_of_a_run_is_a_root_of_its_images(tiny, tmp_path):
     file = tmp_path / "run.yaml"
     file.write_text(f"output: made\nscenes:\n  - {{image: out/{vrt.name}, surface: {{height: 500}}}}\n")
     job = batch_plan.plan(file).jobs[0]
-    assert commands.info(job.image, job.scene)["sensor"] == "rpc"
+    assert commands.info(job.image, job.request.scene)["sensor"] == "rpc"
 
 
 @pytest.mark.parametrize("source", ["../../secret.tif", "/etc/hostname", "link.tif"])

@@ -297,7 +297,7 @@ def test_a_plan_reads_the_document_of_a_dem_once_for_all_scenes(
     true = stac_item.read_document
     monkeypatch.setattr(stac_item, "read_document", lambda path, **more: read.append(path) or true(path, **more))
     planned = plan(config)
-    assert [job.surface.dem for job in planned.jobs] == [str(cells / "items.json")] * 20
+    assert [job.request.surface.dem for job in planned.jobs] == [str(cells / "items.json")] * 20
     assert len(read) == 1
 
 

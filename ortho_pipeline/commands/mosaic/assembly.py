@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.commands.resolved.ledger import require_unchanged
+from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.results import ENDINGS, Result, attempted, to_store
 from ortho_pipeline.errors import InputError, ReportError
 from ortho_pipeline.files import allowed, states, together, write_json
@@ -68,11 +68,11 @@ def mosaic(
     files = {"mosaic": path, "seams": path.with_suffix(".json"), "page": path.with_suffix(".html")}
     _check_paths(paths, files)
     layers = [_ortho(one, name) for one, name in zip(paths, _names(paths), strict=True)]
-    begun = states([*paths, *(one.accuracy for one in layers if one.accuracy)])
+    ledger = Ledger(begun=states([*paths, *(one.accuracy for one in layers if one.accuracy)]))
     with together(path.parent, path.stem):
         document, failure = assemble(layers, files, options, resources=resources)
         write_json(files["seams"], document)
-        require_unchanged(begun)
+        ledger.require_unchanged()
     return Result(files, {"mosaic": document}, summary_text(document), failure)
 
 

@@ -108,7 +108,10 @@ class Ledger:
         InputError
             With the file.
         """
-        require_unchanged(self.begun)
+        now = states(self.begun)
+        for path, state in self.begun.items():
+            if now.get(path) != state:
+                raise InputError("this file changed while it was being used", file=path, remedy="run again")
 
     def hashed(self, digest: Callable[..., str] = sha256, stop: threading.Event | None = None) -> list[dict[str, Any]]:
         """Return role, path, bytes and SHA-256 of each file.
@@ -118,7 +121,10 @@ class Ledger:
         digest : callable (path, stop) -> str
             May know checksums that were taken before.
         """
-        return hashed(self.roles, digest, stop)
+        return [
+            {"role": role, "path": str(path), "bytes": path.stat().st_size, "sha256": digest(path, stop)}
+            for path, role in self.roles.items()
+        ]
 
     @contextlib.contextmanager
     def hashed_beside(self, digest: Callable[..., str] = sha256) -> Iterator[Future[list[dict[str, Any]]]]:
@@ -136,24 +142,6 @@ class Ledger:
                 yield future
             finally:
                 stop.set()
-
-
-def require_unchanged(before: State) -> None:
-    """Raise an `InputError` for the first file whose state (`files.states`) is not what it was."""
-    now = states(before)
-    for path, state in before.items():
-        if now.get(path) != state:
-            raise InputError("this file changed while it was being used", file=path, remedy="run again")
-
-
-def hashed(
-    roles: Mapping[Path, str], digest: Callable[..., str] = sha256, stop: threading.Event | None = None
-) -> list[dict[str, Any]]:
-    """Return role, path, bytes and SHA-256 of files: see `Ledger.hashed`."""
-    return [
-        {"role": role, "path": str(path), "bytes": path.stat().st_size, "sha256": digest(path, stop)}
-        for path, role in roles.items()
-    ]
 
 
 def _files_of(path: str | os.PathLike[str], scene: SceneOptions) -> list[str]:

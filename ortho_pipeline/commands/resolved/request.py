@@ -48,15 +48,20 @@ class Request:
         return gcps if isinstance(gcps, str | os.PathLike) else None
 
     @property
-    def files(self) -> list[tuple[str, str | os.PathLike[str]]]:
-        """The files that the user named, each with its role."""
+    def named(self) -> list[tuple[str, str | os.PathLike[str]]]:
+        """The files that the user named, each with its role; a DEM may be a pattern of several."""
         named: list[tuple[str, Any]] = [
             ("image", self.image), *self.scene.files.items(), ("points", self.point_file),
-            *(("DEM", path) for path in dem_files(self.surface)), ("geoid", self.surface.vertical),
-            ("DEM accuracy", sigma_file(self.surface)), *(("reference", path) for path in self.match.reference),
-            *self.output.files.items(),
+            ("DEM", self.surface.dem), ("geoid", self.surface.vertical), ("DEM accuracy", sigma_file(self.surface)),
+            *(("reference", path) for path in self.match.reference), *self.output.files.items(),
         ]  # fmt: skip
         return [(role, path) for role, path in named if path is not None]
+
+    @property
+    def files(self) -> list[tuple[str, str | os.PathLike[str]]]:
+        """The files that the user named, each with its role; of a pattern, those that there are."""
+        dem = [("DEM", path) for path in dem_files(self.surface)]
+        return [file for role, path in self.named for file in (dem if role == "DEM" else [(role, path)])]
 
     def asked(self, *groups: str) -> dict[str, Any]:
         """Return those of the named groups of options that say something, for the record of a result."""
