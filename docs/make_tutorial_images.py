@@ -192,7 +192,7 @@ def compared(path: Path) -> None:
     ]
     found = op.compare(points, names, own=scene.models["rpc"], size=(scene.width, scene.height))
     figure, axes = plt.subplots(figsize=(8, 4.6), layout="constrained")
-    found.plot(axes)
+    op.plot(found, axes)
     save(figure, path)
 
 

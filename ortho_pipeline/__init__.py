@@ -7,6 +7,7 @@ The names below are the public interface; each is loaded when it is first used, 
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from ortho_pipeline.estimation.fit import Fit as Fit
     from ortho_pipeline.estimation.fit import fit as fit
     from ortho_pipeline.estimation.problem import Prior as Prior
+    from ortho_pipeline.exchange.geodataframe import from_geodataframe as from_geodataframe
+    from ortho_pipeline.exchange.geodataframe import to_geodataframe as to_geodataframe
     from ortho_pipeline.exchange.model_file import load_model as load_model
     from ortho_pipeline.exchange.model_file import save_model as save_model
     from ortho_pipeline.exchange.rpc import export_rpc as export_rpc
@@ -46,6 +49,8 @@ if TYPE_CHECKING:
     from ortho_pipeline.points import write_points as write_points
     from ortho_pipeline.raster.source import Grid as Grid
     from ortho_pipeline.raster.source import RasterSource as RasterSource
+    from ortho_pipeline.report.notebook.charts import plot as plot
+    from ortho_pipeline.report.notebook.tables import html as html
     from ortho_pipeline.surface.base import Surface as Surface
 
 __version__: str
@@ -76,17 +81,21 @@ _HOMES = {
     "compare": "estimation.comparison",
     "export_rpc": "exchange.rpc",
     "fit": "estimation.fit",
+    "from_geodataframe": "exchange.geodataframe",
     "hookimpl": "hookspecs",
+    "html": "report.notebook.tables",
     "intersect": "block.intersection",
     "load_model": "exchange.model_file",
     "match_scene": "commands.control.matching",
     "open_scene": "plugins",
     "ortho_array": "commands.arrays.lazy",
+    "plot": "report.notebook.charts",
     "read_block_points": "block.point_files",
     "read_points": "points",
     "read_rpc": "exchange.rpc",
     "rectify": "commands",
     "save_model": "exchange.model_file",
+    "to_geodataframe": "exchange.geodataframe",
     "write_points": "points",
     "write_rpc_txt": "exchange.rpc",
 }
@@ -105,6 +114,29 @@ if not TYPE_CHECKING:  # a checker knows the names from above, and no others
         value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
         globals()[name] = value
         return value
+
+
+#: What a notebook shows as a table: module and name of each type.
+_SHOWN = (
+    ("hookspecs", "Scene"), ("points.table", "Points"), ("estimation.fit", "Fit"), ("block.fit", "BlockFit"),
+    ("estimation.comparison", "Comparison"),
+)  # fmt: skip
+
+
+def _html(result: Any) -> str:
+    """Return a result as HTML; what makes it is loaded when it is shown."""
+    return str(importlib.import_module(f"{__name__}.report.notebook.tables").html(result))
+
+
+def load_ipython_extension(shell: Any) -> None:
+    """Let a notebook show scenes, points, fits, comparisons and blocks as tables."""
+    formatter = shell.display_formatter.formatters["text/html"]
+    for module, name in _SHOWN:
+        formatter.for_type_by_name(f"{__name__}.{module}", name, _html)
+
+
+if "IPython" in sys.modules and (_shell := sys.modules["IPython"].get_ipython()) is not None:
+    load_ipython_extension(_shell)
 
 
 def __dir__() -> list[str]:

@@ -36,7 +36,6 @@ from typing import TYPE_CHECKING, Any
 
 import pluggy
 
-from ortho_pipeline.display.notebook import scene_html
 from ortho_pipeline.display.notices import FROM_SENSOR, Notice, with_code
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.problem import Prior
@@ -199,14 +198,6 @@ class Scene:
     def __repr__(self) -> str:
         models = ", ".join(self.models) or "none"
         return f"<scene {Path(self.path).name}: {self.width} x {self.height}, sensor {self.sensor}, models {models}>"
-
-    def _repr_html_(self) -> str:
-        rows = [
-            ("size", f"{self.width} x {self.height} pixels"), ("sensor", self.sensor),
-            ("models", ", ".join(self.models)), ("read from", str(self.model_source)),
-            *((name, str(value)) for name, value in self.facts.items()),
-        ]  # fmt: skip
-        return scene_html(f"Scene {Path(self.path).name}", rows, self.warnings)
 
     @property
     def notices(self) -> tuple[Notice, ...]:

@@ -75,7 +75,7 @@ GDAL_MODULES |= {
     "warp.gdal_engine",
 }
 NUMBA_MODULES = {"files.kernels.compiler"}
-MATPLOTLIB_MODULES = {"display.charts", "display.drawing"}
+MATPLOTLIB_MODULES = {"report.notebook.charts", "display.drawing"}
 MAX_ENTRIES, MAX_MODULES, MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_PARAMETERS = 26, 12, 500, 250, 50, 12
 
 FILES = sorted(PACKAGE.rglob("*.py"))

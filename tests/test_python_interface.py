@@ -228,7 +228,7 @@ def test_a_fit_that_adjusts_nothing_says_so() -> None:
 def test_a_scene_shows_itself() -> None:
     scene = op.open_scene("sample_data/scene.tif")
     assert repr(scene) == "<scene scene.tif: 1000 x 1000, sensor rpc, models rpc>"
-    html = scene._repr_html_()
+    html = op.html(scene)
     for text in ("scene.tif", "1000 x 1000 pixels", "scene_RPC.TXT"):
         assert text in html
 

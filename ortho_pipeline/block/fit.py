@@ -19,7 +19,6 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.reliability.known_points import Outlying
 from ortho_pipeline.block.reliability.suspects import Rejected
 from ortho_pipeline.block.variances.components import Variances
-from ortho_pipeline.display.notebook import block_html
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import root_mean_square
@@ -83,9 +82,6 @@ class BlockFit:
         sigma0 = "unknown" if self.sigma0 is None else f"{self.sigma0:.3g}"
         size = f"{counted(len(self.models), 'image')}, {counted(len(self.points), 'point')}"
         return f"<block of {size}: sigma0 {sigma0}{checks}>"
-
-    def _repr_html_(self) -> str:
-        return block_html(self.to_json())
 
     @property
     def values(self) -> Array:

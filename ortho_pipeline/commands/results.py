@@ -12,7 +12,6 @@ from pathlib import Path, PurePosixPath
 from typing import Any, ParamSpec, TypeVar, cast
 
 from ortho_pipeline.commands.control.matching import Matched
-from ortho_pipeline.display import notebook
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import OrthoError, ReportError, error_document
 from ortho_pipeline.estimation import comparison as comparing
@@ -29,6 +28,7 @@ from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.map_scale import map_scale
 from ortho_pipeline.report.matching import MatchingRecord, matching_record
+from ortho_pipeline.report.notebook import tables
 from ortho_pipeline.report.records import SceneReport
 from ortho_pipeline.report.wording import refuted
 
@@ -122,8 +122,8 @@ class Result:
         """Show the report in a notebook, or the summary where there is none."""
         if "html" in self.files:
             page = self.files["html"]
-            return notebook.page_html(page.read_text(encoding="utf-8")) if isinstance(page, Path) else self.summary
-        return notebook.text_html(self.summary)
+            return tables.page_html(page.read_text(encoding="utf-8")) if isinstance(page, Path) else self.summary
+        return tables.text_html(self.summary)
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.display.charts import rmse_axes
-from ortho_pipeline.display.notebook import comparison_html
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.estimation.choice.recommendation import recommend
@@ -95,18 +93,6 @@ class Comparison:
     def best(self) -> Row | None:
         """The recommended row."""
         return next((row for row in self.rows if row.model == self.recommended), None)
-
-    def _repr_html_(self) -> str:
-        return comparison_html(self.to_json())
-
-    def plot(self, axes: Any = None) -> Any:
-        """Draw the RMSE of every model that could be fitted with matplotlib, on `axes` if given; return the axes."""
-        rmses = {
-            row.model: {kind: float(found["total"]) for kind, found in row.fit.rmses.items() if found}
-            for row in self.rows
-            if row.fit is not None
-        }
-        return rmse_axes(rmses, self.recommended, axes)
 
     def to_json(self) -> dict[str, Any]:
         """Return the part of ``ortho compare --json`` that is about models."""

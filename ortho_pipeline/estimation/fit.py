@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.display.charts import residual_axes
-from ortho_pipeline.display.notebook import fit_html
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import DegeneratePoints, InputError, ModelError
 from ortho_pipeline.estimation.blunders import REJECTED_LIMIT, Outlying, checks_apart, find_blunders, outlying
@@ -210,14 +208,6 @@ class Fit:
         return (
             f"<fit of {self.model_name} to {counted(int(self.used.sum()), 'control point')}: RMSE {said or 'unknown'}>"
         )
-
-    def _repr_html_(self) -> str:
-        return fit_html(self.to_json())
-
-    def plot(self, axes: Any = None) -> Any:
-        """Draw the residual vectors in the image with matplotlib, on `axes` if given; return the axes."""
-        kinds = np.where(self.points.control & ~self.used, "out", self.points.roles)
-        return residual_axes(self.points.image, self.residuals, kinds.tolist(), repr(self)[1:-1], axes)
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho fit --json`` (docs/formats.md)."""

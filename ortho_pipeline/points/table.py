@@ -19,13 +19,11 @@ import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_pipeline.display.notebook import points_html
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import json_text, write_text
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, parse_crs
 from ortho_pipeline.geodesy.naming import crs_definition
 from ortho_pipeline.options.texts import counted
-from ortho_pipeline.points.dataframes.geodataframe import frame_of, table_of
 from ortho_pipeline.points.formats import read_table
 from ortho_pipeline.points.geojson import feature_of
 from ortho_pipeline.points.ground import ground_of
@@ -58,7 +56,7 @@ from ortho_pipeline.points.rows import (
 )
 
 if TYPE_CHECKING:
-    from geopandas import GeoDataFrame
+    pass
 
 Array = NDArray[np.float64]
 
@@ -172,10 +170,6 @@ class Points:
         roles = ", ".join(f"{(self.roles == role).sum()} {role}" for role in ROLES if (self.roles == role).any())
         return f"<{counted(len(self.ids), 'point')}: {roles or 'none'}; {self.crs.name}; {self.source}>"
 
-    def _repr_html_(self) -> str:
-        rows = [(point.id, point.role, point.image, point.ground) for point in self]
-        return points_html(repr(self)[1:-1], rows)
-
     def __len__(self) -> int:
         return len(self.ids)
 
@@ -216,33 +210,6 @@ class Points:
         """
         measured = self.check & (self.groups < 0)
         return measured if measured.any() else self.check
-
-    def to_geodataframe(self) -> GeoDataFrame:
-        """Return the points as a GeoDataFrame, from which `from_geodataframe` makes them again, to the last bit.
-
-        Columns are those of CSV files: `col` and `row` (px, from the outer corner of the first pixel), `h` (metres
-        above the ellipsoid, NaN where it is not given), role and standard deviations, those in plan one by one. The
-        geometry is x, y in `crs`. It needs GeoPandas (``pip install 'ortho-pipeline[geopandas]'``).
-        """
-        return frame_of(self)
-
-    @classmethod
-    def from_geodataframe(
-        cls, frame: GeoDataFrame, *, crs: str | pyproj.CRS | None = None, vertical: str | Vertical | None = None
-    ) -> Points:
-        """Make points of a GeoDataFrame with the columns `col` and `row`; all others of `to_geodataframe` may be there.
-
-        Heights are column `h`, or those of the geometry. `crs` and `vertical` say what places and heights are in where
-        the frame does not: its CRS, or ``frame.attrs["vertical"]`` as `to_geodataframe` leaves it.
-
-        Raises
-        ------
-        InputError, CrsError, DatumError
-            Names the row and the column, and what to do.
-        """
-        table, sigmas = table_of(frame)
-        found = _points_of(str(frame.attrs.get("source", "GeoDataFrame")), table, crs, vertical)
-        return replace(found, sigma_ground=sigmas)
 
     def select(self, mask: ArrayLike) -> Points:
         """Return the points of a mask ``(N,)`` or of indices, in their order."""
@@ -338,15 +305,7 @@ def points_of(
     pixel_origin: str,
 ) -> Points:  # fmt: skip
     """Return the points of a table that was read; parameters and errors are those of `read_points`."""
-    return _points_of(path, table, crs, vertical, origin_shift(path, table, pixel_origin))
-
-
-def _points_of(
-    path: str | os.PathLike[str], table: Table, crs: str | pyproj.CRS | None, vertical: str | Vertical | None,
-    shift: float = 0.0,
-) -> Points:  # fmt: skip
-    """Return the points of the rows of a table; `shift` px is added to their places in the image."""
-    rows = table.rows
+    shift, rows = origin_shift(path, table, pixel_origin), table.rows
     ids = numbered_ids(path, rows)
     pieces = np.array([row.piece for row in rows]).reshape(-1, 3)
     image = (np.array([row.image for row in rows]).reshape(-1, 2) + shift) * pieces[:, 2:] + pieces[:, :2]

@@ -34,6 +34,7 @@ from ortho_pipeline.models.base import Constraints
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.points.selection import select_control
+from ortho_pipeline.report.notebook.tables import html
 from ortho_pipeline.simulation.scanner import LineScanner
 
 LON, LAT = 33.35, 37.25
@@ -981,12 +982,12 @@ def test_results_are_short_in_a_console_and_tables_in_a_notebook(rpcs: dict[str,
     assert repr(found).startswith("<block of 3 images, 30 points: sigma0 0.")
     assert "at 20 check points" in repr(found)
     assert repr(intersect(found.models, points)).startswith("<30 of 30 points intersected from 90 rays: sigma0 ")
-    html = found._repr_html_()
-    assert "check points" in html
-    assert "left, control points" in html
-    assert "left out: point p10" in html
+    shown = html(found)
+    assert "check points" in shown
+    assert "left, control points" in shown
+    assert "left out: point p10" in shown
     ties = adjust(starts(truth), measured(truth, places(20), "tie", noise=0.3))
-    assert "left, tie points" in ties._repr_html_()
+    assert "left, tie points" in html(ties)
 
 
 @pytest.mark.parametrize("axes", [(0, 1), (2,), (0, 1, 2)])

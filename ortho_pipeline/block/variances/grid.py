@@ -20,7 +20,6 @@ sum of two variances); Gelman 2006 (priors of variances); Koch 2007 (in geodesy)
 from __future__ import annotations
 
 import math
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -55,26 +54,15 @@ _ROUNDS = 4
 _SAME = 0.03
 
 
-_grids: WeakKeyDictionary[Solved, tuple[_Grid, Variances]] = WeakKeyDictionary()
-
-
 def estimate(solved: Solved) -> Variances:
     """Return the variance components at a solution, which was found with sigmas near enough to linearise there."""
-    return _grid_of(solved)[1]
+    return _Grid(solved).variances()
 
 
 def posterior(solved: Solved) -> Posterior:
     """Return the variance components at a solution, and covariances with their uncertainty."""
-    grid, variances = _grid_of(solved)
-    return grid.posterior(variances)
-
-
-def _grid_of(solved: Solved) -> tuple[_Grid, Variances]:
-    """Return the grid at a solution, made once for it: the search for gross errors and the result ask for the same."""
-    if solved not in _grids:
-        grid = _Grid(solved)
-        _grids[solved] = grid, grid.variances()
-    return _grids[solved]
+    grid = _Grid(solved)
+    return grid.posterior(grid.variances())
 
 
 def reweighed(solved: Solved, selection: Selection, variances: Variances, tolerance: float = EXACT) -> Solved:

@@ -1,14 +1,25 @@
-"""Results in a notebook: plain HTML that takes the notebook's own colours."""
+"""Results in a notebook: plain HTML that takes the notebook's own colours.
+
+IPython is told of `html` when the package is imported (`show_in`), so that what computes a result need not know HTML.
+"""
 
 from __future__ import annotations
 
 import base64
+import functools
+import itertools
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.display.pages import render
+from ortho_pipeline.estimation.comparison import Comparison
+from ortho_pipeline.estimation.fit import Fit
+from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options.texts import counted
+from ortho_pipeline.points import Points
 
 #: In a notebook, pages of reports are this high (CSS pixels).
 _PAGE_HEIGHT = 640
@@ -16,8 +27,26 @@ _PAGE_HEIGHT = 640
 _LISTED = 20
 
 
+@functools.singledispatch
+def html(result: object) -> str:
+    """Return a scene, points, a fit, a comparison or a block as an HTML table, as a notebook shows it.
+
+    Examples
+    --------
+    >>> import ortho_pipeline as op
+    >>> "12 control" in op.html(op.read_points("sample_data/gcps.geojson"))
+    True
+    """
+    return text_html(repr(result))
+
+
 def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> dict[str, Any]:
     return {"title": title, "head": head, "rows": rows}
+
+
+@html.register
+def _(fit: Fit) -> str:
+    return fit_html(fit.to_json())
 
 
 def fit_html(document: Mapping[str, Any]) -> str:
@@ -33,16 +62,23 @@ def fit_html(document: Mapping[str, Any]) -> str:
     if values:
         tables.append(_table("Parameters", ("", "value", "sigma"), values))
     said = [f"left out: point {one['id']} ({one['reason']})" for one in document["rejected"]] + document["warnings"]
-    return render("display/notebook.html.j2", tables=tables, notes=said)
+    return render("report/notebook.html.j2", tables=tables, notes=said)
 
 
-def scene_html(title: str, rows: Sequence[tuple[str, str]], notes: Sequence[str]) -> str:
-    """Return what is known of a scene as HTML: names and texts, and its warnings."""
-    return render("display/notebook.html.j2", tables=[_table(title, ("", ""), rows)], notes=notes)
+@html.register
+def _(scene: Scene) -> str:
+    rows = [
+        ("size", f"{scene.width} x {scene.height} pixels"), ("sensor", scene.sensor),
+        ("models", ", ".join(scene.models)), ("read from", str(scene.model_source)),
+        *((name, str(value)) for name, value in scene.facts.items()),
+    ]  # fmt: skip
+    table = _table(f"Scene {Path(scene.path).name}", ("", ""), rows)
+    return render("report/notebook.html.j2", tables=[table], notes=scene.warnings)
 
 
-def block_html(document: Mapping[str, Any]) -> str:
-    """Return the document of a block (`BlockFit.to_json`) as HTML: RMSE on the ground and in the images, warnings."""
+@html.register
+def _(block: BlockFit) -> str:
+    document = block.to_json()
     ground = [
         (f"{role} points", str(found["n"]), *(f"{found[axis]:.3f}" for axis in "xyh"))
         for role, found in document["object_rms"].items()
@@ -62,23 +98,27 @@ def block_html(document: Mapping[str, Any]) -> str:
     said += [f"left out: point {one['point']} ({one['reason']})" for one in rejected[:_LISTED]]
     if len(rejected) > _LISTED:
         said.append(f"and {counted(len(rejected) - _LISTED, 'more gross error')}")
-    return render("display/notebook.html.j2", tables=tables, notes=said)
+    return render("report/notebook.html.j2", tables=tables, notes=said)
 
 
-def points_html(title: str, rows: Sequence[tuple[str, str, Sequence[float], Sequence[float]]]) -> str:
-    """Return points as HTML; a row has id, role, column and row, and x, y and height (NaN where it is not given)."""
+@html.register
+def _(points: Points) -> str:
     head = ("", "role", "column", "row", "x", "y", "height")
     texts = [
-        (name, role, *(f"{value:.2f}" for value in image), *("–" if math.isnan(v) else f"{v:.10g}" for v in ground))
-        for name, role, image, ground in rows[:_LISTED]
-    ]
-    rest = len(rows) - len(texts)
+        (
+            one.id, one.role, *(f"{value:.2f}" for value in one.image),
+            *("–" if math.isnan(value) else f"{value:.10g}" for value in one.ground),
+        )
+        for one in itertools.islice(points, _LISTED)
+    ]  # fmt: skip
+    rest = len(points) - len(texts)
     said = [f"and {counted(rest, 'more point')}"] if rest else []
-    return render("display/notebook.html.j2", tables=[_table(title, head, texts)], notes=said)
+    return render("report/notebook.html.j2", tables=[_table(repr(points)[1:-1], head, texts)], notes=said)
 
 
-def comparison_html(document: Mapping[str, Any]) -> str:
-    """Return the document of a comparison (`Comparison.to_json`) as HTML: RMSE of each model, and which to take."""
+@html.register
+def _(comparison: Comparison) -> str:
+    document = comparison.to_json()
 
     def total(rmse: Mapping[str, float] | None) -> str:
         return f"{rmse['total']:.3f}" if rmse else "–"
@@ -91,7 +131,7 @@ def comparison_html(document: Mapping[str, Any]) -> str:
     said = [f"recommended: {advice['model'] or 'none'} ({advice['reason']})"]
     said += [f"left out: point {one['id']} ({one['reason']})" for one in document["left_out"]] + document["warnings"]
     head = ("", "parameters", "check points", "each left out in turn", "control points")
-    return render("display/notebook.html.j2", tables=[_table("RMSE, pixels", head, rows)], notes=said)
+    return render("report/notebook.html.j2", tables=[_table("RMSE, pixels", head, rows)], notes=said)
 
 
 def page_html(page: str) -> str:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyproj
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import Vertical
+from ortho_pipeline.points import Points, points_of
 from ortho_pipeline.points.image_errors import read_image_errors, says_more
 from ortho_pipeline.points.rows import CSV_ERRORS, Row, Table, number, role_of, sigma_of
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame
-
-    from ortho_pipeline.points.table import Points
 
 #: What errors call a frame that does not say where its points come from.
 _FRAME = "GeoDataFrame"
@@ -22,8 +24,12 @@ _SIGMAS = ("sigma_image", "sigma_x", "sigma_y", "sigma_h")
 _COLUMNS = ("id", "role", "col", "row", "h", *_SIGMAS, "sigma_xy", *CSV_ERRORS)
 
 
-def frame_of(points: Points) -> GeoDataFrame:
-    """Return points as a GeoDataFrame, as `Points.to_geodataframe` describes it.
+def to_geodataframe(points: Points) -> GeoDataFrame:
+    """Return points as a GeoDataFrame, from which `from_geodataframe` makes them again, to the last bit.
+
+    Columns are those of CSV files: `col` and `row` (px, from the outer corner of the first pixel), `h` (metres above
+    the ellipsoid, NaN where it is not given), role and standard deviations, those in plan one by one. The geometry is
+    x, y in the CRS of the points. It needs GeoPandas (``pip install 'ortho-pipeline[geopandas]'``).
 
     Raises
     ------
@@ -72,14 +78,26 @@ def _error_columns(points: Points) -> dict[str, Any]:
     return found
 
 
-def table_of(frame: GeoDataFrame) -> tuple[Table, np.ndarray]:
-    """Return the rows of a GeoDataFrame, and standard deviations ``(N, 3)`` m of their ground (0 where not given).
+def from_geodataframe(
+    frame: GeoDataFrame, *, crs: str | pyproj.CRS | None = None, vertical: str | Vertical | None = None
+) -> Points:
+    """Make points of a GeoDataFrame with the columns `col` and `row`; all others of `to_geodataframe` may be there.
+
+    Heights are column `h`, or those of the geometry. `crs` and `vertical` say what places and heights are in where the
+    frame does not: its CRS, or ``frame.attrs["vertical"]`` as `to_geodataframe` leaves it.
 
     Raises
     ------
-    InputError
-        If it is no GeoDataFrame, or a column is missing or has another thing than it should.
+    InputError, CrsError, DatumError
+        Names the row and the column, and what to do.
     """
+    table, sigmas = _table_of(frame)
+    found = points_of(str(frame.attrs.get("source", _FRAME)), table, crs, vertical, "corner")
+    return replace(found, sigma_ground=sigmas)
+
+
+def _table_of(frame: GeoDataFrame) -> tuple[Table, np.ndarray]:
+    """Return the rows of a GeoDataFrame, and standard deviations ``(N, 3)`` m of their ground (0 where not given)."""
     if not hasattr(frame, "geometry") or not hasattr(frame, "columns"):
         raise InputError(
             f"{type(frame).__name__} has no geometry", file=_FRAME, field="frame", remedy="give a GeoDataFrame"

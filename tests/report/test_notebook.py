@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import importlib
 import re
 import runpy
 from pathlib import Path
@@ -21,7 +22,7 @@ def test_a_fit_shows_itself():
     assert repr(points).startswith("<18 points: 12 control, 6 check; WGS 84; ")
     fit = op.fit(op.ImageCorrection.identity(scene.model, "shift", (500.0, 500.0)), points)
     assert re.fullmatch(r"<fit of .* to 12 control points: RMSE control 0\.221 px, check .* px, loo .* px>", repr(fit))
-    html = fit._repr_html_()
+    html = op.html(fit)
     assert html.count("<table>") == 2
     assert "col_shift" in html
     assert "0.221" in html
@@ -29,20 +30,40 @@ def test_a_fit_shows_itself():
 
 def test_points_and_a_comparison_show_themselves():
     scene, points = op.open_scene(SAMPLE / "scene.tif"), op.read_points(SAMPLE / "gcps.geojson")
-    html = points._repr_html_()
+    html = op.html(points)
     assert html.count("<tr>") == 19
     assert "12 control, 6 check" in html
     assert ">136.44<" in html
     many = op.Points.of([[k, k] for k in range(23)], [[30 + k, 40, float("nan")] for k in range(23)], "EPSG:4326")
-    assert "and 3 more points" in many._repr_html_()
+    assert "and 3 more points" in op.html(many)
     found = op.compare(points, ["rpc+shift", "affine3d"], own=scene.model, size=(scene.width, scene.height))
-    html = found._repr_html_()
+    html = op.html(found)
     assert html.count("<tr>") == 3
     assert "recommended: rpc+shift" in html
 
 
+def test_ipython_shows_what_is_displayed():
+    shown = {}
+
+    class Formatter:
+        def for_type_by_name(self, module, name, function):
+            shown[module, name] = function
+
+    class Display:
+        formatters = {"text/html": Formatter()}  # noqa: RUF012
+
+    class Shell:
+        display_formatter = Display()
+
+    op.load_ipython_extension(Shell())
+    points = op.read_points(SAMPLE / "gcps.geojson")
+    assert "12 control, 6 check" in shown[type(points).__module__, "Points"](points)
+    for module, name in shown:
+        assert getattr(importlib.import_module(module), name).__module__ == module
+
+
 def test_names_from_files_are_text_and_not_html():
-    from ortho_pipeline.display.notebook import fit_html, text_html
+    from ortho_pipeline.report.notebook.tables import fit_html, text_html
 
     document = {
         "model": "<b>", "rmse": {"control": {"n": 1, "col": 0.1, "row": 0.1, "total": 0.14}, "check": None},

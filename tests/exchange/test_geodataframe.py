@@ -45,17 +45,17 @@ def assert_equal(found: op.Points, wanted: op.Points) -> None:
 
 
 def test_they_come_back_to_the_last_bit(points):
-    frame = points.to_geodataframe()
+    frame = op.to_geodataframe(points)
     assert frame.crs == pyproj.CRS("EPSG:32636")
     assert frame.geometry.is_empty.sum() + frame.geometry.isna().sum() == 1
-    assert_equal(op.Points.from_geodataframe(frame), points)
+    assert_equal(op.from_geodataframe(frame), points)
     sample = op.read_points(SAMPLE / "gcps.geojson")
-    again = op.Points.from_geodataframe(sample.to_geodataframe())
+    again = op.from_geodataframe(op.to_geodataframe(sample))
     assert_equal(again, sample)
     assert again.source == sample.source
-    assert "group" not in sample.to_geodataframe()
+    assert "group" not in op.to_geodataframe(sample)
     # The frame is one of GeoPandas: another CRS there is that of `to_crs` here.
-    moved = op.Points.from_geodataframe(sample.to_geodataframe().to_crs("EPSG:32636"))
+    moved = op.from_geodataframe(op.to_geodataframe(sample).to_crs("EPSG:32636"))
     np.testing.assert_allclose(moved.ground, sample.to_crs("EPSG:32636").ground, atol=1e-6)
 
 
@@ -67,16 +67,16 @@ def test_frames_of_others_say_what_their_heights_are(points):
         geometry=[shapely.Point(33.3, 37.2, 800.0), shapely.Point(33.4, 37.3, 900.0)], crs="EPSG:4326",
     )  # fmt: skip
     with pytest.raises(DatumError, match="not known what the heights"):
-        op.Points.from_geodataframe(frame)
-    found = op.Points.from_geodataframe(frame, vertical="ellipsoid")
+        op.from_geodataframe(frame)
+    found = op.from_geodataframe(frame, vertical="ellipsoid")
     assert found.ids == ("1", "2")
     assert found.ground[:, 2].tolist() == [800.0, 900.0]
     assert found.sigma_ground.tolist() == [[0.2, 0.2, 0.0], [0.0, 0.0, 0.0]]
     assert found.roles.tolist() == ["control"] * 2
     # The CRS of EPSG:4979 says it itself.
-    assert op.Points.from_geodataframe(frame.set_crs("EPSG:4979", allow_override=True)).ground[1, 2] == 900.0
+    assert op.from_geodataframe(frame.set_crs("EPSG:4979", allow_override=True)).ground[1, 2] == 900.0
     with pytest.raises(CrsError, match="CRS of these points is not known"):
-        op.Points.from_geodataframe(frame.set_crs(None, allow_override=True), vertical="ellipsoid")
+        op.from_geodataframe(frame.set_crs(None, allow_override=True), vertical="ellipsoid")
 
 
 @pytest.mark.parametrize(
@@ -95,12 +95,12 @@ def test_frames_of_others_say_what_their_heights_are(points):
 )
 def test_what_is_wrong_is_named(points, change, said):
     with pytest.raises(InputError) as error:
-        op.Points.from_geodataframe(change(points.to_geodataframe()))
+        op.from_geodataframe(change(op.to_geodataframe(points)))
     assert said in str(error.value)
 
 
 def test_without_geopandas_the_remedy_is_said(points, monkeypatch):
     monkeypatch.setitem(sys.modules, "geopandas", None)
     with pytest.raises(InputError, match=r"needs GeoPandas") as error:
-        points.to_geodataframe()
+        op.to_geodataframe(points)
     assert "ortho-pipeline[geopandas]" in error.value.remedy

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.estimation.comparison import Comparison
+from ortho_pipeline.estimation.fit import Fit
 
 #: Kind of point or figure -> mark and colour.
 _MARKS = {
@@ -18,6 +21,48 @@ _MARKS = {
     "loo": ("v", "tab:green"),
 }
 _NAMES = {"control": "control", "check": "check", "out": "left out", "loo": "each left out in turn"}
+
+
+@functools.singledispatch
+def plot(result: object, axes: Any = None) -> Any:
+    """Draw a fit (its residual vectors) or a comparison (the RMSE of all models) with matplotlib; return the axes.
+
+    Parameters
+    ----------
+    axes : matplotlib axes, optional
+        Drawn on; new ones without.
+
+    Raises
+    ------
+    InputError
+        If matplotlib is not installed, or the result is neither.
+
+    Examples
+    --------
+    >>> import ortho_pipeline as op
+    >>> scene, points = op.open_scene("sample_data/scene.tif"), op.read_points("sample_data/gcps.geojson")
+    >>> op.plot(scene.fit(points, "shift")).get_ylabel()
+    'row, px'
+    """
+    raise InputError(
+        f"there is no plot of a {type(result).__name__}", field="result", remedy="give a fit or a comparison"
+    )
+
+
+@plot.register
+def _(fit: Fit, axes: Any = None) -> Any:
+    kinds = np.where(fit.points.control & ~fit.used, "out", fit.points.roles)
+    return residual_axes(fit.points.image, fit.residuals, kinds.tolist(), repr(fit)[1:-1], axes)
+
+
+@plot.register
+def _(comparison: Comparison, axes: Any = None) -> Any:
+    rmses = {
+        row.model: {kind: float(found["total"]) for kind, found in row.fit.rmses.items() if found}
+        for row in comparison.rows
+        if row.fit is not None
+    }
+    return rmse_axes(rmses, comparison.recommended, axes)
 
 
 def residual_axes(

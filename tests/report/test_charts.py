@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 import pytest
 
-from ortho_pipeline.display.charts import residual_axes, rmse_axes
+from ortho_pipeline.report.notebook.charts import residual_axes, rmse_axes
 
 matplotlib.use("Agg")
 

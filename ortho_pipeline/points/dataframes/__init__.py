@@ -1,1 +1,0 @@
-"""Points as tables of other libraries."""

@@ -1,0 +1,1 @@
+"""Results as Python users see them: tables in notebooks, plots of matplotlib."""
