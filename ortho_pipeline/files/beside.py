@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 
 from ortho_pipeline.files.locations import AnyPath, VsiPath, is_far, located
-from ortho_pipeline.files.process_limits import startable_threads
+from ortho_pipeline.files.process_limits import thread_pool
 
 #: Questions at a time.
 _AT_ONCE = 16
@@ -50,7 +49,7 @@ def ask_beside(*paths: AnyPath | None, allow_network: bool = False) -> None:
     if not new:
         return
     _known.update(far)
-    with ThreadPoolExecutor(startable_threads(_AT_ONCE), thread_name_prefix="beside") as pool:
+    with thread_pool(_AT_ONCE, "beside") as pool:
         for path in new:
             pool.submit(path.read, _HEADER)
         for path in new:

@@ -15,7 +15,8 @@ import resource
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -122,6 +123,17 @@ def startable_threads(wanted: int) -> int:
     return len(started)
 
 
+def thread_pool(threads: int, name: str) -> ThreadPoolExecutor:
+    """Return a pool of so many threads of a name, or of as many as can be started.
+
+    Raises
+    ------
+    OrthoError
+        If there can be none.
+    """
+    return ThreadPoolExecutor(startable_threads(threads), thread_name_prefix=name)
+
+
 class _Pool:
     """The process in which GDAL's pool of threads was begun."""
 
@@ -166,34 +178,27 @@ def parts_of(count: int, least: int) -> list[tuple[int, int]]:
     return list(itertools.pairwise(count * number // parts for number in range(parts + 1)))
 
 
-def side_by_side(work: Callable[[int, int, int], None], parts: list[tuple[int, int]]) -> None:
-    """Do a work on parts, each given by its number, begin and end, with as many threads as there are processors.
+def side_by_side(
+    work: Callable[[int, int, int], None], parts: list[tuple[int, int]], threads: int | None = None
+) -> None:
+    """Do a work on parts, each given by its number, begin and end, with some threads, or one for each processor.
 
     The work has to release the GIL, as compiled code does, and each part to write to a place of its own. This thread
     works too; threads that cannot be started leave their parts to the others.
     """
-    jobs = iter([(number, *part) for number, part in enumerate(parts)])
-    done, failed = threading.Semaphore(0), list[BaseException]()
+    jobs, others = iter([(number, *part) for number, part in enumerate(parts)]), list[Future[None]]()
 
     def take_part() -> None:
         for job in jobs:
-            try:
-                if not failed:
-                    work(*job)
-            except BaseException as error:  # told by the thread that asked for the work
-                failed.append(error)
-            done.release()
+            work(*job)
 
-    try:
-        for _ in range(min(os.cpu_count() or 1, len(parts)) - 1):
-            threading.Thread(target=take_part, daemon=True).start()
-    except (RuntimeError, MemoryError):
-        pass
-    take_part()
-    for _ in parts:
-        done.acquire()
-    if failed:
-        raise failed[0]
+    with ThreadPoolExecutor(len(parts) or 1, thread_name_prefix="parts") as pool:
+        with suppress(RuntimeError, MemoryError):
+            for _ in range(min(threads or os.cpu_count() or 1, len(parts)) - 1):
+                others.append(pool.submit(take_part))
+        take_part()
+    for other in others:
+        other.result()
 
 
 class _Blas:

@@ -13,7 +13,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.process_limits import thread_pool
 from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.raster.far.ahead import AHEAD, ReadAhead, read_ahead
 from ortho_pipeline.raster.ortho import (
@@ -131,7 +132,7 @@ def _in_order(threads: int, work: TileMaker, tiles: list[tuple[int, int, int, in
         # A thread of its own would open the files again, and ask PROJ for its transformations anew.
         yield work.make(tiles[0])
         return
-    with ThreadPoolExecutor(threads, thread_name_prefix="warp") as pool:
+    with thread_pool(threads, "warp") as pool:
         prepared = deque(pool.submit(work.prepare, tile) for tile in tiles[:ahead])
         pending: deque[Future[Any]] = deque()
         try:

@@ -13,7 +13,14 @@ from pathlib import Path
 import pytest
 
 from ortho_pipeline.errors import OrthoError
-from ortho_pipeline.files.process_limits import MOST_THREADS, parts_of, require_memory, side_by_side, startable_threads
+from ortho_pipeline.files.process_limits import (
+    MOST_THREADS,
+    parts_of,
+    require_memory,
+    side_by_side,
+    startable_threads,
+    thread_pool,
+)
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 EXTENT = ("530600", "4122000", "530800", "4122200")
@@ -114,17 +121,39 @@ def test_threads_share_a_heap() -> None:
     assert heaps[1] == 0
 
 
-def _cannot(*_: object) -> int:
-    raise RuntimeError("can't start new thread")
+def _start_no_more_than(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no more threads run at once, as a limit of the system does."""
+    start = threading.Thread.start
+
+    def limited(thread: threading.Thread) -> None:
+        if threading.active_count() > most:
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", limited)
 
 
-@pytest.mark.parametrize("start", [None, _cannot], ids=["threads", "no threads"])
-def test_each_part_of_a_work_is_done_once(monkeypatch: pytest.MonkeyPatch, start: object) -> None:
+def test_a_pool_has_no_more_threads_than_can_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    _start_no_more_than(threading.active_count() + 1, monkeypatch)
+    names = set()
+
+    def work(number: int) -> int:
+        names.add(threading.current_thread().name.rpartition("_")[0])
+        return number
+
+    with thread_pool(6, "named") as pool:
+        assert list(pool.map(work, range(50))) == list(range(50))
+    assert names == {"named"}
+
+
+@pytest.mark.parametrize("most", [0, 1, 4])
+@pytest.mark.parametrize("threads", [None, 1, 3])
+def test_each_part_of_a_work_is_done_once(monkeypatch: pytest.MonkeyPatch, most: int, threads: int | None) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: 4)
-    if start is not None:
-        monkeypatch.setattr(threading.Thread, "start", start)
+    _start_no_more_than(threading.active_count() + most - 1, monkeypatch)
     parts, done = parts_of(1003, 10), list[tuple[int, int, int]]()
-    side_by_side(lambda *job: done.append(job), parts)
+    side_by_side(lambda *job: done.append(job), parts, threads)
+    side_by_side(lambda *job: done.append(job), [], threads)
     assert sorted(done) == [(number, *part) for number, part in enumerate(parts)]
     assert len(parts) == 8
 

@@ -7,7 +7,7 @@ import dataclasses
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from ortho_pipeline.exchange.rpc import files_of
 from ortho_pipeline.files import sha256, states
 from ortho_pipeline.files.documents import software_version
 from ortho_pipeline.files.locations import archive_of, is_far
-from ortho_pipeline.files.process_limits import startable_threads
+from ortho_pipeline.files.process_limits import thread_pool
 from ortho_pipeline.files.traffic import bytes_read
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import SceneOptions
@@ -134,9 +134,8 @@ class Ledger:
         thread is inside of a GDAL function (its binding's destructor takes the lock of the interpreter, and the process
         aborts).
         """
-        startable_threads(1)
         stop = threading.Event()
-        with ThreadPoolExecutor(1, thread_name_prefix="checksums") as pool:
+        with thread_pool(1, "checksums") as pool:
             future = pool.submit(self.hashed, digest, stop)
             try:
                 yield future

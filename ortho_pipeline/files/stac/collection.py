@@ -5,13 +5,12 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 from urllib.parse import urlencode
 
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files.locations import AnyPath, is_address, url_of
-from ortho_pipeline.files.process_limits import startable_threads
+from ortho_pipeline.files.process_limits import thread_pool
 from ortho_pipeline.files.stac.documents import COLLECTIONS, read_document, target
 from ortho_pipeline.files.stac.item import Item, item_of, read_item
 from ortho_pipeline.files.stac.places import Box, any_meet, extent_boxes, questions
@@ -114,7 +113,7 @@ class Collection:
             if len(seen) > _MOST_DOCUMENTS:
                 raise InputError(f"more than {_MOST_DOCUMENTS} documents", file=self.address, remedy=_FEWER)
             below = []
-            with ThreadPoolExecutor(startable_threads(_AT_ONCE), thread_name_prefix="stac") as pool:
+            with thread_pool(_AT_ONCE, "stac") as pool:
                 for place, read in zip(wanted, pool.map(self._read, wanted), strict=True):
                     if isinstance(read, Item):
                         yield read

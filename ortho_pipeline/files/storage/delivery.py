@@ -11,14 +11,13 @@ import contextlib
 import os
 import tempfile
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.locations import STORES, is_address
-from ortho_pipeline.files.process_limits import startable_threads
+from ortho_pipeline.files.process_limits import thread_pool
 from ortho_pipeline.files.storage.objects import Content, Objects
 from ortho_pipeline.files.whole import json_text
 
@@ -71,8 +70,7 @@ def _upload(store: Objects, folder: Path, record: str, keep: Callable[[Path], bo
     paths = sorted(path for path in folder.rglob("*") if path.is_file() and keep(path))
     names = [path.relative_to(folder).as_posix() for path in paths]
     store.delete(record)
-    startable_threads(_AT_ONCE)
-    with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="upload") as pool:
+    with thread_pool(_AT_ONCE, "upload") as pool:
         contents = list(pool.map(store.put, names, paths))
     store.put(record, _record_of(names, contents))
     return dict(zip(names, contents, strict=True))

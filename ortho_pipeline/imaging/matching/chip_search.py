@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ortho_pipeline.files.process_limits import side_by_side
 from ortho_pipeline.imaging.band_shifts import BandShift
 from ortho_pipeline.imaging.matching.chips import Renderer
 from ortho_pipeline.imaging.matching.correlation import Peaks, orientation, peaks, surfaces
@@ -79,13 +79,8 @@ def doubts(found: Peaks, wide: Chips, around: Chips, radius: int) -> NDArray[np.
 
 def in_batches(work: Callable[[NDArray[np.int_]], None], index: NDArray[np.int_], threads: int) -> None:
     """Do a work on numbers ``(n,)``, some at a time."""
-    batches = [index[first : first + _BATCH] for first in range(0, len(index), _BATCH)]
-    if threads == 1:
-        for batch in batches:
-            work(batch)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(work, batches))
+    parts = [(first, first + _BATCH) for first in range(0, len(index), _BATCH)]
+    side_by_side(lambda _, begin, end: work(index[begin:end]), parts, threads)
 
 
 def in_each_band(

@@ -12,12 +12,12 @@ import math
 import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import parse_json
+from ortho_pipeline.files.process_limits import thread_pool
 from ortho_pipeline.measure.block.session import BlockSession
 from ortho_pipeline.measure.project import Project
 from ortho_pipeline.measure.serving.entry import Entry
@@ -227,7 +227,7 @@ class _Given:
         self._session, self._tiles, self._answers = session, tiles, _Answers(session, tiles)
         room = resources.files("ortho_pipeline.measure")
         self._files = {name: room.joinpath("page", name).read_bytes() for name in PAGE}
-        self._workers = ThreadPoolExecutor(max(2, os.cpu_count() or 1), thread_name_prefix="measure")
+        self._workers = thread_pool(max(2, os.cpu_count() or 1), "measure")
 
     async def _run(self, work: Callable[..., Any], *given: Any) -> Any:
         return await asyncio.get_running_loop().run_in_executor(self._workers, work, *given)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.files.locations import is_far
-from ortho_pipeline.files.process_limits import startable_threads
+from ortho_pipeline.files.process_limits import thread_pool
 from ortho_pipeline.raster.source import RasterSource
 
 #: Windows that are read at a time; GDAL asks for the parts of each at once.
@@ -39,8 +39,7 @@ def read_ahead(source: RasterSource, memory: int) -> Iterator[RasterSource]:
     if not any(is_far(path) for path in source.paths):
         yield source
         return
-    startable_threads(_AT_ONCE)
-    pool = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="ahead")
+    pool = thread_pool(_AT_ONCE, "ahead")
     try:
         yield ReadAhead(source, memory, pool)
     finally:

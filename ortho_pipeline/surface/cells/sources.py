@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import os
 from abc import ABC, abstractmethod
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import is_address
-from ortho_pipeline.files.process_limits import startable_threads
+from ortho_pipeline.files.process_limits import thread_pool
 from ortho_pipeline.files.stac.collection import Collection, is_collection
 from ortho_pipeline.files.storage.kept import kept
 from ortho_pipeline.files.storage.objects import Objects
@@ -90,8 +89,7 @@ class _Bucket(Source):
         self._allow_network = allow_network
 
     def files(self, cells: list[Cell]) -> dict[Cell, str]:
-        startable_threads(_AT_ONCE)
-        with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="cells") as pool:
+        with thread_pool(_AT_ONCE, "cells") as pool:
             found = dict(zip(cells, pool.map(self._kept, cells), strict=True))
         return {cell: path for cell, path in found.items() if path is not None}
 
@@ -128,8 +126,7 @@ class _Catalogue(Source):
 
     def files(self, cells: list[Cell]) -> dict[Cell, str]:
         found = {cell: self._asset(cell) for cell in cells}
-        startable_threads(_AT_ONCE)
-        with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="cells") as pool:
+        with thread_pool(_AT_ONCE, "cells") as pool:
             there = [cell for cell, href in found.items() if href is not None]
             return dict(zip(there, pool.map(self._kept, there, [found[cell] for cell in there]), strict=True))
 
