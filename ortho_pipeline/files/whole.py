@@ -23,6 +23,8 @@ from ortho_pipeline.files.reading import read_bounded
 
 #: What a temporary name has between its random part and its suffix.
 _PART = ".part"
+#: What helps where a file cannot be written, if nothing else is said.
+_REMEDY = "choose a folder that you may write to and that has room"
 
 
 class Outputs:
@@ -34,10 +36,12 @@ class Outputs:
     name : str
         What the outputs are called together (the stem of a scene); two commands do not write outputs of one name at
         the same time, and the next one clears up after one that was killed.
+    remedy : str
+        What helps where they cannot be written.
     """
 
-    def __init__(self, folder: Path, name: str) -> None:
-        self.folder, self.name = folder, name
+    def __init__(self, folder: Path, name: str, remedy: str = _REMEDY) -> None:
+        self.folder, self.name, self.remedy = folder, name, remedy
         # Temporary names are as long for every output: a final name may have all that a file system allows.
         self.prefix = f".{hashlib.sha256(name.encode(errors='surrogateescape')).hexdigest()[:12]}."
         self.staged: dict[Path, Path] = {}
@@ -60,18 +64,24 @@ class Outputs:
 
     # -- begin and end -----------------------------------------------------------------------------------------------
 
-    def begin(self) -> None:
-        """Make the folder, lock the name, and clear up after a command that was killed."""
+    def begin(self, *, wait: bool = False) -> None:
+        """Make the folder, lock the name, and clear up after a command that was killed.
+
+        Parameters
+        ----------
+        wait : bool
+            Wait for another command that writes them; otherwise it is an error.
+        """
         try:
             missing = [path for path in (self.folder, *self.folder.parents) if not path.exists()]
             self.folder.mkdir(parents=True, exist_ok=True)
             self._made = missing
-            self._lock, killed = self._locked()
+            self._lock, killed = self._locked(wait)
             if killed:
                 self._recover()
         except OSError as error:
             self.end()
-            raise _unwritable(self.folder, error) from error
+            raise self.unwritable(self.folder, error) from error
         except InputError:
             self.end()
             raise
@@ -89,13 +99,13 @@ class Outputs:
             with contextlib.suppress(OSError):
                 path.rmdir()
 
-    def _locked(self) -> tuple[Lock, bool]:
+    def _locked(self, wait: bool) -> tuple[Lock, bool]:
         """Return the lock of this name, and whether a killed command has left its file."""
         path = self.lock_path
         while True:
             killed = os.path.lexists(path)
             try:
-                lock = Lock(path, wait=False, needed=False)
+                lock = Lock(path, wait=wait, needed=False)
             except BlockingIOError as error:
                 raise InputError(
                     f"another command is writing {self.name!r} in this folder", file=self.folder, field="folder",
@@ -170,7 +180,7 @@ class Outputs:
             # Made at once, so that a folder that cannot be written is known before the work.
             os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666))
         except OSError as error:
-            raise _unwritable(self.folder, error) from error
+            raise self.unwritable(self.folder, error) from error
         return path
 
     def put(self, temporary: Path, final: Path) -> None:
@@ -212,9 +222,13 @@ class Outputs:
             sync_folder(self.folder)
             self.journal.unlink(missing_ok=True)
         except OSError as error:
-            raise _unwritable(self.folder, error) from error
+            raise self.unwritable(self.folder, error) from error
         if self.staged:
             self._made = []
+
+    def unwritable(self, path: Path, error: OSError) -> InputError:
+        """Return the error that a file or folder of these cannot be written."""
+        return _unwritable(path, error, self.remedy)
 
 
 #: The outputs of the command that is under way in this context.
@@ -257,7 +271,9 @@ def allowed(path: str | os.PathLike[str]) -> Path:
 
 
 @contextlib.contextmanager
-def together(folder: str | os.PathLike[str], name: str) -> Iterator[Outputs]:
+def together(
+    folder: str | os.PathLike[str], name: str, *, wait: bool = False, remedy: str = _REMEDY
+) -> Iterator[Outputs]:
     """Let all files that are written into `folder` within the block appear at once, when it ends well.
 
     On an exception nothing appears, and files that were there before are untouched. Within a block for the same
@@ -267,20 +283,24 @@ def together(folder: str | os.PathLike[str], name: str) -> Iterator[Outputs]:
     ----------
     name : str
         What the outputs are called together, see `Outputs`.
+    wait : bool
+        Wait for another command that is writing outputs of this name there.
+    remedy : str
+        What helps where they cannot be written.
 
     Raises
     ------
     InputError
-        If the folder cannot be written, or another command is writing outputs of this name there.
+        If the folder cannot be written, or, without `wait`, another command is writing outputs of this name there.
     """
     place = _place(Path(folder) / _PART).parent
     outer = _under_way.get()
     if outer is not None and outer.folder == place:
         yield outer
         return
-    outputs = Outputs(place, name)
+    outputs = Outputs(place, name, remedy)
     allowed(outputs.lock_path)
-    outputs.begin()
+    outputs.begin(wait=wait)
     token, failed = _under_way.set(outputs), True
     try:
         yield outputs
@@ -324,7 +344,7 @@ def whole_or_nothing(path: str | os.PathLike[str], *, side_cars: bool = True) ->
         except OSError as error:
             outputs.drop(temporary)
             if error.filename in (None, os.fspath(temporary)):
-                raise _unwritable(final, error) from error
+                raise outputs.unwritable(final, error) from error
             raise
         except BaseException:
             outputs.drop(temporary)
@@ -383,11 +403,8 @@ def _place(path: str | os.PathLike[str]) -> Path:
     )
 
 
-def _unwritable(path: Path, error: OSError) -> InputError:
-    return InputError(
-        f"cannot write here ({error.strerror or error})", file=path,
-        remedy="choose a folder that you may write to and that has room",
-    )  # fmt: skip
+def _unwritable(path: Path, error: OSError, remedy: str = _REMEDY) -> InputError:
+    return InputError(f"cannot write here ({error.strerror or error})", file=path, remedy=remedy)
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import contextvars
 import re
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import pyproj
 
 from ortho_pipeline.errors import DatumError, InputError, StorageError
-from ortho_pipeline.files import parse_json
+from ortho_pipeline.files import parse_json, together, whole_or_nothing
 from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.geodesy.crs import VERTICAL_NAMES, add_system_grids, vertical_transformer
 from ortho_pipeline.geodesy.geoid_grid import header_fault
@@ -19,6 +19,7 @@ from ortho_pipeline.geodesy.geoid_grid import header_fault
 _LIST, _LIST_BYTES = "files.geojson", 50_000_000
 #: No grid is larger.
 _GRID_BYTES = 2_000_000_000
+_REMEDY = "name a folder that you may write to in PROJ_USER_WRITABLE_DIRECTORY"
 
 
 def proj_info() -> dict[str, Any]:
@@ -96,26 +97,27 @@ def fetch_grid(name: str) -> Path:
     except (StopIteration, KeyError, TypeError) as error:
         raise InputError(f"PROJ has no grid {name}", file=store.of(_LIST), remedy="check the name") from error
     path = Path(pyproj.datadir.get_user_data_dir(True)) / name
-    part = path.with_name(f"{name}.{os.getpid()}.part")
     try:
-        content = store.fetch(name, part, _GRID_BYTES)
-        wrong = header_fault(part) or (
-            "" if content.sha256 == digest else "its SHA-256 is not the one that PROJ states"
-        )
-        if wrong:
-            raise StorageError(f"what was fetched is not the grid: {wrong}", file=store.of(name), remedy="try later")
-        os.replace(part, path)
-    except OSError as error:
-        raise InputError(
-            f"the grid cannot be kept here ({error.strerror or error})", file=path.parent,
-            remedy="name a folder that you may write to in PROJ_USER_WRITABLE_DIRECTORY",
-        ) from error  # fmt: skip
-    finally:
-        part.unlink(missing_ok=True)
+        # In a context of its own: the grid is no part of the outputs that are under way, nor confined to their folder.
+        contextvars.Context().run(_fetch, store, path, digest)
+    except FileNotFoundError as error:
+        raise StorageError("PROJ's store does not have this grid", file=store.of(name), remedy="try later") from error
     # PROJ remembers which grids were not there, until it is told of its folders.
     pyproj.datadir.set_data_dir(pyproj.datadir.get_data_dir())
     vertical_transformer.cache_clear()
     return path
+
+
+def _fetch(store: Objects, path: Path, digest: str) -> None:
+    with together(path.parent, path.name, wait=True, remedy=_REMEDY), whole_or_nothing(path, side_cars=False) as part:
+        content = store.fetch(path.name, part, _GRID_BYTES)
+        wrong = header_fault(part) or (
+            "" if content.sha256 == digest else "its SHA-256 is not the one that PROJ states"
+        )
+        if wrong:
+            raise StorageError(
+                f"what was fetched is not the grid: {wrong}", file=store.of(path.name), remedy="try later"
+            )
 
 
 def fetch_missing() -> list[dict[str, Any]]:

@@ -2,18 +2,18 @@
 
 Beside each file stands a record (its name and ``.json``) of where it came from, its size and its SHA-256. A file that
 does not agree with its record, or has none, counts as not there and is fetched again. Several processes share the
-folder; who needs a file that another one is fetching waits for it.
+folder; who needs a file that another one is fetching waits for it. A file and its record are written as the outputs of
+a command are (`files.together`), but in a context of their own: they are no part of the outputs that are under way, nor
+confined to their folder.
 """
 
 from __future__ import annotations
 
 import contextlib
-import glob
+import contextvars
 import hashlib
-import json
 import os
 import re
-import secrets
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,13 +21,14 @@ from pathlib import Path
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.folders import cache_folder
-from ortho_pipeline.files.locks import Lock
 from ortho_pipeline.files.reading import parse_json, read_bounded, sha256
 from ortho_pipeline.files.storage.objects import Content
+from ortho_pipeline.files.whole import Outputs, together, whole_or_nothing, write_json
 
 #: Environment variable: the folder of what is kept.
 FOLDER = "ORTHO_CACHE"
-_RECORD, _LOCK, _PART = ".json", ".lock", ".part"
+_RECORD = ".json"
+_REMEDY = f"name a folder that you may write to and that has room in the environment variable {FOLDER}"
 _RECORD_BYTES = 100_000
 #: Members of a record, and of which types they are.
 _FIELDS: dict[str, tuple[type, ...]] = {"address": (str,), "bytes": (int,), "sha256": (str,), "fetched": (int, float)}
@@ -94,46 +95,28 @@ def kept(
         If the folder cannot be written, or there is a fault in what was fetched.
     """
     path = folder() / kind / _name_of(address)
-    if _agrees(path, address):
-        return path
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with _locked(path):
-            if not _agrees(path, address):
-                _fill(path, address, fetch, fault)
-    except OSError as error:
-        if isinstance(error, FileNotFoundError) and error.filename == address:
-            raise
-        raise InputError(
-            f"files of the network cannot be kept here ({error.strerror or error})", file=path.parent,
-            remedy=f"name a folder that you may write to and that has room in the environment variable {FOLDER}",
-        ) from error  # fmt: skip
+    if not _agrees(path, address):
+        contextvars.Context().run(_fill, path, address, fetch, fault)
     return path
 
 
 def _fill(path: Path, address: str, fetch: Callable[[Path], Content], fault: Callable[[Path], str] | None) -> None:
-    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}{_PART}")
-    for left in path.parent.glob(f"{glob.escape(path.name)}.*{_PART}"):
-        left.unlink(missing_ok=True)  # of a process that was killed: we hold the lock
-    try:
-        content = fetch(part)
-        wrong = fault(part) if fault is not None else ""
-        if wrong:
-            raise InputError(f"what was fetched is not sound: {wrong}", file=address, remedy="check the address")
+    with _alone(path):
+        if _agrees(path, address):
+            return
+        with whole_or_nothing(path, side_cars=False) as part:
+            content = fetch(part)
+            wrong = fault(part) if fault is not None else ""
+            if wrong:
+                raise InputError(f"what was fetched is not sound: {wrong}", file=address, remedy="check the address")
+            _agreed[os.fspath(path)] = _state(part)
         record = {"address": address, "bytes": content.size, "sha256": content.sha256, "fetched": time.time()}
-        text = path.with_name(f"{part.name}{_RECORD}{_PART}")
-        text.write_text(json.dumps(record), encoding="utf-8")
-        # A file without its record is fetched again, and so is one with the record of another.
-        os.replace(part, path)
-        os.replace(text, _record_of(path))
-        _agreed[os.fspath(path)] = _state(path)
-    finally:
-        part.unlink(missing_ok=True)
+        write_json(_record_of(path), record)
 
 
 def records() -> Iterator[Record]:
     """Yield what is kept, by name."""
-    for path in sorted(folder().glob(f"*/*{_RECORD}")):
+    for path in sorted(folder().glob(f"*/[!.]*{_RECORD}")):
         found = _read(path)
         if found is not None:
             yield found
@@ -143,12 +126,11 @@ def clear() -> tuple[int, int]:
     """Remove all that is kept; return the number of files and their bytes."""
     count = size = 0
     for record in list(records()):
-        with _locked(record.path):
+        with _alone(record.path) as files:
             with contextlib.suppress(FileNotFoundError):
                 size += record.path.stat().st_size
-                record.path.unlink()
                 count += 1
-            _record_of(record.path).unlink(missing_ok=True)
+            files.obsolete += [record.path, _record_of(record.path)]
         _agreed.pop(os.fspath(record.path), None)
     return count, size
 
@@ -180,9 +162,9 @@ def _read(path: Path) -> Record | None:
     return record if kinds and record.bytes >= 0 else None
 
 
-def _locked(path: Path) -> contextlib.closing[Lock]:
-    """Wait for others who are at this file. On a file system without locks the same file is fetched twice."""
-    return contextlib.closing(Lock(path.with_name(path.name + _LOCK), needed=False))
+def _alone(path: Path) -> contextlib.AbstractContextManager[Outputs]:
+    """Wait for others who are at this file, and let what is done with it and its record appear at once."""
+    return together(path.parent, path.name, wait=True, remedy=_REMEDY)
 
 
 def _record_of(path: Path) -> Path:
