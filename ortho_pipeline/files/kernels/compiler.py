@@ -10,10 +10,9 @@ import hashlib
 import logging
 import os
 import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numba
 from numba.core.caching import FunctionCache, NullCache
@@ -24,45 +23,45 @@ from ortho_pipeline.files.kernels import places
 log = logging.getLogger(__name__)
 
 _njit = functools.partial(numba.njit, nogil=True, error_model="numpy", boundscheck=False)
-_lock = threading.Lock()
 
 
 def dispatcher(kernel: Kernel) -> Any:
-    """Return numba's object for a kernel, with a cache of ours unless it is inlined."""
+    """Return numba's object for a kernel, with a cache of ours unless it is inlined; one kernel at a time."""
     function = kernel.py_func
     if kernel.inline:
         return _njit(forceinline=True)(function)
     made: Any = _njit()(function)
-    own = _placed(_Cache, _Own, function) if places.own()[0] else None
-    root = _placed(_OfRoot, _Roots, function) if places.of_root() else None
-    if own is not None:
-        own.shared = root
-    made._cache = own or root or _Nowhere()  # as enable_caching() does with numba's own
+    # As enable_caching() does with numba's own.
+    made._cache = _Kept(_cache_in(places.own()[0], function), _cache_in(places.of_root(), function))
     return made
 
 
-def _placed(kind: Callable[..., Any], place: type[_Own], function: Callable[..., Any]) -> Any:
-    """Return a cache in a place of ours, whatever places numba's settings name."""
+def _cache_in(folder: Path | None, function: Callable[..., Any]) -> FunctionCache | None:
+    """Return numba's cache of a function in a folder of ours, whatever places numba's settings name."""
+    if folder is None:
+        return None
     settings: Any = numba.config
-    with _lock:
-        before = settings.CACHE_LOCATOR_CLASSES
-        settings.CACHE_LOCATOR_CLASSES = f"{place.__module__}.{place.__name__}"
-        try:
-            return kind(function)
-        finally:
-            settings.CACHE_LOCATOR_CLASSES = before
+    before = settings.CACHE_LOCATOR_CLASSES
+    settings.CACHE_LOCATOR_CLASSES, _Place.folder = f"{__name__}.{_Place.__name__}", folder
+    try:
+        return FunctionCache(function)
+    finally:
+        settings.CACHE_LOCATOR_CLASSES = before
 
 
-class _Own:
-    """The files of one kernel in this user's folder: what numba asks of the places of its caches."""
+class _Place:
+    """The files of one kernel in a folder: what numba asks of the places of its caches."""
 
-    def __init__(self, function: Callable[..., Any], path: str, folder: Path | None) -> None:
-        self._function, self._path, self._folder = function, path, folder
+    #: Of the caches that are made next.
+    folder: ClassVar[Path]
+
+    def __init__(self, function: Callable[..., Any], path: str) -> None:
+        self._function, self._path, self._folder = function, path, self.folder
 
     @classmethod
-    def from_function(cls, function: Callable[..., Any], path: str) -> _Own:
+    def from_function(cls, function: Callable[..., Any], path: str) -> _Place:
         """Return the place of a kernel."""
-        return cls(function, path, places.own()[0])
+        return cls(function, path)
 
     def get_cache_path(self) -> str:
         """Return the folder."""
@@ -80,40 +79,23 @@ class _Own:
         return hashlib.sha256(os.fsencode(os.path.abspath(self._path))).hexdigest()[:16]
 
 
-class _Roots(_Own):
-    """The same in the folder of root, where it is only read."""
+class _Kept(NullCache):
+    """Machine code of this user, and of root where this user has none; either may have no folder."""
 
-    @classmethod
-    def from_function(cls, function: Callable[..., Any], path: str) -> _Own:
-        """Return the place of a kernel."""
-        return cls(function, path, places.of_root())
-
-
-class _Cache(FunctionCache):
-    """Machine code of this user, and of root where this user has none."""
-
-    shared: _Cache | None = None
+    def __init__(self, own: FunctionCache | None, of_root: FunctionCache | None) -> None:
+        self.own, self.of_root = own, of_root
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load what is compiled, from where this user keeps it, else from where root does."""
-        found = super().load_overload(sig, target_context)
-        return self.shared.load_overload(sig, target_context) if found is None and self.shared is not None else found
-
-
-class _OfRoot(_Cache):
-    """Machine code that root has kept; what is compiled is not."""
+        loaded = (cache.load_overload(sig, target_context) for cache in (self.own, self.of_root) if cache)
+        return next((found for found in loaded if found is not None), None)
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep nothing, and say so."""
-        _say_once()
-
-
-class _Nowhere(NullCache):
-    """Where nothing may be kept and root has compiled nothing."""
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep nothing, and say so."""
-        _say_once()
+        """Keep what is compiled in this user's folder, or say that there is none."""
+        if self.own is None:
+            _say_once()
+        else:
+            self.own.save_overload(sig, data)
 
 
 @functools.cache
