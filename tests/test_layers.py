@@ -166,11 +166,23 @@ def test_heavy_libraries_stay_where_they_belong() -> None:
         if library in ("starlette", "uvicorn"):
             assert name == "measure.serving.server", f"{name} imports {library}: only measure/serving/server.py does"
             assert not at_top, f"{name}: {library} is an extra, and only loaded inside functions"
+        if imported == "fcntl":
+            assert name == "files.locks", f"{name} imports fcntl: locks of files are files.Lock"
         if library == "jinja2":
             assert name == "display.pages", f"{name} imports jinja2: pages are rendered by display/pages.py"
         if library == "matplotlib":
             assert name in MATPLOTLIB_MODULES, f"{name} imports matplotlib"
             assert not at_top, f"{name}: matplotlib only inside functions"
+
+
+def test_pools_of_threads_are_made_in_one_place() -> None:
+    made = {
+        module_of(path)
+        for path in FILES
+        for node in nodes(path)
+        if isinstance(node, ast.Call) and "ThreadPoolExecutor" in ast.unparse(node.func)
+    }
+    assert made == {"files.process_limits"}, "process_limits.thread_pool asks how many threads there can be"
 
 
 def test_the_package_itself_imports_nothing_of_its_own() -> None:

@@ -52,6 +52,17 @@ class Lock:
                 self.close()
                 raise
 
+    def append(self, data: bytes) -> None:
+        """Append to the file and wait until it is on disk; where that fails nothing of it is left."""
+        size = os.lseek(self.descriptor, 0, os.SEEK_END)
+        try:
+            while data:
+                data = data[os.write(self.descriptor, data) :]
+            os.fsync(self.descriptor)
+        except OSError:
+            os.ftruncate(self.descriptor, size)
+            raise
+
     def close(self) -> None:
         """Release the lock."""
         os.close(self.descriptor)

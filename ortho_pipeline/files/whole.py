@@ -443,16 +443,9 @@ def append_line(path: str | os.PathLike[str], line: str) -> None:
         If it cannot be written.
     """
     path = allowed(path)
-    data = (line + "\n").encode("utf-8", errors="backslashreplace")
     try:
         with contextlib.closing(Lock(path)) as lock:
-            size = os.lseek(lock.descriptor, 0, os.SEEK_END)
-            try:
-                while data:
-                    data = data[os.write(lock.descriptor, data) :]
-            except OSError:
-                os.ftruncate(lock.descriptor, size)
-                raise
+            lock.append((line + "\n").encode("utf-8", errors="backslashreplace"))
     except OSError as error:
         raise _unwritable(path, error) from error
 

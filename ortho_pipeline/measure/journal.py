@@ -7,6 +7,7 @@ One process holds the lock and writes; another one reads.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import zlib
@@ -51,9 +52,11 @@ class Journal:
         self.path = allowed(path)
         try:
             try:
-                self._file, self.read_only = Lock(path, wait=False).descriptor, False
+                self._lock: Lock | None = Lock(path, wait=False)
+                self._file = self._lock.descriptor
             except BlockingIOError:
-                self._file, self.read_only = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), True
+                self._lock, self._file = None, os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            self.read_only = self._lock is None
             data = _whole(self._file, path)
         except OSError as error:
             raise _unwritable(path, error) from error
@@ -73,19 +76,12 @@ class Journal:
         InputError
             If another process holds the journal, or it cannot be written.
         """
-        if self.read_only:
+        if self._lock is None:
             raise InputError("another process measures these points: this one only shows them", file=self.path,
                              remedy="close the other one, and start again")  # fmt: skip
-        data = _line(action)
-        size = os.fstat(self._file).st_size
         try:
-            os.lseek(self._file, size, os.SEEK_SET)
-            left = data
-            while left:
-                left = left[os.write(self._file, left) :]
-            os.fsync(self._file)
+            self._lock.append(_line(action))
         except OSError as error:
-            os.ftruncate(self._file, size)
             raise _unwritable(self.path, error) from error
         self.actions.append(dict(action))
 
@@ -119,11 +115,8 @@ class Journal:
             return
         path = self.path.with_name(self.path.name + REST)
         try:
-            aside = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
-            with os.fdopen(aside, "wb") as file:
-                file.write(rest)
-                file.flush()
-                os.fsync(file.fileno())
+            with contextlib.closing(Lock(path)) as aside:
+                aside.append(rest)
             sync_folder(path.parent)
             os.ftruncate(self._file, len(kept))
             os.fsync(self._file)

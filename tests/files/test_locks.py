@@ -67,6 +67,23 @@ def test_what_a_file_holds_stays(tmp_path):
     assert path.read_text() == "who holds it"
 
 
+def test_what_cannot_be_appended_whole_leaves_nothing(tmp_path, monkeypatch):
+    path, write = tmp_path / "log", os.write
+    append_line(path, "first")
+
+    def full(file: int, data: bytes) -> int:
+        if len(data) < 10:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(file, data[:8])
+
+    monkeypatch.setattr(os, "write", full)
+    with pytest.raises(InputError, match="No space left"):
+        append_line(path, "second, of which some bytes are written")
+    monkeypatch.undo()
+    append_line(path, "third")
+    assert path.read_text() == "first\nthird\n"
+
+
 def _output(folder: Path) -> None:
     with together(folder, "scene"):
         write_text(folder / "scene.txt", "new")
