@@ -21,7 +21,7 @@ from pathlib import Path
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.folders import cache_folder
-from ortho_pipeline.files.reading import parse_json, read_bounded, sha256
+from ortho_pipeline.files.reading import parse_json, read_bounded, sha256, states
 from ortho_pipeline.files.storage.objects import Content
 from ortho_pipeline.files.whole import Outputs, together, whole_or_nothing, write_json
 
@@ -32,7 +32,7 @@ _REMEDY = f"name a folder that you may write to and that has room in the environ
 _RECORD_BYTES = 100_000
 #: Members of a record, and of which types they are.
 _FIELDS: dict[str, tuple[type, ...]] = {"address": (str,), "bytes": (int,), "sha256": (str,), "fetched": (int, float)}
-#: Files of this process that agreed with their records, by size, time of change and inode.
+#: The states in which files agreed with their records in this process.
 _agreed: dict[str, tuple[int, int, int]] = {}
 
 
@@ -109,7 +109,7 @@ def _fill(path: Path, address: str, fetch: Callable[[Path], Content], fault: Cal
             wrong = fault(part) if fault is not None else ""
             if wrong:
                 raise InputError(f"what was fetched is not sound: {wrong}", file=address, remedy="check the address")
-            _agreed[os.fspath(path)] = _state(part)
+            _agreed[os.fspath(path)] = states([part])[os.fspath(part)]
         record = {"address": address, "bytes": content.size, "sha256": content.sha256, "fetched": time.time()}
         write_json(_record_of(path), record)
 
@@ -140,14 +140,10 @@ def _agrees(path: Path, address: str) -> bool:
     record = _read(_record_of(path))
     if record is None or record.address != address:
         return False
-    try:
-        if _agreed.get(os.fspath(path)) == _state(path):
-            return True
-        if record.state() != "sound":
-            return False
-        _agreed[os.fspath(path)] = _state(path)
-    except OSError:
+    now = states([path]).get(os.fspath(path))
+    if now is None or (_agreed.get(os.fspath(path)) != now and record.state() != "sound"):
         return False
+    _agreed[os.fspath(path)] = now
     return True
 
 
@@ -169,11 +165,6 @@ def _alone(path: Path) -> contextlib.AbstractContextManager[Outputs]:
 
 def _record_of(path: Path) -> Path:
     return path.with_name(path.name + _RECORD)
-
-
-def _state(path: Path) -> tuple[int, int, int]:
-    status = path.stat()
-    return status.st_size, status.st_mtime_ns, status.st_ino
 
 
 def _name_of(address: str) -> str:
