@@ -91,7 +91,7 @@ class Outputs:
         if self._lock is not None:
             with contextlib.suppress(OSError):
                 if failed or self.side_cars:
-                    self._clear()
+                    self._clear(self.prefix)
                 self.lock_path.unlink(missing_ok=True)
             self._lock.close()
             self._lock = None
@@ -128,7 +128,7 @@ class Outputs:
                 os.replace(self.folder / name, self.folder / final)
         for name in obsolete:
             (self.folder / name).unlink(missing_ok=True)
-        self._clear()
+        self._clear(self.prefix)
 
     def _listed(self) -> tuple[list[tuple[str, str]], list[str]]:
         """Return the renames of the journal, and the names to remove.
@@ -154,10 +154,11 @@ class Outputs:
             and not os.path.isdir(self.folder / name)
         )
 
-    def _clear(self) -> None:
+    def _clear(self, start: str) -> None:
+        """Remove the files in the folder whose names begin so, but for the lock's."""
         with os.scandir(self.folder) as entries:
             left = [entry.path for entry in entries
-                    if entry.name.startswith(self.prefix) and not entry.name.endswith(f"lock{_PART}")
+                    if entry.name.startswith(start) and not entry.name.endswith(f"lock{_PART}")
                     and not entry.is_dir(follow_symlinks=False)]  # fmt: skip
         for path in left:
             Path(path).unlink(missing_ok=True)
@@ -198,9 +199,7 @@ class Outputs:
 
     def drop(self, temporary: Path) -> None:
         """Remove a temporary file and the side-cars that a driver put beside it."""
-        for left in self.folder.iterdir():
-            if left.name.startswith(temporary.name):
-                left.unlink(missing_ok=True)
+        self._clear(temporary.name)
 
     # -- all files ---------------------------------------------------------------------------------------------------
 

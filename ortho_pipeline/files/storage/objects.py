@@ -110,14 +110,11 @@ class Objects:
         return self._attempts(name, limit, b"".join)
 
     def fetch(self, name: str, path: Path, limit: int) -> Content:
-        """Write an object to a file, which has no other name yet; see `read`."""
+        """Write an object to a file, which has no other name yet (`files.whole_or_nothing`); see `read`."""
 
         def write(chunks: Iterator[bytes]) -> None:
             with path.open("wb") as file:
-                for chunk in chunks:
-                    file.write(chunk)
-                file.flush()
-                os.fsync(file.fileno())
+                file.writelines(chunks)
 
         return self._attempts(name, limit, write)[1]
 
