@@ -19,7 +19,6 @@ from scipy.ndimage import uniform_filter
 from sessions import run
 
 import ortho_pipeline as op
-from ortho_pipeline.files.documents import record_of
 from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.network.drawing import plot_network
 from ortho_pipeline.simulation.terrain import Landscape, Terrain
@@ -201,7 +200,7 @@ def compared(path: Path) -> None:
 
 def network(path: Path) -> None:
     """Draw the network as the page of the block does."""
-    report = record_of(BlockReport, json.loads(Path("block/block_report.json").read_text()))
+    report = BlockReport.read(json.loads(Path("block/block_report.json").read_text()))
     drawing = plot_network(report)
     assert drawing is not None
     path.write_bytes(drawing.png(scale=1.2))

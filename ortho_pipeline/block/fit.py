@@ -23,7 +23,7 @@ from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import root_mean_square
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
-from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted

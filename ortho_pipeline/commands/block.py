@@ -39,7 +39,7 @@ from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
 from ortho_pipeline.files import json_text, together, write_json, write_text
-from ortho_pipeline.files.documents import json_position, json_value
+from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
@@ -132,7 +132,7 @@ def adjust(
         _write(files, made, fit, starts, exported, record)
         failure = attempted(lambda: _write_report(files, made, pictures), files, "report", "html")
     text = Text.joined("\n", [*gathered.text, block_report.summary_text(made)])
-    return Result(files, {"report": json_value(made), **gathered.document}, text, failure)
+    return Result(files, {"report": made.to_json(), **gathered.document}, text, failure)
 
 
 @with_items
@@ -328,7 +328,7 @@ def _write(
     write_text(files["points-csv"], _csv(rows))
     for label, start in starts.items():
         scene = start.scene
-        adjustment = {"gauge": fit.gauge, "sigma0": fit.sigma0, **json_value(made.adjustment.images[label])}
+        adjustment = {"gauge": fit.gauge, "sigma0": fit.sigma0, **made.adjustment.images[label].to_json()}
         saved = SavedModel(
             _plain(fit.models[label]), scene.sensor, start.source, (scene.width, scene.height),
             {**record, "adjustment": adjustment},
@@ -339,7 +339,7 @@ def _write(
 
 
 def _write_report(files: Mapping[str, Path], made: BlockReport, pictures: Mapping[str, bytes]) -> None:
-    write_json(files["report"], json_value(made), ascii_only=False)
+    write_json(files["report"], made.to_json(), ascii_only=False)
     write_text(files["html"], block_report.page(made, pictures))
 
 

@@ -33,7 +33,6 @@ from ortho_pipeline.exchange import export as formats_of_models
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import retire, sha256
-from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.process_limits import Progress, Resources, one_blas_thread
 from ortho_pipeline.files.traffic import bytes_read
 from ortho_pipeline.hookspecs import Scene
@@ -143,7 +142,7 @@ def rectify(
     retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
     if isinstance(made, ReportError):
         return Result(files, {"report": None}, "Ortho and model are complete; there is no report.", made)
-    return Result(files, {"report": json_value(made)}, report.summary_text(made))
+    return Result(files, {"report": made.to_json()}, report.summary_text(made))
 
 
 @with_items

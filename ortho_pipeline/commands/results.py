@@ -19,7 +19,6 @@ from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import part_of_outputs, staged, together, write_text
-from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.files.storage.delivery import address_of, delivered
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import OutputOptions, SceneOptions
@@ -96,7 +95,7 @@ class FitResult:
             "model_source": self.scene.model_source,
             **document,
             "removed": [dict(one) for one in self.removed],
-            **({} if self.matching is None else {"matching": json_value(self.matching)}),
+            **({} if self.matching is None else {"matching": self.matching.to_json()}),
             "map_scale": None if scale is None else scale.to_json(),
             "covariance": {role: one and one.to_json() for role, one in analyse_fit(self.fit, near=self.near).items()},
         }

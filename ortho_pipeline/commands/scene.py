@@ -20,7 +20,7 @@ from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files import write_json, write_text
-from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.files.storage import kept
 from ortho_pipeline.geodesy.crs import ground_transform

@@ -1,4 +1,4 @@
-"""Presentation, whatever it is of: numbers as people read them, notices, SVG drawings, HTML for notebooks.
+"""Presentation, whatever it is of: numbers as people read them, notices, SVG drawings.
 
 Knows no result and imports nothing above `files`.
 """

@@ -29,7 +29,7 @@ from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.spatial.common_error import CommonError
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors, shared_errors
 from ortho_pipeline.estimation.statistics import correlation_of, student_of, total_correlation_of
-from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted

@@ -1,4 +1,4 @@
-"""Measurements in pixels: edges, resolution, ellipses, the registration of bands and images.
+"""Measurements in pixels: edges, resolution, the registration of bands and images.
 
 Imports `surface` and what is below.
 """

@@ -12,9 +12,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+import pydantic
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.documents import DocumentError, json_value, record, record_of
+from ortho_pipeline.files.json.records import DocumentError, Record
 from ortho_pipeline.geodesy.crs import horizontal, parse_crs
 from ortho_pipeline.options import CORRECTIONS
 from ortho_pipeline.options.texts import counted
@@ -31,8 +32,7 @@ MOST_MARKS, LONGEST_ID, LONGEST_NOTE = 20_000, 64, 500
 _SIGMAS, _GROUPS = (1e-6, 1e6), 1 << 31
 
 
-@record
-class Ray:
+class Ray(Record):
     """A point as it was measured in one of several images: as `Mark` has it of a single one."""
 
     image: tuple[float, float]
@@ -47,8 +47,7 @@ class Ray:
         return _matrix(self.sigma_image, self.covariance)
 
 
-@record
-class Mark:
+class Mark(Record):
     """One point as it was measured.
 
     `image` is column, row from the outer corner of the first pixel (px), `ground` as `GROUND_CRS`; None is not
@@ -72,7 +71,7 @@ class Mark:
     how: Literal["manual", "matched", "file"] = "manual"
     ground_from: Literal["reference", "typed", "file"] | None = None
     score: float | None = None
-    rays: dict[str, Ray] = field(default_factory=dict)
+    rays: dict[str, Ray] = pydantic.Field(default_factory=dict)
     note: str = ""
     at: str = ""
 
@@ -176,7 +175,7 @@ def mark_of(document: Any) -> Mark:
         With the member that is wrong.
     """
     try:
-        return checked(record_of(Mark, document))
+        return checked(Mark.read(document))
     except DocumentError as error:
         raise InputError(f"not a mark: {error.fault}", field=error.place or "mark") from error
 
@@ -221,7 +220,7 @@ class Marks:
                 "measured": mark.how, "ground_from": mark.ground_from, "score": mark.score, "at": mark.at,
                 **({"note": mark.note} if mark.note else {}),
             }  # fmt: skip
-        left = [json_value(mark) for mark in self.by_id.values() if not mark.counts]
+        left = [mark.to_json() for mark in self.by_id.values() if not mark.counts]
         return {"type": "FeatureCollection", "features": features, **({"left_out": left} if left else {})}
 
 
@@ -234,7 +233,7 @@ class Written:
     def of(self, mark: Mark) -> dict[str, Any]:
         """Return a mark as JSON values."""
         if mark.id not in self._known or self._known[mark.id][0] is not mark:
-            self._known[mark.id] = mark, json_value(mark)
+            self._known[mark.id] = mark, mark.to_json()
         return self._known[mark.id][1]
 
 

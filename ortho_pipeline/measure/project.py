@@ -16,7 +16,7 @@ import numpy as np
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.files import write_json
-from ortho_pipeline.files.documents import json_position, json_value
+from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.imaging.matching import View
 from ortho_pipeline.measure.journal import REMEDY as JOURNAL_REMEDY
@@ -289,7 +289,7 @@ class Project(_Shown):
             raise InputError("there are points here, and no journal of them", file=self.output, field="output",
                              remedy=Text("give them as ", Setting("points.gcps"), " to go on, or choose another "
                                          "output"))  # fmt: skip
-        return {"do": "begin", "marks": [json_value(mark) for mark in given or ()], "source": self._source(),
+        return {"do": "begin", "marks": [mark.to_json() for mark in given or ()], "source": self._source(),
                 "image": self._identity(), "at": now()}  # fmt: skip
 
     def save(self) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.statistics import squared_distances
-from ortho_pipeline.files.documents import json_position, json_value
+from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.imaging.matching import REASONS
 from ortho_pipeline.imaging.matching.chip_search import MEASURED, SIDE, doubts, found_again
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips

@@ -21,7 +21,7 @@ from ortho_pipeline.commands.resolved.resolving import on_surface
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import confined, sha256
-from ortho_pipeline.files.documents import json_position
+from ortho_pipeline.files.json.values import json_position
 from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.matching import Reference, View

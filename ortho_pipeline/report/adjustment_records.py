@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, TypeGuard
 
-from ortho_pipeline.files.documents import Shape, record
+import pydantic
 
-Count = Annotated[int, Shape(minimum=0)]
+from ortho_pipeline.files.json.records import Record, Words
+
+Count = Annotated[int, pydantic.Field(ge=0)]
 Pair = tuple[float, float]
 #: Of a point for which it may be unknown.
 Residual = tuple[float | None, float | None]
@@ -17,9 +19,14 @@ Role = Literal["control", "check", "tie"]
 #: A warning with its code and what it is about (docs/notices.md).
 NoticeDocument = Annotated[
     dict[str, Any],
-    Shape(
-        properties={"code": {"type": "string", "pattern": "^[a-z0-9]+(-[a-z0-9]+)*$"}, "text": {"type": "string"}},
-        required=["code", "text"],
+    pydantic.Field(
+        json_schema_extra={
+            "properties": {
+                "code": {"type": "string", "pattern": "^[a-z0-9]+(-[a-z0-9]+)*$"},
+                "text": {"type": "string"},
+            },
+            "required": ["code", "text"],
+        }
     ),
 ]
 
@@ -29,8 +36,7 @@ def is_known(values: Residual | None) -> TypeGuard[Pair]:
     return values is not None and None not in values
 
 
-@record
-class Rmse:
+class Rmse(Record):
     """Root mean square in pixels."""
 
     col: float
@@ -39,8 +45,7 @@ class Rmse:
     n: Count
 
 
-@record
-class RmseOnGround:
+class RmseOnGround(Record):
     """Root mean square in metres on the ground."""
 
     x: float
@@ -49,8 +54,7 @@ class RmseOnGround:
     n: Count
 
 
-@record
-class RmseOfView:
+class RmseOfView(Record):
     """Root mean square in pixels along and across the direction of view."""
 
     along: float
@@ -58,8 +62,7 @@ class RmseOfView:
     n: Count
 
 
-@record
-class Rmses:
+class Rmses(Record):
     """Over control points (the fit), check points, and control points left out in turn.
 
     Where check points were measured beside matches, `check` is of those, absolute, and `matched` of the matches that
@@ -72,8 +75,7 @@ class Rmses:
     matched: Rmse | None = None
 
 
-@record
-class RmsesOnGround:
+class RmsesOnGround(Record):
     """As `Rmses`."""
 
     control: RmseOnGround | None
@@ -82,16 +84,14 @@ class RmsesOnGround:
     matched: RmseOnGround | None = None
 
 
-@record
-class RmsesOfView:
+class RmsesOfView(Record):
     """Over control points (the fit) and check points."""
 
     control: RmseOfView | None
     check: RmseOfView | None
 
 
-@record
-class Bias:
+class Bias(Record):
     """Mean and scatter of measured minus predicted of the model as delivered, over the used points."""
 
     col: float
@@ -101,16 +101,14 @@ class Bias:
     n: Count
 
 
-@record
-class Parameter:
+class Parameter(Record):
     """An adjusted parameter."""
 
     value: float
     sigma: float | None
 
 
-@record
-class CommonError:
+class CommonError(Record):
     """An error that points have in common, as matches that of their reference: metres true east and north.
 
     `estimate_m` is what other points tell of it, and `estimate_sigma_m` what that leaves.
@@ -122,8 +120,7 @@ class CommonError:
     estimate_sigma_m: Pair
 
 
-@record
-class Statistics:
+class Statistics(Record):
     """Tests of the parameters; ridge is the regularisation, condition that of the design."""
 
     correlation: tuple[tuple[float | None, ...], ...]
@@ -140,8 +137,7 @@ class Statistics:
     common_error: CommonError | None = None
 
 
-@record
-class SharedErrors:
+class SharedErrors(Record):
     """Errors that neighbouring points share, in units of stated sigmas; docs/accuracy.md says what each number is."""
 
     points: Count
@@ -152,15 +148,13 @@ class SharedErrors:
     range_px: Pair | None
 
 
-@record
 class GroupedStatistics(Statistics):
     """Tests of the parameters where points have groups."""
 
     shared_errors: SharedErrors
 
 
-@record
-class Point:
+class Point(Record):
     """A point in the image: `residual_m` is where the ortho shows it minus where it belongs, metres east and north.
 
     `view_residual` is along and across the direction of view, `raw_residual` of the model as delivered. `lon_lat` is
@@ -189,16 +183,14 @@ class Point:
         return "check" if self.role == "check" else "control"
 
 
-@record
-class LeftOut:
+class LeftOut(Record):
     """A point that was left out as a gross error."""
 
     id: str
     reason: str
 
 
-@record
-class OutlyingPoint:
+class OutlyingPoint(Record):
     """A point that contradicts the others and still counts."""
 
     id: str
@@ -210,8 +202,7 @@ class OutlyingPoint:
     reason: str
 
 
-@record
-class Adjustment:
+class Adjustment(Record):
     """The model that was adjusted to the points, and how well it fits them."""
 
     model: str
@@ -224,6 +215,6 @@ class Adjustment:
     rejected: tuple[LeftOut, ...]
     outlying: tuple[OutlyingPoint, ...] = ()
     rmse_of_agreeing_checks: Rmse | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Words, ...] = ()
     notices: tuple[NoticeDocument, ...] = ()
     statistics: Statistics | GroupedStatistics | None = None

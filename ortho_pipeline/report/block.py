@@ -14,7 +14,7 @@ from ortho_pipeline.display.notices import Notice, doubted, to_document
 from ortho_pipeline.display.numbers import flat, metres, px
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.estimation.blunders import contradicting
-from ortho_pipeline.files.documents import json_value, made_of
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.options.texts import Text, counted
 from ortho_pipeline.points.rows import ROLES
 from ortho_pipeline.report.adjustment_records import Rmse, is_known
@@ -93,13 +93,13 @@ def build_report(
             **places[label],
         )
     adjustment, noted = (
-        made_of(BlockAdjustment, json_value(fit.to_json())),
+        BlockAdjustment.model_validate(json_value(fit.to_json())),
         to_document([*warnings, *parted, *thinly_covered(places)]),
     )
     return BlockReport(
         images=images,
         adjustment=adjustment,
-        provenance=made_of(BlockProvenance, json_value(provenance)),
+        provenance=BlockProvenance.model_validate(json_value(provenance)),
         warnings=tuple(noted["warnings"]),
         notices=tuple(noted["notices"]),
         headline=_corrected(
@@ -108,7 +108,7 @@ def build_report(
         network=network_record(network),
         map_scale=None
         if suffices is None or refuted(noted["notices"])
-        else made_of(MapScaleRecord, suffices.to_json()),
+        else MapScaleRecord.model_validate(suffices.to_json()),
     )
 
 
@@ -254,7 +254,7 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
     plan, network = plot_ground(report), plot_network(report)
     places = [place for image in report.images.values() for place in image.outline or ()]
     where = plot_locator((places[0][0], places[0][1])) if places else None
-    provenance = {key: value for key, value in json_value(report.provenance).items() if key != "inputs"}
+    provenance = {key: value for key, value in report.provenance.to_json().items() if key != "inputs"}
     said = signals(
         report.warnings,
         report.notices,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any, Literal
 
-from ortho_pipeline.files.documents import record
+from ortho_pipeline.files.json.records import Record, Words
 from ortho_pipeline.report.adjustment_records import (
     CommonError,
     Count,
@@ -28,8 +28,7 @@ Triple = tuple[float, float, float]
 OnGround = tuple[float | None, float | None, float | None]
 
 
-@record
-class BlockImage:
+class BlockImage(Record):
     """An image of the block, and the model that was adjusted.
 
     Where it lies is at the middle height of the points: `outline` has the longitudes and latitudes of its corners, from
@@ -51,8 +50,7 @@ class BlockImage:
     covered: float
 
 
-@record
-class RmseByRole:
+class RmseByRole(Record):
     """Over the points of each role in one image."""
 
     control: Rmse | None
@@ -65,8 +63,7 @@ class RmseByRole:
         return merged(self.control, self.check, self.tie)
 
 
-@record
-class ImageRms:
+class ImageRms(Record):
     """At the adjusted ground, at the known ground, and at the known ground with the models as they were."""
 
     residuals: RmseByRole
@@ -74,8 +71,7 @@ class ImageRms:
     raw_residuals: RmseByRole
 
 
-@record
-class AdjustedImage:
+class AdjustedImage(Record):
     """The adjusted parameters of an image, and how well its rays fit."""
 
     parameters: dict[str, Parameter]
@@ -83,8 +79,7 @@ class AdjustedImage:
     rms: ImageRms
 
 
-@record
-class ObjectRms:
+class ObjectRms(Record):
     """Root mean squares on the ground, in plan and height, and the least and greatest residual."""
 
     x: float
@@ -96,24 +91,21 @@ class ObjectRms:
     max: Triple
 
 
-@record
-class ObjectRmsByRole:
+class ObjectRmsByRole(Record):
     """Of control points, whose ground was used, and of check points, whose ground was not."""
 
     control: ObjectRms | None
     check: ObjectRms | None
 
 
-@record
-class ImageVariance:
+class ImageVariance(Record):
     """The factor of the stated sigmas of measurements, and their part of the redundancy."""
 
     factor: float
     redundancy: float
 
 
-@record
-class GroundVariance:
+class GroundVariance(Record):
     """The sigma of ground that states none, of how many points, and its part of the redundancy."""
 
     sigma: float | None
@@ -121,16 +113,14 @@ class GroundVariance:
     redundancy: float
 
 
-@record
-class UnstatedGround:
+class UnstatedGround(Record):
     """In plan (each axis) and in height."""
 
     xy: GroundVariance
     h: GroundVariance
 
 
-@record
-class VariancesRecord:
+class VariancesRecord(Record):
     """Standard deviations of the observations, as stated or found; separable is whether they can be told apart."""
 
     image: ImageVariance
@@ -138,8 +128,7 @@ class VariancesRecord:
     separable: bool
 
 
-@record
-class BlockPoint:
+class BlockPoint(Record):
     """A point: its adjusted longitude, latitude and height, its sigma in metres, and known minus adjusted ground."""
 
     id: str
@@ -150,8 +139,7 @@ class BlockPoint:
     residual: OnGround
 
 
-@record
-class ImagePairRecord:
+class ImagePairRecord(Record):
     """Two images, the number of points that both have rays of, and the median angle between these rays."""
 
     first: str
@@ -160,8 +148,7 @@ class ImagePairRecord:
     angle_deg: float
 
 
-@record
-class Angles:
+class Angles(Record):
     """The largest angle between two rays of each point, degrees, over the points that have two."""
 
     points: Count
@@ -170,8 +157,7 @@ class Angles:
     greatest: float
 
 
-@record
-class NetworkRecord:
+class NetworkRecord(Record):
     """What ties the images: pairs with points in common, the angles at which rays meet, parts that hang together.
 
     `largest_deg` has the largest angle of each point, in the order of the adjustment's points.
@@ -183,8 +169,7 @@ class NetworkRecord:
     largest_deg: tuple[float | None, ...]
 
 
-@record
-class Ray:
+class Ray(Record):
     """A point in an image: its residual at the adjusted ground, and at the known ground."""
 
     id: str
@@ -195,8 +180,7 @@ class Ray:
     back_projected: Residual
 
 
-@record
-class GrossError:
+class GrossError(Record):
     """A measurement, the ground of a control point, or a whole point that was left out."""
 
     point: str
@@ -205,8 +189,7 @@ class GrossError:
     reason: str
 
 
-@record
-class ContradictedPoint:
+class ContradictedPoint(Record):
     """A known point that the block contradicts, and that was left as it is."""
 
     point: str
@@ -216,8 +199,7 @@ class ContradictedPoint:
     sigmas: float
 
 
-@record
-class BlockAdjustment:
+class BlockAdjustment(Record):
     """The adjustment of all images and points together; gauge names what defines the datum."""
 
     gauge: str
@@ -233,14 +215,13 @@ class BlockAdjustment:
     rays: tuple[Ray, ...]
     rejected: tuple[GrossError, ...]
     outlying: tuple[ContradictedPoint, ...]
-    warnings: tuple[str, ...]
+    warnings: tuple[Words, ...]
     notices: tuple[NoticeDocument, ...]
     common_error: CommonError | None = None
     shared_errors: dict[str, SharedErrors] | None = None
 
 
-@record
-class BlockProvenance:
+class BlockProvenance(Record):
     """Files, options and versions with which the same result can be made again."""
 
     command: str | None
@@ -249,8 +230,7 @@ class BlockProvenance:
     software: dict[str, str]
 
 
-@record
-class BlockHeadline:
+class BlockHeadline(Record):
     """The accuracy in words: a figure, that of heights, a phrase that follows, and reservations."""
 
     figure: str
@@ -259,8 +239,7 @@ class BlockHeadline:
     notes: tuple[str, ...]
 
 
-@record
-class BlockReport:
+class BlockReport(Record):
     """The content of block_report.json. Numbers that do not exist are null."""
 
     document: Literal["ortho-pipeline block report"] = "ortho-pipeline block report"
@@ -268,7 +247,7 @@ class BlockReport:
     images: dict[str, BlockImage]
     adjustment: BlockAdjustment
     provenance: BlockProvenance
-    warnings: tuple[str, ...]
+    warnings: tuple[Words, ...]
     notices: tuple[NoticeDocument, ...]
     headline: BlockHeadline
     network: NetworkRecord

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.display.numbers import px
-from ortho_pipeline.files.documents import record_of
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
 from ortho_pipeline.options.texts import counted
@@ -38,7 +37,7 @@ def _untested(*notes: str, what: str = "there were no ground control points") ->
 
 
 def _of_scene(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
-    adjustment = record_of(Adjustment, adjusted)
+    adjustment = Adjustment.read(adjusted)
     found = headline(adjustment, None)
     name = f"{adjustment.model}, {counted(sum(point.used for point in adjustment.points), 'control point')}"
     return Headline(
@@ -50,7 +49,7 @@ def _of_scene(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
 def _of_block(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
     from ortho_pipeline.report.block_records import AdjustedImage  # few scenes come from a block
 
-    image = record_of(AdjustedImage, {name: one for name, one in adjusted.items() if name not in ("gauge", "sigma0")})
+    image = AdjustedImage.read({name: one for name, one in adjusted.items() if name not in ("gauge", "sigma0")})
     sigma0 = f", sigma0 {float(adjusted['sigma0']):.3g}" if adjusted["sigma0"] else ""
     notes = (f"The block: {adjusted['gauge']}{sigma0}.", _source(scene))
     kinds = (

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,7 +26,8 @@ from ortho_pipeline.estimation.fit import Fit, root_mean_square
 from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rmse_metres, viewing
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
-from ortho_pipeline.files.documents import DocumentError, json_position, json_value, made_of, record_of
+from ortho_pipeline.files.json.records import DocumentError
+from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform
 from ortho_pipeline.geodesy.distortion import map_from_enu, metres_of_steps
 from ortho_pipeline.geodesy.naming import crs_definition, crs_name
@@ -73,6 +74,7 @@ Array = NDArray[np.float64]
 #: Median of control height minus DEM height from which a difference of datums is suspected, metres.
 _SUSPICIOUS_HEIGHT = 5.0
 _MAX_BYTES = 50_000_000
+_DOCUMENT, _VERSION = "ortho-pipeline report", 1
 _REMEDY = "give a <stem>_report.json"
 
 __all__ = [
@@ -132,7 +134,7 @@ def build_report(
     seen = viewing(fit.model, scene.width, scene.height)
     heights, doubts = (None, []) if surface is None else _heights_of_points(fit, surface, seen)
     noted = to_document([*warnings, *doubts])
-    adjustment, rmse_m = _adjustment(fit, noted), made_of(RmsesOnGround, rmse_metres(fit))
+    adjustment, rmse_m = _adjustment(fit, noted), RmsesOnGround.model_validate(rmse_metres(fit))
     matched = None if matching is None else matching_record(matching, fit)
     hull = control_hull(fit.points.image[fit.used], (scene.width, scene.height))
     return SceneReport(
@@ -142,15 +144,15 @@ def build_report(
         view_rmse=_view_rmse(fit),
         covariance=_covariances(fit, near),
         map_scale=None if refuted(noted["notices"]) else _map_scale(fit, seen, grid),
-        control_hull=None if hull is None else made_of(ControlHull, hull),
-        comparison=None if comparison is None else made_of(ComparisonRecord, json_value(comparison)),
+        control_hull=None if hull is None else ControlHull.model_validate(hull),
+        comparison=None if comparison is None else ComparisonRecord.model_validate(json_value(comparison)),
         matching=matched,
         heights=heights,
         surface=None if surface is None else _surface(surface, coverage),
         rpc=None if exported is None else RpcRecord(exact=exported.exact, max_error_px=exported.max_error_px),
         ortho=None if grid is None else _ortho(grid, warp),
         warp=None if warp is None else _warped(warp),
-        provenance=made_of(Provenance, json_value(provenance or {})),
+        provenance=Provenance.model_validate(json_value(provenance or {})),
         warnings=tuple(noted["warnings"]),
         notices=tuple(noted["notices"]),
         headline=corrected(
@@ -168,7 +170,7 @@ def _scene(scene: Scene, seen: Mapping[str, Any]) -> SceneRecord:
         "model_source": scene.model_source,
         "facts": json_value(scene.facts),
     }
-    return made_of(SceneRecord, {**known, **seen})
+    return SceneRecord.model_validate({**known, **seen})
 
 
 def _adjustment(fit: Fit, noted: Mapping[str, Any]) -> Adjustment:
@@ -182,7 +184,7 @@ def _adjustment(fit: Fit, noted: Mapping[str, Any]) -> Adjustment:
         point["view_residual"] = json_position(views[i])
         point["height_m"] = json_value(fit.points.ground[i, 2])
         point["lon_lat"], point["shown_lon_lat"] = json_position(places[i]), json_position(shown[i])
-    return made_of(Adjustment, document)
+    return Adjustment.model_validate(document)
 
 
 def _in_degrees(fit: Fit, shifts: Array) -> tuple[Array, Array]:
@@ -197,13 +199,13 @@ def _in_degrees(fit: Fit, shifts: Array) -> tuple[Array, Array]:
 
 def _covariances(fit: Fit, near: float | None) -> Covariances:
     found = analyse_fit(fit, near=near)
-    return made_of(Covariances, {role: one and one.to_json() for role, one in found.items()})
+    return Covariances.model_validate({role: one and one.to_json() for role, one in found.items()})
 
 
 def _map_scale(fit: Fit, seen: Mapping[str, Any], grid: Grid | None) -> MapScaleRecord | None:
     pixels = [*(seen["ground_pixel_m"] or ()), *(() if grid is None else _pixel_on_ground(grid))]
     found = map_scale(fit, max(pixels) if pixels else None)
-    return None if found is None else made_of(MapScaleRecord, found.to_json())
+    return None if found is None else MapScaleRecord.model_validate(found.to_json())
 
 
 def _pixel_on_ground(grid: Grid) -> list[float]:
@@ -229,7 +231,7 @@ def _view_rmse(fit: Fit) -> RmsesOfView:
 def _surface(surface: Surface, coverage: float | None) -> FlatGround | Dem:
     if isinstance(surface, FlatSurface):
         return FlatGround(coverage=coverage, constant_height=surface.height)
-    return made_of(Dem, {"coverage": coverage, **json_value(surface.provenance)})
+    return Dem.model_validate({"coverage": coverage, **json_value(surface.provenance)})
 
 
 def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> tuple[PointHeights | None, list[Notice]]:
@@ -281,20 +283,20 @@ def _ortho(grid: Grid, warp: WarpResult | None) -> OrthoRecord:
 
 def _warped(warp: WarpResult) -> WarpRecord:
     """Return what the warp did without how long it took: the same inputs make the same report, byte by byte."""
-    return made_of(WarpRecord, {name: value for name, value in asdict(warp).items() if name != "seconds"})
+    return WarpRecord.model_validate({name: value for name, value in asdict(warp).items() if name != "seconds"})
 
 
 def with_layers(
     report: SceneReport, *, accuracy: AccuracyLayer | None, angles: AnglesLayer | None = None
 ) -> SceneReport:
     """Return the report with what layers beside the ortho say; the headline gives the accuracy over the scene."""
-    report = replace(report, angles=angles)
+    report = report.replaced(angles=angles)
     if accuracy is None:
         return report
     head = report.headline
     if head.figure == UNKNOWN:  # nor does the layer know of the error
-        return replace(report, accuracy=accuracy)
-    return replace(report, accuracy=accuracy, headline=replace(head, notes=(accuracy.statement, *head.notes)))
+        return report.replaced(accuracy=accuracy)
+    return report.replaced(accuracy=accuracy, headline=head.replaced(notes=(accuracy.statement, *head.notes)))
 
 
 def residuals_geojson(fit: Fit) -> dict[str, Any]:
@@ -355,7 +357,7 @@ def residuals_style(report: SceneReport) -> str:
 
 def write_report_json(report: SceneReport, path: str | PathLike[str]) -> None:
     """Write the report as JSON, whole or not at all."""
-    write_json(path, json_value(report), ascii_only=False)
+    write_json(path, report.to_json(), ascii_only=False)
 
 
 def read_report_json(path: str | PathLike[str]) -> dict[str, Any]:
@@ -367,12 +369,12 @@ def read_report_json(path: str | PathLike[str]) -> dict[str, Any]:
         If the file is not a report of this version.
     """
     document = read_json(path, _MAX_BYTES, _REMEDY)
-    if not isinstance(document, dict) or document.get("document") != SceneReport.document:
+    if not isinstance(document, dict) or document.get("document") != _DOCUMENT:
         raise InputError("this is not a report of ortho-pipeline", file=path, remedy=_REMEDY)
-    if document.get("schema_version") != SceneReport.schema_version:
+    if document.get("schema_version") != _VERSION:
         raise InputError(
             f"schema version {document.get('schema_version')!r} is not known here (this version reads "
-            f"{SceneReport.schema_version})", file=path, field="schema_version", remedy="make the report again",
+            f"{_VERSION})", file=path, field="schema_version", remedy="make the report again",
         )  # fmt: skip
     return document
 
@@ -387,7 +389,7 @@ def read_report(path: str | PathLike[str]) -> SceneReport:
     """
     document = read_report_json(path)
     try:
-        return record_of(SceneReport, document)
+        return SceneReport.read(document)
     except DocumentError as error:
         raise InputError(
             f"the report is damaged: {error.fault}", file=path, field=error.place, remedy="make the report again"

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from ortho_pipeline.display.numbers import metres, px, share
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres
-from ortho_pipeline.files.documents import json_value, made_of, record
+from ortho_pipeline.files.json.records import Record
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.report.adjustment_records import Adjustment, Count, Pair
 
@@ -19,8 +20,7 @@ from ortho_pipeline.report.adjustment_records import Adjustment, Count, Pair
 RELATIVE = "relative-to-reference"
 
 
-@record
-class MatchLevel:
+class MatchLevel(Record):
     """A level of the search: chips of pixels that are `factor` image pixels wide."""
 
     factor: Count
@@ -30,8 +30,7 @@ class MatchLevel:
     shift_px: Pair
 
 
-@record
-class Candidate:
+class Candidate(Record):
     """A place in the image that was looked for in the references; `reason` is null where it became a point."""
 
     id: str
@@ -40,8 +39,7 @@ class Candidate:
     reason: str | None
 
 
-@record
-class MatchComponents:
+class MatchComponents(Record):
     """What the covariances of the matches are made of (docs/matching.md)."""
 
     matching: float
@@ -59,8 +57,7 @@ class MatchComponents:
         return ", ".join(said)
 
 
-@record
-class MatchCoverage:
+class MatchCoverage(Record):
     """Matches that were tried and kept in the fields of the image, rows of columns; share of fields with some."""
 
     share: float
@@ -68,8 +65,7 @@ class MatchCoverage:
     kept: tuple[tuple[Count, ...], ...]
 
 
-@record
-class Tested:
+class Tested(Record):
     """Root mean square at points that took no part, in pixels and in metres on the ground."""
 
     n: Count
@@ -77,8 +73,7 @@ class Tested:
     m: float | None
 
 
-@record
-class MatchingRecord:
+class MatchingRecord(Record):
     """Matching of the scene with reference orthoimages; `shift_px` is measured minus delivered model.
 
     `relative` is at matches that were held out, `absolute` at check points that somebody measured.
@@ -136,7 +131,7 @@ def matching_record(matching: Mapping[str, Any], fit: Fit) -> MatchingRecord:
     tested = {
         "relative": _tested(fit, fit.points.check & matched), "absolute": _tested(fit, fit.points.check & ~matched)
     }  # fmt: skip
-    return made_of(MatchingRecord, json_value({**matching, **tested}))
+    return MatchingRecord.model_validate({**json_value(matching), **tested})
 
 
 def is_relative(adjustment: Adjustment) -> bool:

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from ortho_pipeline.files.documents import Shape, record
+import pydantic
+
+from ortho_pipeline.files.json.records import Record, Words
 from ortho_pipeline.report.adjustment_records import (
     Adjustment,
     Count,
@@ -22,32 +24,29 @@ from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.report.layers.angles import AnglesLayer
 from ortho_pipeline.report.matching import MatchingRecord
 
-Size = tuple[Annotated[int, Shape(minimum=1)], Annotated[int, Shape(minimum=1)]]
+Size = tuple[Annotated[int, pydantic.Field(ge=1)], Annotated[int, pydantic.Field(ge=1)]]
 
 
 # -- where it comes from ---------------------------------------------------------------------------------------------
 
 
-@record
-class InputFile:
+class InputFile(Record):
     """A file that was read."""
 
     role: str
     path: str
     bytes: Count
-    sha256: Annotated[str, Shape(pattern="^[0-9a-f]{64}$")]
+    sha256: Annotated[str, pydantic.Field(pattern="^[0-9a-f]{64}$")]
 
 
-@record
-class ImageFile:
+class ImageFile(Record):
     """The image that was opened."""
 
     path: str
     size: Size
 
 
-@record
-class Provenance:
+class Provenance(Record):
     """Files, options and versions with which the same result can be made again."""
 
     command: str | None = None
@@ -62,16 +61,14 @@ class Provenance:
     network_bytes: int | None = None
 
 
-@record
-class PixelOnGround:
+class PixelOnGround(Record):
     """Size of a pixel on level ground, metres along and across the direction of view."""
 
     along_view: float
     across_view: float
 
 
-@record
-class View:
+class View(Record):
     """Direction of view in the middle of the image; azimuth from the ground to the sensor, null straight down."""
 
     incidence_deg: float
@@ -79,8 +76,7 @@ class View:
     pixel_m: PixelOnGround
 
 
-@record
-class SceneRecord:
+class SceneRecord(Record):
     """The scene; geometry is that of its middle, by the adjusted model."""
 
     name: str
@@ -97,20 +93,18 @@ class SceneRecord:
 # -- accuracy --------------------------------------------------------------------------------------------------------
 
 
-@record
-class DistanceClass:
+class DistanceClass(Record):
     """Pairs of points whose distance is in a range, metres."""
 
     from_m: float
     to_m: float
     distance_m: float
-    pairs: Annotated[int, Shape(minimum=1)]
+    pairs: Annotated[int, pydantic.Field(ge=1)]
     correlation: Pair
     relative: Pair
 
 
-@record
-class CovarianceFunction:
+class CovarianceFunction(Record):
     """Standard deviations of noise and of what neighbours share, and the distance at which 1/e of that is left."""
 
     noise: float
@@ -118,8 +112,7 @@ class CovarianceFunction:
     range_m: float
 
 
-@record
-class Covariance:
+class Covariance(Record):
     """Covariance analysis of residuals on the ground, per axis (x, y); docs/accuracy.md says what each number is."""
 
     unit: str
@@ -141,8 +134,7 @@ class Covariance:
     statement: str
 
 
-@record
-class Covariances:
+class Covariances(Record):
     """Of control and of check points, never of both together."""
 
     control: Covariance | None = None
@@ -163,12 +155,11 @@ class Covariances:
         return self.check if role == "check" else self.control
 
 
-@record
-class MapScaleRecord:
+class MapScaleRecord(Record):
     """The largest map scales that the accuracy suffices for; docs/accuracy.md says what each number is."""
 
     evidence: Literal["check", "delivered", "loo"]
-    n: Annotated[int, Shape(minimum=1)]
+    n: Annotated[int, pydantic.Field(ge=1)]
     rmse: float
     ce90: float
     pixel: float | None
@@ -181,11 +172,10 @@ class MapScaleRecord:
     statement: str
 
 
-@record
-class ControlHull:
+class ControlHull(Record):
     """Convex hull of the used control points, and its share of the image; no outline of points in a line."""
 
-    share: Annotated[float, Shape(minimum=0)]
+    share: Annotated[float, pydantic.Field(ge=0)]
     n: Count
     outline: tuple[Pair, ...]
 
@@ -194,8 +184,7 @@ class ControlHull:
 NOT_TESTED = "Not tested"
 
 
-@record
-class Headline:
+class Headline(Record):
     """The accuracy in words: a figure, the same in metres, a phrase that follows, and reservations."""
 
     figure: str
@@ -207,8 +196,7 @@ class Headline:
 # -- compared models -------------------------------------------------------------------------------------------------
 
 
-@record
-class ComparedModel:
+class ComparedModel(Record):
     """A model that was fitted, or why it could not be."""
 
     model: str
@@ -224,20 +212,18 @@ class ComparedModel:
     fitted_as: str | None
     ridge: float | None
     effective_parameters: float | None
-    warnings: tuple[str, ...]
+    warnings: tuple[Words, ...]
     notices: tuple[NoticeDocument, ...] = ()
 
 
-@record
-class PointCounts:
+class PointCounts(Record):
     """Numbers of points."""
 
     control: Count
     check: Count
 
 
-@record
-class Recommendation:
+class Recommendation(Record):
     """The model to take, null where nothing can be said, and what speaks for it."""
 
     model: str | None
@@ -245,8 +231,7 @@ class Recommendation:
     reason: str
 
 
-@record
-class ComparisonRecord:
+class ComparisonRecord(Record):
     """Models that ortho compare fitted to the same points, and its recommendation."""
 
     schema_version: Count
@@ -257,7 +242,7 @@ class ComparisonRecord:
     rows: tuple[ComparedModel, ...]
     left_out: tuple[LeftOut, ...]
     recommendation: Recommendation
-    warnings: tuple[str, ...]
+    warnings: tuple[Words, ...]
     notices: tuple[NoticeDocument, ...] = ()
     files: dict[str, str]
 
@@ -265,8 +250,7 @@ class ComparisonRecord:
 # -- heights and the ortho -------------------------------------------------------------------------------------------
 
 
-@record
-class PointHeights:
+class PointHeights(Record):
     """Heights of the points minus those of the DEM."""
 
     median_m: float
@@ -275,8 +259,7 @@ class PointHeights:
     warning: str | None
 
 
-@record
-class FlatGround:
+class FlatGround(Record):
     """Flat ground, metres above the ellipsoid."""
 
     coverage: float | None
@@ -288,8 +271,7 @@ class FlatGround:
         return True
 
 
-@record
-class Dem:
+class Dem(Record):
     """The DEM, and how its heights were understood."""
 
     coverage: float | None
@@ -318,16 +300,14 @@ class Dem:
         return False
 
 
-@record
-class RpcRecord:
+class RpcRecord(Record):
     """The adjusted model as RPC: exactly, or fitted to it."""
 
     exact: bool
     max_error_px: float
 
 
-@record
-class OrthoRecord:
+class OrthoRecord(Record):
     """The grid of the ortho; extent is left, bottom, right, top.
 
     `crs` is what programs read: a code (``EPSG:n``), or WKT where the CRS has none.
@@ -347,8 +327,7 @@ class OrthoRecord:
         return self.crs_name if "[" in self.crs else self.crs
 
 
-@record
-class WarpRecord:
+class WarpRecord(Record):
     """The exactness of the warp, in pixels of the image; the transformer is GDAL's where its warper made the ortho.
 
     `hidden_share` is that of the pixels that the image reaches which terrain hides, null where nobody looked;
@@ -367,8 +346,7 @@ class WarpRecord:
     filled_share: float | None = None
 
 
-@record
-class SceneReport:
+class SceneReport(Record):
     """The content of <stem>_report.json. Numbers that do not exist are null."""
 
     document: Literal["ortho-pipeline report"] = "ortho-pipeline report"
@@ -390,6 +368,6 @@ class SceneReport:
     accuracy: AccuracyLayer | None = None
     angles: AnglesLayer | None = None
     provenance: Provenance
-    warnings: tuple[str, ...]
+    warnings: tuple[Words, ...]
     notices: tuple[NoticeDocument, ...] = ()
     headline: Headline

@@ -20,7 +20,7 @@ import pyproj
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.points.formats import read_block_table
 from ortho_pipeline.points.ground import ground_of

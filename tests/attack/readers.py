@@ -40,7 +40,7 @@ from ortho_pipeline.exchange.csm import csm_text, read_csm
 from ortho_pipeline.exchange.model_file import read_model_file, save_model
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpb, write_rpc_txt
-from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.files.stac.collection import Collection
 from ortho_pipeline.files.stac.item import read_item as read_stac_item
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs

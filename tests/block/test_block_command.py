@@ -22,7 +22,6 @@ from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.exchange.rpc import export_rpc, read_rpc, rpc_metadata
-from ortho_pipeline.files.documents import record_of
 from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.models import RPC
 from ortho_pipeline.options import SceneOptions
@@ -606,6 +605,6 @@ def test_control_that_was_held_has_no_rmse_of_zero(stereo: Stereo, tmp_path: Pat
     known = document["adjustment"]["object_rms"]["control"] or document["adjustment"]["object_rms"]["check"]
     zero = {name: [0.0] * 3 if isinstance(value, list) else 0.0 for name, value in known.items()} | {"n": 1504}
     document["adjustment"]["object_rms"]["control"] = zero
-    said = summary_text(record_of(BlockReport, document))
+    said = summary_text(BlockReport.read(document))
     assert "1504 control points: held at the given coordinates, so no RMSE on the ground" in said
     assert "RMSE E 0.000" not in said

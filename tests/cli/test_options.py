@@ -16,7 +16,7 @@ from ortho_pipeline.cli.flags import FLAGS, flags_of, with_flags
 from ortho_pipeline.cli.program import COMMANDS, cli
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, error_document
-from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.options import GROUPS, BlockOptions, SurfaceOptions, options_of
 from ortho_pipeline.options.texts import Setting, Text
 

@@ -16,7 +16,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.estimation.spatial.correlation import CovarianceAnalysis, analyse, analyse_fit
-from ortho_pipeline.files.documents import json_value, record_of
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import SensorModel
@@ -294,7 +294,7 @@ def test_report_holds_the_analysis_and_draws_it(tmp_path):
     provenance = {"command": None, "inputs": [], "software": {}}
     made = report.build_report(scene=scene, fit=result, provenance=provenance)
     schema = json.loads((Path(__file__).parent.parent.parent / "docs" / "report.schema.json").read_text())
-    jsonschema.validate(json_value(made), schema, cls=jsonschema.Draft202012Validator)
+    jsonschema.validate(made.to_json(), schema, cls=jsonschema.Draft202012Validator)
     # The check points were tested: their analysis is drawn, and the words are on page and terminal.
     assert {"neighbours", "relative"} <= set(report.plots(made))
     report.write_report_html(made, tmp_path / "r.html")
@@ -316,9 +316,9 @@ def test_report_of_few_points_says_so_and_draws_nothing():
     assert control.verdict == "too few points"
     assert not {"neighbours", "relative"} & set(report.plots(made))
     # Reports that were written before this section was there are still shown.
-    earlier = json_value(made)
+    earlier = made.to_json()
     del earlier["covariance"], earlier["scene"]["view"], earlier["notices"]
-    assert "residuals" in report.plots(record_of(SceneReport, earlier))
+    assert "residuals" in report.plots(SceneReport.read(earlier))
 
 
 # -- the size of a pixel by direction of view ------------------------------------------------------------------------

@@ -17,7 +17,6 @@ from osgeo import gdal
 
 from ortho_pipeline.commands.control.matching import Matched, Search
 from ortho_pipeline.estimation.fit import Fit, fit
-from ortho_pipeline.files.documents import json_value, made_of, record_of
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.matching import REASONS, Matches
 from ortho_pipeline.imaging.matching.search import Level
@@ -106,7 +105,7 @@ def page_of(one: Case, folder: Path, *, chips: bool = True) -> str:
 
 
 def test_every_candidate_is_in_the_json_and_the_counts_agree(plain: Case) -> None:
-    document = json.loads(json.dumps(json_value(plain.report), allow_nan=False))
+    document = json.loads(json.dumps(plain.report.to_json(), allow_nan=False))
     jsonschema.validate(document, SCHEMA, cls=jsonschema.Draft202012Validator)
     matching = document["matching"]
     assert len(matching["candidates"]) == matching["tried"] == 46
@@ -117,8 +116,7 @@ def test_every_candidate_is_in_the_json_and_the_counts_agree(plain: Case) -> Non
         assert sum(one["reason"] == reason for one in matching["candidates"]) == count
     # What could not be measured has no score: null, not NaN.
     assert [one["score"] for one in matching["candidates"] if one["reason"] == "not measured"] == [None]
-    assert json_value(record_of(SceneReport, document)) == document
-    assert repr(made_of(SceneReport, document)) == repr(record_of(SceneReport, document))
+    assert SceneReport.read(document).to_json() == document
 
 
 def test_the_map_shows_each_match_once_where_it_is(plain: Case) -> None:
@@ -169,9 +167,9 @@ def test_histograms_are_along_and_across_the_line_of_sight(plain: Case) -> None:
 
 
 def test_straight_down_the_histograms_are_of_columns_and_rows(plain: Case, tmp_path: Path) -> None:
-    points = [dataclasses.replace(one, view_residual=None) for one in plain.report.adjustment.points]
-    adjustment = dataclasses.replace(plain.report.adjustment, points=tuple(points))
-    down = Case(plain.matches, plain.fit, dataclasses.replace(plain.report, adjustment=adjustment))
+    points = [one.replaced(view_residual=None) for one in plain.report.adjustment.points]
+    adjustment = plain.report.adjustment.replaced(points=tuple(points))
+    down = Case(plain.matches, plain.fit, plain.report.replaced(adjustment=adjustment))
     names, found = residuals_by_axis(down.report)
     assert names == ("column", "row")
     np.testing.assert_allclose(
@@ -273,7 +271,7 @@ def test_without_chips_the_page_has_the_plots_alone(plain: Case, tmp_path: Path)
 
 
 def test_without_a_matching_there_is_nothing_of_it(plain: Case, tmp_path: Path) -> None:
-    bare = Case(plain.matches, plain.fit, dataclasses.replace(plain.report, matching=None))
+    bare = Case(plain.matches, plain.fit, plain.report.replaced(matching=None))
     assert not {"matches", "match_histograms"} & set(plots(bare.report))
     page = page_of(bare, tmp_path)
     assert "<h2>Matching</h2>" not in page
@@ -282,9 +280,9 @@ def test_without_a_matching_there_is_nothing_of_it(plain: Case, tmp_path: Path) 
 
 def test_two_of_a_name_keep_their_own_residuals(plain: Case) -> None:
     # Beside points of a file called m0, m1, ... matches are renamed; the gallery names them as the tables do.
-    points = tuple(dataclasses.replace(one, id=f"m{one.id}") for one in plain.report.adjustment.points)
-    adjustment = dataclasses.replace(plain.report.adjustment, points=points)
-    renamed = gallery(dataclasses.replace(plain.report, adjustment=adjustment), plain.matches)
+    points = tuple(one.replaced(id=f"m{one.id}") for one in plain.report.adjustment.points)
+    adjustment = plain.report.adjustment.replaced(points=points)
+    renamed = gallery(plain.report.replaced(adjustment=adjustment), plain.matches)
     first = gallery(plain.report, plain.matches)
     assert [f"m{tile.id}" for tile in first.worst] == [tile.id for tile in renamed.worst]
     assert [tile.residual for tile in first.worst] == [tile.residual for tile in renamed.worst]

@@ -300,8 +300,8 @@ def test_places_of_points_are_in_the_json(tmp_path):
 
 def test_a_scene_that_nothing_tests_is_not_said_to_be_fine(tmp_path):
     tested = made(measured())
-    head = dataclasses.replace(tested.headline, figure=NOT_TESTED)
-    empty = dataclasses.replace(tested, headline=head, warnings=(), notices=())
+    head = tested.headline.replaced(figure=NOT_TESTED)
+    empty = tested.replaced(headline=head, warnings=(), notices=())
     report.write_report_html(empty, tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "Nothing to complain of" not in page
@@ -352,8 +352,8 @@ def test_the_north_arrow_covers_no_point_and_names_stay_on_the_map(index):
     for down in (40.0, 2.0):
         side = 4000.0
         right, top = x + 26.0 * side / 720.0, y + down * side / 720.0
-        grid = dataclasses.replace(said.ortho, extent=(right - side, top - side, right, top))
-        drawing = plot_ortho(dataclasses.replace(said, ortho=grid))
+        grid = said.ortho.replaced(extent=(right - side, top - side, right, top))
+        drawing = plot_ortho(said.replaced(ortho=grid))
         (north,) = [item for kind, item in drawing.items if kind == "text" and item["text"] == "N"]
         names = {point.id for point in said.adjustment.points}
         for kind, item in drawing.items:

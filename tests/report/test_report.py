@@ -23,7 +23,6 @@ from osgeo import gdal
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import Fit, fit
-from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.points import Points
@@ -109,7 +108,7 @@ def test_report_is_json_without_nan(tmp_path):
     )
     report.write_report_json(made, tmp_path / "r.json")
     again = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"), parse_constant=pytest.fail)
-    assert again == json_value(made)
+    assert again == made.to_json()
     assert again["schema_version"] == 1
     assert again["scene"]["facts"] == {"sun": None}
     assert again["warnings"] == ["look here"]
@@ -396,9 +395,9 @@ def test_plot_keeps_points_outside_of_the_image_in_view():
 
 def test_plot_of_a_perfect_point_has_no_arrow():
     made = document(adjusted(points(control=1, check=0)))
-    exact = dataclasses.replace(made.adjustment.points[0], residual=(0.0, 0.0))
-    adjustment = dataclasses.replace(made.adjustment, points=(exact,))
-    assert "<line" not in drawn_residuals(dataclasses.replace(made, adjustment=adjustment))
+    exact = made.adjustment.points[0].replaced(residual=(0.0, 0.0))
+    adjustment = made.adjustment.replaced(points=(exact,))
+    assert "<line" not in drawn_residuals(made.replaced(adjustment=adjustment))
 
 
 def test_plots_of_a_whole_report_as_svg_and_png(tmp_path):
@@ -436,7 +435,7 @@ def test_a_report_that_is_none_is_refused(tmp_path):
     ],
 )
 def test_a_damaged_report_is_refused_by_the_name_of_the_member(tmp_path, section, name, value, said):
-    damaged = json_value(document(adjusted(points())))
+    damaged = document(adjusted(points())).to_json()
     damaged[section] |= {name: value}
     (tmp_path / "r.json").write_text(json.dumps(damaged))
     with pytest.raises(InputError, match="damaged") as refused:
@@ -447,9 +446,9 @@ def test_a_damaged_report_is_refused_by_the_name_of_the_member(tmp_path, section
 def test_a_point_that_does_not_project_is_not_drawn():
     """A residual of nulls was taken for one."""
     made = document(adjusted(points()))
-    lost = dataclasses.replace(made.adjustment.points[0], residual=(None, None), view_residual=None)
-    adjustment = dataclasses.replace(made.adjustment, points=(lost, *made.adjustment.points[1:]))
-    drawn = report.plots(dataclasses.replace(made, adjustment=adjustment))
+    lost = made.adjustment.points[0].replaced(residual=(None, None), view_residual=None)
+    adjustment = made.adjustment.replaced(points=(lost, *made.adjustment.points[1:]))
+    drawn = report.plots(made.replaced(adjustment=adjustment))
     assert lost.id not in drawn["residuals"].svg()
     assert {"directions", "heights"} <= set(drawn)
 

@@ -15,7 +15,7 @@ import numpy as np
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC

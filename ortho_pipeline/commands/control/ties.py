@@ -27,7 +27,7 @@ from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import write_text
-from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions

@@ -16,7 +16,7 @@ from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.files import write_text
-from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import RPC, ImageCorrection, Pieces, SensorModel
 from ortho_pipeline.models.base import Array

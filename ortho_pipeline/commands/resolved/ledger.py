@@ -19,7 +19,7 @@ from ortho_pipeline.commands.stac.given import is_collected
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange.rpc import files_of
 from ortho_pipeline.files import sha256, states
-from ortho_pipeline.files.documents import software_version
+from ortho_pipeline.files.json.values import software_version
 from ortho_pipeline.files.locations import archive_of, is_far
 from ortho_pipeline.files.process_limits import thread_pool
 from ortho_pipeline.files.traffic import bytes_read

@@ -10,7 +10,7 @@ import pyproj
 
 from ortho_pipeline.commands.results import SCHEMA_VERSION
 from ortho_pipeline.display.notices import to_document
-from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
 from ortho_pipeline.geodesy.naming import crs_text

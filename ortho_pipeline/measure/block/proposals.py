@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.files.documents import json_position, json_value
+from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.imaging.matching import OtherScene
 from ortho_pipeline.measure.places import Places
 from ortho_pipeline.measure.proposals import NEAR, proposal_of, propose

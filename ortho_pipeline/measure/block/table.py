@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.block.points import BlockPoints, shape_of
-from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.measure.marks import GROUND_CRS, Mark, Marks, Ray, checked, errors_of
 from ortho_pipeline.points.geojson import feature_of
@@ -62,7 +61,7 @@ def document(marks: Marks, names: Mapping[str, str], source: str) -> dict[str, A
                 **({"note": mark.note} if mark.note else {}),
             }  # fmt: skip
             found.append(feature)
-    left = [json_value(mark) for mark in marks.by_id.values() if not mark.counts]
+    left = [mark.to_json() for mark in marks.by_id.values() if not mark.counts]
     return {"type": "FeatureCollection", "features": found, **({"left_out": left} if left else {})}
 
 

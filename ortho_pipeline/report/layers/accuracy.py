@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated
 
+import pydantic
+
 from ortho_pipeline.display.drawing import Drawing
 from ortho_pipeline.display.numbers import metres, share
-from ortho_pipeline.files.documents import Shape, record
+from ortho_pipeline.files.json.records import Record
 
 #: What makes up the error of an ortho, in words.
 _NAMES = {
@@ -18,11 +20,10 @@ _NAMES = {
 }
 #: Side of the map in CSS pixels.
 _SIDE = 420.0
-Share = Annotated[float, Shape(minimum=0)]
+Share = Annotated[float, pydantic.Field(ge=0)]
 
 
-@record
-class AccuracyLayer:
+class AccuracyLayer(Record):
     """How accurate the pixels of the ortho are; docs/accuracy.md says what each number is.
 
     `ce90_m` holds 90 % of the errors of all pixels together, `range_m` is 5, 50 and 95 % of the pixels' own, `sigma_m`

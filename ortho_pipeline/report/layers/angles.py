@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from ortho_pipeline.display.numbers import share
-from ortho_pipeline.files.documents import record
+from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.report.layers.styles import raster_style
 
 
-@record
-class AnglesLayer:
+class AnglesLayer(Record):
     """Least and greatest zenith angle of view; azimuth and elevation of the sun, and the share of the ortho in shadow.
 
     The last two are null where nobody knows where the sun stood.

@@ -12,7 +12,7 @@ from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.network import Network, network_of
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.estimation.ground_residuals import viewing
-from ortho_pipeline.files.documents import json_value
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.control_hull import COVERED, empty_parts

@@ -12,7 +12,6 @@ from ortho_pipeline.display.notices import doubted
 from ortho_pipeline.display.numbers import flat
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.files import write_text
-from ortho_pipeline.files.documents import json_value
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.adjustment_records import is_known
 from ortho_pipeline.report.gallery.chips import gallery
@@ -110,4 +109,4 @@ def _running(name: str) -> str:
 def _brief(provenance: Provenance) -> dict[str, Any]:
     """Return the provenance without what the page shows in tables of its own."""
     shown = ("inputs", "surface", "model_source")
-    return {key: value for key, value in json_value(provenance).items() if key not in shown}
+    return {key: value for key, value in provenance.to_json().items() if key not in shown}

@@ -1,4 +1,4 @@
-"""What becomes of values in JSON documents."""
+"""What becomes of values in JSON documents, and records made of documents."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import numpy as np
 import pyproj
 import pytest
 
-from ortho_pipeline.files.documents import DocumentError, json_position, json_value, record, record_of
+from ortho_pipeline.files.json.records import DocumentError, Record
+from ortho_pipeline.files.json.values import json_position, json_value
 
 
 @dataclasses.dataclass
@@ -41,8 +42,7 @@ def test_half_a_place_is_none():
     assert json_position(np.array([1.0, np.nan])) is None
 
 
-@record
-class One:
+class One(Record):
     """A record."""
 
     number: int
@@ -50,5 +50,5 @@ class One:
 
 def test_a_member_without_a_name_is_named() -> None:
     with pytest.raises(DocumentError) as caught:
-        record_of(One, {"number": 1, "": 2})
+        One.read({"number": 1, "": 2})
     assert caught.value.place == "''"

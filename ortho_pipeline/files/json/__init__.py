@@ -1,0 +1,1 @@
+"""JSON documents: values, and records that check them."""
