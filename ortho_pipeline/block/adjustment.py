@@ -27,7 +27,7 @@ from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.block.reliability.blunders import find_blunders
 from ortho_pipeline.block.reliability.known_points import notices, outlying
-from ortho_pipeline.block.reliability.suspects import Rejected
+from ortho_pipeline.block.reliability.suspects import GrossError
 from ortho_pipeline.block.variances.components import Posterior
 from ortho_pipeline.block.variances.grid import estimate, posterior, reweighed
 from ortho_pipeline.block.variances.shared_errors import SharedByImage
@@ -110,7 +110,7 @@ def adjust(
     solved, inside = _checked(solved, whole) if held is None else (held, held.without_astray(whole))
     if problem.unstated.any():
         solved = reweighed(solved, inside, estimate(solved), tolerance)
-    rejected, near = tuple[Rejected, ...](), solved.state
+    rejected, near = tuple[GrossError, ...](), solved.state
     if robust and problem.size and solved.unit_weight()[1] >= 4:
         blunders = find_blunders(solved, inside)
         rejected, near = blunders.rejected, blunders.state
@@ -315,7 +315,7 @@ def _result(
     order: Index,
     start: tuple[SensorModel, ...],
     gauge: str,
-    rejected: tuple[Rejected, ...],
+    rejected: tuple[GrossError, ...],
     notes: list[Notice],
 ) -> BlockFit:
     """Return what is told of `points`, whose rays the solution has in an `order`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,8 @@ from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.intersection import sigmas_of
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.points import BlockPoints
-from ortho_pipeline.block.reliability.known_points import Outlying
-from ortho_pipeline.block.reliability.suspects import Rejected
+from ortho_pipeline.block.reliability.known_points import ContradictedPoint
+from ortho_pipeline.block.reliability.suspects import GrossError
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError
@@ -66,8 +66,8 @@ class BlockFit:
     sigma0: float | None
     gauge: str
     variances: Variances
-    rejected: tuple[Rejected, ...] = ()
-    outlying: tuple[Outlying, ...] = ()
+    rejected: tuple[GrossError, ...] = ()
+    outlying: tuple[ContradictedPoint, ...] = ()
     warnings: tuple[Notice, ...] = ()
     common_error: CommonError | None = None
     shared_errors: Mapping[str, SharedErrors] = field(default_factory=dict)
@@ -175,8 +175,8 @@ class BlockFit:
             "object_rms": {role: self.object_rms(role) for role in ("control", "check")},
             "points": [self._point(k) for k in range(len(points))],
             "rays": [self._ray(k) for k in range(points.rays)],
-            "rejected": [asdict(one) for one in self.rejected],
-            "outlying": [asdict(one) for one in self.outlying],
+            "rejected": [one.to_json() for one in self.rejected],
+            "outlying": [one.to_json() for one in self.outlying],
             **to_document(self.warnings),
         }
 

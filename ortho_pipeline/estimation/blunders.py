@@ -15,8 +15,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Literal, Self
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
 from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.statistics import squared_distances
+from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
@@ -236,36 +237,39 @@ def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
 # -- what is not left out --------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Outlying:
-    """A point that contradicts the others and still counts.
+Role = Literal["control", "check"]
 
-    `distance` (px) is that from where the fit of the others puts it, `expected` the root mean square of such
-    distances for good points, `chance` that of so large a one for a good point. `leverage` is the share (0 to 1) of its
-    own residual that it takes away: 0 for check points, and little for control points among many.
-    """
 
+class OutlyingPoint(Record):
+    """A point that contradicts the others and still counts."""
+
+    # Its distance (px) from where the fit of the others puts it, the root mean square of such distances for good
+    # points, and the chance of so large a one for a good point. Leverage is the share (0 to 1) of its own residual that
+    # it takes away: 0 for check points, and little for control points among many.
     id: str
-    role: str
+    role: Role
     distance: float
     expected: float
     chance: float
     leverage: float
+    reason: str
 
-    @property
-    def reason(self) -> str:
-        """The sentence about it, without its name."""
-        said = f"{self.distance:.3g} px from where the others put it, {self.expected:.2g} px expected"
-        if self.role == "check":
-            return f"{said}: measure it again, for it counts in the RMSE of the check points all the same"
-        return f"{said}: measure it again, for it stays in the adjustment (leverage {self.leverage:.2f})"
+    @classmethod
+    def of(cls, name: str, role: Role, distance: float, expected: float, chance: float, leverage: float = 0.0) -> Self:
+        """Return it with the sentence about it, without its name."""
+        said = f"{distance:.3g} px from where the others put it, {expected:.2g} px expected: measure it again, for it "
+        if role == "check":
+            said += "counts in the RMSE of the check points all the same"
+        else:
+            said += f"stays in the adjustment (leverage {leverage:.2f})"
+        return cls(
+            id=name, role=role, distance=distance, expected=expected, chance=chance, leverage=leverage, reason=said
+        )
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the point as JSON values."""
-        return {**asdict(self), "reason": self.reason}
 
-
-def outlying(solution: Solution, points: Points, used: np.ndarray, common: Array | None = None) -> tuple[Outlying, ...]:
+def outlying(
+    solution: Solution, points: Points, used: np.ndarray, common: Array | None = None
+) -> tuple[OutlyingPoint, ...]:
     """Return check points, and used control points, that contradict the fit; none without redundancy.
 
     A check point is tested with its own uncertainty and that of the model there; from five check points on their own
@@ -283,7 +287,7 @@ def outlying(solution: Solution, points: Points, used: np.ndarray, common: Array
     )
 
 
-def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> list[Outlying]:
+def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> list[OutlyingPoint]:
     from scipy.special import fdtrc
 
     redundancy = solution.redundancy_blocks()
@@ -304,7 +308,7 @@ def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> l
         chance = float(fdtrc(2, freedom, square / 2 / others))
         if chance < OUTLYING_RISK / len(rows):
             found.append(
-                Outlying(
+                OutlyingPoint.of(
                     points.ids[rows[i]], "control", float(np.hypot(*left[i])), math.sqrt(others * float(spreads[i])),
                     chance, float(1 - np.trace(redundancy[i]) / 2),
                 )
@@ -354,7 +358,7 @@ def _checks(solution: Solution, points: Points, used: np.ndarray, common: Array 
 
 def _outlying_checks(
     solution: Solution, points: Points, used: np.ndarray, sigma0: float, common: Array | None
-) -> list[Outlying]:
+) -> list[OutlyingPoint]:
     checks = _checks(solution, points, used, common)
     if checks is None:
         return []
@@ -374,15 +378,15 @@ def _outlying_checks(
     chances = fdtrc(2, freedom, squares / 2 / scale)
     expected, rows = checks.expected(scale), checks.problem.rows
     return [
-        Outlying(
-            points.ids[rows[i]], "check", float(np.hypot(*checks.miss[i])), float(expected[i]), float(chances[i]), 0.0
+        OutlyingPoint.of(
+            points.ids[rows[i]], "check", float(np.hypot(*checks.miss[i])), float(expected[i]), float(chances[i])
         )
         for i in np.flatnonzero(chances < OUTLYING_RISK / len(chances)).tolist()
     ]
 
 
 def checks_apart(
-    solution: Solution, points: Points, used: np.ndarray, said: Sequence[Outlying], *, shared: bool = False
+    solution: Solution, points: Points, used: np.ndarray, said: Sequence[OutlyingPoint], *, shared: bool = False
 ) -> list[Notice]:
     """Return a notice where check points contradict the control points, so that their RMSE tells no accuracy.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import DegeneratePoints, InputError, ModelError
-from ortho_pipeline.estimation.blunders import REJECTED_LIMIT, Outlying, checks_apart, find_blunders, outlying
+from ortho_pipeline.estimation.blunders import REJECTED_LIMIT, OutlyingPoint, checks_apart, find_blunders, outlying
 from ortho_pipeline.estimation.determinacy import (
     EXTRAPOLATION_WARNING,
     UNSTABLE,
@@ -77,7 +77,7 @@ class Fit:
     priors: Mapping[str, Prior] = field(default_factory=dict)
     significance: float = SIGNIFICANCE
     corner_ratio: float = 0.0
-    outlying: tuple[Outlying, ...] = ()
+    outlying: tuple[OutlyingPoint, ...] = ()
     shared_errors: SharedErrors | None = None
     common_error: CommonError | None = None
 

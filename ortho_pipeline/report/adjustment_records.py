@@ -9,10 +9,10 @@ from typing import Annotated, Any, Literal, TypeGuard
 
 import pydantic
 
-from ortho_pipeline.files.json.records import Record, Words
+from ortho_pipeline.estimation.blunders import OutlyingPoint
+from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
+from ortho_pipeline.files.json.records import Count, Pair, Record, Words
 
-Count = Annotated[int, pydantic.Field(ge=0)]
-Pair = tuple[float, float]
 #: Of a point for which it may be unknown.
 Residual = tuple[float | None, float | None]
 Role = Literal["control", "check", "tie"]
@@ -137,17 +137,6 @@ class Statistics(Record):
     common_error: CommonError | None = None
 
 
-class SharedErrors(Record):
-    """Errors that neighbouring points share, in units of stated sigmas; docs/accuracy.md says what each number is."""
-
-    points: Count
-    groups: Count
-    effective_points: float
-    noise: Pair | None
-    shared: Pair | None
-    range_px: Pair | None
-
-
 class GroupedStatistics(Statistics):
     """Tests of the parameters where points have groups."""
 
@@ -187,18 +176,6 @@ class LeftOut(Record):
     """A point that was left out as a gross error."""
 
     id: str
-    reason: str
-
-
-class OutlyingPoint(Record):
-    """A point that contradicts the others and still counts."""
-
-    id: str
-    role: Literal["control", "check"]
-    distance: float
-    expected: float
-    chance: float
-    leverage: float
     reason: str
 
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from typing import Any, Literal
 
+from ortho_pipeline.block.reliability.known_points import ContradictedPoint
+from ortho_pipeline.block.reliability.suspects import GrossError
 from ortho_pipeline.files.json.records import Record, Words
 from ortho_pipeline.report.adjustment_records import (
     CommonError,
@@ -178,25 +180,6 @@ class Ray(Record):
     measured: Residual
     residual: Residual
     back_projected: Residual
-
-
-class GrossError(Record):
-    """A measurement, the ground of a control point, or a whole point that was left out."""
-
-    point: str
-    what: Literal["ray", "ground", "point"]
-    image: str | None
-    reason: str
-
-
-class ContradictedPoint(Record):
-    """A known point that the block contradicts, and that was left as it is."""
-
-    point: str
-    role: Literal["control", "check"]
-    what: Literal["plan", "height", "ground"]
-    metres: float
-    sigmas: float
 
 
 class BlockAdjustment(Record):

@@ -205,7 +205,7 @@ def _covariances(fit: Fit, near: float | None) -> Covariances:
 def _map_scale(fit: Fit, seen: Mapping[str, Any], grid: Grid | None) -> MapScaleRecord | None:
     pixels = [*(seen["ground_pixel_m"] or ()), *(() if grid is None else _pixel_on_ground(grid))]
     found = map_scale(fit, max(pixels) if pixels else None)
-    return None if found is None else MapScaleRecord.model_validate(found.to_json())
+    return found
 
 
 def _pixel_on_ground(grid: Grid) -> list[float]:

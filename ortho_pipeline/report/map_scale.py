@@ -17,16 +17,20 @@ edition 2 (2023), horizontal accuracy; United States National Map Accuracy Stand
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Annotated, Literal
 
 import numpy as np
+import pydantic
 
 from ortho_pipeline.display.numbers import class_size
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres
+from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
+
+Evidence = Literal["check", "delivered", "loo"]
+Limit = Literal["pixel", "accuracy"]
 
 #: Denominators of the usual scales of maps.
 SCALES = tuple(int(step * 10**power) for power in range(2, 7) for step in (1, 2, 2.5, 5))
@@ -38,50 +42,27 @@ POSITION, PIXEL = 0.25e-3, 0.1e-3
 _INCH, _STEP = 0.0254, 20_000
 
 
-@dataclass(frozen=True)
-class MapScale:
-    """The verdicts; a scale is its denominator, None where even 1:5,000,000 is too large.
+class MapScaleRecord(Record):
+    """The largest map scales that the accuracy suffices for; docs/accuracy.md says what each number is."""
 
-    `evidence` is ``check`` (check points), ``delivered`` (any points, of a model that was not adjusted) or ``loo``
-    (control points left out in turn); only the first two are independent of the adjustment. `ce90` (m) is the distance
-    that at most one point in ten exceeds. `class_cm` is that of ASPRS 2023, `survey` (m) the RMSE of the check points
-    themselves in it (0: not stated), `claim` whether it may be claimed.
-    """
-
-    evidence: str
-    n: int
+    # A scale is its denominator, None where even 1:5,000,000 is too large. Only check points and those of a delivered
+    # model are independent of the adjustment. At most one point in ten exceeds ce90 (m); class_cm is that of ASPRS
+    # 2023, survey (m) the RMSE of the check points themselves in it (0: not stated), claim whether it may be claimed.
+    evidence: Evidence
+    n: Annotated[int, pydantic.Field(ge=1)]
     rmse: float
     ce90: float
     pixel: float | None
     paper_scale: int | None
-    limited_by: str | None
+    limited_by: Limit | None
     class_cm: int
     survey: float
     claim: bool
     nmas_scale: int | None
-
-    @property
-    def statement(self) -> str:
-        """The map scale in words, with what it rests on."""
-        base = {
-            "check": counted(self.n, "check point"),
-            "delivered": f"{counted(self.n, 'point')} of the delivered model",
-            "loo": f"{counted(self.n, 'control point')} left out in turn",
-        }[self.evidence]
-        by = {"pixel": " (limited by the pixel size)", "accuracy": " (limited by the error)", None: ""}[self.limited_by]
-        said = f"{scale_text(self.paper_scale, none='no usual map scale')}{by}."
-        if not self.claim:
-            asks = "30 check points" if self.evidence != "check" else "30"
-            return f"{said} Indicative: {base}; ASPRS 2023 asks for {asks}."
-        said += f" ASPRS 2023 class {class_size(self.class_cm)} at {base}."
-        return said if self.survey else f"{said} It does not include the error of the check points themselves."
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the verdicts as JSON values."""
-        return {**asdict(self), "statement": self.statement}
+    statement: str
 
 
-def map_scale(fit: Fit, pixel: float | None) -> MapScale | None:
+def map_scale(fit: Fit, pixel: float | None) -> MapScaleRecord | None:
     """Return the map scales that a fit suffices for; None where nothing tests it.
 
     Parameters
@@ -98,13 +79,13 @@ def map_scale(fit: Fit, pixel: float | None) -> MapScale | None:
     return None
 
 
-def _evidence(fit: Fit) -> dict[str, Array]:
+def _evidence(fit: Fit) -> dict[Evidence, Array]:
     """Return residuals (px) by what they are evidence of, the best first; NaN for points that are none."""
     if not len(fit.points):
         return {}
     # A scale is a claim about the ground: points that were matched are relative to another image.
     measured = (fit.points.groups < 0)[:, None]
-    found = {"check": np.where(fit.points.check[:, None] & measured, fit.residuals, np.nan)}
+    found: dict[Evidence, Array] = {"check": np.where(fit.points.check[:, None] & measured, fit.residuals, np.nan)}
     if not len(fit.param_names):
         found["delivered"] = np.where(fit.used[:, None] & measured, fit.residuals, np.nan)
     elif fit.redundancy > 0:
@@ -112,7 +93,7 @@ def _evidence(fit: Fit) -> dict[str, Array]:
     return found
 
 
-def judge(errors: Array, evidence: str, pixel: float | None, survey: float = 0.0) -> MapScale:
+def judge(errors: Array, evidence: Evidence, pixel: float | None, survey: float = 0.0) -> MapScaleRecord:
     """Return the verdicts on errors ``(N, 2)`` in metres of at least one point.
 
     The pixel counts in two digits: 2.503 m is a pixel of 2.5 m.
@@ -121,13 +102,31 @@ def judge(errors: Array, evidence: str, pixel: float | None, survey: float = 0.0
     squares = (errors**2).sum(axis=1)
     count, rmse = len(squares), float(np.sqrt(squares.mean()))
     ce90 = float(np.sqrt(np.sort(squares)[count - 1 - count // 10]))
-    limited = None if pixel is None else ("pixel" if pixel / PIXEL > rmse / POSITION else "accuracy")
+    limited: Limit | None = None if pixel is None else ("pixel" if pixel / PIXEL > rmse / POSITION else "accuracy")
     paper = usual_scale(max(rmse / POSITION, (pixel or 0.0) / PIXEL))
     nmas = next((scale for scale in SCALES if ce90 <= nmas_limit(scale) * (1 + 1e-9)), None)
-    return MapScale(
-        evidence, count, rmse, ce90, pixel, paper, limited, math.ceil(100 * math.hypot(rmse, survey) - 1e-9), survey,
-        evidence != "loo" and count >= ENOUGH_CHECK_POINTS, nmas,
+    found = MapScaleRecord(
+        evidence=evidence, n=count, rmse=rmse, ce90=ce90, pixel=pixel, paper_scale=paper, limited_by=limited,
+        class_cm=math.ceil(100 * math.hypot(rmse, survey) - 1e-9), survey=survey,
+        claim=evidence != "loo" and count >= ENOUGH_CHECK_POINTS, nmas_scale=nmas, statement="",
     )  # fmt: skip
+    return found.replaced(statement=_statement(found))
+
+
+def _statement(found: MapScaleRecord) -> str:
+    """Return the map scale in words, with what it rests on."""
+    base = {
+        "check": counted(found.n, "check point"),
+        "delivered": f"{counted(found.n, 'point')} of the delivered model",
+        "loo": f"{counted(found.n, 'control point')} left out in turn",
+    }[found.evidence]
+    by = {"pixel": " (limited by the pixel size)", "accuracy": " (limited by the error)", None: ""}[found.limited_by]
+    said = f"{scale_text(found.paper_scale, none='no usual map scale')}{by}."
+    if not found.claim:
+        asks = "30 check points" if found.evidence != "check" else "30"
+        return f"{said} Indicative: {base}; ASPRS 2023 asks for {asks}."
+    said += f" ASPRS 2023 class {class_size(found.class_cm)} at {base}."
+    return said if found.survey else f"{said} It does not include the error of the check points themselves."
 
 
 def usual_scale(smallest: float) -> int | None:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
+from ortho_pipeline.estimation.spatial.correlation import Covariance
 from ortho_pipeline.files.json.records import Record, Words
 from ortho_pipeline.report.adjustment_records import (
     Adjustment,
@@ -22,6 +23,7 @@ from ortho_pipeline.report.adjustment_records import (
 )
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.report.layers.angles import AnglesLayer
+from ortho_pipeline.report.map_scale import MapScaleRecord
 from ortho_pipeline.report.matching import MatchingRecord
 
 Size = tuple[Annotated[int, pydantic.Field(ge=1)], Annotated[int, pydantic.Field(ge=1)]]
@@ -93,47 +95,6 @@ class SceneRecord(Record):
 # -- accuracy --------------------------------------------------------------------------------------------------------
 
 
-class DistanceClass(Record):
-    """Pairs of points whose distance is in a range, metres."""
-
-    from_m: float
-    to_m: float
-    distance_m: float
-    pairs: Annotated[int, pydantic.Field(ge=1)]
-    correlation: Pair
-    relative: Pair
-
-
-class CovarianceFunction(Record):
-    """Standard deviations of noise and of what neighbours share, and the distance at which 1/e of that is left."""
-
-    noise: float
-    systematic: float
-    range_m: float
-
-
-class Covariance(Record):
-    """Covariance analysis of residuals on the ground, per axis (x, y); docs/accuracy.md says what each number is."""
-
-    unit: str
-    n: Count
-    near_m: float | None
-    pairs_near: Count
-    mean: Pair
-    mean_p: Pair | None
-    absolute: Pair
-    relative: Pair | None
-    correlation: Pair | None
-    classes: tuple[DistanceClass, ...]
-    functions: tuple[CovarianceFunction | None, CovarianceFunction | None]
-    moran: Pair | None
-    p: Pair | None
-    p_joint: float | None
-    critical: float | None
-    verdict: Literal["systematic", "none found", "too few points"]
-    statement: str
-
-
 class Covariances(Record):
     """Of control and of check points, never of both together."""
 
@@ -153,23 +114,6 @@ class Covariances(Record):
     def of(self, role: Literal["control", "check"]) -> Covariance | None:
         """Return the analysis of the points of a role."""
         return self.check if role == "check" else self.control
-
-
-class MapScaleRecord(Record):
-    """The largest map scales that the accuracy suffices for; docs/accuracy.md says what each number is."""
-
-    evidence: Literal["check", "delivered", "loo"]
-    n: Annotated[int, pydantic.Field(ge=1)]
-    rmse: float
-    ce90: float
-    pixel: float | None
-    paper_scale: int | None
-    limited_by: Literal["pixel", "accuracy"] | None
-    class_cm: int
-    survey: float
-    claim: bool
-    nmas_scale: int | None
-    statement: str
 
 
 class ControlHull(Record):

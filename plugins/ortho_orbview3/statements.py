@@ -11,7 +11,7 @@ import numpy as np
 
 from ortho_orbview3 import rendering
 from ortho_orbview3 import truth as simulated
-from ortho_pipeline.estimation.spatial.correlation import CovarianceAnalysis
+from ortho_pipeline.estimation.spatial.correlation import Covariance
 from ortho_pipeline.imaging.edge import analyse_edge
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.simulation.tables import Statement
@@ -35,7 +35,7 @@ class Findings:
 
     numbers: dict[str, list[float]] = field(default_factory=dict)
     pruned: dict[str, Counter[str]] = field(default_factory=dict)
-    analyses: dict[str, list[CovarianceAnalysis]] = field(default_factory=dict)
+    analyses: dict[str, list[Covariance]] = field(default_factory=dict)
     absolute: dict[str, list[Array]] = field(default_factory=dict)
 
     def add(self, name: str, value: float) -> None:
@@ -214,7 +214,7 @@ def relative_deviation(findings: Findings) -> dict[str, list[float]]:
             squares: list[list[float]] = [[] for _ in CLASSES[1:]]
             for analysis in analyses:
                 for one in analysis.classes:
-                    squares[CLASSES.index(one.low)].append(one.relative[k] ** 2)
+                    squares[CLASSES.index(one.from_m)].append(one.relative[k] ** 2)
             found[f"{scene} {axis}"] = [float(np.sqrt(np.mean(part))) for part in squares]
     return found
 

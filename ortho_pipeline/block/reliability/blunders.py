@@ -21,7 +21,7 @@ from ortho_pipeline.block.equations.problem import BlockProblem, Selection, Stat
 from ortho_pipeline.block.equations.solver import NEAR, Solved, attempt, once, solve_inside
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.reliability.standardised_residuals import SCALE_FLOOR, StandardisedResiduals, standardise
-from ortho_pipeline.block.reliability.suspects import Rejected, Trusted, judge
+from ortho_pipeline.block.reliability.suspects import GrossError, Trusted, judge
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.block.variances.grid import estimate, reweighed
 from ortho_pipeline.errors import DegeneratePoints
@@ -47,7 +47,7 @@ class Found:
 
     kept: Selection
     state: State
-    rejected: tuple[Rejected, ...] = ()
+    rejected: tuple[GrossError, ...] = ()
     undecided: tuple[str, ...] = ()
 
 
@@ -79,7 +79,7 @@ def find_blunders(solved: Solved, selection: Selection) -> Found:
         # Weights of few points fall at random, and may leave too few: then only what all others contradict is doubted.
         suspects = significant
         trusted = _trusted(problem, (state,), selection, suspects)
-    kept, rejected = selection, dict[int, Rejected]()
+    kept, rejected = selection, dict[int, GrossError]()
     for _ in range(_TEST_ROUNDS):
         if trusted is None:
             doubted = np.flatnonzero(suspects).tolist()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from ortho_pipeline.block.reliability.standardised_residuals import standardise_
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.estimation.blunders import FAR_ABOVE, are_alike, contradicting
+from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.models.base import Array
 
 #: Chance that of a good block any point is named.
@@ -29,24 +30,13 @@ _RISK = 0.01
 _NAMED = 10
 
 
-@dataclass(frozen=True)
-class Outlying:
-    """A known point that the block contradicts.
+class ContradictedPoint(Record):
+    """A known point that the block contradicts, and that was left as it is."""
 
-    Parameters
-    ----------
-    point, role : str
-        Its id; check or control.
-    what : {'plan', 'height', 'ground'}
-    metres : float
-        How far it is off.
-    sigmas : float
-        The same over its standard deviation (root of the mean square of the axes).
-    """
-
+    # How far it is off, and the same over its standard deviation (root of the mean square of the axes).
     point: str
-    role: str
-    what: str
+    role: Literal["control", "check"]
+    what: Literal["plan", "height", "ground"]
     metres: float
     sigmas: float
 
@@ -68,7 +58,7 @@ class Outlying:
 
 def outlying(
     solved: Solved, variances: Variances, residuals: Array, covariance: Array, used: Mask
-) -> tuple[Outlying, ...]:
+) -> tuple[ContradictedPoint, ...]:
     """Return the check points, and the control points that were used, which the block contradicts.
 
     Parameters
@@ -105,13 +95,21 @@ def outlying(
         chance = float(fdtrc(ranks[k], of, square))
         found.append((int(k), "ground", float(np.linalg.norm(apart)), math.sqrt(square), chance))
     return tuple(
-        Outlying(points.ids[k], str(points.roles[k]), what, metres, sigmas)
+        ContradictedPoint.model_validate(
+            {
+                "point": points.ids[k],
+                "role": str(points.roles[k]),
+                "what": what,
+                "metres": metres,
+                "sigmas": sigmas,
+            }
+        )
         for k, what, metres, sigmas, chance in found
         if chance < _RISK / len(found)
     )
 
 
-def notices(doubts: Sequence[Outlying], points: BlockPoints, residuals: Array) -> list[Notice]:
+def notices(doubts: Sequence[ContradictedPoint], points: BlockPoints, residuals: Array) -> list[Notice]:
     """Return a notice for each contradicting point; one for all check points where their RMSE tells no accuracy.
 
     That is where it is more than twice that of the others in plan or in height, or no more of them agree than

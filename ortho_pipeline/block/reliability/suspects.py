@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from ortho_pipeline.block.intersection import PARALLEL
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.estimation.blunders import BLUNDER_RISK
+from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.models.base import Array
 
 #: The chance at which a good part is rejected, for ground whose sigma is estimated: few points never reach a smaller
@@ -29,24 +31,11 @@ _EPSILON = float(np.finfo(float).eps)
 _GROUND = -1
 
 
-@dataclass(frozen=True)
-class Rejected:
-    """A part of a block that was left out of its adjustment as a gross error.
-
-    Parameters
-    ----------
-    point : str
-        Its id.
-    what : {'ray', 'ground', 'point'}
-        One measurement, the known ground of a control point, or the point as a whole.
-    image : str or None
-        Of a ray.
-    reason : str
-        For people.
-    """
+class GrossError(Record):
+    """A measurement, the ground of a control point, or a whole point that was left out."""
 
     point: str
-    what: str
+    what: Literal["ray", "ground", "point"]
     image: str | None
     reason: str
 
@@ -59,13 +48,13 @@ class Trusted:
     variances: Variances
 
 
-def judge(trusted: Trusted, selection: Selection, suspects: Mask) -> tuple[Selection, dict[int, Rejected]]:
+def judge(trusted: Trusted, selection: Selection, suspects: Mask) -> tuple[Selection, dict[int, GrossError]]:
     """Take the parts of suspects that contradict the trusted solution out of a selection, and name these by point."""
     problem, solved = trusted.solved.problem, trusted.solved
     of_suspects = suspects[problem.points.point]
     alone = Selection.of(selection.rays & of_suspects, selection.ground & suspects)
     rays, ground = selection.rays.copy(), selection.ground.copy()
-    rejected: dict[int, Rejected] = {}
+    rejected: dict[int, GrossError] = {}
     linear = Linear.at(problem, solved.state, alone)
     limits = _Limits.of(trusted, selection)
     estimated = trusted.variances.of_ground(problem)
@@ -219,7 +208,7 @@ class _Suspects:
             return np.asarray(np.linalg.norm(np.where(known, apart * np.where(known, sigmas, 0.0), 0.0), axis=1))
         return np.asarray(np.linalg.norm(points.in_pixels(apart, chunk.rays[of, culprit]), axis=1))
 
-    def rejected(self, k: int, culprit: int | None, size: float) -> Rejected:
+    def rejected(self, k: int, culprit: int | None, size: float) -> GrossError:
         """Return what is said of a point when a part of it, or an unknown one, is so far off."""
         points, chunk = self.problem.points, self.chunk
         name = points.ids[chunk.points[k]]
@@ -227,11 +216,18 @@ class _Suspects:
             known = _GROUND in self.parts
             who = "its ground and its measurements contradict each other" if known else "its rays miss each other"
             reason = f"gross error, {who} by {size:.1f} px, and it cannot be decided which is wrong"
-            return Rejected(name, "point", None, reason)
+            return GrossError(point=name, what="point", image=None, reason=reason)
         if culprit == _GROUND:
-            return Rejected(name, "ground", None, f"gross error, {size:.1f} m from where its rays meet")
+            return GrossError(
+                point=name, what="ground", image=None, reason=f"gross error, {size:.1f} m from where its rays meet"
+            )
         image = points.images[points.image[chunk.rays[k, culprit]]]
-        return Rejected(name, "ray", image, f"gross error, {size:.1f} px from where the other rays and points put it")
+        return GrossError(
+            point=name,
+            what="ray",
+            image=image,
+            reason=f"gross error, {size:.1f} px from where the other rays and points put it",
+        )
 
     def _apart(self, of: Index, without: int | None) -> Array:
         """Return the misfits ``(n, m)`` of all rows of some points at the places that all parts but one give."""

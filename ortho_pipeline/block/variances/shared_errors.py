@@ -19,7 +19,7 @@ from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.points import Index
-from ortho_pipeline.estimation.spatial.shared_errors import MATCHED_ALIKE, Neighbours, SharedErrors
+from ortho_pipeline.estimation.spatial.shared_errors import MATCHED_ALIKE, NOT_KNOWN, Neighbours, SharedErrors
 from ortho_pipeline.models.base import Array
 
 #: Of blocks with more parameters it is not estimated: each measurement has an influence on all of them.
@@ -109,7 +109,7 @@ def _estimated(solved: Solved, rays: Index, design: Array, variance: float) -> t
     if scene is None:
         # All that is known is who shares: a group is one point.
         own = (count / groups - 1.0) * variance * flat.T @ flat
-        return SharedErrors(count, groups, float(groups)), own + moved @ moved.T
+        return SharedErrors(points=count, groups=groups, effective_points=groups, **NOT_KNOWN), own + moved @ moved.T
     middle, likely = scene.middle(variance)
     normal = variance * left.T @ left
     grown = normal + _positive(middle[size:, size:], left)
@@ -117,7 +117,7 @@ def _estimated(solved: Solved, rays: Index, design: Array, variance: float) -> t
     inverse = np.linalg.inv(left.T @ left)
     ratio = np.trace(inverse @ normal @ inverse) / np.trace(inverse @ grown @ inverse)
     own = _positive(middle[:size, :size], flat)
-    return SharedErrors(count, groups, count * float(ratio), *likely), own + moved @ moved.T
+    return SharedErrors(points=count, groups=groups, effective_points=count * ratio, **likely), own + moved @ moved.T
 
 
 def _positive(excess: Array, design: Array) -> Array:

@@ -22,22 +22,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import pydantic
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres, metre_partials, with_reference_height
 from ortho_pipeline.estimation.statistics import student_of
+from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
-
-Pair = tuple[float, float]
 
 #: Chance of calling residuals systematic that are not.
 SIGNIFICANCE = 0.05
@@ -53,65 +52,47 @@ MOST_POINTS = 1000
 _PAIRS_PER_CLASS, _MOST_CLASSES = 30, 12
 
 
-@dataclass(frozen=True)
-class DistanceClass:
-    """Pairs of points between two distances: their mean distance, and correlation and relative accuracy per axis."""
+Verdict = Literal["systematic", "none found", "too few points"]
 
-    low: float
-    high: float
-    distance: float
-    pairs: int
+
+class DistanceClass(Record):
+    """Pairs of points whose distance is in a range, metres."""
+
+    from_m: float
+    to_m: float
+    distance_m: float
+    pairs: Annotated[int, pydantic.Field(ge=1)]
     correlation: Pair
     relative: Pair
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the class as JSON values."""
-        return {
-            "from_m": self.low,
-            "to_m": self.high,
-            "distance_m": self.distance,
-            "pairs": self.pairs,
-            "correlation": list(self.correlation),
-            "relative": list(self.relative),
-        }
 
-
-@dataclass(frozen=True)
-class CovarianceFunction:
-    """Standard deviations of noise and of what neighbours share, and the distance (m) at which 1/e of that is left."""
+class CovarianceFunction(Record):
+    """Standard deviations of noise and of what neighbours share, and the distance at which 1/e of that is left."""
 
     noise: float
     systematic: float
-    range: float
+    range_m: float
 
     def covariance(self, distance: ArrayLike) -> Array:
         """Return the covariance of residuals at distances, noise not included."""
-        return np.asarray(self.systematic**2 * np.exp(-np.asarray(distance, dtype=np.float64) / self.range))
+        return np.asarray(self.systematic**2 * np.exp(-np.asarray(distance, dtype=np.float64) / self.range_m))
 
     def relative(self, distance: ArrayLike) -> Array:
         """Return the relative standard deviation at distances."""
         return np.sqrt(self.noise**2 + self.systematic**2 - self.covariance(distance))
 
-    def to_json(self) -> dict[str, float]:
-        """Return the function as JSON values."""
-        return {"noise": self.noise, "systematic": self.systematic, "range_m": self.range}
 
+class Covariance(Record):
+    """Covariance analysis of residuals on the ground, per axis (x, y); docs/accuracy.md says what each number is."""
 
-@dataclass(frozen=True)
-class CovarianceAnalysis:
-    """How alike residuals of one kind of points (control or check, never both) are.
-
-    Pairs of numbers are per axis, in the unit of the residuals. `relative` and `correlation` are those of pairs closer
-    than `near` (m), None where there is none; `functions` are None for an axis without a covariance that falls with
-    distance. `moran`, its `p` per axis and `p_joint` of the larger one are of each point with its nearest neighbours;
-    `critical` is what chance exceeds one time in twenty. They are None for too few points.
-    """
-
+    # Pairs of numbers are per axis, in the unit of the residuals. Relative and correlation are those of pairs closer
+    # than near_m, None where there is none; functions are None for an axis without a covariance that falls with
+    # distance. Moran's I, its p per axis and that of the larger one are of each point with its nearest neighbours;
+    # critical is what chance exceeds one time in twenty. They are None for too few points.
     unit: str
-    n: int
-    given: int
-    near: float | None
-    pairs_near: int
+    n: Count
+    near_m: float | None
+    pairs_near: Count
     mean: Pair
     mean_p: Pair | None
     absolute: Pair
@@ -123,40 +104,8 @@ class CovarianceAnalysis:
     p: Pair | None
     p_joint: float | None
     critical: float | None
-
-    @property
-    def verdict(self) -> str:
-        """``systematic``, ``none found`` or ``too few points``."""
-        if self.p_joint is None:
-            return "too few points"
-        return "systematic" if self.p_joint < SIGNIFICANCE else "none found"
-
-    @property
-    def statement(self) -> str:
-        """The verdict in words, with what it rests on."""
-        return " ".join(_sentences(self))
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the section of the report (docs/report.schema.json)."""
-        return {
-            "unit": self.unit,
-            "n": self.n,
-            "near_m": self.near,
-            "pairs_near": self.pairs_near,
-            "mean": list(self.mean),
-            "mean_p": self.mean_p and list(self.mean_p),
-            "absolute": list(self.absolute),
-            "relative": self.relative and list(self.relative),
-            "correlation": self.correlation and list(self.correlation),
-            "classes": [one.to_json() for one in self.classes],
-            "functions": [one and one.to_json() for one in self.functions],
-            "moran": self.moran and list(self.moran),
-            "p": self.p and list(self.p),
-            "p_joint": self.p_joint,
-            "critical": self.critical,
-            "verdict": self.verdict,
-            "statement": self.statement,
-        }
+    verdict: Verdict
+    statement: str
 
 
 def analyse(
@@ -168,7 +117,7 @@ def analyse(
     design: ArrayLike | None = None,
     draws: int = 999,
     unit: str = "m",
-) -> CovarianceAnalysis:
+) -> Covariance:
     """Analyse the residuals ``(N, 2)`` of points at ``xy (N, 2)`` metres; rows with NaN are left out.
 
     Parameters
@@ -187,22 +136,26 @@ def analyse(
     InputError
         If the arrays do not belong together, or a distance is not positive.
     """
-    where, values, partials, given = _usable(xy, residuals, design)
-    absolute, mean = (np.sqrt((values**2).mean(axis=0)), values.mean(axis=0)) if given else (np.zeros(2), np.zeros(2))
+    where, values, partials = _usable(xy, residuals, design)
+    mean, absolute = np.zeros(2), np.zeros(2)
+    if len(values):
+        mean, absolute = values.mean(axis=0), np.sqrt((values**2).mean(axis=0))
     i, j = np.triu_indices(len(values), 1)
     distance = np.hypot(*(where[i] - where[j]).T)
     near = _default_near(distance, len(values)) if near is None else _positive(near)
     edges = _edges(distance, near) if classes is None else _checked_edges(classes)
     products, halves = _pair_values(values, i, j)
-    variance = ((values - mean) ** 2).mean(axis=0) if given else np.ones(2)
+    variance = ((values - mean) ** 2).mean(axis=0) if len(values) else np.ones(2)
     close = distance <= near if near is not None else np.zeros(len(distance), dtype=bool)
     some = bool(close.any())
     tested = _test(where, values, partials, draws)
-    return CovarianceAnalysis(
+    verdict: Verdict = "too few points"
+    if tested is not None:
+        verdict = "systematic" if tested[2] < SIGNIFICANCE else "none found"
+    found = Covariance(
         unit=unit,
         n=len(values),
-        given=given,
-        near=near,
+        near_m=near,
         pairs_near=int(close.sum()),
         mean=_pair(mean),
         mean_p=_mean_p(values),
@@ -215,10 +168,13 @@ def analyse(
         p=tested and tested[1],
         p_joint=tested and tested[2],
         critical=tested and tested[3],
+        verdict=verdict,
+        statement="",
     )
+    return found.replaced(statement=" ".join(_sentences(found)))
 
 
-def analyse_fit(fit: Fit, *, near: float | None = None) -> dict[str, CovarianceAnalysis | None]:
+def analyse_fit(fit: Fit, *, near: float | None = None) -> dict[str, Covariance | None]:
     """Analyse the residuals of a fit on the ground (m, true east and north), control and check apart.
 
     Returns
@@ -261,7 +217,7 @@ def _design(fit: Fit) -> Array:
     return solved
 
 
-def _usable(xy: ArrayLike, residuals: ArrayLike, design: ArrayLike | None) -> tuple[Array, Array, Array, int]:
+def _usable(xy: ArrayLike, residuals: ArrayLike, design: ArrayLike | None) -> tuple[Array, Array, Array]:
     """Return positions, residuals and design of the points that have all, at most `MOST_POINTS`, and how many had."""
     where, values = np.asarray(xy, dtype=np.float64), np.asarray(residuals, dtype=np.float64)
     if where.ndim != 2 or where.shape[1:] != (2,) or where.shape != values.shape:
@@ -275,7 +231,7 @@ def _usable(xy: ArrayLike, residuals: ArrayLike, design: ArrayLike | None) -> tu
     given = len(rows)
     if given > MOST_POINTS:
         rows = np.sort(np.random.default_rng(0).choice(rows, MOST_POINTS, replace=False))
-    return where[rows], values[rows], partials[rows], given
+    return where[rows], values[rows], partials[rows]
 
 
 def _positive(near: float) -> float:
@@ -332,8 +288,9 @@ def _classes(
         if within.any():
             found.append(
                 DistanceClass(
-                    low, high, float(distance[within].mean()), int(within.sum()),
-                    _pair(_ratio(products[within].mean(axis=0), variance)), _pair(np.sqrt(halves[within].mean(axis=0))),
+                    from_m=low, to_m=high, distance_m=float(distance[within].mean()), pairs=int(within.sum()),
+                    correlation=_pair(_ratio(products[within].mean(axis=0), variance)),
+                    relative=_pair(np.sqrt(halves[within].mean(axis=0))),
                 )
             )  # fmt: skip
     return tuple(found)
@@ -381,7 +338,9 @@ def _function(distance: Array, halves: Array) -> CovarianceFunction | None:
         model = best[0] + best[1] * -np.expm1(-at / best[2])
         weight = pairs / np.maximum(model, 1e-9 * seen.max()) ** 2
     noise, shared, length = best or (0.0, 0.0, 0.0)
-    return CovarianceFunction(math.sqrt(noise), math.sqrt(shared), length) if shared > 0 else None
+    if shared <= 0:
+        return None
+    return CovarianceFunction(noise=math.sqrt(noise), systematic=math.sqrt(shared), range_m=length)
 
 
 def _best_range(at: Array, seen: Array, weight: Array, reach: float) -> tuple[float, float, float]:
@@ -469,7 +428,7 @@ def _moran(values: Array, first: NDArray[Any], second: NDArray[Any]) -> Array:
 # -- words -----------------------------------------------------------------------------------------------------------
 
 
-def _sentences(found: CovarianceAnalysis) -> list[str]:
+def _sentences(found: Covariance) -> list[str]:
     if found.moran is None or found.critical is None:
         return [
             f"{counted(found.n, 'point')}: too few to tell a systematic error from chance (it takes "
@@ -484,7 +443,7 @@ def _sentences(found: CovarianceAnalysis) -> list[str]:
     if found.relative is not None:
         numbers = "{:.2f} and {:.2f}".format(*found.relative), "{:.2f} and {:.2f}".format(*found.absolute)
         said.append(
-            f"Points closer than {found.near:g} m are accurate to each other to {numbers[0]} {found.unit} "
+            f"Points closer than {found.near_m:g} m are accurate to each other to {numbers[0]} {found.unit} "
             f"({counted(found.pairs_near, 'pair')}), all to {numbers[1]} {found.unit}."
         )
     if found.mean_p and min(found.mean_p) < SIGNIFICANCE / 2:

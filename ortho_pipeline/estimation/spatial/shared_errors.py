@@ -27,13 +27,14 @@ Stein 1999, section 2.10 (Matern); Handcock and Stein 1993 (mean over what is li
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ortho_pipeline.estimation.problem import Solution
 from ortho_pipeline.estimation.spatial.common_error import CommonError
+from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.models.base import Array
 
 #: Fewer points with groups, or degrees of freedom, say nothing of a function: each group then counts as one point.
@@ -59,25 +60,22 @@ _CELLS = 144
 MATCHED_ALIKE = 0.002
 
 
-@dataclass(frozen=True)
-class SharedErrors:
-    """Errors that neighbours share, along two axes of whitened errors (the first has the larger shared part).
+#: Of what neighbours share, where they are too few to tell.
+NOT_KNOWN: dict[str, Any] = {"noise": None, "shared": None, "range_px": None}
 
-    `noise` and `shared` are standard deviations in units of the stated ones, `range_px` the distance at which 1/e of
-    the covariance is left, all as means over what is likely; None where `points`, those with a group, are too few.
-    `effective_points` is the number of independent points that would determine a shift as well as all of the fit.
-    """
 
-    points: int
-    groups: int
+class SharedErrors(Record):
+    """Errors that neighbouring points share, in units of stated sigmas; docs/accuracy.md says what each number is."""
+
+    # Of two axes, the first with the larger shared part: means over what is likely, None where the points are too few.
+    # The range is the distance at which 1/e of the covariance is left. As many independent points as are effective
+    # would determine a shift as well as all of the fit.
+    points: Count
+    groups: Count
     effective_points: float
-    noise: tuple[float, float] | None = None
-    shared: tuple[float, float] | None = None
-    range_px: tuple[float, float] | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the section ``shared_errors`` of the statistics of a fit."""
-        return asdict(self)
+    noise: Pair | None
+    shared: Pair | None
+    range_px: Pair | None
 
 
 def shared_errors(
@@ -113,7 +111,8 @@ def shared_errors(
     if scene is None:
         # All that is known is who shares: a group is one point.
         effective = float(len(solution.groups) - len(rows) + groups)
-        return SharedErrors(len(rows), groups, effective), usual * max(len(rows) / groups, 1.0) + alike @ alike.T
+        found = SharedErrors(points=len(rows), groups=groups, effective_points=effective, **NOT_KNOWN)
+        return found, usual * max(len(rows) / groups, 1.0) + alike @ alike.T
     middle, likely = scene.middle(variance)
     count = design.shape[2]
     covariance = usual + positive_part(middle[count : 2 * count, count : 2 * count], usual)
@@ -123,7 +122,9 @@ def shared_errors(
     total = variance * inverse
     grown = total + positive_part(inverse @ middle[2 * count :, 2 * count :] @ inverse, total)
     effective = len(solution.groups) * float(np.trace(total) / np.trace(grown))
-    return SharedErrors(len(rows), groups, effective, *likely), covariance + alike @ alike.T
+    return SharedErrors(
+        points=len(rows), groups=groups, effective_points=effective, **likely
+    ), covariance + alike @ alike.T
 
 
 def positive_part(matrix: Array, unit: Array) -> Array:
@@ -215,9 +216,7 @@ class Neighbours:
             excess += self.weight * own * rows.T @ rows + self.weight**2 * rows.T @ between @ rows
         share = shared / np.maximum(shared.sum(axis=0), 1e-300)
         mean = np.exp(share.T @ np.log(np.tile(self.ranges, len(_FAMILIES))))
-        return excess, tuple(
-            (float(pair[0]), float(pair[1])) for pair in (np.sqrt(noise), np.sqrt(shared.sum(axis=0)), mean)
-        )
+        return excess, {"noise": np.sqrt(noise), "shared": np.sqrt(shared.sum(axis=0)), "range_px": mean}
 
 
 def _basis(columns: Array) -> Array:

@@ -22,6 +22,10 @@ def _as_it_is(text: object) -> str:
 Words = Annotated[str, pydantic.PlainValidator(_as_it_is), pydantic.WithJsonSchema({"type": "string"})]
 
 
+Count = Annotated[int, pydantic.Field(ge=0)]
+Pair = tuple[float, float]
+
+
 class DocumentError(ValueError):
     """A document that is not the one of a record: `place` is the first member that is wrong, `fault` how."""
 

@@ -17,7 +17,7 @@ from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.control_hull import COVERED, empty_parts
 from ortho_pipeline.report.block_records import Angles, ImagePairRecord, NetworkRecord
-from ortho_pipeline.report.map_scale import MapScale, judge
+from ortho_pipeline.report.map_scale import MapScaleRecord, judge
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.start import Start
@@ -80,7 +80,7 @@ def placed(fit: BlockFit, starts: Mapping[str, Start]) -> dict[str, dict[str, An
     return found
 
 
-def suffices_for(fit: BlockFit) -> MapScale | None:
+def suffices_for(fit: BlockFit) -> MapScaleRecord | None:
     """Return the map scales that the check points of a block suffice for in plan; None without any."""
     check = fit.points.check & np.isfinite(fit.object_residuals).all(axis=1)
     if not check.any():
