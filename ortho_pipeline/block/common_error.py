@@ -20,7 +20,6 @@ one image.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -31,17 +30,16 @@ from ortho_pipeline.block.equations.solver import Solved, attempt, solve
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
+from ortho_pipeline.estimation.spatial.common_unknown import CommonUnknown
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array, solve_2x2
 
-#: The estimate stands when it moves by less than this (standard deviations); the models are nearly linear in it.
-_STANDS, _ROUNDS = 1e-3, 5
-#: Other points that put the reference farther off than so many of its sigmas contradict it: they do not correct it.
-_BELIEVED = 4.0
+#: The estimate stands when it moves by less than this (standard deviations).
+_STANDS = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class CommonError:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CommonError(CommonUnknown):
     """What known ground has in common, and what a block tells of it.
 
     Parameters
@@ -50,12 +48,6 @@ class CommonError:
         Its standard deviation at each point, m per axis; 0 for those that do not share it.
     known : ndarray (N, 3)
         Lon, lat, h of the ground as it was stated.
-    points : int
-        Points whose ground was used that share it.
-    value : ndarray (2,)
-        Its estimate, east and north, in standard deviations: how far that ground lies from the truth.
-    told : ndarray (2, 2)
-        Information of the block on it; that of its own standard deviation is I.
     by_params, by_points : ndarray (P, 2), (N, 3, 2)
         How one standard deviation of it moves parameters, and points in their east, north, up.
     seen : ndarray (M, 2, 2)
@@ -64,9 +56,6 @@ class CommonError:
 
     sigmas: Array
     known: Array
-    points: int
-    value: Array
-    told: Array
     by_params: Array
     by_points: Array
     seen: Array
@@ -80,8 +69,11 @@ class CommonError:
         if not shared or not problem.size:
             return None
         rays = problem.points.rays
-        nothing = np.zeros((problem.size, 2)), np.zeros((len(sigmas), 3, 2)), np.zeros((rays, 2, 2))
-        found = cls(sigmas, problem.known, shared, np.zeros(2), np.zeros((2, 2)), *nothing)
+        found = cls(
+            sigma=float(sigmas.max()), points=shared, value=np.zeros(2), told=np.zeros((2, 2)), sigmas=sigmas,
+            known=problem.known, by_params=np.zeros((problem.size, 2)), by_points=np.zeros((len(sigmas), 3, 2)),
+            seen=np.zeros((rays, 2, 2)),
+        )  # fmt: skip
         return found._seen_by(problem, state, selection) if (used & (sigmas == 0)).any() else found
 
     def corrected(self, known: Array) -> Array:
@@ -100,19 +92,18 @@ class CommonError:
         """Return the solution with it as an unknown, from one with its present value."""
         problem = solved.problem
         shared = selection.ground & problem.active(selection) & (self.sigmas > 0)
-        found = replace(self, points=int(shared.sum()))
-        for _ in range(_ROUNDS):
+
+        def seen(found: CommonError, solved: Solved) -> tuple[CommonError, Array]:
             found, left = found._moving(solved)
             # Without anything else only rounding, and the bending of the models, would tell of it.
-            told = left.T @ left if found._is_told(solved, selection) else np.zeros((2, 2))
-            found = replace(found, told=told)
-            slope = left.T @ solved.linear.misfits.vector if told.any() else np.zeros(2)
-            step = np.linalg.solve(np.eye(2) + told, slope - found.value)
-            if np.abs(step).max() < _STANDS:
-                break
-            found = replace(found, value=found.value + step)
-            solved = solve(found.applied(problem), solved.state, selection)
-        return solved, found
+            if not found._is_told(solved, selection):
+                return replace(found, told=np.zeros((2, 2))), np.zeros(2)
+            return replace(found, told=left.T @ left), left.T @ solved.linear.misfits.vector
+
+        def again(found: CommonError, solved: Solved) -> Solved:
+            return solve(found.applied(problem), solved.state, selection)
+
+        return replace(self, points=int(shared.sum())).settled_with(solved, seen, again, _STANDS)
 
     def _is_told(self, solved: Solved, selection: Selection) -> bool:
         """Tell whether control without it, or knowledge of parameters, takes part."""
@@ -147,10 +138,7 @@ class CommonError:
         return found
 
     def _seen_by(self, problem: BlockProblem, state: State, selection: Selection) -> CommonError:
-        """Return it as known ground without it sees it, by the median of its rays, from a block without that ground.
-
-        For a start that gross errors do not spoil. If they put it beyond what its sigma allows, it stays 0.
-        """
+        """Return it as known ground without it sees it, ray by ray, from a block without that ground."""
         alone = replace(selection, ground=selection.ground & (self.sigmas > 0))
         try:
             solved = attempt(problem, state, alone)
@@ -160,11 +148,10 @@ class CommonError:
             return self
         moved, _ = self._moving(solved)
         others = selection.ground & (self.sigmas == 0) & np.isfinite(problem.known).all(axis=1)
-        value = moved._median(solved, others, selection.rays)
-        return replace(self, value=value) if (np.abs(value) < _BELIEVED).all() else self
+        return self.started(moved._each(solved, others, selection.rays))
 
-    def _median(self, solved: Solved, others: Mask, rays: Mask) -> Array:
-        """Return the median of what rays ``(M,)`` of known ground ``(N,)`` say of it by themselves."""
+    def _each(self, solved: Solved, others: Mask, rays: Mask) -> Array:
+        """Return what rays ``(M,)`` of known ground ``(N,)`` say of it by themselves ``(n, 2)``."""
         problem, points = solved.problem, solved.problem.points
         places = problem.frame.places(problem.target)
         each = [np.zeros((0, 2))]
@@ -176,26 +163,11 @@ class CommonError:
             miss = points.measured[used] - places.project(model, rows)
             partials = model.param_partials(places.in_crs(model.crs)[rows])
             each.append(solve_2x2(partials @ self.by_params[problem.columns.of_image(image)], miss))
-        found = np.concatenate(each)
-        found = found[np.isfinite(found).all(axis=1)]
-        return np.median(found, axis=0) if len(found) else np.zeros(2)
+        return np.concatenate(each)
 
     # -- what it leaves ------------------------------------------------------------------------------------------------
-
-    @property
-    def left(self) -> Array:
-        """Covariance ``(2, 2)`` of its estimate, in standard deviations."""
-        return np.asarray(np.linalg.inv(np.eye(2) + self.told))
 
     @property
     def of_points(self) -> Array:
         """Its part ``(N, 3, 3)`` of the covariance of the ground, m²."""
         return np.asarray(self.by_points @ self.left @ self.by_points.swapaxes(1, 2))
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the section ``common_error`` of the block's document: sigmas and estimate per axis in metres."""
-        sigma = float(self.sigmas.max())
-        return {
-            "points": self.points, "sigma_m": sigma, "estimate_m": (self.value * sigma).tolist(),
-            "estimate_sigma_m": (np.sqrt(np.diag(self.left)) * sigma).tolist(),
-        }  # fmt: skip

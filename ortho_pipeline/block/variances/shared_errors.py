@@ -19,13 +19,17 @@ from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.points import Index
-from ortho_pipeline.estimation.spatial.shared_errors import MATCHED_ALIKE, NOT_KNOWN, Neighbours, SharedErrors
+from ortho_pipeline.estimation.spatial.shared_errors import (
+    MATCHED_ALIKE,
+    NOT_KNOWN,
+    Neighbours,
+    SharedErrors,
+    positive_part,
+)
 from ortho_pipeline.models.base import Array
 
 #: Of blocks with more parameters it is not estimated: each measurement has an influence on all of them.
 MOST_PARAMETERS = 1000
-#: Combinations of parameters whose effect is less than this part of the largest are none.
-_NO_EFFECT = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,22 +116,12 @@ def _estimated(solved: Solved, rays: Index, design: Array, variance: float) -> t
         return SharedErrors(points=count, groups=groups, effective_points=groups, **NOT_KNOWN), own + moved @ moved.T
     middle, likely = scene.middle(variance)
     normal = variance * left.T @ left
-    grown = normal + _positive(middle[size:, size:], left)
+    grown = normal + positive_part(middle[size:, size:], left)
     # Of a shift alone: the covariance is N^-1 (N + excess) N^-1.
     inverse = np.linalg.inv(left.T @ left)
     ratio = np.trace(inverse @ normal @ inverse) / np.trace(inverse @ grown @ inverse)
-    own = _positive(middle[:size, :size], flat)
+    own = positive_part(middle[:size, :size], flat)
     return SharedErrors(points=count, groups=groups, effective_points=count * ratio, **likely), own + moved @ moved.T
-
-
-def _positive(excess: Array, design: Array) -> Array:
-    """Return F' D F without the negative part of D in the span of the design F ``(n, m)``."""
-    _, singular, turn = np.linalg.svd(design, full_matrices=False)
-    real = singular > _NO_EFFECT * singular[0]
-    back, forth = turn[real].T / singular[real], singular[real][:, None] * turn[real]
-    values, vectors = np.linalg.eigh(back.T @ excess @ back)
-    half = forth.T @ vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(half @ half.T)
 
 
 def _blocks(parts: list[Array]) -> Array:

@@ -20,52 +20,37 @@ Source: Koch 1999, section 3.2 (elimination of unknowns) and 3.6 (mixed model).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from ortho_pipeline.estimation.problem import Problem, Solution
+from ortho_pipeline.estimation.spatial.common_unknown import CommonUnknown
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.distortion import map_from_enu
 from ortho_pipeline.models.base import Array, SensorModel, solve_2x2
 from ortho_pipeline.points import Points
 
-#: The estimate stands when it moves by less than this (standard deviations); the model is nearly linear in it.
-_STANDS, _ROUNDS = 1e-4, 5
-#: Other points that put the reference farther off than so many of its sigmas contradict it: they do not correct it.
-_BELIEVED = 4.0
+#: The estimate stands when it moves by less than this (standard deviations).
+_STANDS = 1e-4
 #: Information that is less than this part of what it is the rest of.
 _ROUNDING = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class CommonError:
-    """What some points have in common, and what the others tell of it.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CommonError(CommonUnknown):
+    """What some points of an image have in common, and what the others tell of it.
 
     Parameters
     ----------
-    sigma : float
-        Its standard deviation per axis, m: the largest, where points state several.
-    points : int
-        Control points that share it.
     per_sigma : (P, 2)
         What the parameters follow it by, per standard deviation along each axis.
-    value : (2,)
-        Its estimate, in standard deviations: how far true east and north of the truth the ground of these points lies;
-        0 where nothing tells of it.
-    told : (2, 2)
-        Information of other points and of priors on it; that of its own standard deviation is I.
     gain : (P, 2)
         What it leaves in the parameters.
     shares : (n,) of bool
         Which points of the last solution share it.
     """
 
-    sigma: float
-    points: int
     per_sigma: Array
-    value: Array
-    told: Array
     gain: Array
     shares: np.ndarray
 
@@ -86,7 +71,10 @@ class CommonError:
         per_sigma = np.asarray(found / scale[:, None])
         largest = float(problem.points.sigma_common.max())
         everyone = np.ones(len(problem.rows), dtype=bool)
-        return cls(largest, len(everyone), per_sigma, np.zeros(2), np.zeros((2, 2)), per_sigma, everyone)
+        return cls(
+            sigma=largest, points=len(everyone), value=np.zeros(2), told=np.zeros((2, 2)), per_sigma=per_sigma,
+            gain=per_sigma, shares=everyone,
+        )  # fmt: skip
 
     def offset(self, model: SensorModel, points: Points) -> Array:
         """Return how far (px) it moves each of points ``(N, 2)``; 0 for those that do not share it."""
@@ -96,16 +84,9 @@ class CommonError:
         return found
 
     def seen_by(self, model: SensorModel, others: Points) -> CommonError:
-        """Return it as points without it see it, by their median, from a model that was adjusted to those with it.
-
-        For a start that gross errors do not spoil. If they put it beyond what its sigma allows, it stays 0.
-        """
+        """Return it as points without it see it, from a model that was adjusted to those with it."""
         miss = others.image - model.ground_to_image(others.ground)
-        moved = model.param_partials(others.ground) @ self.per_sigma
-        each = solve_2x2(moved, -miss)
-        each = each[np.isfinite(each).all(axis=1)]
-        value = np.median(each, axis=0) if len(each) else np.zeros(2)
-        return replace(self, value=value) if (np.abs(value) < _BELIEVED).all() else self
+        return self.started(solve_2x2(model.param_partials(others.ground) @ self.per_sigma, -miss))
 
     def settled(self, problem: Problem, keep: np.ndarray, solution: Solution) -> tuple[Solution, CommonError]:
         """Return the solution with it as an unknown.
@@ -119,21 +100,23 @@ class CommonError:
         solution : Solution
             With its present value.
         """
-        found = replace(self, shares=problem.points.sigma_common[keep] > 0)
-        for _ in range(_ROUNDS):
-            design = solution.errors.whitened(solution.jacobian)
-            moved = found.moved(solution)
-            cross = np.einsum("nip,nik->pk", design, moved)
-            gain = solution.cofactors @ cross
-            told = _difference(np.einsum("nik,nil->kl", moved, moved), cross.T @ gain)
-            slope = np.einsum("nik,ni->k", moved, solution.errors.whitened(solution.residuals)) - found.value
-            step = np.linalg.solve(np.eye(2) + told, slope)
-            found = replace(found, told=told, gain=gain @ np.linalg.inv(np.eye(2) + told))
-            if np.abs(step).max() < _STANDS:
-                break
-            found = replace(found, value=found.value + step)
-            solution = problem.shifted(-found.offset(problem.model, problem.points)).solve(keep)
-        return solution, found
+
+        def again(found: CommonError, _: Solution) -> Solution:
+            return problem.shifted(-found.offset(problem.model, problem.points)).solve(keep)
+
+        shared = replace(self, shares=problem.points.sigma_common[keep] > 0)
+        return shared.settled_with(solution, CommonError._seen, again, _STANDS)
+
+    def _seen(self, solution: Solution) -> tuple[CommonError, Array]:
+        """Return it with what a solution tells of it, and the slope of half the sum of squares ``(2,)``."""
+        design = solution.errors.whitened(solution.jacobian)
+        moved = self.moved(solution)
+        cross = np.einsum("nip,nik->pk", design, moved)
+        gain = solution.cofactors @ cross
+        told = _difference(np.einsum("nik,nil->kl", moved, moved), cross.T @ gain)
+        slope = np.einsum("nik,ni->k", moved, solution.errors.whitened(solution.residuals))
+        found = replace(self, told=told)
+        return replace(found, gain=gain @ found.left), slope
 
     def moved(self, solution: Solution) -> Array:
         """Return by how much one sigma of it moves the points of a solution ``(n, 2, 2)``, whitened."""
@@ -155,14 +138,6 @@ class CommonError:
     def covariance(self) -> Array:
         """Its part ``(P, P)`` of the covariance of the parameters."""
         return self.gain @ self.gain.T
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the section ``common_error`` of the statistics of a fit: sigmas and estimate per axis in metres."""
-        left = np.sqrt(np.diag(np.linalg.inv(np.eye(2) + self.told)))
-        return {
-            "points": self.points, "sigma_m": self.sigma, "estimate_m": (self.value * self.sigma).tolist(),
-            "estimate_sigma_m": (left * self.sigma).tolist(),
-        }  # fmt: skip
 
 
 def _difference(whole: Array, part: Array) -> Array:

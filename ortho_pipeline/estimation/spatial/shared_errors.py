@@ -53,6 +53,8 @@ _FAMILIES: tuple[Callable[[Array], Array], ...] = (
 )
 #: Ranges and ratios of variances, shared over noise, that are tried; with the largest, noise is 1 % of what is shared.
 _RANGES, _RATIOS, _LARGEST = 16, 20, 1e4
+#: Combinations of parameters whose effect is less than this part of the largest are none.
+_NO_EFFECT = 1e-9
 #: Cells whose means are looked at.
 _CELLS = 144
 #: What all matches of an image err alike (px per axis), however many they are. Pixels of scene and reference meet at
@@ -115,27 +117,32 @@ def shared_errors(
         return found, usual * max(len(rows) / groups, 1.0) + alike @ alike.T
     middle, likely = scene.middle(variance)
     count = design.shape[2]
-    covariance = usual + positive_part(middle[count : 2 * count, count : 2 * count], usual)
+    covariance = usual + positive_part(middle[count : 2 * count, count : 2 * count], _root(usual))
     # The same for a shift alone, of all points: those on their own count as they are.
     normal = np.einsum("nij,nik->jk", shift, shift)
     inverse = np.linalg.inv(normal)
     total = variance * inverse
-    grown = total + positive_part(inverse @ middle[2 * count :, 2 * count :] @ inverse, total)
+    grown = total + positive_part(inverse @ middle[2 * count :, 2 * count :] @ inverse, _root(total))
     effective = len(solution.groups) * float(np.trace(total) / np.trace(grown))
     return SharedErrors(
         points=len(rows), groups=groups, effective_points=effective, **likely
     ), covariance + alike @ alike.T
 
 
-def positive_part(matrix: Array, unit: Array) -> Array:
-    """Return the positive part of a symmetric matrix, in units of a positive one."""
-    values, vectors = np.linalg.eigh(unit)
-    root = vectors * np.sqrt(np.maximum(values, 1e-300))
-    back = vectors / np.sqrt(np.maximum(values, 1e-300))
-    inner = back.T @ matrix @ back
-    values, vectors = np.linalg.eigh((inner + inner.T) / 2)
-    half = root @ vectors * np.sqrt(np.maximum(values, 0.0))
+def positive_part(excess: Array, design: Array) -> Array:
+    """Return the part of a symmetric matrix that is positive in units of F' F, in the span of a design F ``(n, m)``."""
+    _, singular, turn = np.linalg.svd(design, full_matrices=False)
+    real = singular > _NO_EFFECT * singular[0]
+    back, forth = turn[real].T / singular[real], singular[real][:, None] * turn[real]
+    values, vectors = np.linalg.eigh(back.T @ excess @ back)
+    half = forth.T @ vectors * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(half @ half.T)
+
+
+def _root(matrix: Array) -> Array:
+    """Return a root R of a matrix R' R."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,99 @@
+r"""An error that many observations have in common, as an unknown of an adjustment: of one image, and of a block.
+
+It is one vector :math:`c \sim N(0, I)` in plan, in units of its standard deviation. What the adjustment tells of it is
+information :math:`T` (``told``), and the slope :math:`g` of half the sum of squares: a step of it is
+
+.. math:: (I + T)\, dc = g - c
+
+Where nothing tells of it, :math:`T = 0`, it stays 0 with its whole standard deviation.
+
+Source: Koch 1999, section 3.2 (elimination of unknowns) and 3.6 (mixed model).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Self, TypeVar
+
+import numpy as np
+
+from ortho_pipeline.models.base import Array
+
+_S = TypeVar("_S")
+#: Its estimate is renewed so many times at most.
+_ROUNDS = 5
+#: Other points that put the reference farther off than so many of its sigmas contradict it: they do not correct it.
+_BELIEVED = 4.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CommonUnknown:
+    """What observations have in common, and what the others tell of it.
+
+    Parameters
+    ----------
+    sigma : float
+        Its standard deviation per axis, m: the largest, where points state several.
+    points : int
+        Control points that share it.
+    value : (2,)
+        Its estimate, in standard deviations: how far true east and north of the truth the ground of these points lies;
+        0 where nothing tells of it.
+    told : (2, 2)
+        Information of other points and of priors on it; that of its own standard deviation is I.
+    """
+
+    sigma: float
+    points: int
+    value: Array
+    told: Array
+
+    @property
+    def left(self) -> Array:
+        """Covariance ``(2, 2)`` of its estimate, in standard deviations."""
+        return np.asarray(np.linalg.inv(np.eye(2) + self.told))
+
+    def started(self, each: Array) -> Self:
+        """Return it as others see it one by one ``(n, 2)``, by their median: a start that gross errors do not spoil.
+
+        If they put it beyond what its sigma allows, it stays 0.
+        """
+        each = each[np.isfinite(each).all(axis=1)]
+        value = np.median(each, axis=0) if len(each) else np.zeros(2)
+        return replace(self, value=value) if (np.abs(value) < _BELIEVED).all() else self
+
+    def settled_with(
+        self,
+        solution: _S,
+        seen: Callable[[Self, _S], tuple[Self, Array]],
+        again: Callable[[Self, _S], _S],
+        stands: float,
+    ) -> tuple[_S, Self]:
+        """Return a solution with it as an unknown, and it.
+
+        Parameters
+        ----------
+        seen : callable (self, solution) -> (self, (2,))
+            It with what a solution tells of it, and the slope.
+        again : callable (self, solution) -> solution
+            With its new value.
+        stands : float
+            The estimate stands when it moves by less than this (standard deviations); models are nearly linear in it.
+        """
+        found = self
+        for _ in range(_ROUNDS):
+            found, slope = seen(found, solution)
+            step = np.linalg.solve(np.eye(2) + found.told, slope - found.value)
+            if np.abs(step).max() < stands:
+                break
+            found = replace(found, value=found.value + step)
+            solution = again(found, solution)
+        return solution, found
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the section ``common_error`` of documents: sigmas and estimate per axis in metres."""
+        return {
+            "points": self.points, "sigma_m": self.sigma, "estimate_m": (self.value * self.sigma).tolist(),
+            "estimate_sigma_m": (np.sqrt(np.diag(self.left)) * self.sigma).tolist(),
+        }  # fmt: skip
