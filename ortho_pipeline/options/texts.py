@@ -1,6 +1,6 @@
 """Texts that name options: in Python and in the pipeline file by field, on the command line by flag.
 
-What is said of an option is written as ``Text("give ", Setting("surface.dem", "FILE"), " too")``. Such a text is the
+Write a text that names an option as ``Text("give ", Setting("surface.dem", "FILE"), " too")``. Such a text is the
 string "give `surface.dem=FILE` too", and still knows its parts; a formatted string that contains it does not.
 """
 

@@ -106,7 +106,7 @@ def _kept_nodata(value: float | None, dtype: np.dtype[Any], source: RasterSource
     if value is not None and not holds(dtype, value):
         raise InputError(
             f"the image's nodata value {value:g} does not fit into {dtype}", file=source.path, field="output.dtype",
-            remedy=Text("say with ", Setting("output.nodata"), " what pixels without an image shall be"),
+            remedy=Text("set the value of pixels without an image with ", Setting("output.nodata")),
         )  # fmt: skip
     return value
 

@@ -128,7 +128,7 @@ class Footprint:
         if not isinstance(surface, DemSurface):
             return  # flat ground is everywhere
         file = surface.provenance.get("path")
-        wanted = Text("say what the rest shall be: ", Setting("surface.fill", "mask"), " (no pixels there)")
+        wanted = Text("choose how to fill the rest: ", Setting("surface.fill", "mask"), " (no pixels there)")
         if self.beyond and ((surface.fill == "error" and not self.complete) or not self.coverage):
             raise CoverageError(
                 self.beyond, file=file, field="surface.dem",

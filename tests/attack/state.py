@@ -69,7 +69,7 @@ def read_renames(path: Path) -> list[float]:
     return []
 
 
-# -- files of the network that are kept ------------------------------------------------------------------------------
+# -- cached downloads ------------------------------------------------------------------------------
 
 _ADDRESS = "https://example.org/cells/N37E033.tif"
 

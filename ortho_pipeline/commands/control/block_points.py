@@ -136,7 +136,7 @@ def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: S
         for name in ("gcps", "check", "ground_sigma"):
             if getattr(options, name) is not None:
                 raise InputError(
-                    Text(Setting(f"points.{name}"), " is said of points of a file, and there are none"),
+                    Text(Setting(f"points.{name}"), " chooses among points of a file, and there is no file"),
                     field=f"points.{name}",
                     remedy=Text("leave it out, or give ", Setting("points.points")),
                 )  # fmt: skip

@@ -337,9 +337,8 @@ def _default_search(search: Search) -> list[Notice]:
     if search.known:
         return []
     text = Text(
-        f"the scene does not say how accurate its model is: it was looked for within {metres(search.distance)} (",
+        f"no stated accuracy for this scene's model; searched within {metres(search.distance)}. Change it with ",
         Setting("match.search"),
-        ")",
     )
     return [Notice("search-by-default", text, search_m=search.distance)]
 

@@ -158,9 +158,7 @@ def tie_scenes(
     notices = [*_few(found, tuple(scenes))]
     if stated is None:
         text = Text(
-            f"nobody says how accurate the heights are: taken to be within {metres(sigma)} (",
-            Setting("surface.sigma"),
-            ")",
+            f"accuracy of the heights not given; assuming {metres(sigma)}. Set it with ", Setting("surface.sigma")
         )
         notices.append(Notice("dem-sigma-by-default", text, dem_sigma_m=sigma))
     return Tied(_points(found, tuple(scenes)), found, search, sigma, tuple(notices))

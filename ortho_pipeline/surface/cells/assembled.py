@@ -147,7 +147,7 @@ def _lost(source: Source, lost: list[Cell], *, known: bool) -> CoverageError:
     return CoverageError(
         what, file=source.address, field="surface.dem",
         remedy=Text(
-            "give a DEM of this place; or say what such places shall be: ", Setting("surface.fill", "mask"),
+            "give a DEM of this place, or choose how to fill it: ", Setting("surface.fill", "mask"),
             f" (no pixels), nearest, or an ellipsoidal height in metres{otherwise}"
         ),
     )  # fmt: skip
