@@ -16,7 +16,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
 from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
-from ortho_pipeline.estimation.statistics import squared_distances
+from ortho_pipeline.estimation.statistics import chance_of, squared_distances
 from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
@@ -186,25 +186,16 @@ def _snooping_start(
     problem: Problem, solution: Solution, keep: np.ndarray | None = None, *, linear: bool = False
 ) -> np.ndarray:
     """Return the points ``(n,)`` that are left when the one that fits the others worst is taken out, over and over."""
-    from scipy.special import fdtrc
-
     count = len(problem.rows)
     keep = np.ones(count, dtype=bool) if keep is None else keep.copy()
     # One more than may be rejected: the caller then says that there are too many.
     while (~keep).sum() <= REJECTED_LIMIT * count:
-        redundancy = solution.redundancy_blocks()
-        standardised = solution.errors.whitened(solution.residuals)
-        good = np.linalg.det(redundancy) > 1e-6
-        squares = np.zeros(len(redundancy))
-        squares[good] = squared_distances(standardised[good], redundancy[good])
-        freedom = solution.freedom - 2
-        if solution.sigma0 is None or freedom < 1:
+        tested = _against_others(solution)
+        if tested is None:
             break
-        others = np.maximum((solution.sigma0**2 * solution.freedom - squares) / freedom, _SCALE_FLOOR**2)
-        chances = fdtrc(2, freedom, squares / 2 / others)
         # Where chances underflow to zero, the ratio still tells which is worst.
-        worst = int(np.argmax(squares / others))
-        if chances[worst] >= BLUNDER_RISK / count:
+        worst = int(np.argmax(tested.ratios))
+        if tested.chances[worst] >= BLUNDER_RISK / count:
             break
         keep[np.flatnonzero(keep)[worst]] = False
         try:
@@ -214,10 +205,33 @@ def _snooping_start(
     return keep
 
 
+class _Tested(NamedTuple):
+    """Points ``(n,)`` against the variance of the others: squared distances over it, their chances, and that variance.
+
+    A point that the others do not determine the place of is at the distance 0.
+    """
+
+    ratios: Array
+    chances: Array
+    others: Array
+
+
+def _against_others(solution: Solution) -> _Tested | None:
+    """Test the residual of each point; None where there is too little redundancy."""
+    redundancy = solution.redundancy_blocks()
+    standardised = solution.errors.whitened(solution.residuals)
+    good = np.linalg.det(redundancy) > 1e-6
+    squares = np.zeros(len(redundancy))
+    squares[good] = squared_distances(standardised[good], redundancy[good])
+    freedom = solution.freedom - 2
+    if solution.sigma0 is None or freedom < 1:
+        return None
+    others = np.maximum((solution.sigma0**2 * solution.freedom - squares) / freedom, _SCALE_FLOOR**2)
+    return _Tested(squares / others, chance_of(squares / others, 2, freedom), others)
+
+
 def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
     """Return for each point the chance of lying so far from the fit of the kept ones, and that distance in pixels."""
-    from scipy.special import fdtrc
-
     try:
         solution = problem.solve(keep)
     except (DegeneratePoints, TooFewPoints):
@@ -231,7 +245,7 @@ def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
     distance = squared_distances(standardised, spread)
     freedom = max(solution.freedom, 1.0)
     scale = max(solution.sigma0 or 0.0, _SCALE_FLOOR)
-    return fdtrc(2, freedom, distance / 2 / scale**2), np.hypot(miss[:, 0], miss[:, 1])
+    return chance_of(distance / scale**2, 2, freedom), np.hypot(miss[:, 0], miss[:, 1])
 
 
 # -- what is not left out --------------------------------------------------------------------------------------------
@@ -288,31 +302,17 @@ def outlying(
 
 
 def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> list[OutlyingPoint]:
-    from scipy.special import fdtrc
-
-    redundancy = solution.redundancy_blocks()
-    standardised = solution.errors.whitened(solution.residuals)
-    freedom = solution.freedom - 2
-    good = np.linalg.det(redundancy) > 1e-6
-    if freedom < 1 or not good.any():
+    tested = _against_others(solution)
+    if tested is None:
         return []
-    left = solution.leave_each_out()
-    inverses = np.zeros_like(redundancy)
-    inverses[good] = np.linalg.inv(redundancy[good])
-    spreads = solution.errors.mean_square(inverses)
-    rows = np.flatnonzero(used)
-    found = []
-    for i in np.flatnonzero(good).tolist():
-        square = float(standardised[i] @ np.linalg.solve(redundancy[i], standardised[i]))
-        others = max((float(solution.sigma0 or 0) ** 2 * solution.freedom - square) / freedom, _SCALE_FLOOR**2)
-        chance = float(fdtrc(2, freedom, square / 2 / others))
-        if chance < OUTLYING_RISK / len(rows):
-            found.append(
-                OutlyingPoint.of(
-                    points.ids[rows[i]], "control", float(np.hypot(*left[i])), math.sqrt(others * float(spreads[i])),
-                    chance, float(1 - np.trace(redundancy[i]) / 2),
-                )
-            )  # fmt: skip
+    redundancy, left = solution.redundancy_blocks(), solution.leave_each_out()
+    rows, found = np.flatnonzero(used), []
+    for i in np.flatnonzero(tested.chances < OUTLYING_RISK / len(rows)).tolist():
+        spread = solution.errors[np.array([i])].mean_square(np.linalg.inv(redundancy[i : i + 1]).astype(float))
+        expected = math.sqrt(float(tested.others[i] * spread[0]))
+        chance, leverage = float(tested.chances[i]), float(1 - np.trace(redundancy[i]) / 2)
+        name = points.ids[rows[i]]
+        found.append(OutlyingPoint.of(name, "control", float(np.hypot(*left[i])), expected, chance, leverage))
     return found
 
 
@@ -362,8 +362,6 @@ def _outlying_checks(
     checks = _checks(solution, points, used, common)
     if checks is None:
         return []
-    from scipy.special import fdtrc
-
     squares = checks.squares
     scale, freedom = max(sigma0, _SCALE_FLOOR) ** 2, max(solution.freedom, 1.0)
     own = float(np.median(squares)) / _MEDIAN_OF_TWO
@@ -375,7 +373,7 @@ def _outlying_checks(
         shared = checks.partials @ common @ checks.partials.transpose(0, 2, 1) / scale
         checks = replace(checks, spread=checks.spread + np.where(apart[:, None, None], shared, 0.0))
         squares = checks.squares
-    chances = fdtrc(2, freedom, squares / 2 / scale)
+    chances = chance_of(squares / scale, 2, freedom)
     expected, rows = checks.expected(scale), checks.problem.rows
     return [
         OutlyingPoint.of(
@@ -439,12 +437,10 @@ def are_alike(misses: Array) -> bool:
 
 def _together_apart(squares: Array, scale: float, freedom: float) -> bool:
     """Tell whether check points are farther off together than expected, by their squared distances in sigmas."""
-    from scipy.special import fdtrc
-
     if not len(squares):
         return False
-    ratio = float(squares.mean()) / 2 / scale
-    return ratio >= _APART**2 and bool(fdtrc(2 * len(squares), max(freedom, 1.0), ratio) <= OUTLYING_RISK)
+    total, size = float(squares.sum()) / scale, 2 * len(squares)
+    return total >= size * _APART**2 and bool(chance_of(total, size, max(freedom, 1.0)) <= OUTLYING_RISK)
 
 
 def _rms(sizes: Array) -> float:

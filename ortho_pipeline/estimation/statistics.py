@@ -10,6 +10,7 @@ Source: section 3.3 of Bueyueksalih et al. (OrbView-3), after Jacobsen (RAPORIO)
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ortho_pipeline.geodesy.ellipsoid import Array
 
@@ -20,6 +21,16 @@ def squared_distances(residuals: Array, covariance: Array) -> Array:
     Under the normal distribution they follow chi-squared of k degrees of freedom.
     """
     return np.asarray(np.einsum("ni,ni->n", residuals, np.linalg.solve(covariance, residuals[:, :, None])[:, :, 0]))
+
+
+def chance_of(squares: ArrayLike, size: ArrayLike, freedom: ArrayLike) -> Array:
+    """Return the chance of squared distances of `size` degrees of freedom beyond these, in units of a variance.
+
+    That variance was estimated with `freedom` degrees (Fisher's distribution).
+    """
+    from scipy.special import fdtrc  # scipy.stats would take most of the start-up of a command
+
+    return np.asarray(fdtrc(size, freedom, np.asarray(squares) / size))
 
 
 def correlation_of(covariance: Array) -> Array:

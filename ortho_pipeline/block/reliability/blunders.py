@@ -27,6 +27,7 @@ from ortho_pipeline.block.variances.grid import estimate, reweighed
 from ortho_pipeline.errors import DegeneratePoints
 from ortho_pipeline.estimation.blunders import BLUNDER_RISK, REJECTED_LIMIT
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
+from ortho_pipeline.estimation.statistics import chance_of
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import Setting, Text, counted
 
@@ -197,15 +198,13 @@ def _worst(problem: BlockProblem, tests: StandardisedResiduals, variances: Varia
 
 def _significant(solved: Solved, tests: StandardisedResiduals, variances: Variances) -> Mask:
     """Return the points with a part that the others contradict."""
-    from scipy.special import fdtrc
-
     sigma0, freedom = solved.unit_weight()
     scale, freedom = max(1.0 if sigma0 is None else sigma0, SCALE_FLOOR), max(freedom, 1.0)
     count = max(int((tests.ray_rank > 0).sum() + (tests.ground_rank > 0).sum()), 1)
 
     def bad(squares: Array, rank: np.ndarray, freedom: Array | float) -> Mask:
         size = np.maximum(rank, 1)
-        return np.asarray((rank > 0) & (fdtrc(size, freedom, squares / size / scale**2) < BLUNDER_RISK / count))
+        return np.asarray((rank > 0) & (chance_of(squares / scale**2, size, freedom) < BLUNDER_RISK / count))
 
     of_ground = np.where(variances.of_ground(solved.problem), min(variances.freedom, freedom), freedom)
     rays = bad(tests.rays, tests.ray_rank, freedom)

@@ -21,6 +21,7 @@ from ortho_pipeline.block.reliability.standardised_residuals import standardise_
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.estimation.blunders import FAR_ABOVE, are_alike, contradicting
+from ortho_pipeline.estimation.statistics import chance_of
 from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.models.base import Array
 
@@ -70,8 +71,6 @@ def outlying(
     used : ndarray (N,) of bool
         Whose ground was used.
     """
-    from scipy.special import fdtrc
-
     problem, points = solved.problem, solved.problem.points
     own = _sigmas(problem, variances)
     freedom = max(variances.redundancy[0], 1.0)
@@ -86,13 +85,13 @@ def outlying(
             if variances.estimated and (points.sigma_ground[k, axes] == 0).any():
                 chance = variances.chance_of(apart, part, axes)
             else:
-                chance = float(fdtrc(len(axes), freedom, square))
+                chance = float(chance_of(len(axes) * square, len(axes), freedom))
             found.append((int(k), what, math.hypot(*apart), math.sqrt(square), chance))
     squares, ranks = standardise_ground(solved)
     for k in np.flatnonzero(used & (ranks > 0)):
         of = min(freedom, variances.freedom) if problem.unstated[k].any() else freedom
         apart, square = residuals[k, np.isfinite(residuals[k])], float(squares[k] / ranks[k])
-        chance = float(fdtrc(ranks[k], of, square))
+        chance = float(chance_of(squares[k], ranks[k], of))
         found.append((int(k), "ground", float(np.linalg.norm(apart)), math.sqrt(square), chance))
     return tuple(
         ContradictedPoint.model_validate(
