@@ -12,8 +12,9 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.models.rational import RPC, rpc_terms
-from ortho_pipeline.models.rpc_box import has_pole
+from ortho_pipeline.models.polynomials import terms_of
+from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.models.rpc_box import RPC_TERMS, has_pole
 
 #: A fitted RPC that is off by more than the first is reported, by more than the second refused (pixels).
 WARN_ERROR, REFUSE_ERROR = 0.02, 0.1
@@ -76,7 +77,7 @@ def fit_rpc(
     ground, image = _samples(model, box, height_range, grid)
     middle = (image.min(axis=0) + image.max(axis=0)) / 2
     scale = np.maximum((image.max(axis=0) - image.min(axis=0)) / 2, 1.0)
-    terms = rpc_terms(*((ground - centre) / half).T).T
+    terms = terms_of(RPC_TERMS, (ground - centre) / half).T
     names = ("col_off", "row_off", "lon_off", "lat_off", "h_off", "col_scale", "row_scale", "lon_scale", "lat_scale")
     numbers = dict(zip((*names, "h_scale"), map(float, (*middle, *centre, *scale, *half)), strict=True))
     # A box across the antimeridian may be given beyond 180 degrees; readers of RPCs want the offset within.

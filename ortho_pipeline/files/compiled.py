@@ -7,6 +7,7 @@ A kernel is compiled once per machine where a cache may be kept, in the memory o
 from __future__ import annotations
 
 import functools
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -25,12 +26,17 @@ def compiled(function: Callable[..., Any]) -> Any:
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """Compile a function into each compiled one that calls it, and is kept with it.
+    """Compile a function into each compiled one that calls it, and is kept with it. Python calls it as it is.
 
     LLVM does it: numba's own ``inline="always"`` copies the function before types are known, and infers them anew for
     each copy, which took most of the time of compiling.
     """
     return Kernel(function, inline=True)
+
+
+def is_loaded() -> bool:
+    """Tell whether this process has loaded numba, which takes a second."""
+    return "numba" in sys.modules
 
 
 class Kernel:
@@ -45,7 +51,7 @@ class Kernel:
         self._made: Any = None
 
     def __call__(self, *given: Any, **named: Any) -> Any:
-        return (self._made or self.dispatcher)(*given, **named)
+        return (self.py_func if self.inline else self._made or self.dispatcher)(*given, **named)
 
     @property
     def dispatcher(self) -> Any:

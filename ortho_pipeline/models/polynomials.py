@@ -44,29 +44,29 @@ def term_table(name: str) -> TermTable:
     return TermTable(family, np.array([exponents(term) for term in terms]), tuple(places))
 
 
-def _powers(name: str, normalised: Array) -> tuple[NDArray[np.int64], list[list[Array]]]:
-    table = term_table(name).powers
+def _powers_of(exponents: NDArray[np.int64], normalised: Array) -> list[list[Array]]:
+    """Return 1, x, x^2 … of each coordinate, as far as there are exponents."""
     found = []
     for axis in range(3):
         powers = [np.ones(len(normalised))]
-        for _ in range(int(table[:, axis].max())):
+        for _ in range(int(exponents[:, axis].max())):
             powers.append(powers[-1] * normalised[:, axis])
         found.append(powers)
-    return table, found
+    return found
 
 
-def terms_of(name: str, normalised: Array) -> Array:
-    """Return the terms of a family ``(T, N)``."""
-    table, powers = _powers(name, normalised)
-    return np.array([powers[0][i] * powers[1][j] * powers[2][k] for i, j, k in table])
+def terms_of(exponents: NDArray[np.int64], normalised: Array) -> Array:
+    """Return the terms ``(T, N)`` with exponents ``(T, 3)`` of normalised coordinates ``(N, 3)``."""
+    powers = _powers_of(exponents, normalised)
+    return np.array([powers[0][i] * powers[1][j] * powers[2][k] for i, j, k in exponents])
 
 
-def term_partials(name: str, normalised: Array) -> Array:
+def term_partials(exponents: NDArray[np.int64], normalised: Array) -> Array:
     """Return the derivatives of the terms by the normalised coordinates ``(3, T, N)``."""
-    table, powers = _powers(name, normalised)
-    partials = np.zeros((3, len(table), len(normalised)))
+    powers = _powers_of(exponents, normalised)
+    partials = np.zeros((3, len(exponents), len(normalised)))
     for axis in range(3):
-        for term, exponent in enumerate(table):
+        for term, exponent in enumerate(exponents):
             if exponent[axis]:
                 i, j, k = exponent - (np.arange(3) == axis)
                 partials[axis, term] = float(exponent[axis]) * powers[0][i] * powers[1][j] * powers[2][k]

@@ -24,7 +24,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.compiled import is_loaded
 from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
+from ortho_pipeline.models import rpc_kernel
 from ortho_pipeline.models.base import (
     INVERSE_TOLERANCE,
     INVERSE_VERIFIED,
@@ -35,50 +37,21 @@ from ortho_pipeline.models.base import (
 )
 from ortho_pipeline.models.families import exponents, family_of, points_needed
 from ortho_pipeline.models.polynomials import term_partials, term_table, terms_of
-from ortho_pipeline.models.rpc_box import RPC_TERMS, check_numbers, sound_heights
+from ortho_pipeline.models.rpc_box import check_numbers, sound_heights
 
-#: From this many points on the compiled kernels are used: loading them takes longer than few points do.
+#: From this many points on the compiled kernels are used: loading a compiler takes longer than few points do.
 COMPILED_FROM = 20_000
+#: The same where the compiler is loaded: there are only kernels to be found.
+LOADED_FROM = 500
 _NUMBERS = tuple(f"{name}_{part}" for part in ("off", "scale") for name in ("col", "row", "lon", "lat", "h"))
+#: Points that NumPy takes at a time: their arrays stay in the second cache.
+_PART = 1024
 #: Beyond this many scales from its centre an RPC is extrapolation without meaning, and has false roots.
 DOMAIN_LIMIT = 1.5
 
 
-def rpc_terms(lon: Array, lat: Array, h: Array) -> Array:
-    """Return the 20 terms of RPC00B as ``(20, N)`` for normalised coordinates ``(N,)``."""
-    terms = np.empty((20, lon.size))
-    terms[0] = 1.0
-    terms[1], terms[2], terms[3] = lon, lat, h
-    np.multiply(lon, lat, out=terms[4])
-    np.multiply(lon, h, out=terms[5])
-    np.multiply(lat, h, out=terms[6])
-    np.multiply(lon, lon, out=terms[7])
-    np.multiply(lat, lat, out=terms[8])
-    np.multiply(h, h, out=terms[9])
-    np.multiply(terms[4], h, out=terms[10])
-    np.multiply(terms[7], lon, out=terms[11])
-    np.multiply(lon, terms[8], out=terms[12])
-    np.multiply(lon, terms[9], out=terms[13])
-    np.multiply(terms[7], lat, out=terms[14])
-    np.multiply(terms[8], lat, out=terms[15])
-    np.multiply(lat, terms[9], out=terms[16])
-    np.multiply(terms[7], h, out=terms[17])
-    np.multiply(terms[8], h, out=terms[18])
-    np.multiply(terms[9], h, out=terms[19])
-    return terms
-
-
-def _slopes_of_terms() -> Array:
-    """Return what d(terms)/d(L, P, H) has of the first ten terms ``(3, 20, 10)``, which are all quadratic ones."""
-    found = np.zeros((3, 20, 10))
-    for axis in range(3):
-        for term, powers in enumerate(RPC_TERMS):
-            lowered = powers - np.eye(3, dtype=np.int64)[axis]
-            found[axis, term, (RPC_TERMS[:10] == lowered).all(axis=1)] = powers[axis]
-    return found
-
-
-_SLOPES = _slopes_of_terms()
+def _is_for_numpy(count: int) -> bool:
+    return count < (LOADED_FROM if is_loaded() else COMPILED_FROM)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,112 +131,67 @@ class RPC(SensorModel):
         low, high = sorted(self.h_off + self.h_scale * reach for reach in self._reach)
         return low, high
 
-    def normalise(self, ground: ArrayLike) -> tuple[Array, Array, Array]:
-        """Return normalised longitude, latitude, height, each ``(N,)``; NaN outside the domain."""
-        ground = as_ground(ground)
-        lon = ground[:, 0] - self.lon_off
-        with np.errstate(invalid="ignore"):
-            if (np.abs(lon) > 180.0).any():
-                lon = np.remainder(lon + 180.0, 360.0) - 180.0
-            lon = lon / self.lon_scale
-            lat = (ground[:, 1] - self.lat_off) / self.lat_scale
-            h = (ground[:, 2] - self.h_off) / self.h_scale
-            outside = (np.abs(lon) > DOMAIN_LIMIT) | (np.abs(lat) > DOMAIN_LIMIT)
-            outside |= (h < self._reach[0]) | (h > self._reach[1])
-        if outside.any():
-            lon[outside] = np.nan
-        return lon, lat, h
-
     def ground_to_image(self, ground: ArrayLike) -> Array:
         ground = as_ground(ground)
-        if len(ground) < COMPILED_FROM:
-            return self._project(ground)
-        from ortho_pipeline.models import rpc_kernel
-
         image = np.empty((len(ground), 2))
-        rpc_kernel.project(ground, *self.tables, image)
+        if _is_for_numpy(len(ground)):
+            self._project(ground, image)
+        else:
+            rpc_kernel.project(ground, *self.tables, image)
         return image
+
+    def ground_partials(self, ground: ArrayLike) -> Array:
+        return self.projected(ground)[1]
+
+    def projected(self, ground: ArrayLike) -> tuple[Array, Array]:
+        ground = as_ground(ground)
+        image, partials = np.empty((len(ground), 2)), np.empty((len(ground), 2, 3))
+        if _is_for_numpy(len(ground)):
+            self._project(ground, image, partials)
+        else:
+            rpc_kernel.projected(ground, *self.tables, image, partials)
+        return image, partials
+
+    def _project(self, ground: Array, image: Array, partials: Array | None = None) -> None:
+        """Do in NumPy what `rpc_kernel.project` and `projected` do, with the same result in every bit."""
+        offsets, scales, coefficients, limits = self.tables
+        terms = tuple(coefficients.T[:, :, None])
+        with np.errstate(all="ignore"):
+            for first in range(0, len(ground), _PART):
+                part = slice(first, first + _PART)
+                place = rpc_kernel.normalised(*ground[part].T, offsets, scales)
+                values = rpc_kernel.polynomial(terms, *place)
+                ratios, denominators = values[::2] / values[1::2], values[1::2]
+                good = rpc_kernel.is_within(*place, limits) & rpc_kernel.is_point(*ratios, *denominators)
+                ratios[:, ~good] = np.nan
+                image[part] = (ratios * scales[3:, None] + offsets[3:, None]).T
+                if partials is not None:
+                    changes = np.array(rpc_kernel.slopes(terms, *place))
+                    found = (changes[:, ::2] - ratios * changes[:, 1::2]) * (1.0 / denominators)
+                    partials[part] = (found * scales[3:, None] / scales[:3, None, None]).T
 
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
         image = as_image(image)
         if len(image) < COMPILED_FROM:
             return super().image_to_ground(image, height)
-        from ortho_pipeline.models import rpc_kernel
-
         ground = np.empty((len(image), 3))
         heights = np.ascontiguousarray(np.broadcast_to(np.asarray(height, dtype=np.float64), len(image)))
-        offsets, scales, coefficients, limits = self.tables
-        rpc_kernel.image_to_ground(
-            image, heights, offsets, scales, coefficients, self._inverse_start(), limits, INVERSE_TOLERANCE,
-            INVERSE_VERIFIED, 25, ground,
-        )  # fmt: skip
+        rpc_kernel.image_to_ground(image, heights, *self.tables, INVERSE_TOLERANCE, INVERSE_VERIFIED, 25, ground)
         return ground
 
     @cached_property
     def tables(self) -> tuple[Array, Array, Array, Array]:
-        """Offsets and scales of lon, lat, h, column, row; coefficients ``(4, 20)`` and limits as in `rpc_kernel`."""
+        """Offsets and scales, coefficients and limits as in `rpc_kernel`."""
         offsets = np.array([self.lon_off, self.lat_off, self.h_off, self.col_off, self.row_off])
         scales = np.array([self.lon_scale, self.lat_scale, self.h_scale, self.col_scale, self.row_scale])
         # With positive denominators at the centre: where one is not, there is a pole in between.
         coefficients = self._polynomials * np.repeat(np.sign(self._polynomials[1::2, :1]), 2, axis=0)
         return offsets, scales, coefficients, np.array([DOMAIN_LIMIT, *self._reach])
 
-    def _inverse_start(self) -> Array:
-        """Return first approximations ``(2, 6)`` of the inverse: see `rpc_kernel.image_to_ground`."""
-        steps = np.linspace(-1.0, 1.0, 5)
-        lon, lat, h = (axis.ravel() for axis in np.meshgrid(steps, steps, steps))
-        ground = np.stack(
-            [lon * self.lon_scale + self.lon_off, lat * self.lat_scale + self.lat_off, h * self.h_scale + self.h_off], 1
-        )
-        image = (self._project(ground) - (self.col_off, self.row_off)) / (self.col_scale, self.row_scale)
-        good = np.isfinite(image).all(axis=1)
-        col, row, h = image[good, 0], image[good, 1], h[good]
-        design = np.stack([np.ones_like(col), col, row, h, col * h, row * h], axis=1)
-        return np.linalg.lstsq(design, np.stack([lon[good], lat[good]], axis=1))[0].T.copy()
-
-    @cached_property
+    @property
     def _polynomials(self) -> Array:
         """Coefficients ``(4, 20)``: column numerator and denominator, row numerator and denominator."""
         return np.stack([self.col_num, self.col_den, self.row_num, self.row_den])
-
-    def _project(self, ground: Array) -> Array:
-        return self._image(self._polynomials @ rpc_terms(*self.normalise(ground)))
-
-    def _image(self, sums: Array) -> Array:
-        """Return image points of the values ``(4, N)`` of the polynomials."""
-        col_num, col_den, row_num, row_den = sums
-        with np.errstate(divide="ignore", invalid="ignore"):
-            col = col_num / col_den * self.col_scale + self.col_off
-            row = row_num / row_den * self.row_scale + self.row_off
-            before_poles = (col_den * self.col_den[0] > 0) & (row_den * self.row_den[0] > 0)
-        image = np.empty((sums.shape[1], 2))
-        image[:, 0], image[:, 1] = col, row
-        good = before_poles & np.isfinite(col) & np.isfinite(row)
-        if not good.all():
-            image[~good] = np.nan
-        return image
-
-    def ground_partials(self, ground: ArrayLike) -> Array:
-        terms = rpc_terms(*self.normalise(ground))
-        return self._partials(terms, self._polynomials @ terms)
-
-    def projected(self, ground: ArrayLike) -> tuple[Array, Array]:
-        terms = rpc_terms(*self.normalise(ground))
-        sums = self._polynomials @ terms
-        return self._image(sums), self._partials(terms, sums)
-
-    @cached_property
-    def _slope_polynomials(self) -> Array:
-        """Coefficients ``(12, 10)`` of the slopes of the polynomials by L, then P, then H."""
-        return (self._polynomials @ _SLOPES).reshape(12, 10)
-
-    def _partials(self, terms: Array, sums: Array) -> Array:
-        """Return d(image)/d(ground) of the terms ``(20, N)`` and the values ``(4, N)`` of the polynomials."""
-        by_axis = (self._slope_polynomials @ terms[:10]).reshape(3, 4, -1)
-        scale = np.divide.outer((self.col_scale, self.row_scale), (self.lon_scale, self.lat_scale, self.h_scale)).T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            found = (by_axis[:, ::2] - sums[::2] / sums[1::2] * by_axis[:, 1::2]) / sums[1::2] * scale[:, :, None]
-        return np.ascontiguousarray(found.transpose(2, 1, 0))
 
     def shifted(self, columns: float, rows: float) -> RPC:
         """Return the model of a crop whose first pixel is (columns, rows) of this image."""
@@ -439,16 +367,16 @@ class Rational(SensorModel):
 
     def ground_to_image(self, ground: ArrayLike) -> Array:
         normalised, _ = self.normalise(ground)
-        sums = self._sums(terms_of(self.family, normalised))
+        sums = self._sums(terms_of(term_table(self.family).powers, normalised))
         image = (sums[:2] / sums[2:]).T * self.image_scale + self.image_offset
         image[~np.isfinite(normalised).all(axis=1)] = np.nan
         return np.ascontiguousarray(image)
 
     def ground_partials(self, ground: ArrayLike) -> Array:
         normalised, slopes = self.normalise(ground)
-        sums = self._sums(terms_of(self.family, normalised))
+        sums = self._sums(terms_of(term_table(self.family).powers, normalised))
         ratios = sums[:2] / sums[2:]
-        by_axis = self._table @ term_partials(self.family, normalised)  # type: ignore[attr-defined]
+        by_axis = self._table @ term_partials(term_table(self.family).powers, normalised)  # type: ignore[attr-defined]
         partials = np.moveaxis((by_axis[:, :2] - ratios * by_axis[:, 2:]) / sums[2:], (0, 1, 2), (2, 1, 0))
         partials = partials * self.image_scale[:, None] / self.ground_scale
         partials[~np.isfinite(normalised).all(axis=1)] = np.nan
@@ -456,7 +384,7 @@ class Rational(SensorModel):
 
     def param_partials(self, ground: ArrayLike) -> Array:
         normalised, _ = self.normalise(ground)
-        terms = terms_of(self.family, normalised)
+        terms = terms_of(term_table(self.family).powers, normalised)
         sums = self._sums(terms)
         factors = np.concatenate([1.0 / sums[2:], -sums[:2] / sums[2:] ** 2]) * np.tile(self.image_scale, 2)[:, None]
         free = self._free

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.models.rpc_kernel import polynomial, slopes
 
 Array = NDArray[np.float64]
 
@@ -64,6 +65,8 @@ _SIDES = (_HALF, _HALF[::-1, ::-1])
 #: Normalised heights at which folds are looked for, and within which of them an RPC has to be sound.
 _LEVELS = np.linspace(-1.0, 1.0, 17)
 _LEAST = 0.25
+#: Places on each of these levels: normalised longitudes and latitudes of 5 x 5.
+_ACROSS, _ALONG = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 2))
 
 
 @functools.cache
@@ -106,19 +109,6 @@ def has_pole(denominator: Array, low: float = -1.0, high: float = 1.0) -> bool:
             halves = [np.einsum(f"x{axis},nijk->n{'ijk'.replace(axis, 'x')}", side, boxes) for side in _SIDES]
             boxes = np.concatenate(halves)
     return True
-
-
-@functools.cache
-def _samples() -> tuple[Array, Array]:
-    """Return the terms ``(20, N)`` and their partial derivatives by L and P ``(20, 2 N)`` at 5 x 5 places per level."""
-    steps = np.linspace(-1.0, 1.0, 5)
-    at = np.stack(np.meshgrid(_LEVELS, steps, steps, indexing="ij")[::-1], axis=-1).reshape(-1, 3)
-    slopes = []
-    for axis in (0, 1):
-        lowered = RPC_TERMS.copy()
-        lowered[:, axis] = np.maximum(lowered[:, axis] - 1, 0)
-        slopes.append(RPC_TERMS[:, axis, None] * np.prod(at[None] ** lowered[:, None], axis=2))
-    return np.prod(at[None] ** RPC_TERMS[:, None], axis=2), np.concatenate(slopes, axis=1)
 
 
 def check_numbers(values: dict[str, float]) -> None:
@@ -184,10 +174,10 @@ def sound_heights(values: dict[str, float], coefficients: Array) -> tuple[float,
 
 def _jacobians(coefficients: Array) -> Array:
     """Return d(normalised column, row)/d(L, P) as ``(2, 2, levels, places)``."""
-    terms, slopes = _samples()
-    values, changes = coefficients @ terms, (coefficients @ slopes).reshape(4, 2, -1)
-    num, den = values[::2, None], values[1::2, None]
-    return np.asarray((changes[::2] - num / den * changes[1::2]) / den).reshape(2, 2, len(_LEVELS), -1)
+    terms = coefficients.T[:, :, None, None]
+    values, changes = (by(terms, _ACROSS, _ALONG, _LEVELS[:, None]) for by in (polynomial, slopes))
+    ratios = values[::2] / values[1::2]
+    return np.stack([(change[::2] - ratios * change[1::2]) / values[1::2] for change in changes[:2]], axis=1)
 
 
 def _check_pixel(values: dict[str, float], jacobian: Array) -> None:

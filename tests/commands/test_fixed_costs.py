@@ -8,7 +8,7 @@ import importlib.metadata
 import pyproj
 
 from ortho_pipeline import commands
-from ortho_pipeline.models import rational
+from ortho_pipeline.models import rational, rpc_kernel
 from ortho_pipeline.options import SurfaceOptions
 from ortho_pipeline.plugins import Host
 
@@ -43,11 +43,11 @@ def test_metadata_of_a_distribution_are_parsed_once_for_all_of_its_plugins(monke
     assert len(parsed) == len({one.distribution for one in plugins}) + 1
 
 
-def test_an_inverse_of_few_points_takes_terms_once_a_step(tiny, monkeypatch) -> None:
-    """Terms of the polynomials were made twice for each step of Newton's method: for the place and for its slopes."""
+def test_an_inverse_of_few_points_takes_polynomials_once_a_step(tiny, monkeypatch) -> None:
+    """Polynomials were evaluated twice for each step of Newton's method: for the place and for its slopes."""
     made: list[object] = []
-    terms = rational.rpc_terms
-    monkeypatch.setattr(rational, "rpc_terms", lambda *given: made.append(given) or terms(*given))
+    polynomial = rpc_kernel.polynomial
+    monkeypatch.setattr(rpc_kernel, "polynomial", lambda *given: made.append(given) or polynomial(*given))
     steps: list[object] = []
     projected = rational.RPC.projected
     monkeypatch.setattr(rational.RPC, "projected", lambda *given: steps.append(given) or projected(*given))
