@@ -48,6 +48,10 @@ class One(Record):
     number: int
 
 
+def test_a_record_within_other_values_is_an_object() -> None:
+    assert json_value({"records": (One(number=1),)}) == {"records": [{"number": 1}]}
+
+
 def test_a_member_without_a_name_is_named() -> None:
     with pytest.raises(DocumentError) as caught:
         One.read({"number": 1, "": 2})

@@ -22,7 +22,7 @@ def json_value(value: Any) -> Any:
     """Return a value as what JSON holds, however nested.
 
     A number that is not finite is null, by itself or within an array; NumPy's numbers are Python's; arrays, tuples and
-    sets are lists; mappings and dataclasses are objects; paths and whatever else is not known are text.
+    sets are lists; mappings, dataclasses and records are objects; paths and whatever else is not known are text.
     """
     kind = type(value)
     if kind in _PLAIN:  # most of a document, which is asked nothing more
@@ -31,6 +31,8 @@ def json_value(value: Any) -> Any:
         return {key if type(key) is str else str(key): json_value(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
+    if hasattr(value, "model_dump"):  # a record; what records are made of need not be loaded to know it
+        value = value.model_dump(mode="json")
     if isinstance(value, os.PathLike):
         value = os.fspath(value)
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
