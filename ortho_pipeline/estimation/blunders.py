@@ -208,9 +208,11 @@ def _snooping_start(
 class _Tested(NamedTuple):
     """Points ``(n,)`` against the variance of the others: squared distances over it, their chances, and that variance.
 
-    A point that the others do not determine the place of is at the distance 0.
+    A point that the others do not determine the place of is at the distance 0. `redundancy` ``(n, 2, 2)`` are the
+    blocks of `Solution.redundancy_blocks`.
     """
 
+    redundancy: Array
     ratios: Array
     chances: Array
     others: Array
@@ -227,7 +229,7 @@ def _against_others(solution: Solution) -> _Tested | None:
     if solution.sigma0 is None or freedom < 1:
         return None
     others = np.maximum((solution.sigma0**2 * solution.freedom - squares) / freedom, _SCALE_FLOOR**2)
-    return _Tested(squares / others, chance_of(squares / others, 2, freedom), others)
+    return _Tested(redundancy, squares / others, chance_of(squares / others, 2, freedom), others)
 
 
 def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
@@ -303,10 +305,10 @@ def outlying(
 
 def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> list[OutlyingPoint]:
     tested = _against_others(solution)
-    if tested is None:
-        return []
-    redundancy, left = solution.redundancy_blocks(), solution.leave_each_out()
     rows, found = np.flatnonzero(used), []
+    if tested is None or not (tested.chances < OUTLYING_RISK / len(rows)).any():
+        return []
+    redundancy, left = tested.redundancy, solution.leave_each_out()
     for i in np.flatnonzero(tested.chances < OUTLYING_RISK / len(rows)).tolist():
         spread = solution.errors[np.array([i])].mean_square(np.linalg.inv(redundancy[i : i + 1]).astype(float))
         expected = math.sqrt(float(tested.others[i] * spread[0]))

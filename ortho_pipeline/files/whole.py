@@ -23,7 +23,7 @@ from ortho_pipeline.files.reading import read_bounded
 
 #: What a temporary name has between its random part and its suffix.
 _PART = ".part"
-#: What helps where a file cannot be written, if nothing else is said.
+#: Default remedy for a file that cannot be written.
 _REMEDY = "choose a folder that you may write to and that has room"
 
 

@@ -36,7 +36,7 @@ from ortho_pipeline.report.network.facts import found_network, network_record, p
 from ortho_pipeline.report.page.advice import WORDS, signals
 from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import plot_locator
-from ortho_pipeline.report.records import NOT_TESTED, MapScaleRecord, RpcRecord
+from ortho_pipeline.report.records import NOT_TESTED, RpcRecord
 from ortho_pipeline.report.wording import (
     ENOUGH_CHECK_POINTS,
     FEW,
@@ -106,9 +106,7 @@ def build_report(
             headline(adjustment, relative=any(one.code == RELATIVE for one in warnings)), noted["notices"]
         ),
         network=network_record(network),
-        map_scale=None
-        if suffices is None or refuted(noted["notices"])
-        else MapScaleRecord.model_validate(suffices.to_json()),
+        map_scale=None if refuted(noted["notices"]) else suffices,
     )
 
 

@@ -198,14 +198,12 @@ def _in_degrees(fit: Fit, shifts: Array) -> tuple[Array, Array]:
 
 
 def _covariances(fit: Fit, near: float | None) -> Covariances:
-    found = analyse_fit(fit, near=near)
-    return Covariances.model_validate({role: one and one.to_json() for role, one in found.items()})
+    return Covariances(**analyse_fit(fit, near=near))
 
 
 def _map_scale(fit: Fit, seen: Mapping[str, Any], grid: Grid | None) -> MapScaleRecord | None:
     pixels = [*(seen["ground_pixel_m"] or ()), *(() if grid is None else _pixel_on_ground(grid))]
-    found = map_scale(fit, max(pixels) if pixels else None)
-    return found
+    return map_scale(fit, max(pixels) if pixels else None)
 
 
 def _pixel_on_ground(grid: Grid) -> list[float]:

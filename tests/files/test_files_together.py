@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from dying import SOURCE
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import staged, together, whole_or_nothing, write_text
@@ -18,27 +19,17 @@ NAMES = [f"scene{number}.txt" for number in range(4)]
 OBSOLETE = "scene_old.txt"
 
 #: Writes a set of files and dies at the k-th call of the system that changes the folder.
-DYING = """
-import os, sys
+DYING = f"""{SOURCE}
+import sys
 from pathlib import Path
-folder, deadline = Path(sys.argv[1]), int(sys.argv[2])
-calls = 0
-def dying(function):
-    def call(*given, **named):
-        global calls
-        calls += 1
-        if calls == deadline:
-            os._exit(7)
-        return function(*given, **named)
-    return call
+folder = Path(sys.argv[1])
 from ortho_pipeline.files import whole as files
-for name in ("replace", "unlink", "fsync", "open", "mkdir"):
-    setattr(os, name, dying(getattr(os, name)))
+calls = die_at(int(sys.argv[2]))
 with files.together(folder, "scene") as outputs:
     outputs.obsolete.append(folder.resolve() / "scene_old.txt")
     for number in range(4):
-        files.write_text(folder / f"scene{number}.txt", "new")
-print(calls)
+        files.write_text(folder / f"scene{{number}}.txt", "new")
+print(calls())
 """
 
 

@@ -10,6 +10,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from dying import SOURCE
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import confined, together, write_text
@@ -40,24 +41,14 @@ def names(folder: Path) -> list[str]:
 
 
 #: Fetches a file and dies at the k-th call of the system that changes the folder.
-DYING = """
-import hashlib, os, sys
+DYING = f"""{SOURCE}
+import hashlib, sys
 from ortho_pipeline.files.storage import kept
 from ortho_pipeline.files.storage.objects import Content
-deadline, calls = int(sys.argv[1]), 0
-def dying(function):
-    def call(*given, **named):
-        global calls
-        calls += 1
-        if calls == deadline:
-            os._exit(7)
-        return function(*given, **named)
-    return call
 def fetched(path):
     path.write_bytes(b"heights")
     return Content(7, hashlib.sha256(b"heights").hexdigest(), (), None)
-for name in ("replace", "unlink", "fsync", "open", "mkdir"):
-    setattr(os, name, dying(getattr(os, name)))
+die_at(int(sys.argv[1]))
 kept.kept("dem", sys.argv[2], fetched)
 """
 

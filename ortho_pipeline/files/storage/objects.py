@@ -419,7 +419,7 @@ def _google_settings() -> dict[str, Any]:
     return given
 
 
-#: What is said to the clients of stores, by the scheme.
+#: Settings of the clients of stores, by scheme.
 _SETTINGS = {"s3": _s3_settings, "az": _azure_settings, "gs": _google_settings}
 
 
