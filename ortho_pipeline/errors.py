@@ -25,6 +25,7 @@ import functools
 import traceback
 from collections.abc import Callable, Iterator
 from os import PathLike, fspath
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 _P = ParamSpec("_P")
@@ -169,6 +170,22 @@ class StorageError(OrthoError):
 
 class ReportError(OrthoError):
     """The report could not be made; the other outputs of the command are complete."""
+
+
+def described(error: BaseException, culprit: object) -> str:
+    """Return kind, text and place of an error: the last line that it passed of the plugin that `culprit` is from.
+
+    `culprit` is a function or class of the plugin, or the name of its module.
+    """
+    module = culprit if isinstance(culprit, str) else getattr(culprit, "__module__", "")
+    package = module.partition(".")[0]
+    frames = list(traceback.walk_tb(error.__traceback__))
+    own = [one for one in frames if one[0].f_globals.get("__name__", "").partition(".")[0] == package]
+    where = ""
+    if own:
+        frame, line = own[-1]
+        where = f" at {Path(frame.f_code.co_filename).name}:{line}"
+    return f"{type(error).__name__}: {error}{where}"
 
 
 def error_document(error: BaseException) -> dict[str, Any]:

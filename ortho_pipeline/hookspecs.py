@@ -24,6 +24,10 @@ methods of `pathlib.Path` for an image on disk and for one in an archive (docs/p
 
 The host tries every scene at a few points before it works with it (`ortho_pipeline.plugins.contract`). Test more with
 `ortho_pipeline.testing.check_sensor`.
+
+A package that adds commands to ``ortho`` names a module in the group ``ortho_pipeline_commands``, which implements
+`ortho_commands`. That module is imported by ``ortho --help``: it declares the commands and imports nothing heavy. So
+this module imports nothing heavy either.
 """
 
 from __future__ import annotations
@@ -36,20 +40,19 @@ from typing import TYPE_CHECKING, Any
 
 import pluggy
 
-from ortho_pipeline.display.notices import FROM_SENSOR, Notice, with_code
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.problem import Prior
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.models.base import SensorModel
-from ortho_pipeline.models.correction import ImageCorrection
-from ortho_pipeline.models.mosaicked import Pieces
-from ortho_pipeline.options import CORRECTIONS
-
 if TYPE_CHECKING:
+    from ortho_pipeline.display.notices import Notice
     from ortho_pipeline.estimation.fit import Fit
+    from ortho_pipeline.estimation.problem import Prior
+    from ortho_pipeline.models.base import SensorModel
     from ortho_pipeline.points import Points
 
 PROJECT_NAME = "ortho_pipeline"
+#: The entry-point groups, and the hooks that are called in the modules which each names.
+GROUPS = {
+    PROJECT_NAME: ("ortho_sensors", "ortho_models", "ortho_studies"),
+    "ortho_pipeline_commands": ("ortho_commands",),
+}
 hookspec = pluggy.HookspecMarker(PROJECT_NAME)
 hookimpl = pluggy.HookimplMarker(PROJECT_NAME)
 
@@ -135,6 +138,8 @@ class Scene:
     adjusted: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
+        from ortho_pipeline.files.locations import place
+
         object.__setattr__(self, "path", place(self.path))
         if isinstance(self.model_source, PathLike):
             object.__setattr__(self, "model_source", str(self.model_source))
@@ -159,6 +164,8 @@ class Scene:
                 parts.setdefault(piece.offset, (piece.model, piece.size))
         if len(parts) == 1:
             return self.model
+        from ortho_pipeline.models.mosaicked import Pieces
+
         models, sizes = zip(*parts.values(), strict=True)
         return Pieces(models, tuple(parts), sizes)
 
@@ -177,9 +184,12 @@ class Scene:
         InputError
             For an unknown correction, or if the points do not determine it.
         """
+        from ortho_pipeline.errors import InputError
         from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
         from ortho_pipeline.estimation.family_fit import OWN, fit_own
         from ortho_pipeline.estimation.fit import fit
+        from ortho_pipeline.models.correction import ImageCorrection
+        from ortho_pipeline.options import CORRECTIONS
 
         if correction not in CORRECTIONS:
             raise InputError(
@@ -202,6 +212,8 @@ class Scene:
     @property
     def notices(self) -> tuple[Notice, ...]:
         """The warnings, each with a code: one that came as text alone is ``from-sensor``."""
+        from ortho_pipeline.display.notices import FROM_SENSOR, with_code
+
         return with_code(self.warnings, FROM_SENSOR)
 
     @property
@@ -325,6 +337,34 @@ class Study:
     realisations: int = 100
 
 
+@dataclass(frozen=True)
+class Subcommand:
+    """A command of ``ortho`` that a package adds; its code is imported when somebody calls it.
+
+    ::
+
+        @hookimpl
+        def ortho_commands():
+            yield Subcommand("coverage", "Show which part of IMAGE the DEM covers.", "ortho_coverage.command:coverage")
+
+    Parameters
+    ----------
+    name : str
+        As it is typed: lower case, digits and dashes; unique among all packages.
+    summary : str
+        The first sentence of its help, for the list of ``ortho --help``.
+    target : str
+        ``package.module:name`` of the command or group of click.
+    examples : tuple of (str, str)
+        What each is for, and its command line (``ortho coverage ...``): they end the command's help.
+    """
+
+    name: str
+    summary: str
+    target: str
+    examples: tuple[tuple[str, str], ...] = ()
+
+
 @hookspec
 def ortho_sensors() -> Iterable[Sensor]:
     """Return the sensors that this plugin offers."""
@@ -343,4 +383,13 @@ def ortho_models() -> Mapping[str, type[SensorModel]]:
 @hookspec
 def ortho_studies() -> Iterable[Study]:
     """Return simulated scenes and experiments; called for ``ortho simulate`` and ``ortho reproduce`` alone."""
+    raise NotImplementedError
+
+
+@hookspec
+def ortho_commands() -> Iterable[Subcommand]:
+    """Return commands of ``ortho``; called in modules of the entry-point group ``ortho_pipeline_commands`` alone.
+
+    It is called for ``ortho --help`` and for a command that the host does not have.
+    """
     raise NotImplementedError

@@ -188,3 +188,22 @@ def _write_tiny_image(made: Tiny) -> None:
     dataset.SetMetadata(rpc_metadata(made.model), "RPC")
     dataset.WriteArray(pixels)
     dataset = None
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Return a function that installs a distribution with one plugin module."""
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    modules = []
+
+    def installed(distribution, module, source, entry=None, group="ortho_pipeline"):
+        info = tmp_path / "site" / f"{distribution.replace('-', '_')}-1.2.dist-info"
+        info.mkdir(parents=True)
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.2\n")
+        (info / "entry_points.txt").write_text(f"[{group}]\n{entry or module} = {module}\n")
+        (tmp_path / "site" / f"{module}.py").write_text(source)
+        modules.append(module)
+
+    yield installed
+    for module in modules:
+        sys.modules.pop(module, None)

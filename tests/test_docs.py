@@ -58,11 +58,13 @@ def with_tinysat(monkeypatch):
     from ortho_pipeline.commands import studies
 
     monkeypatch.syspath_prepend(str(ROOT / "examples" / "ortho_tinysat"))
+    import ortho_tinysat_flight
     import ortho_tinysat_study
 
+    monkeypatch.setitem(cli.commands, "flight", ortho_tinysat_flight.flight)
     monkeypatch.setattr(studies, "studies", lambda: {"tinysat": ortho_tinysat_study.STUDY, **Host.discover().studies})
     yield
-    for name in ("ortho_tinysat_study", "ortho_tinysat"):
+    for name in ("ortho_tinysat_study", "ortho_tinysat_flight", "ortho_tinysat"):
         sys.modules.pop(name, None)
 
 

@@ -3,6 +3,7 @@
 import re
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,25 +69,6 @@ def make_plugin(*sensors, name="plugin", hook="ortho_sensors") -> types.ModuleTy
     return module
 
 
-@pytest.fixture
-def install(tmp_path, monkeypatch):
-    """Return a function that installs a distribution with one plugin module."""
-    monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    modules = []
-
-    def installed(distribution, module, source, entry=None):
-        info = tmp_path / "site" / f"{distribution.replace('-', '_')}-1.2.dist-info"
-        info.mkdir(parents=True)
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.2\n")
-        (info / "entry_points.txt").write_text(f"[ortho_pipeline]\n{entry or module} = {module}\n")
-        (tmp_path / "site" / f"{module}.py").write_text(source)
-        modules.append(module)
-
-    yield installed
-    for module in modules:
-        sys.modules.pop(module, None)
-
-
 def test_discover_finds_the_bundled_plugin():
     host = Host.discover()
     assert host is Host.discover()
@@ -145,7 +127,7 @@ def test_name_of_a_broken_bundled_plugin_stays_reserved(install):
 def test_two_sensors_of_one_name_are_an_error():
     with pytest.raises(PluginError, match="two plugins offer the sensor 'alpha': one and two"):
         Host([make_plugin(make_sensor(), name="one"), make_plugin(make_sensor(), name="two")])
-    with pytest.raises(PluginError, match="plugin offers two sensors 'alpha'"):
+    with pytest.raises(PluginError, match="plugin offers the sensor 'alpha' twice"):
         Host([make_plugin(make_sensor(), make_sensor())])
 
 
@@ -213,6 +195,23 @@ def test_hook_that_raises_names_its_plugin():
         PluginError, match=r"raising: ortho_sensors failed \(RuntimeError: no luck at test_plugins\.py:\d+\)"
     ):
         Host([module])
+
+
+def test_hooks_are_called_through_pluggy_so_that_wrappers_go_around_them():
+    wrapping = types.ModuleType("wrapping")
+
+    @hookimpl(wrapper=True)
+    def ortho_sensors():
+        offered = yield
+        return [[replace(sensor, description="wrapped") for sensor in sensors] for sensors in offered]
+
+    wrapping.ortho_sensors = ortho_sensors
+    host = Host([make_plugin(make_sensor("alpha"), name="one"), wrapping, make_plugin(make_sensor("beta"), name="two")])
+    assert {name: sensor.description for name, sensor in host.sensors.items()} == {
+        "alpha": "wrapped",
+        "beta": "wrapped",
+    }
+    assert host.provenance("beta").plugin == "two"
 
 
 def test_model_families_are_collected():
@@ -362,7 +361,7 @@ def test_studies_are_collected_when_they_are_asked_for():
     ("offered", "message"),
     [
         ([3], "yields int, not Study"),
-        ([Study("mine", ""), Study("mine", "")], "two studies 'mine'"),
+        ([Study("mine", ""), Study("mine", "")], "the study 'mine' twice"),
         (None, "ortho_studies returned NoneType"),
     ],
 )

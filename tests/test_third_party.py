@@ -119,6 +119,15 @@ def test_the_test_of_the_tutorial_runs_as_it_is_printed(fresh, tinysat, tmp_path
     run(fresh / "python", "-m", "pytest", "-q", "-p", "no:cacheprovider", folder, cwd=tmp_path)
 
 
+def test_its_command_is_one_of_ortho(fresh, tinysat):
+    assert "\n  flight  " in run(fresh / "ortho", "--help")
+    (helped, shown), (code, told) = several(fresh, ["flight", "--help"], ["flight", tinysat, "--json"])
+    assert (helped, code) == (0, 0)
+    assert "ortho flight scene.tif" in shown
+    # The tutorial prints a speed of 7.5 km/s at 500 km, rounded.
+    assert json.loads(told) == {"height": pytest.approx(500e3, abs=1), "speed": pytest.approx(7500, abs=1)}
+
+
 @pytest.mark.slow
 def test_its_study_is_a_command_of_simulate_and_reproduce(fresh, tmp_path):
     helped, simulated, refused = several(
@@ -166,17 +175,17 @@ def test_the_camera_of_the_tutorial_looks_where_it_says():
 
 
 def test_the_tutorial_is_the_example():
-    for name in ("pyproject.toml", "ortho_tinysat.py", "ortho_tinysat_study.py"):
+    for name in ("pyproject.toml", *(path.name for path in EXAMPLE.glob("*.py"))):
         parts = [text.strip("\n") for text in blocks_of(name)]
         assert "\n\n\n".join(parts) + "\n" == (EXAMPLE / name).read_text(encoding="utf-8"), name
 
 
-KINDS = (hookspecs.Sensor, hookspecs.Scene, hookspecs.Study)
+KINDS = (hookspecs.Sensor, hookspecs.Scene, hookspecs.Study, hookspecs.Subcommand)
 
 
 def test_everything_that_an_author_can_use_is_in_the_tutorial():
     hooks = [name for name, value in vars(hookspecs).items() if hasattr(value, "ortho_pipeline_spec")]
-    assert len(hooks) == 3
+    assert len(hooks) == 4
     fields = [field.name for kind in KINDS for field in dataclasses.fields(kind)]
     for name in hooks + fields:
         assert f"`{name}`" in TUTORIAL, f"{name} is not explained in docs/plugins.md"

@@ -1,24 +1,29 @@
 """The command line: each command parses, calls a function of `commands`, prints.
 
-A command is loaded when it is called, and loads what it works with when it begins: ``ortho --help`` needs click and
-this module.
+A command is loaded when it is called, and loads what it works with when it begins: ``ortho --help`` needs click, this
+module, and what installed packages declare of the commands that they add.
 """
 
 from __future__ import annotations
 
+import functools
 import importlib
+import logging
 import shlex
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ortho_pipeline.cli.machine.terminal import PrintableLog, say
 from ortho_pipeline.cli.signals import Terminated, ended_by_signals
-from ortho_pipeline.errors import InputError, OrthoError, error_document
+from ortho_pipeline.errors import InputError, OrthoError, PluginError, error_document
+
+if TYPE_CHECKING:
+    from ortho_pipeline.cli.machine.added import AddedCommands
 
 FAILED, CORRECTABLE, INTERRUPTED = 1, 2, 130
-#: Every command: the module of this room that holds it, and the first sentence of its help.
+#: Every command of the host: the module of this room that holds it, and the first sentence of its help.
 COMMANDS = {
     "adjust": ("block", "Adjust several IMAGEs and the points that they share (bundle adjustment of a stereo pair or a "
                         "block)."),
@@ -63,24 +68,42 @@ class _Commands(click.Group):
     With ``--json`` an error is also a document on stdout.
     """
 
+    @functools.cached_property
+    def added(self) -> AddedCommands:
+        """The commands of installed packages; they are looked for once, for the help and for names not of the host."""
+        from ortho_pipeline.cli.machine.added import AddedCommands
+
+        return AddedCommands(COMMANDS)
+
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
+        return sorted([*COMMANDS, *self.added.offers])
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name in COMMANDS and cmd_name not in self.commands:
-            from ortho_pipeline.cli.survey.examples import EXAMPLES, with_examples
+        if cmd_name in self.commands:
+            return self.commands[cmd_name]
+        from ortho_pipeline.cli.survey.examples import EXAMPLES, with_examples
 
+        if cmd_name in COMMANDS:
             module = importlib.import_module(f"ortho_pipeline.cli.{COMMANDS[cmd_name][0]}")
-            command: click.Command = getattr(module, cmd_name.replace("-", "_"))
-            command.help = with_examples(command.help, EXAMPLES.get(cmd_name, ()))
-            self.add_command(command)
-        return super().get_command(ctx, cmd_name)
+            command, examples = getattr(module, cmd_name.replace("-", "_")), EXAMPLES.get(cmd_name, ())
+        elif cmd_name in self.added.offers:
+            try:
+                command, examples = self.added.load(cmd_name), self.added.offers[cmd_name].examples
+            except PluginError:
+                if ctx.resilient_parsing:  # a shell completes the other commands
+                    return None
+                raise
+        else:
+            return None
+        command.help = with_examples(command.help, examples)
+        self.add_command(command, cmd_name)
+        return command
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find the command that is called; of an unknown one name the nearest."""
-        if args and not args[0].startswith("-") and args[0] not in self.list_commands(ctx):
+        if args and not args[0].startswith("-") and self.get_command(ctx, args[0]) is None:
             import difflib
 
             if close := difflib.get_close_matches(args[0], self.list_commands(ctx), 1):
@@ -89,7 +112,9 @@ class _Commands(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands by what is known of them, without loading any."""
-        known = {name: click.Command(name, help=said) for name, (_, said) in COMMANDS.items()}
+        told = {name: said for name, (_, said) in COMMANDS.items()}
+        told |= {name: offer.summary for name, offer in self.added.offers.items()}
+        known = {name: click.Command(name, help=said) for name, said in told.items()}
         click.Group(self.name, known).format_commands(ctx, formatter)
 
     def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> click.Context:
@@ -181,6 +206,9 @@ def _without_gdal() -> InputError | None:
 
 def main() -> None:
     """Run the command line."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(PrintableLog("%(levelname)s: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
     with ended_by_signals():
         try:
             cli(prog_name="ortho", obj=_begin)
@@ -194,8 +222,6 @@ def main() -> None:
 
 def _begin() -> None:
     """Prepare the process for a command, before it is loaded."""
-    import logging
-
     from ortho_pipeline.files.folders import ignore_working_folder
     from ortho_pipeline.files.locations import close_network
     from ortho_pipeline.files.process_limits import share_freed_memory
@@ -204,9 +230,6 @@ def _begin() -> None:
     # Before GDAL is loaded, which reads the environment; worker processes inherit it.
     ignore_working_folder()
     close_network()
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(PrintableLog("%(levelname)s: %(message)s"))
-    logging.basicConfig(level=logging.WARNING, handlers=[handler])
 
 
 @click.group(

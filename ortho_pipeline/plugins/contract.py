@@ -9,14 +9,13 @@ from __future__ import annotations
 import inspect
 import json
 import math
-import traceback
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.errors import OrthoError, described
 from ortho_pipeline.estimation.problem import Prior
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.distortion import metres_of_steps
@@ -28,22 +27,6 @@ from ortho_pipeline.options.texts import counted
 SMALLEST_PIXEL, NARROWEST = 1e-3, 1.0
 #: Parts of the half-size of the domain at which a model is tried, and a row of NaN.
 _TRIED = np.array([[0, 0, 0], [0.5, 0, 0], [0, 0.5, 0], [0, 0, 0.5], [-0.5, -0.5, -0.5], [math.nan] * 3])
-
-
-def described(error: BaseException, culprit: object) -> str:
-    """Return kind, text and place of an error: the last line that it passed of the plugin that `culprit` is from.
-
-    `culprit` is a function or class of the plugin, or the name of its module.
-    """
-    module = culprit if isinstance(culprit, str) else getattr(culprit, "__module__", "")
-    package = module.partition(".")[0]
-    frames = list(traceback.walk_tb(error.__traceback__))
-    own = [one for one in frames if one[0].f_globals.get("__name__", "").partition(".")[0] == package]
-    where = ""
-    if own:
-        frame, line = own[-1]
-        where = f" at {Path(frame.f_code.co_filename).name}:{line}"
-    return f"{type(error).__name__}: {error}{where}"
 
 
 def sensor_faults(sensor: object) -> Iterator[str]:

@@ -11,12 +11,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed
+from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed, described
 from ortho_pipeline.exchange.crop import placed
 from ortho_pipeline.hookspecs import Scene, Sensor, Study
 from ortho_pipeline.models import KINDS
 from ortho_pipeline.options.texts import Setting, Text
-from ortho_pipeline.plugins.contract import described, scene_faults
+from ortho_pipeline.plugins.contract import scene_faults
 from ortho_pipeline.plugins.registry import Broken, Provenance, Registry
 from ortho_pipeline.plugins.unread import unread
 from ortho_pipeline.raster.source import open_dataset

@@ -1,7 +1,7 @@
 """The plugins that are there: where each came from, what its hooks return, and which names are whose.
 
-Plugins are found through the entry-point group ``ortho_pipeline``, the bundled ones included: they have no privileged
-path, only reserved names.
+Plugins are found through entry-point groups, the bundled ones included: they have no privileged path, only reserved
+names. Those of commands have a group of their own, because ``ortho --help`` asks them: sensors import NumPy and GDAL.
 """
 
 from __future__ import annotations
@@ -9,28 +9,31 @@ from __future__ import annotations
 import contextlib
 import difflib
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pluggy
 
 from ortho_pipeline import hookspecs
-from ortho_pipeline.errors import PluginError
-from ortho_pipeline.hookspecs import PROJECT_NAME, Sensor, Study
-from ortho_pipeline.models import KINDS, SensorModel
-from ortho_pipeline.plugins.contract import described, sensor_faults
+from ortho_pipeline.errors import PluginError, described
+from ortho_pipeline.hookspecs import GROUPS, PROJECT_NAME, Sensor, Study, Subcommand
+
+if TYPE_CHECKING:
+    from ortho_pipeline.models import SensorModel
 
 BUNDLED = "ortho-pipeline"
-HOOKS = ("ortho_sensors", "ortho_models", "ortho_studies")
 #: What each hook returns, what it is collected in, and what authors are told who return something else.
 _RETURNS: dict[str, tuple[type, type, str]] = {
     "ortho_sensors": (Iterable, list, "yield the Sensor, or return [Sensor(...)]"),
     "ortho_models": (Mapping, dict, "return {kind: class}"),
     "ortho_studies": (Iterable, list, "yield the Study, or return [Study(...)]"),
+    "ortho_commands": (Iterable, list, "yield the Subcommand, or return [Subcommand(...)]"),
 }
+_COMMAND, _TARGET = re.compile(r"[a-z][a-z0-9-]*"), re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 log = logging.getLogger(__name__)
 
 
@@ -80,20 +83,25 @@ class Registry:
     ----------
     lenient : bool
         Leave out a plugin that breaks the contract and list it in `broken`, instead of raising.
+    group : str
+        Entry-point group of the plugins, of `hookspecs.GROUPS`.
+    reserved : iterable of str
+        Names that belong to the host.
 
     Attributes
     ----------
     origin : dict of str to Provenance
         Of every plugin, by its name.
     owner : dict of str to str
-        The plugin that a sensor, a model family or a study belongs to.
+        The plugin that a sensor, a model family, a study or a command belongs to.
     broken : tuple of Broken
     """
 
-    def __init__(self, lenient: bool) -> None:
+    def __init__(self, lenient: bool, group: str = PROJECT_NAME, reserved: Iterable[str] = ()) -> None:
         self._manager = pluggy.PluginManager(PROJECT_NAME)
         self._manager.add_hookspecs(hookspecs)
-        self._reserved: set[str] = set()
+        self._group = group
+        self._reserved = set(reserved)
         self._lenient = lenient
         self.origin: dict[str, Provenance] = {}
         self.owner: dict[str, str] = {}
@@ -102,19 +110,21 @@ class Registry:
     def register_installed(self) -> None:
         """Register the plugins that installed distributions name as entry points."""
         known: dict[int, tuple[str, str]] = {}  # each look at a name or a version parses all metadata
-        for entry in sorted(metadata.entry_points(group=PROJECT_NAME), key=lambda entry: entry.name):
+        origins: list[tuple[Provenance, metadata.EntryPoint]] = []
+        for entry in metadata.entry_points(group=self._group):
             if id(entry.dist) not in known:
                 told = entry.dist.metadata if entry.dist else {"Name": "(unknown)", "Version": ""}
                 known[id(entry.dist)] = told["Name"], told["Version"]
-            distribution, version = known[id(entry.dist)]
-            origin = Provenance(entry.name, entry.value, distribution, version)
+            origins.append((Provenance(entry.name, entry.value, *known[id(entry.dist)]), entry))
+        # Bundled ones first: what they offer is theirs.
+        for origin, entry in sorted(origins, key=lambda one: (not one[0].bundled, one[1].name)):
             if origin.bundled:
                 self._reserved.add(entry.name)
             try:
                 plugin = entry.load()
             except (Exception, SystemExit) as error:
                 # A plugin is somebody else's code: whatever its import does wrong, the others go on.
-                self._leave_out(Broken(entry.name, distribution, version, described(error, entry.module)))
+                self._leave_out(Broken(entry.name, origin.distribution, origin.version, described(error, entry.module)))
                 continue
             self.register(plugin, origin)
 
@@ -132,21 +142,14 @@ class Registry:
 
     def sensors(self) -> Mapping[str, Sensor]:
         """Collect the sensors that plugins offer, by name."""
-        sensors: dict[str, Sensor] = {}
-        for plugin, offered in self._returned("ortho_sensors"):
-            with self._judged(self.origin[plugin]):
-                for sensor in offered:
-                    fault = next(sensor_faults(sensor), None)
-                    if fault:
-                        raise PluginError(f"plugin {plugin}: {fault}")
-                    if sensor.name in sensors and self.owner[sensor.name] == plugin:
-                        raise PluginError(f"plugin {plugin} offers two sensors {sensor.name!r}")
-                    self._claim(plugin, sensor.name, "sensor")
-                    sensors[sensor.name] = sensor
-        return MappingProxyType(dict(sorted(sensors.items())))
+        from ortho_pipeline.plugins.contract import sensor_faults
+
+        return self._named("ortho_sensors", "sensor", sensor_faults)
 
     def models(self) -> Mapping[str, type[SensorModel]]:
         """Collect the model families that plugins offer, by kind."""
+        from ortho_pipeline.models import KINDS, SensorModel
+
         families: dict[str, type[SensorModel]] = {}
         for plugin, offered in self._returned("ortho_models"):
             with self._judged(self.origin[plugin]):
@@ -166,17 +169,25 @@ class Registry:
 
     def studies(self) -> Mapping[str, Study]:
         """Collect the studies that plugins offer, by name."""
-        studies: dict[str, Study] = {}
-        for plugin, offered in self._returned("ortho_studies"):
+        return self._named("ortho_studies", "study", _study_faults)
+
+    def commands(self) -> Mapping[str, Subcommand]:
+        """Collect the commands that packages add, by name."""
+        return self._named("ortho_commands", "command", _command_faults)
+
+    def _named(self, hook: str, what: str, faults: Callable[[Any], Iterator[str]]) -> Mapping[str, Any]:
+        """Collect what a hook offers, by name; the first fault of an offer is that of its plugin."""
+        offers: dict[str, Any] = {}
+        for plugin, offered in self._returned(hook):
             with self._judged(self.origin[plugin]):
-                for study in offered:
-                    if not isinstance(study, Study):
-                        raise PluginError(f"plugin {plugin}: ortho_studies yields {type(study).__name__}, not Study")
-                    if study.name in studies and self.owner[study.name] == plugin:
-                        raise PluginError(f"plugin {plugin} offers two studies {study.name!r}")
-                    self._claim(plugin, study.name, "study")
-                    studies[study.name] = study
-        return MappingProxyType(dict(sorted(studies.items())))
+                for offer in offered:
+                    if fault := next(faults(offer), None):
+                        raise PluginError(f"plugin {plugin}: {fault}")
+                    if offer.name in offers and self.owner[offer.name] == plugin:
+                        raise PluginError(f"plugin {plugin} offers the {what} {offer.name!r} twice")
+                    self._claim(plugin, offer.name, what)
+                    offers[offer.name] = offer
+        return MappingProxyType(dict(sorted(offers.items())))
 
     @contextlib.contextmanager
     def _judged(self, origin: Provenance) -> Iterator[None]:
@@ -193,26 +204,36 @@ class Registry:
         log.warning("%s", broken)
 
     def _refuse_misspelt(self, plugin: Any, name: str) -> None:
-        for hook in HOOKS:
+        hooks = GROUPS[self._group]
+        for hook in hooks:
             if callable(getattr(plugin, hook, None)) and self._manager.parse_hookimpl_opts(plugin, hook) is None:
                 raise PluginError(
                     f"plugin {name}: {hook} is not marked with @hookimpl", remedy="write @hookimpl above it"
                 )
         for hook in dir(plugin):
-            if hook not in HOOKS and self._manager.parse_hookimpl_opts(plugin, hook) is not None:
-                meant = difflib.get_close_matches(hook, HOOKS, 1) or HOOKS
-                raise PluginError(
-                    f"plugin {name}: there is no hook {hook!r}", remedy=f"did you mean {' or '.join(meant)}?"
-                )
+            if hook in hooks or self._manager.parse_hookimpl_opts(plugin, hook) is None:
+                continue
+            for group, others in GROUPS.items():
+                if hook in others:
+                    raise PluginError(
+                        f"plugin {name}: {hook} is not called in plugins of the entry-point group {self._group}",
+                        remedy=f"its author: name its module in the group {group}",
+                    )
+            meant = difflib.get_close_matches(hook, hooks, 1) or hooks
+            raise PluginError(f"plugin {name}: there is no hook {hook!r}", remedy=f"did you mean {' or '.join(meant)}?")
 
     def _returned(self, hook: str) -> Iterator[tuple[str, Any]]:
-        # Each implementation is called by itself, so that an error can name its plugin.
+        # pluggy calls the hook once for each plugin, wrappers around it: so an error can name its plugin.
         wanted, collect, advice = _RETURNS[hook]
-        for implementation in getattr(self._manager.hook, hook).get_hookimpls():
+        every = getattr(self._manager.hook, hook).get_hookimpls()
+        offering = [one for one in every if not (one.wrapper or one.hookwrapper)]
+        for implementation in offering:
             plugin = implementation.plugin_name
+            others = [one.plugin for one in offering if one is not implementation]
             with self._judged(self.origin[plugin]):
                 try:
-                    offered = implementation.function()
+                    # pluggy returns no None.
+                    offered = next(iter(self._manager.subset_hook_caller(hook, others)()), None)
                     returned = collect(offered) if isinstance(offered, wanted) else None
                 except (Exception, SystemExit) as error:
                     text = described(error, implementation.function)
@@ -236,3 +257,21 @@ class Registry:
                 remedy=f"an author: rename the {what}; a user: uninstall one of the two",
             )
         self.owner[name] = plugin
+
+
+def _study_faults(study: object) -> Iterator[str]:
+    if not isinstance(study, Study):
+        yield f"ortho_studies yields {type(study).__name__}, not Study"
+
+
+def _command_faults(command: object) -> Iterator[str]:
+    if not isinstance(command, Subcommand):
+        yield f"ortho_commands yields {type(command).__name__}, not Subcommand"
+        return
+    texts = (command.name, command.summary, command.target)
+    if not all(isinstance(text, str) for text in texts) or not _COMMAND.fullmatch(command.name):
+        yield f"{command.name!r} is not a name of a command: lower case, digits and dashes"
+    elif not _TARGET.fullmatch(command.target):
+        yield f"command {command.name!r}: its target {command.target!r} is not 'package.module:name'"
+    elif not command.summary.strip():
+        yield f"command {command.name!r}: its summary is empty"

@@ -16,8 +16,11 @@ from ortho_pipeline.cli.printing import print_json
 def doctor(fetch_grids: bool, as_json: bool) -> None:
     """Show what is installed: GDAL, PROJ, geoid grids, plugins."""
     from ortho_pipeline import commands
+    from ortho_pipeline.cli.program import cli
 
     document = commands.doctor(fetch_grids=fetch_grids)
+    document["plugins"] += [one.to_json() for one in cli.added.packages()]
+    document["broken"] += [one.to_json() for one in cli.added.broken()]
     if as_json:
         return print_json(document)
     gdal, proj = document["gdal"], document["proj"]

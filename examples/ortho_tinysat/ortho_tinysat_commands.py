@@ -1,0 +1,12 @@
+"""The commands that TinySat-1 adds to `ortho`. Its help imports this module: it declares them, and imports no more."""
+
+from collections.abc import Iterable
+
+from ortho_pipeline.hookspecs import Subcommand, hookimpl
+
+
+@hookimpl
+def ortho_commands() -> Iterable[Subcommand]:
+    example = ("How high and how fast?", "ortho flight scene.tif")
+    summary = "Show how high and how fast TinySat-1 flew when it took IMAGE."
+    yield Subcommand("flight", summary, "ortho_tinysat_flight:flight", (example,))

@@ -1,0 +1,30 @@
+"""The command `ortho flight`."""
+
+import click
+
+from ortho_pipeline.cli.machine.terminal import say
+from ortho_pipeline.cli.options import image_argument, json_option
+from ortho_pipeline.cli.parsing import Command
+from ortho_pipeline.cli.printing import print_json
+
+
+@click.command(cls=Command)
+@image_argument
+@json_option
+def flight(image: str, as_json: bool) -> None:
+    """Show how high and how fast TinySat-1 flew when it took IMAGE.
+
+    The height is above the ellipsoid.
+    """
+    import numpy as np  # here: the help of the command does not need it
+
+    import ortho_pipeline as op
+    from ortho_pipeline.geodesy.ellipsoid import geodetic
+
+    model = op.open_scene(image, "tinysat").model
+    height = float(geodetic(np.array([model.position]))[0, 2])
+    speed = float(np.linalg.norm(model.velocity))
+    if as_json:
+        print_json({"height": height, "speed": speed})
+    else:
+        say(f"{height / 1000:.0f} km, {speed / 1000:.1f} km/s")

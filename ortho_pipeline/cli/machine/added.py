@@ -1,0 +1,66 @@
+"""The commands that installed packages add to `ortho`, by the hook `ortho_commands`."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
+
+import click
+
+from ortho_pipeline.errors import PluginError, described
+from ortho_pipeline.plugins.registry import Registry
+
+if TYPE_CHECKING:
+    from ortho_pipeline.hookspecs import Subcommand
+    from ortho_pipeline.plugins.registry import Broken, Provenance
+
+GROUP = "ortho_pipeline_commands"
+
+
+class AddedCommands:
+    """What installed packages add; a package that breaks the contract is left out with a warning.
+
+    Parameters
+    ----------
+    reserved : iterable of str
+        The commands of the host.
+
+    Attributes
+    ----------
+    offers : mapping of str to Subcommand
+    """
+
+    def __init__(self, reserved: Iterable[str]) -> None:
+        self._registry = Registry(True, GROUP, reserved)
+        self._registry.register_installed()
+        self.offers: Mapping[str, Subcommand] = self._registry.commands()
+
+    def packages(self) -> tuple[Provenance, ...]:
+        """Return where each package came from."""
+        return tuple(self._registry.origin.values())
+
+    def broken(self) -> tuple[Broken, ...]:
+        """Return the packages that were left out, and why."""
+        return self._registry.broken
+
+    def load(self, name: str) -> click.Command:
+        """Import a command.
+
+        Raises
+        ------
+        PluginError
+            If its package fails, or its target is no command of click.
+        """
+        module, _, attribute = self.offers[name].target.partition(":")
+        said = f"the command {name!r} of plugin {self._registry.owner[name]} cannot be loaded"
+        try:
+            command = getattr(importlib.import_module(module), attribute)
+        except (Exception, SystemExit) as error:
+            # A package is somebody else's code, and its other requirements may be missing.
+            raise PluginError(
+                f"{said} ({described(error, module)})", remedy="install what it needs, or report it to its author"
+            ) from error
+        if not isinstance(command, click.Command):
+            raise PluginError(f"{said}: {module}:{attribute} is a {type(command).__name__}, not a command of click")
+        return command
