@@ -22,6 +22,7 @@ import numpy as np
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
+from ortho_pipeline.estimation.left_out import left_out
 from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.statistics import chance_of, squared_distances
@@ -53,6 +54,8 @@ _MEDIAN_OF_TWO = 2 * math.log(2)
 REJECTED_LIMIT = 0.3
 #: Residuals are never tested at a finer scale than this part of their stated sigma (noise-free simulations).
 _SCALE_FLOOR = 1e-3
+#: A point with less redundancy than this in some direction is not tested.
+_TESTABLE = 1e-6
 #: A point without an image is so far off (px): its square is still a number.
 _FAR = 1e150
 _SUBSETS = 500
@@ -93,6 +96,18 @@ def find_blunders(problem: Problem, ridge: float | str | None = None) -> tuple[n
             break
         keep = keep | agree
     return keep, reasons
+
+
+def refuse_many(names: Sequence[str], count: int, what: str, source: str, remedy: str) -> None:
+    """Refuse to clean up where so many of `count` contradict that which of them are wrong is a guess."""
+    if len(names) > REJECTED_LIMIT * count:
+        some = ", ".join(names[:_NAMED]) + (" ..." if len(names) > _NAMED else "")
+        raise DegeneratePoints(
+            f"{len(names)} of {counted(count, what)} contradict the others ({some}): which of them are wrong cannot be "
+            "decided",
+            file=source or None,
+            remedy=remedy,
+        )
 
 
 def _common(problem: Problem) -> Solution:
@@ -221,11 +236,8 @@ class _Tested(NamedTuple):
 def _against_others(solution: Solution) -> _Tested | None:
     """Test the residual of each point; None where there is too little redundancy."""
     redundancy = solution.redundancy_blocks()
-    standardised = solution.errors.whitened(solution.residuals)
-    good = np.linalg.det(redundancy) > 1e-6
-    squares = np.zeros(len(redundancy))
-    squares[good] = squared_distances(standardised[good], redundancy[good])
-    freedom = solution.freedom - 2
+    apart = left_out(redundancy, solution.errors.whitened(solution.residuals), known=_TESTABLE)
+    squares, freedom = np.where(apart.rank == 2, apart.squares, 0.0), solution.freedom - 2
     if solution.sigma0 is None or freedom < 1:
         return None
     others = np.maximum((solution.sigma0**2 * solution.freedom - squares) / freedom, _SCALE_FLOOR**2)

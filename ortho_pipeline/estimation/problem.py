@@ -29,6 +29,7 @@ import numpy as np
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
 from ortho_pipeline.estimation.least_squares import condition_of, minimise, solve_linear
+from ortho_pipeline.estimation.left_out import left_out
 from ortho_pipeline.geodesy.distortion import map_from_enu
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted
@@ -37,6 +38,8 @@ from ortho_pipeline.points.image_errors import says_more
 
 #: A scaled normal matrix beyond this condition is taken as singular: the points do not determine the model.
 CONDITION_LIMIT = 1e6
+#: A point with less redundancy than this in some direction is indispensable.
+INDISPENSABLE = 1e-9
 #: An error across a direction that is smaller than this part of that along it is rounding.
 _ROUNDING = 1e-14
 
@@ -187,33 +190,20 @@ class Solution:
 
         NaN is a point, or a group, that is indispensable.
         """
-        left = self.leave_each_out()
-        shared = [np.flatnonzero(self.groups == group) for group in sorted({*self.groups.tolist()} - {-1})]
-        if shared:
-            left[self.groups >= 0] = self.leave_out(shared)[self.groups >= 0]
+        left, white = self.leave_each_out(), self.errors.whitened(self.residuals)
+        design = self.errors.whitened(self.jacobian)
+        for group in sorted({*self.groups.tolist()} - {-1}):
+            of = self.groups == group
+            rows = design[of].reshape(2 * int(of.sum()), -1)
+            redundancy = np.eye(len(rows)) - rows @ self.cofactors @ rows.T
+            together = left_out(redundancy[None], white[of].reshape(1, -1), known=INDISPENSABLE).whole
+            left[of] = self.errors[of].restored(together.reshape(-1, 2))
         return left
 
     def leave_each_out(self) -> Array:
         """Return residuals ``(n, 2)`` px that each point would have had alone without itself, whatever its group."""
-        left = np.full(self.residuals.shape, np.nan)
-        redundancy, white = self.redundancy_blocks(), self.errors.whitened(self.residuals)
-        good = np.linalg.det(redundancy) > 1e-9
-        solved = np.linalg.solve(redundancy[good], white[good][:, :, None])[:, :, 0]
-        left[good] = self.errors[good].restored(solved)
-        return left
-
-    def leave_out(self, groups: list[np.ndarray]) -> Array:
-        """Return residuals ``(n, 2)`` px that the points of each group would have had, had the group taken no part."""
-        left = np.full(self.residuals.shape, np.nan)
-        count = self.cofactors.shape[0]
-        jacobian, residuals = self.errors.whitened(self.jacobian), self.errors.whitened(self.residuals)
-        for group in groups:
-            rows = jacobian[group].reshape(2 * len(group), count)
-            matrix = np.eye(len(rows)) - rows @ self.cofactors @ rows.T
-            if np.linalg.eigvalsh(matrix)[0] > 1e-9:
-                solved = np.linalg.solve(matrix, residuals[group].ravel())
-                left[group] = self.errors[group].restored(solved.reshape(-1, 2))
-        return left
+        white = self.errors.whitened(self.residuals)
+        return self.errors.restored(left_out(self.redundancy_blocks(), white, known=INDISPENSABLE).whole)
 
 
 @dataclass(frozen=True, eq=False)
