@@ -9,6 +9,9 @@ Source: section 3.3 of Bueyueksalih et al. (OrbView-3), after Jacobsen (RAPORIO)
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -31,6 +34,23 @@ def chance_of(squares: ArrayLike, size: ArrayLike, freedom: ArrayLike) -> Array:
     from scipy.special import fdtrc  # scipy.stats would take most of the start-up of a command
 
     return np.asarray(fdtrc(size, freedom, np.asarray(squares) / size))
+
+
+def effective_parameters(count: int, fictitious: Iterable[tuple[Array, Array]]) -> float:
+    """Return how many of `count` parameters true observations determine: the trace of their hat matrix.
+
+    `fictitious` are rows ``(k, p)`` of other observations over their sigmas (a regularisation, soft constraints, what
+    holds a datum) and the cofactors ``(p, p)`` of their parameters: what these determine is not unknown.
+    """
+    return count - sum(float(((rows @ cofactors) * rows).sum()) for rows, cofactors in fictitious)
+
+
+def unit_weight(square: float, freedom: float, least: float) -> float | None:
+    """Return the standard error of unit weight of a sum of squares; None for no more than `least` degrees of freedom.
+
+    These are a fraction where some observations are fictitious.
+    """
+    return math.sqrt(square / freedom) if freedom > least else None
 
 
 def correlation_of(covariance: Array) -> Array:

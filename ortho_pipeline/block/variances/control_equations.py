@@ -69,11 +69,11 @@ class ControlEquations:
         problem, linear = solved.problem, solved.linear
         self.size = problem.size
         self.rows = linear.ordering.grounded
-        self.u, by_params, self.ue, self.d = self._control(linear)
-        self.observed = np.isfinite(problem.known[self.rows])
+        ground = problem.on_points(linear.state.local, self.rows)
+        self.observed, self.d = ground.observed, ground.apart
+        self.u, by_params, self.ue = self._control(linear, ground.axes)
         self.unstated = self.observed & (problem.points.sigma_ground[self.rows] == 0)
-        with np.errstate(divide="ignore"):
-            self.weights = np.where(self.observed, problem.ground_sigmas[self.rows] ** -2.0, 0.0)
+        self.weights = ground.sigmas**-2.0
         own = self.u + diagonal(self.weights)
         self.root = _root(solved.cofactors, own, by_params, linear.pseudo_design)
         self.rest = self.size - self.root.shape[1]
@@ -101,24 +101,21 @@ class ControlEquations:
         """Number m of the parameters z."""
         return self.root.shape[1]
 
-    def _control(self, linear: Linear) -> tuple[Array, Array, Array, Array]:
-        """Return `u`, B'A ``(n, 3, P)``, `ue` and `d`."""
+    def _control(self, linear: Linear, axes: Array) -> tuple[Array, Array, Array]:
+        """Return `u`, B'A ``(n, 3, P)`` and `ue`, along `axes` ``(n, 3, 3)`` of the points."""
         problem, ordering, points = linear.problem, linear.ordering, linear.problem.points
         place = np.full(len(points), -1)
         place[self.rows] = np.arange(len(self.rows))
         rays = ordering.rays[place[points.point[ordering.rays]] >= 0]
         of = place[points.point[rays]]
-        enu = problem.enu[self.rows]
-        turned = (linear.by_point[rays] @ enu[of].swapaxes(1, 2)).swapaxes(1, 2)
+        turned = (linear.by_point[rays] @ axes[of].swapaxes(1, 2)).swapaxes(1, 2)
         u, ue = np.zeros((len(self.rows), 3, 3)), np.zeros((len(self.rows), 3))
         np.add.at(u, of, turned @ turned.swapaxes(1, 2))
         np.add.at(ue, of, (turned @ linear.misfits.rays[rays][:, :, None])[:, :, 0])
         by_params = np.zeros((len(self.rows), 3, self.size + 1))
         columns = problem.columns.padded[points.image[rays]]
         by_params[of[:, None, None], np.arange(3)[:, None], columns[:, None]] = turned @ linear.by_params[rays]
-        apart = (enu @ (problem.target[self.rows] - linear.state.local[self.rows])[:, :, None])[:, :, 0]
-        apart = np.where(np.isfinite(problem.known[self.rows]), apart, 0.0)
-        return u, by_params[:, :, : self.size], ue, apart
+        return u, by_params[:, :, : self.size], ue
 
     def likelihoods(self, nodes: Array) -> Array:
         """Return the log likelihoods ``(b,)`` with variances ``(b, 3)`` of image, plan and height."""

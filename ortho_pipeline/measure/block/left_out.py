@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ortho_pipeline.block.adjustment import pseudo_of
 from ortho_pipeline.block.datum import with_datum
 from ortho_pipeline.block.equations.elimination import step_of
 from ortho_pipeline.block.equations.linear import Linear
-from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
+from ortho_pipeline.block.equations.problem import BlockProblem, Selection, State
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.intersection import frame_of
 from ortho_pipeline.block.local_frame import GEODETIC
@@ -66,7 +67,7 @@ class LeftOut:
         grounded = linear.ordering.grounded
         ground = np.where(fit.used_ground[:, None], np.nan, fit.object_residuals)
         of_ground = left_out(np.eye(3) - hats[1][grounded], misfits.ground[grounded], known=_KNOWN, testable=_TESTABLE)
-        ground[grounded] = of_ground.whole * problem.ground_sigmas[grounded]
+        ground[grounded] = of_ground.whole * problem.on_points(linear.state.local, grounded).sigmas
         others = np.flatnonzero(~fit.used_ground & points.check & np.isfinite(fit.object_residuals).all(axis=1))
         tests = [
             (points.point[used], of_rays.squares, of_rays.rank),
@@ -80,23 +81,15 @@ def _equations(fit: BlockFit, starts: Mapping[str, Start], hold: float | None) -
     """Return the observation equations at the solution, with the sigmas that were found."""
     points, models = fit.points, tuple(fit.models[label] for label in fit.points.images)
     begun = tuple(fit.start[label] for label in points.images)
+    priors = {label: start.priors for label, start in starts.items()}
     known = np.where(points.control[:, None], points.known_in(GEODETIC), np.nan)
-    problem = BlockProblem(points, begun, frame_of(begun, points), known, _priors(fit, starts))
+    problem = BlockProblem(points, begun, frame_of(begun, points), known, pseudo_of(begun, points, priors))
     local = problem.frame.of_geodetic(fit.ground)
     selection = Selection.of(fit.used_rays, fit.used_ground)
     problem, _ = with_datum(problem, State(begun, local), selection, hold)
     problem = fit.variances.applied(problem)
     problem = replace(problem, assumed=(max(problem.assumed[0], _LEAST), max(problem.assumed[1], _LEAST)))
     return problem, Linear.at(problem, State(models, local), selection)
-
-
-def _priors(fit: BlockFit, starts: Mapping[str, Start]) -> tuple[Pseudo, ...]:
-    """Return what is known of parameters by themselves."""
-    return tuple(
-        Pseudo(column, prior.mean, prior.sigma)
-        for column, (label, name) in enumerate(fit.parameters)
-        if (prior := starts[label].priors.get(name)) is not None
-    )
 
 
 def _of_checks(fit: BlockFit, checks: Index) -> Array:
