@@ -33,7 +33,7 @@ from ortho_pipeline.block.variances.grid import estimate, posterior, reweighed
 from ortho_pipeline.block.variances.shared_errors import SharedByImage
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged
-from ortho_pipeline.estimation.observations import Prior
+from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
 from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.geodesy.crs import ground_transform

@@ -29,8 +29,8 @@ from ortho_pipeline.block.equations.problem import BlockProblem, Misfits, Select
 from ortho_pipeline.block.equations.solver import Solved, attempt, solve
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.estimation.observations.common_unknown import CommonUnknown
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
-from ortho_pipeline.estimation.spatial.common_unknown import CommonUnknown
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array, solve_2x2
 

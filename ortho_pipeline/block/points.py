@@ -18,7 +18,7 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.observations import ImageErrors
+from ortho_pipeline.estimation.observations.image_errors import ImageErrors
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs, same_crs
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import is_usable

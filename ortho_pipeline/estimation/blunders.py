@@ -22,10 +22,9 @@ import numpy as np
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
-from ortho_pipeline.estimation.left_out import left_out
 from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
-from ortho_pipeline.estimation.statistics import chance_of, squared_distances
+from ortho_pipeline.estimation.statistics import chance_of, left_out, squared_distances
 from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
@@ -54,7 +53,7 @@ _MEDIAN_OF_TWO = 2 * math.log(2)
 REJECTED_LIMIT = 0.3
 #: Residuals are never tested at a finer scale than this part of their stated sigma (noise-free simulations).
 _SCALE_FLOOR = 1e-3
-#: A point with less redundancy than this in some direction is not tested.
+#: A point with a smaller determinant of its redundancy is not tested.
 _TESTABLE = 1e-6
 #: A point without an image is so far off (px): its square is still a number.
 _FAR = 1e150
@@ -236,8 +235,8 @@ class _Tested(NamedTuple):
 def _against_others(solution: Solution) -> _Tested | None:
     """Test the residual of each point; None where there is too little redundancy."""
     redundancy = solution.redundancy_blocks()
-    apart = left_out(redundancy, solution.errors.whitened(solution.residuals), known=_TESTABLE)
-    squares, freedom = np.where(apart.rank == 2, apart.squares, 0.0), solution.freedom - 2
+    apart = left_out(redundancy, solution.errors.whitened(solution.residuals), known=0.0)
+    squares, freedom = np.where(np.linalg.det(redundancy) > _TESTABLE, apart.squares, 0.0), solution.freedom - 2
     if solution.sigma0 is None or freedom < 1:
         return None
     others = np.maximum((solution.sigma0**2 * solution.freedom - squares) / freedom, _SCALE_FLOOR**2)

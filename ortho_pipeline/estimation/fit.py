@@ -24,7 +24,7 @@ from ortho_pipeline.estimation.determinacy import (
     uncertain_edge,
     unstable,
 )
-from ortho_pipeline.estimation.observations import Prior
+from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.spatial.common_error import CommonError

@@ -29,9 +29,9 @@ import numpy as np
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
 from ortho_pipeline.estimation.least_squares import condition_of, minimise, solve_linear
-from ortho_pipeline.estimation.left_out import left_out
-from ortho_pipeline.estimation.observations import ImageErrors, Prior
-from ortho_pipeline.estimation.statistics import effective_parameters, unit_weight
+from ortho_pipeline.estimation.observations.image_errors import ImageErrors
+from ortho_pipeline.estimation.observations.prior import Prior
+from ortho_pipeline.estimation.statistics import effective_parameters, left_out, unit_weight
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points

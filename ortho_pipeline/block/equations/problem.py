@@ -11,11 +11,11 @@ from functools import cached_property
 import numpy as np
 
 from ortho_pipeline.block.equations.image_pairs import ImagePairs, Levels
-from ortho_pipeline.block.equations.on_points import OnPoints
 from ortho_pipeline.block.equations.unknowns import Columns, Mask, Ordering
 from ortho_pipeline.block.local_frame import GroundFrame
 from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.block.projection.buffers import Buffers
+from ortho_pipeline.estimation.observations.on_points import OnPoints
 from ortho_pipeline.models.base import Array, SensorModel
 
 #: Ground is never weighted with less than this sigma (m): far below any pixel, far above rounding.

@@ -13,7 +13,7 @@ import numpy as np
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.points import Index
-from ortho_pipeline.estimation.left_out import left_out
+from ortho_pipeline.estimation.statistics import left_out
 from ortho_pipeline.models.base import Array
 
 #: Residuals are never tested at a finer scale than this part of their stated sigma (noise-free simulations).

@@ -158,7 +158,7 @@ class ControlEquations:
         scale = 1.0 / nodes[:, 0]
         weights = np.where(self.unstated, 1.0 / nodes[:, None, [1, 1, 2]], self.weights)
         spread, own = _inverted(self.u * scale[:, None, None, None] + diagonal(weights))
-        spread -= np.log(weights).sum(axis=(1, 2), where=self.unstated)
+        spread -= np.log(weights[:, self.unstated]).sum(axis=1)
         right = self.ue * scale[:, None, None] + weights * self.d
         met = own @ right[..., None]
         square = (weights * self.d**2 - right * met[..., 0]).sum(axis=(1, 2)) + self.square * scale

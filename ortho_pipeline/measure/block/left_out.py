@@ -1,7 +1,7 @@
 r"""Each measurement of a block had it taken no part, and how far it is from all others: its residual left out, and w.
 
-As `estimation.left_out` has it, of each ray and of the known ground of each point. Of a ray that alone gives its point
-a distance nothing is known along the other ray: only the part across it is said.
+By `estimation.statistics.left_out`, of each ray and of the known ground of each point. Of a ray that alone gives its
+point a distance nothing is known along the other ray: only the part across it is said.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from ortho_pipeline.block.intersection import frame_of
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.block.start import Start
-from ortho_pipeline.estimation.left_out import left_out
-from ortho_pipeline.estimation.statistics import squared_distances
+from ortho_pipeline.estimation.statistics import left_out, squared_distances
 from ortho_pipeline.models.base import Array
 
 #: Directions in which all others tell less than this share of what a part tells itself: nothing tests it in them, and

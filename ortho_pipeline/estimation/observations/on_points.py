@@ -6,7 +6,7 @@ three axes of each point, how far what was observed is from where the point is, 
 - Known ground has the axes east, north and up. Of ground without a known height nothing is observed along the third.
 - A height of a surface would be observed along the normal of its tangent plane at the point's present place.
 
-A further type gives its apart, axes and sigmas for its points in `BlockProblem.on_points`.
+A further type gives its apart, axes and sigmas for its points in `block.equations.problem.BlockProblem.on_points`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.models.base import Array
 
 
@@ -38,7 +38,7 @@ class OnPoints:
     sigmas: Array
 
     @property
-    def observed(self) -> Mask:
+    def observed(self) -> NDArray[np.bool_]:
         """Along which axes ``(n, 3)`` something is observed: each is one equation."""
         return np.isfinite(self.sigmas)
 

@@ -1,14 +1,7 @@
-"""Observations of an adjustment, of one image and of a block: the types that both have.
-
-An image point has `ImageErrors`. In the fit of one image they contain the errors of the known ground. A block keeps the
-ground as an unknown, and observes it (`block.equations.on_points`). A parameter that is known beforehand has a `Prior`.
-An error that many points have in common is a `CommonUnknown`. A tie is image points of one place without ground.
-"""
+"""Errors of image points, with those of their ground."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,26 +14,6 @@ from ortho_pipeline.points.image_errors import says_more
 
 #: An error across a direction that is smaller than this part of that along it is rounding.
 _ROUNDING = 1e-14
-
-
-@dataclass(frozen=True)
-class Prior:
-    """A parameter known beforehand: one more observation with this mean and sigma, in the parameter's unit."""
-
-    mean: float
-    sigma: float
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.mean) and self.sigma > 0):
-            raise InputError(
-                f"a prior has a finite mean and a positive sigma, not {self.mean} and {self.sigma}", field="prior"
-            )
-
-
-def priors_at(model: SensorModel, sigmas: Mapping[str, float]) -> dict[str, Prior]:
-    """Return priors that hold parameters at their values in `model`, with these sigmas by name."""
-    values = dict(zip(model.param_names, model.params.tolist(), strict=True))
-    return {name: Prior(values[name], sigma) for name, sigma in sigmas.items()}
 
 
 @dataclass(frozen=True, eq=False)
