@@ -82,6 +82,12 @@ def chance_of(squares: ArrayLike, size: ArrayLike, freedom: ArrayLike) -> Array:
     return np.asarray(fdtrc(size, freedom, np.asarray(squares) / size))
 
 
+def rms(sizes: Array) -> float:
+    """Return the root mean square of sizes ``(n,)``; what is not finite is left out, and 0 stands for none."""
+    known = sizes[np.isfinite(sizes)]
+    return float(np.sqrt((known**2).mean())) if len(known) else 0.0
+
+
 def effective_parameters(count: int, fictitious: Iterable[tuple[Array, Array]]) -> float:
     """Return how many of `count` parameters true observations determine: the trace of their hat matrix.
 
