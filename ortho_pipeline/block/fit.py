@@ -13,6 +13,7 @@ import pyproj
 from ortho_pipeline.block.common_error import CommonError
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.unknowns import Mask
+from ortho_pipeline.block.heights.settling import HeightsUsed
 from ortho_pipeline.block.intersection import sigmas_of
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.points import BlockPoints
@@ -44,8 +45,8 @@ class BlockFit:
     100 with few points too.
     `outlying` are known points that the block contradicts and that were left as they are. Where points have an error in
     common, `common_error` is that, covariances have its part, and residuals of known ground are what is left beside its
-    estimate. Of images whose neighbouring measurements share errors, `shared_errors` says what they do, and covariances
-    have grown by it.
+    estimate. `heights` is what a DEM said of ties. Of images whose neighbouring measurements share errors,
+    `shared_errors` says what they do, and covariances have grown by it.
     """
 
     models: dict[str, SensorModel]
@@ -70,6 +71,7 @@ class BlockFit:
     outlying: tuple[ContradictedPoint, ...] = ()
     warnings: tuple[Notice, ...] = ()
     common_error: CommonError | None = None
+    heights: HeightsUsed | None = None
     shared_errors: Mapping[str, SharedErrors] = field(default_factory=dict)
     condition: float = 1.0
     iterations: int = 0
@@ -154,6 +156,7 @@ class BlockFit:
             "iterations": self.iterations,
             "variances": self.variances.to_json(),
             **({} if self.common_error is None else {"common_error": self.common_error.to_json()}),
+            **({} if self.heights is None else {"heights": self.heights.to_json()}),
             **(
                 {"shared_errors": {k: v.to_json() for k, v in self.shared_errors.items()}} if self.shared_errors else {}
             ),
