@@ -256,7 +256,10 @@ scenes_options = _of_each(*_OF_IMAGES, "model")
 point_options = _grouped("points", PointOptions)
 block_options = _grouped("points", BlockOptions, "points", "gcps", "crs", "vertical", "pixel_origin", "check", "model")
 #: The rest of that group, which is taken by its decorator too.
-adjustment_options = click_options("points", BlockOptions, "ties", "correction", "ground_sigma", "model_crs", "hold")
+adjustment_options = click_options(
+    "points", BlockOptions, "ties", "correction", "ground_sigma", "model_crs", "hold", "dem_heights", "dem_bias",
+    "dem_correlation", "dem_shift_sigma", "join_limit",
+)  # fmt: skip
 surface_options = _grouped("surface", SurfaceOptions)
 match_options = _grouped("match", MatchOptions)
 matching_options = _grouped(

@@ -20,11 +20,13 @@ from ortho_pipeline.block.intersection import Intersection
 from ortho_pipeline.block.intersection import intersect as intersect_rays
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.block.relative.joins import joins_of, weak_joins
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
 from ortho_pipeline.commands.control.block_points import (
     gather,
+    observed,
     read_points,
     refuse_contradictions,
     relative_to_reference,
@@ -84,7 +86,7 @@ def adjust(
     match : MatchOptions
         References to take control points from, and how to match, also for ties (`points.ties`).
     surface : SurfaceOptions
-        Heights, for matching.
+        Heights, for matching and as observations of the ties.
 
     Returns
     -------
@@ -113,7 +115,10 @@ def adjust(
     fit = adjust_block(
         {label: start.model for label, start in starts.items()}, table,
         priors={label: start.priors for label, start in starts.items()}, hold=points.hold,
+        heights=observed(points, surface, gathered.heights),
     )  # fmt: skip
+    joins = joins_of(fit)
+    notes += weak_joins(joins, points.join_limit, with_heights=fit.heights is not None)
     notes += relative_to_reference(fit, points, match)
     exported: dict[str, rpc.RpcExport] = {}
     for label in labels:
@@ -125,7 +130,13 @@ def adjust(
             del files[f"{label} rpc"]
     record = _record(images, points, scenes, starts, command, match, surface, gathered.heights)
     made = block_report.build_report(
-        fit=fit, starts=starts, exported=exported, provenance=record, warnings=[*_warnings(fit, starts), *notes]
+        fit=fit,
+        starts=starts,
+        exported=exported,
+        provenance=record,
+        warnings=[*_warnings(fit, starts), *notes],
+        joins=joins,
+        join_limit=points.join_limit,
     )
     pictures = _pictures(starts, scenes[0])
     with together(folder, "block"):
@@ -257,8 +268,8 @@ def _record(
         for given in (options.points, options.gcps)
     ]
     first = next(iter(starts.values())).scene
-    matched = options.ties is not None or match.reference
-    asked = {"match": match, "surface": surface} if matched else {}
+    matched = options.ties is not None or bool(match.reference)
+    asked = ({"match": match} if matched else {}) | ({"surface": surface} if matched or heights is not None else {})
     whole = provenance(
         Request(images[0]), first, None, ledgers[0].joined(*ledgers[1:]).hashed(), command,
         {"block": options, "scene": replace(scenes[0], model=None), **asked},

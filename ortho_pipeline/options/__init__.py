@@ -7,9 +7,9 @@ Python and in the pipeline file, and of which the command line shows the flag.
 Imports nothing but `errors`. A new option is a field in `groups`.
 """
 
+from ortho_pipeline.options.block import BlockOptions
 from ortho_pipeline.options.groups import (
     GROUPS,
-    BlockOptions,
     MatchOptions,
     OutputOptions,
     PointOptions,

@@ -84,15 +84,15 @@ class PointTable(Protocol):
 
 #: Chips are held in memory, and more matches say no more of a model.
 _MOST_MATCHES = 100_000
-_VERTICAL_FORMS = "ellipsoid, egm96, egm2008, EPSG:n or a grid file"
-_PIXEL_ORIGIN = Option(
+VERTICAL_FORMS = "ellipsoid, egm96, egm2008, EPSG:n or a grid file"
+PIXEL_ORIGIN = Option(
     "--pixel-origin",
     "What CSV, ODM and link files call the first pixel: its outer corner or its centre (0, 0), or its corner or its "
     "centre (1, 1).",
     choices=tuple(PIXEL_ORIGINS),
 )
-_CHECK = Option("--check", "Points that check and do not control.", "every:N|ids:A,B")
-_MODEL_CRS = "Ground of fitted models: geocentric, geographic, utm or EPSG:n."
+CHECK = Option("--check", "Points that check and do not control.", "every:N|ids:A,B")
+MODEL_CRS = "Ground of fitted models: geocentric, geographic, utm or EPSG:n."
 
 
 @documented
@@ -114,10 +114,10 @@ class PointOptions:
     ] = None
     crs: Annotated[str | None, Option("--points-crs", "CRS of the points, where their file has none.", "CRS")] = None
     vertical: Annotated[
-        str | None, Option("--points-vertical", f"Height datum of the points: {_VERTICAL_FORMS}.", "DATUM")
+        str | None, Option("--points-vertical", f"Height datum of the points: {VERTICAL_FORMS}.", "DATUM")
     ] = None
-    pixel_origin: Annotated[str, _PIXEL_ORIGIN] = "corner"
-    check: Annotated[str | None, _CHECK] = None
+    pixel_origin: Annotated[str, PIXEL_ORIGIN] = "corner"
+    check: Annotated[str | None, CHECK] = None
     select: Annotated[
         str | None,
         Option(
@@ -144,7 +144,7 @@ class PointOptions:
         ),
     ] = None
     model_crs: Annotated[
-        str | None, Option("--model-crs", _MODEL_CRS, "CRS", unset="that of the points")
+        str | None, Option("--model-crs", MODEL_CRS, "CRS", unset="that of the points")
     ] = None  # fmt: skip
     prune: Annotated[bool, Option("--prune", "Remove parameters that the points do not justify.")] = False
     params: Annotated[str | None, Option("--params", "Adjust these parameters only.", "A,B,C", unset="all")] = None
@@ -169,72 +169,6 @@ class PointOptions:
 
 @documented
 @dataclass(frozen=True)
-class BlockOptions:
-    """Which points of a block there are, and what is adjusted to them.
-
-    `model` is a name among the models of each scene, or a family that is fitted to the control points of each image.
-    """
-
-    points: Annotated[
-        PathLike | None,
-        Option(
-            "--points",
-            "Rays: CSV (id,image,col,row[,x,y,h,role,...]), GeoJSON with 'ji' by image, or ODM gcp_list.txt.",
-            "FILE",
-        ),
-    ] = None
-    ties: Annotated[
-        str | None,
-        Option("--ties", Text(
-            "Find tie points between the images by matching, besides those of ", Setting("points.points"), "."
-        ), choices=("auto",)),
-    ] = None  # fmt: skip
-    gcps: Annotated[
-        PathLike | None, Option("--gcps", "Ground of the points: CSV (id,x,y,h,...) or GeoJSON.", "FILE")
-    ] = None
-    crs: Annotated[str | None, Option("--points-crs", "CRS of the ground, where its file has none.", "CRS")] = None
-    vertical: Annotated[
-        str | None, Option("--points-vertical", f"Height datum of the ground: {_VERTICAL_FORMS}.", "DATUM")
-    ] = None
-    pixel_origin: Annotated[str, _PIXEL_ORIGIN] = "corner"
-    check: Annotated[str | None, _CHECK] = None
-    model: Annotated[
-        str | None,
-        Option(
-            "--model",
-            "One of the images' models, such as rpc or pushbroom, or a model fitted to points (see 'ortho models').",
-            "NAME",
-            unset="the images' best",
-        ),
-    ] = None
-    correction: Annotated[
-        str | None,
-        Option(
-            "--correction",
-            "What is adjusted: the image points, or the parameters of the model itself.",
-            unset="the model's own if it has any, else a shift",
-            choices=CORRECTIONS,
-        ),
-    ] = None
-    ground_sigma: Annotated[
-        str | None,
-        Option(
-            "--ground-sigma", "Sigmas (m) in plan and height of ground that states none in the points file.", "XY[,H]",
-            unset="estimated",
-        ),
-    ] = None  # fmt: skip
-    model_crs: Annotated[str | None, Option("--model-crs", _MODEL_CRS, "CRS")] = None
-    hold: Annotated[
-        float | None,
-        Option(
-            "--hold", "Hold the orientation at its start values with this sigma.", "PX", kind="number", above=0,
-            unset="10 where nothing else gives a datum",
-        ),
-    ] = None  # fmt: skip
-
-
-@documented
-@dataclass(frozen=True)
 class SurfaceOptions:
     """Where heights come from: a DEM, or one ellipsoidal height in metres."""
 
@@ -246,7 +180,7 @@ class SurfaceOptions:
         ),
     ] = None  # fmt: skip
     vertical: Annotated[
-        str | None, Option("--dem-vertical", f"Height datum of the DEM: {_VERTICAL_FORMS}.", "DATUM")
+        str | None, Option("--dem-vertical", f"Height datum of the DEM: {VERTICAL_FORMS}.", "DATUM")
     ] = None
     override_vertical: Annotated[
         bool,

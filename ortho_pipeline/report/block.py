@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.relative.joins import Join
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, doubted, to_document
 from ortho_pipeline.display.numbers import flat, metres, px
@@ -25,6 +26,8 @@ from ortho_pipeline.report.block_records import (
     BlockPoint,
     BlockProvenance,
     BlockReport,
+    HeightsRecord,
+    NetworkRecord,
     Ray,
     VariancesRecord,
     merged,
@@ -74,6 +77,8 @@ def build_report(
     exported: Mapping[str, RpcExport],
     provenance: Mapping[str, Any],
     warnings: Sequence[Notice],
+    joins: Sequence[Join] = (),
+    join_limit: float = math.inf,
 ) -> BlockReport:
     """Collect everything that the report says (docs/formats/block-points.md)."""
     places = placed(fit, starts)
@@ -105,7 +110,7 @@ def build_report(
         headline=_corrected(
             headline(adjustment, relative=any(one.code == RELATIVE for one in warnings)), noted["notices"]
         ),
-        network=network_record(network),
+        network=network_record(network, joins, join_limit),
         map_scale=None if refuted(noted["notices"]) else suffices,
     )
 
@@ -207,12 +212,35 @@ def summary_text(report: BlockReport) -> str:
             lines.append(f"{counted(rms.n, f'{role} point')}: RMSE {text} m")
     sigma0 = "unknown" if adjustment.sigma0 is None else f"{adjustment.sigma0:.3g}"
     lines += variance_lines(adjustment.variances)
+    lines += [*height_lines(adjustment.heights), *join_lines(report.network)]
     lines.append(
         f"Redundancy {adjustment.redundancy}, sigma0 {sigma0}, {counted(len(adjustment.rejected), 'gross error')}"
     )
     height = f", height {head.height}" if head.height else ""
     lines += [f"{head.figure}{height}: {head.what}", *head.notes]
     return Text.joined("\n", [*lines, *(Text("Warning: ", text) for text in report.warnings)])
+
+
+def height_lines(heights: HeightsRecord | None) -> list[str]:
+    """Say what a DEM said of the heights of ties."""
+    if heights is None:
+        return []
+    left = f", {heights.left_out} left out" if heights.left_out else ""
+    return [
+        f"{counted(heights.used, 'height')} of the DEM{left}: sigma {heights.sigma_m:.2g} m ({heights.sigma_is}), "
+        f"common error {heights.bias_m:+.2f} m (sigma {heights.bias_sigma_m:.2g} m)"
+    ]
+
+
+def join_lines(network: NetworkRecord) -> list[str]:
+    """Say how well images that share points lie to each other, apart from where all of them lie."""
+    known = sorted(one.sigma_px for one in network.pairs if one.sigma_px is not None)
+    if not known:
+        return []
+    return [
+        f"Relative accuracy: {counted(len(known), 'pair')} of images within {known[len(known) // 2]:.2g} px of each "
+        f"other (median sigma), the worst within {known[-1]:.2g} px"
+    ]
 
 
 def variance_lines(variances: VariancesRecord) -> list[str]:
@@ -291,6 +319,7 @@ def _marks(report: BlockReport) -> list[str]:
     kinds = {"control": "dots are control points", "check": "squares are check points", "tie": "small dots are ties"}
     said = [what for role, what in kinds.items() if role in there]
     said += ["crosses are what was left out"] if report.adjustment.rejected else []
+    said += ["red lines are joins that are hardly determined"] if any(one.weak for one in report.network.pairs) else []
     return [*said, "in red rings what contradicts"] if doubted(report.notices) else said
 
 

@@ -142,12 +142,20 @@ class BlockPoint(Record):
 
 
 class ImagePairRecord(Record):
-    """Two images, the number of points that both have rays of, and the median angle between these rays."""
+    """Two images, the number of points that both have rays of, and the median angle between these rays.
+
+    `sigma_px` and `sigma_m` say how far they may be shifted against each other (standard deviation) along
+    `azimuth_deg`, where that is most. A join beyond the limit is `weak`.
+    """
 
     first: str
     second: str
     points: Count
     angle_deg: float
+    sigma_px: float | None = None
+    sigma_m: float | None = None
+    azimuth_deg: float | None = None
+    weak: bool = False
 
 
 class Angles(Record):
@@ -182,6 +190,29 @@ class Ray(Record):
     back_projected: Residual
 
 
+class HeightsRecord(Record):
+    """What a DEM said of the heights of ties: how many, their sigma, and the DEM's bias and shift, metres.
+
+    `left_out` contradicted their ties, at breaks the DEM is no plane, `without` lie in voids. `sigma_is` says who says
+    the sigma. Shifts are east and north.
+    """
+
+    used: Count
+    left_out: Count
+    at_breaks: Count
+    without: Count
+    sigma_m: float
+    sigma_is: Literal["stated", "estimated", "assumed"]
+    rms_m: float | None
+    bias_m: float
+    bias_sigma_m: float
+    bias_prior_m: float
+    shift_m: Pair
+    shift_sigma_m: Pair
+    shift_prior_m: float
+    correlation_m: float | None
+
+
 class BlockAdjustment(Record):
     """The adjustment of all images and points together; gauge names what defines the datum."""
 
@@ -202,6 +233,7 @@ class BlockAdjustment(Record):
     notices: tuple[NoticeDocument, ...]
     common_error: CommonError | None = None
     shared_errors: dict[str, SharedErrors] | None = None
+    heights: HeightsRecord | None = None
 
 
 class BlockProvenance(Record):

@@ -23,6 +23,8 @@ from ortho_pipeline.surface.dem import DemSurface
 USUAL = 10.0
 #: Times that a ray is followed to the height of the DEM below it: terrain is less steep than the ray.
 _FOLLOWED = 6
+#: The option of each number that is said of a DEM.
+_OPTIONS = {"bias": "dem_bias", "correlation": "dem_correlation", "shift": "dem_shift_sigma"}
 #: Slopes are taken over so many sigmas of the heights to each side, from one to so many samples.
 _SLOPE, _WIDEST = 8.0, 3.0
 #: Interpolated errors are alike over so many samples (an integral of their correlation).
@@ -55,7 +57,9 @@ class DemHeights:
         for name in ("bias", "correlation", "shift"):
             value = getattr(self, name)
             if value is not None and not (0 <= value < np.inf and (name != "correlation" or value > 0)):
-                raise InputError(f"{value} is no {name} of heights", field=f"surface.{name}", remedy="give metres")
+                raise InputError(
+                    f"{value} is no {name} of heights", field=f"points.{_OPTIONS[name]}", remedy="give metres"
+                )
         object.__setattr__(self, "surface", self.surface.with_fill("mask"))
 
     @classmethod

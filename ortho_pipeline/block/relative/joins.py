@@ -52,12 +52,9 @@ class Join:
         east, north = np.linalg.eigh(self.covariance)[1][:, -1]
         return math.degrees(math.atan2(east, north)) % 180.0
 
-    def to_json(self) -> dict[str, Any]:
-        """Return JSON values."""
-        return {
-            "images": [self.first, self.second], "sigma_px": self.sigma, "sigma_m": self.sigma * self.pixel,
-            "azimuth_deg": self.azimuth_deg,
-        }  # fmt: skip
+    def figures(self) -> dict[str, Any]:
+        """Return what documents say of it."""
+        return {"sigma_px": self.sigma, "sigma_m": self.sigma * self.pixel, "azimuth_deg": self.azimuth_deg}
 
 
 def joins_of(fit: BlockFit) -> tuple[Join, ...]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.network import Network, network_of
+from ortho_pipeline.block.relative.joins import Join
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files.json.values import json_value
@@ -23,17 +25,21 @@ if TYPE_CHECKING:
     from ortho_pipeline.block.start import Start
 
 
-def network_record(network: Network) -> NetworkRecord:
-    """Return the network as the report has it."""
+def network_record(network: Network, joins: Sequence[Join] = (), limit: float = math.inf) -> NetworkRecord:
+    """Return the network as the report has it; joins beyond a limit (px) are weak."""
     known = network.angles_deg[np.isfinite(network.angles_deg)]
     angles = None
     if len(known):
         low, high = float(known.min()), float(known.max())
         angles = Angles(points=len(known), least=low, median=float(np.median(known)), greatest=high)
-    pairs = [
-        ImagePairRecord(first=one.first, second=one.second, points=one.points, angle_deg=one.angle_deg)
-        for one in network.pairs
-    ]
+    known_joins = {(join.first, join.second): join for join in joins}
+    pairs = []
+    for one in network.pairs:
+        join = known_joins.get((one.first, one.second))
+        found = {} if join is None else {**join.figures(), "weak": join.sigma > limit}
+        pairs.append(
+            ImagePairRecord(first=one.first, second=one.second, points=one.points, angle_deg=one.angle_deg, **found)
+        )
     return NetworkRecord(
         pairs=tuple(pairs), angles=angles, parts=network.parts, largest_deg=tuple(json_value(network.angles_deg))
     )

@@ -1,0 +1,112 @@
+"""Options of a block of images."""
+
+# Annotations are read from the class: as values, not as text.
+from dataclasses import dataclass
+from typing import Annotated
+
+from ortho_pipeline.options.groups import CHECK, MODEL_CRS, PIXEL_ORIGIN, VERTICAL_FORMS
+from ortho_pipeline.options.option import CORRECTIONS, Option, PathLike, documented
+from ortho_pipeline.options.texts import Setting, Text
+
+
+@documented
+@dataclass(frozen=True)
+class BlockOptions:
+    """Which points of a block there are, and what is adjusted to them.
+
+    `model` is a name among the models of each scene, or a family that is fitted to the control points of each image.
+    """
+
+    points: Annotated[
+        PathLike | None,
+        Option(
+            "--points",
+            "Rays: CSV (id,image,col,row[,x,y,h,role,...]), GeoJSON with 'ji' by image, or ODM gcp_list.txt.",
+            "FILE",
+        ),
+    ] = None
+    ties: Annotated[
+        str | None,
+        Option("--ties", Text(
+            "Find tie points between the images by matching, besides those of ", Setting("points.points"), "."
+        ), choices=("auto",)),
+    ] = None  # fmt: skip
+    gcps: Annotated[
+        PathLike | None, Option("--gcps", "Ground of the points: CSV (id,x,y,h,...) or GeoJSON.", "FILE")
+    ] = None
+    crs: Annotated[str | None, Option("--points-crs", "CRS of the ground, where its file has none.", "CRS")] = None
+    vertical: Annotated[
+        str | None, Option("--points-vertical", f"Height datum of the ground: {VERTICAL_FORMS}.", "DATUM")
+    ] = None
+    pixel_origin: Annotated[str, PIXEL_ORIGIN] = "corner"
+    check: Annotated[str | None, CHECK] = None
+    model: Annotated[
+        str | None,
+        Option(
+            "--model",
+            "One of the images' models, such as rpc or pushbroom, or a model fitted to points (see 'ortho models').",
+            "NAME",
+            unset="the images' best",
+        ),
+    ] = None
+    correction: Annotated[
+        str | None,
+        Option(
+            "--correction",
+            "What is adjusted: the image points, or the parameters of the model itself.",
+            unset="the model's own if it has any, else a shift",
+            choices=CORRECTIONS,
+        ),
+    ] = None
+    ground_sigma: Annotated[
+        str | None,
+        Option(
+            "--ground-sigma", "Sigmas (m) in plan and height of ground that states none in the points file.", "XY[,H]",
+            unset="estimated",
+        ),
+    ] = None  # fmt: skip
+    model_crs: Annotated[str | None, Option("--model-crs", MODEL_CRS, "CRS")] = None
+    hold: Annotated[
+        float | None,
+        Option(
+            "--hold", "Hold the orientation at its start values with this sigma.", "PX", kind="number", above=0,
+            unset="10 where nothing else gives a datum",
+        ),
+    ] = None  # fmt: skip
+    dem_heights: Annotated[
+        str,
+        Option(
+            "--dem-heights", Text(
+                "Whether heights of ", Setting("surface.dem"), " are observations of the ties, or serve matching alone."
+            ),
+            choices=("on", "off"),
+        ),
+    ] = "on"  # fmt: skip
+    dem_bias: Annotated[
+        float | None,
+        Option(
+            "--dem-bias", "Standard deviation of an error that all heights of the DEM have in common.", "M",
+            kind="number", unset="that of a single height",
+        ),
+    ] = None  # fmt: skip
+    dem_correlation: Annotated[
+        float | None,
+        Option(
+            "--dem-correlation", "Distance over which errors of the DEM are alike; their correlation falls with "
+            "exp(-d / M).", "M", kind="number", above=0, unset="that of its samples, beside the bias",
+        ),
+    ] = None  # fmt: skip
+    dem_shift_sigma: Annotated[
+        float | None,
+        Option(
+            "--dem-shift-sigma", "Standard deviation of where the DEM lies, in each axis.", "M", kind="number",
+            unset="half of its samples' side",
+        ),
+    ] = None  # fmt: skip
+    join_limit: Annotated[
+        float,
+        Option(
+            "--join-limit", "Warn of neighbouring images that may be shifted against each other by more (sigma).", "PX",
+            kind="number", above=0,
+        ),
+    ] = 0.5  # fmt: skip
