@@ -1,7 +1,7 @@
 """Run the notebooks of the documentation and store what they show; make pages of them for the site.
 
-    python docs/make_notebooks.py            run docs/notebooks/*.ipynb and store their outputs (make images)
-    python docs/make_notebooks.py --pages    write a page and its pictures for each, from the stored outputs (make docs)
+python docs/make_notebooks.py            run docs/notebooks/*.ipynb and store their outputs (make images)
+python docs/make_notebooks.py --pages    write a page and its pictures for each, from the stored outputs (make docs)
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from ortho_pipeline.warp.layers.sight import Sight
 
 
 def test_errors_are_as_large_as_predicted():
-    """Of 30 scenes with independent DEM errors a spread is known to about 10 %; a thousand are in docs/accuracy.md."""
+    """Of 30 scenes with independent DEM errors a spread is known to about 10 % (docs/engineering/accuracy.md: 1000)."""
     seeds = {"ikonos": 12, "orbview3": 8, "bilsat": 8, "cartosat": 2}
     found = pooled([trial(sensor, seed) for sensor, count in seeds.items() for seed in range(count)])
     assert 0.85 <= found["east"] <= 1.15

@@ -9,7 +9,7 @@ the errors at all points that took no part: check points, and control points eac
 3. Of the models within 2 % of the smallest expected error, the one with the fewest parameters.
 
 The smallest error at the points would be that of a model that is best by chance: there are some twenty candidates, and
-those with nearly as many parameters as observations vary most. docs/accuracy.md has what the choice costs.
+those with nearly as many parameters as observations vary most. docs/engineering/accuracy.md has what the choice costs.
 """
 
 from __future__ import annotations

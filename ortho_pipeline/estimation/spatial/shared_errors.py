@@ -16,9 +16,9 @@ Beforehand families count alike, and ranges and ratios by their logarithms, beca
 known; but residuals show a part of the variance :math:`\sigma_n^2 + \sigma_s^2`, and each part from none to all is as
 likely as any other: else smooth functions of enormous variance, of which a fit leaves hardly anything, dominate.
 No single function is taken: :math:`\Sigma` is the mean over all of them, weighted by their likelihood. So the variance
-is right in the mean over scenes of all these kinds; it is not right for each kind alone (docs/accuracy.md). A constant
-part cannot be told from the shift: residuals do not show it at all. What matching itself adds of that kind is known
-(`MATCHED_ALIKE`), and the covariance has it.
+is right in the mean over scenes of all these kinds; it is not right for each kind alone
+(docs/engineering/accuracy.md). A constant part cannot be told from the shift: residuals do not show it at all. What
+matching itself adds of that kind is known (`MATCHED_ALIKE`), and the covariance has it.
 
 Source: Patterson and Thompson 1971 (restricted likelihood); Liang and Zeger 1986 (sandwich); Cressie 1993, section 2.6;
 Stein 1999, section 2.10 (Matern); Handcock and Stein 1993 (mean over what is likely).
@@ -67,7 +67,7 @@ NOT_KNOWN: dict[str, Any] = {"noise": None, "shared": None, "range_px": None}
 
 
 class SharedErrors(Record):
-    """Errors that neighbouring points share, in units of stated sigmas; docs/accuracy.md says what each number is."""
+    """Errors that neighbouring points share, in units of stated sigmas; see docs/engineering/accuracy.md."""
 
     # Of two axes, the first with the larger shared part: means over what is likely, None where the points are too few.
     # The range is the distance at which 1/e of the covariance is left. As many independent points as are effective
