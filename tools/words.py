@@ -36,17 +36,16 @@ GENERATED = ("docs/reference/", "docs/cli-reference.md")
 #: Wordings that the language guide of this project replaces; each has two words or more.
 PHRASES = (
     "is said", "are said", "was said", "stands in for", "stand in for", "stood in for", "says nothing of",
-    "say nothing of", "says nothing about where", "it was looked for", "was looked for", "tells most", "nobody stated",
-    "nobody says", "nobody can say", "by hand of", "of the network", "lean on", "leans on", "to be kept apart",
-    "kept apart", "are kept apart", "assumed is", "asked for were", "asked were", "what it is fit for",
-    "by this indication", "would do for", "an indication, no claim", "no point tests it", "settle this first",
-    "where control is", "it is not in the figure", "taken to be within", "not opened unasked",
-    "does not do what was asked", "folds the ground", "no journal of them", "too much alike", "not tested not tested",
-    "measure next at", "click it anew", "what stands here", "unreported earlier run", "say on stderr",
-    "whatever their dates say", "go on silently", "goes on silently", "lies metres off", "recognised and said",
-    "finds nothing, or", "have the last word", "on this machine alone", "one needs which", "beside other programs",
-    "without a hand", "control without hands", "heights that are found", "vanish from residuals", "takes them up",
-    "err as their neighbours do", "let the interpreter go", "lets the interpreter go", "judge all files",
+    "say nothing of", "it was looked for", "was looked for", "tells most", "nobody stated", "nobody says",
+    "nobody can say", "by hand of", "of the network", "lean on", "leans on", "kept apart", "assumed is",
+    "asked for were", "what it is fit for", "by this indication", "would do for", "an indication, no claim",
+    "no point tests it", "settle this first", "where control is", "it is not in the figure", "taken to be within",
+    "not opened unasked", "does not do what was asked", "folds the ground", "no journal of them", "too much alike",
+    "not tested not tested", "measure next at", "click it anew", "what stands here", "unreported earlier run",
+    "say on stderr", "whatever their dates say", "go on silently", "goes on silently", "lies metres off",
+    "recognised and said", "finds nothing, or", "have the last word", "on this machine alone", "one needs which",
+    "beside other programs", "without a hand", "control without hands", "heights that are found",
+    "vanish from residuals", "takes them up", "let the interpreter go", "lets the interpreter go", "judge all files",
 )  # fmt: skip
 
 
