@@ -1,6 +1,7 @@
 """Orthorectification speed beside GDAL (and OTB where it is installed), in one run, alternating.
 
     python benchmarks/warp.py                  the 12000 x 12000 job, three rounds: a table
+    python benchmarks/warp.py --dem-crs EPSG:4326    the same with a DEM in longitude and latitude
     python benchmarks/warp.py --scaling        1000² to 40000², 32 bands, Float32, JPEG 2000, one thread
     python benchmarks/warp.py --kernels        by kernel, number of bands and sensor model
     python benchmarks/warp.py --layers         what layers beside the ortho cost, as shares of the warp alone
@@ -63,6 +64,7 @@ class Job:
     side: int
     bands: int = 1
     kind: str = "uint16"
+    dem_crs: str = f"EPSG:{UTM}"
 
     @property
     def image(self) -> Path:
@@ -71,7 +73,7 @@ class Job:
 
     @property
     def dem(self) -> Path:
-        return self.folder / f"dem_{self.side}.tif"
+        return self.folder / f"dem_{self.side}_{self.dem_crs.replace(':', '')}.tif"
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
@@ -108,7 +110,10 @@ class Job:
             )  # fmt: skip
         elif not self.image.exists():
             self._write_image(sparse)
-        if not self.dem.exists():
+        if not self.dem.exists() and self.dem_crs != f"EPSG:{UTM}":
+            original = Job(self.folder, self.side).make(sparse=sparse)
+            gdal.Warp(str(self.dem), str(original.dem), dstSRS=self.dem_crs, resampleAlg="bilinear", dstNodata=-9999)
+        elif not self.dem.exists():
             self.write_dem()
         return self
 
@@ -560,6 +565,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="where scenes are kept between runs (default: a temporary one)")
     parser.add_argument("--json", type=Path, help="write all runs there")
     parser.add_argument("--pairs", type=int, default=5, help="of runs, with --layers and --cog")
+    parser.add_argument("--dem-crs", default=f"EPSG:{UTM}", help="of the table; by default that of the ortho")
     parser.add_argument("--program", action="append", help="of the table, only this one; may be repeated")
     for option in ("scaling", "kernels", "accuracy", "layers", "cog"):
         parser.add_argument(f"--{option}", action="store_true")
@@ -577,7 +583,7 @@ def main() -> None:
         elif arguments.accuracy:
             document["accuracy"] = accuracy(folder, arguments.side)
         else:
-            job = Job(folder, arguments.side)
+            job = Job(folder, arguments.side, dem_crs=arguments.dem_crs)
             apart(job.make)
             runs = cogs(job, arguments.pairs) if arguments.cog else headline(job, arguments.rounds, arguments.program)
             print(f"{job.side} x {job.side} UInt16, {job.megapixels:.0f} Mpx out; {document['machine']}\n")
