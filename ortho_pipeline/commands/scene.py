@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline import plugins
-from ortho_pipeline.commands.heights.surfaces import open_dem
+from ortho_pipeline.commands.heights.surfaces import dem_as_stated
 from ortho_pipeline.commands.inputs import open_image, open_scene
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION, Result, outputs_together
 from ortho_pipeline.commands.stac.given import heights_given, with_items
@@ -203,7 +203,7 @@ def dem_check(
     """
     ground, plane, ids = dem_accuracy.read_check_heights(points, crs, vertical)
     extent = extent_of(ground_transform(plane, "EPSG:4979")(ground)[:, :2])
-    heights = open_dem(heights_given(dem_file, scene), surface, scene, extents=[] if extent is None else [extent])
+    heights = dem_as_stated(heights_given(dem_file, scene), surface, scene, extents=[] if extent is None else [extent])
     found = dem_accuracy.check_dem(heights, ground, plane, ids)
     if not found.overall.count:
         raise InputError(

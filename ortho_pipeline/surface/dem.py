@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -43,23 +44,46 @@ _LOOK = 1024
 
 
 def open_dem(
-    path: str,
-    vertical: Vertical | str | None,
-    override: bool,
-    fill: str | float,
-    access: Mapping[str, Any],
-    memory: int,
+    path: str | os.PathLike[str],
+    vertical: Vertical | str | None = None,
+    override: bool = False,
+    fill: str | float = "error",
+    allow_network: bool = False,
+    roots: Sequence[str | os.PathLike[str]] = (),
+    memory: int = 512_000_000,
 ) -> DemSurface:
-    """Open a DEM: see `Surface.open`."""
+    """Open a DEM.
+
+    Parameters
+    ----------
+    path : path
+        A file, or a pattern such as ``folder/*.tif`` of the files that make one DEM (see `surface.mosaic`).
+    vertical : Vertical or str, optional
+        What the heights are measured above. Needed where the DEM does not say it.
+    override : bool
+        Let `vertical` stand against a datum that the DEM declares by an authority code.
+    fill : 'error', 'mask', 'nearest' or float
+        What stands for a void (see `Surface`); a number is an ellipsoidal height in metres.
+    memory : int
+        Bytes of a whole job. An eighth of them may hold heights that were read.
+
+    Raises
+    ------
+    InputError, DatumError, CrsError
+        If it cannot be opened, its height datum is unknown or contradicted, a geoid grid is missing, or it has no
+        usable georeference.
+    """
+    access = {"allow_network": allow_network, "roots": tuple(roots)}
     files = matching_files(path)
-    file: Samples = DemFile(path, access) if files is None else open_mosaic(path, files, access)
-    return dem_of(file, vertical, override, fill, memory)
+    name = os.fspath(path)
+    file: Samples = DemFile(name, access) if files is None else open_mosaic(name, files, access)
+    return dem_of(file, vertical, override, parse_fill(fill), memory)
 
 
 def dem_of(
     file: Samples, vertical: Vertical | str | None, override: bool, fill: str | float, memory: int
 ) -> DemSurface:
-    """Return samples, of a file or of many, as a surface: see `Surface.open`."""
+    """Return samples, of a file or of many, as a surface: see `open_dem`."""
     path = file.path
     crs, grid = file.place()
     declared = declared_vertical(crs)
@@ -128,7 +152,7 @@ class Tiles:
 
 @dataclass(frozen=True, eq=False)
 class DemSurface(Surface):
-    """The heights of a DEM, as `Surface.open` makes it.
+    """The heights of a DEM, as `open_dem` makes it.
 
     Parameters
     ----------

@@ -51,7 +51,7 @@ from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import RasterSource, open_dataset
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.stac import acquisition_time
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 
 
 @dataclass(frozen=True)
@@ -225,7 +225,7 @@ def _survey(path: Path) -> Any:
 
 
 def _dem(path: Path) -> Any:
-    surface = Surface.open(path, "ellipsoid")
+    surface = open_dem(path, "ellipsoid")
     rows, columns = surface.shape
     part = surface.window(0, 0, min(columns, 40), min(rows, 40))
     return [part[np.isfinite(part)], np.isinf(part).any() * math.inf if np.isinf(part).any() else 0.0]

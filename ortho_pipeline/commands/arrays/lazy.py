@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     import xarray
 
     from ortho_pipeline.warp.engine import TileMaker
+    from ortho_pipeline.warp.job import WarpJob
 
 #: Options of files, and of rasters besides the ortho.
 _IDLE = ("accuracy_raster", "visibility", "angles", "stac", "fill_from")
@@ -76,10 +77,7 @@ def ortho_array(
     for field in _IDLE:
         if getattr(output, field) != getattr(OutputOptions(), field):
             raise InputError("an array is the ortho alone", field=f"output.{field}", remedy="leave it out")
-    if output.engine != "ortho":
-        raise InputError(
-            "GDAL's warper makes files", field="output.engine", remedy=Text("leave out ", Setting("output.engine"))
-        )
+    _tile_maker_of(output)
     surface = dem if isinstance(dem, SurfaceOptions) else SurfaceOptions(dem=dem)
     require_heights(surface)
     request = Request(image, scene, point_options(points), surface, match, output)
@@ -101,6 +99,17 @@ def _side(chunks: int | None) -> int:
             f"blocks of {chunks} pixels are not made", field="chunks", remedy=f"a multiple of {BLOCK}, such as {TILE}"
         )
     return side
+
+
+def _tile_maker_of(output: OutputOptions) -> Callable[[WarpJob], TileMaker]:
+    from ortho_pipeline.warp.engines import engine_of
+
+    make = engine_of(output.engine).tile_maker
+    if make is None:
+        raise InputError(
+            "GDAL's warper only makes files", field="output.engine", remedy=Text("leave out ", Setting("output.engine"))
+        )
+    return make
 
 
 class Tiles:
@@ -129,13 +138,12 @@ class Tiles:
         return made.pixels, made.valid
 
     def _ready(self) -> TileMaker:
-        from ortho_pipeline.warp.engine import tile_maker
         from ortho_pipeline.warp.job import WarpJob
 
         with self._lock:
             if self._maker is None:
                 model, _, surface, grid, output = self._parts
-                self._maker = tile_maker(WarpJob(
+                self._maker = _tile_maker_of(output)(WarpJob(
                     model, self._source, surface, grid, output.resampling, output.dem_interpolation, output.tolerance,
                     Resources(output.memory), profile=self.profile,
                 ))  # fmt: skip

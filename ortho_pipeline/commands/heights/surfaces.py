@@ -17,7 +17,8 @@ from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.cells.collected import open_collected
 from ortho_pipeline.surface.cells.copernicus import Extent
-from ortho_pipeline.surface.dem import DemSurface
+from ortho_pipeline.surface.dem import DemSurface, open_dem
+from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.surface.mosaic import matching_files
 
 #: No height is less certain (m) than that: the Earth has none of that size.
@@ -53,13 +54,13 @@ def open_surface(
     require_heights(options)
     sigma = open_sigma(options, scene, memory)
     if options.height is not None:
-        return Surface.constant(options.height).with_sigma(sigma)
+        return FlatSurface(options.height).with_sigma(sigma)
     assert options.dem is not None
     if is_automatic(options):
         return open_automatic(options, scene, memory, under).with_sigma(sigma)
     path = heights_given(options.dem, scene)
     extents = extents_under(under) if is_collected(path) else []
-    return open_dem(path, options, scene, memory, extents).with_sigma(sigma)
+    return dem_as_stated(path, options, scene, memory, extents).with_sigma(sigma)
 
 
 def open_sigma(
@@ -80,7 +81,7 @@ def open_sigma(
     except (TypeError, ValueError):
         with completed(field="surface.sigma"):
             path = os.fspath(options.sigma)  # type: ignore[arg-type]
-            return Surface.open(path, "ellipsoid", override=True, fill="mask", memory=memory, **scene.access)
+            return open_dem(path, "ellipsoid", override=True, fill="mask", memory=memory, **scene.access)
     if 0 < number <= _LARGEST_SIGMA:
         return number
     raise InputError(
@@ -89,7 +90,7 @@ def open_sigma(
     )  # fmt: skip
 
 
-def open_dem(
+def dem_as_stated(
     path: str | os.PathLike[str],
     options: SurfaceOptions,
     scene: SceneOptions,
@@ -115,7 +116,7 @@ def open_dem(
             return open_collected(
                 path, extents, vertical, options.override_vertical, options.fill, memory, scene.access
             )  # fmt: skip
-        return Surface.open(
+        return open_dem(
             path, vertical, override=options.override_vertical, fill=options.fill, memory=memory, **scene.access
         )
 

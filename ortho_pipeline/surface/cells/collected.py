@@ -51,7 +51,7 @@ def open_collected(
     address : path or address
         With the key of the asset, or a pattern of it, after a ``#``, where its role does not tell.
     vertical, override, fill, memory
-        As for `Surface.open`.
+        As for `open_dem`.
     access : mapping
         What `raster.open_pixels` may do for its files.
 
