@@ -19,7 +19,7 @@ import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_pipeline.errors import CoverageError, DatumError
+from ortho_pipeline.errors import CoverageError, DatumError, completed
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.geodesy.datum import dem_unit, dem_vertical, dem_vertical_remedy
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
@@ -88,8 +88,10 @@ def dem_of(
     crs, grid = file.place()
     declared = declared_vertical(crs)
     option = None if vertical is None else Vertical.parse(vertical)
-    used, warnings = dem_vertical(path, declared, option, override)
-    unit = dem_unit(path, file.unit, declared)
+    with completed(path):
+        used, warnings = dem_vertical(declared, option, override)
+        unit = dem_unit(file.unit, declared)
+        _check_geoid(grid, used)
     record = {
         "path": path,
         "crs": grid.crs.name,
@@ -103,24 +105,22 @@ def dem_of(
         "fill": fill,
         "warnings": warnings,
     }
-    _check_geoid(path, grid, used)
     return DemSurface(file, grid, used, unit, fill, record, memory // _TILES_SHARE)
 
 
-def _check_geoid(path: str, grid: SampleGrid, vertical: Vertical) -> None:
-    """Fail now, with the DEM's name, if the geoid grid is missing or does not reach any part of the DEM."""
+def _check_geoid(grid: SampleGrid, vertical: Vertical) -> None:
+    """Fail now if the geoid grid is missing or does not reach any part of the DEM."""
     rows, columns = grid.shape
     v, u = (axis.ravel() for axis in np.meshgrid(np.linspace(0, rows - 1, 5), np.linspace(0, columns - 1, 5)))
     try:
         undulation = vertical.undulation(*grid.lonlat(u, v))
     except DatumError as error:
         raise DatumError(
-            error.message, file=path, field="surface.vertical", remedy=dem_vertical_remedy(error.remedy or "")
+            error.message, field="surface.vertical", remedy=dem_vertical_remedy(error.remedy or "")
         ) from error
     if not np.isfinite(undulation).any():
         raise DatumError(
             f"the geoid grid of {vertical.label} does not reach this DEM",
-            file=path,
             field="surface.vertical",
             remedy=dem_vertical_remedy(),
         )

@@ -147,7 +147,7 @@ def test_feet_of_the_crs_and_units_that_contradict(tmp_path: Path) -> None:
     surface = open_dem(feet, "ellipsoid", override=True)
     assert surface.window(3, 4, 1, 1)[0, 0] == pytest.approx(hills()[4, 3] * 0.3048)
     with pytest.raises(DatumError, match="unit"):
-        dem_unit("x", "furlong", None)
+        dem_unit("furlong", None)
 
 
 @pytest.mark.parametrize("fill", ["bad", "nan", float("inf")])

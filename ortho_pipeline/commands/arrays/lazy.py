@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.commands.heights.surfaces import require_heights
 from ortho_pipeline.commands.placement import Placement, open_rasters, place_scene
-from ortho_pipeline.commands.resolved.request import Request, point_options
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.scene_fit import adjustable
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.errors import InputError
@@ -73,6 +73,7 @@ def ortho_array(
     InputError
         As `rectify`; for chunks that are no multiple, options that mean further files, and without xarray and dask.
     """
+    assert isinstance(points, PointOptions), "with_items makes options of points"
     side = _side(chunks)
     for field in _IDLE:
         if getattr(output, field) != getattr(OutputOptions(), field):
@@ -80,7 +81,7 @@ def ortho_array(
     _tile_maker_of(output)
     surface = dem if isinstance(dem, SurfaceOptions) else SurfaceOptions(dem=dem)
     require_heights(surface)
-    request = Request(image, scene, point_options(points), surface, match, output)
+    request = Request(image, scene, points, surface, match, output)
     placed = place_scene(adjustable(request))
     path = placed.scene.path if isinstance(image, Scene) else image
     # What is sent to other processes holds no options but these.

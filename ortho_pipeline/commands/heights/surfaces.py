@@ -6,10 +6,10 @@ import math
 import os
 from collections.abc import Iterable, Sequence
 
-from ortho_pipeline.commands.heights.automatic import extents_under, is_automatic, open_automatic
-from ortho_pipeline.commands.stac.given import heights_given, is_collected
+from ortho_pipeline.commands.heights.automatic import AUTO, extents_under, open_automatic
+from ortho_pipeline.commands.stac.given import heights_given
 from ortho_pipeline.errors import InputError, completed, of_option
-from ortho_pipeline.files.stac.item import split
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions, number_of
@@ -56,10 +56,10 @@ def open_surface(
     if options.height is not None:
         return FlatSurface(options.height).with_sigma(sigma)
     assert options.dem is not None
-    if is_automatic(options):
+    if options.dem == AUTO:
         return open_automatic(options, scene, memory, under).with_sigma(sigma)
     path = heights_given(options.dem, scene)
-    extents = extents_under(under) if is_collected(path) else []
+    extents = extents_under(under) if path.is_collection else []
     return dem_as_stated(path, options, scene, memory, extents).with_sigma(sigma)
 
 
@@ -91,7 +91,7 @@ def open_sigma(
 
 
 def dem_as_stated(
-    path: str | os.PathLike[str],
+    path: Location,
     options: SurfaceOptions,
     scene: SceneOptions,
     memory: int = OutputOptions.memory,
@@ -112,7 +112,7 @@ def dem_as_stated(
     with of_option("surface.vertical"):
         vertical = None if options.vertical is None else Vertical.parse(options.vertical)
     with completed(field="surface.dem"):
-        if is_collected(path):
+        if path.is_collection:
             return open_collected(
                 path, extents, vertical, options.override_vertical, options.fill, memory, scene.access
             )  # fmt: skip
@@ -123,11 +123,10 @@ def dem_as_stated(
 
 def dem_files(options: SurfaceOptions) -> list[str]:
     """Return the files of the DEM that the user gave: one, those of a pattern, a collection's document, or none."""
-    if options.dem is None or is_automatic(options):
+    if options.dem is None or options.dem == AUTO:
         return []
-    if is_collected(options.dem):
-        return [split(options.dem)[0]]
-    return [*(matching_files(options.dem) or [os.fspath(options.dem)])]
+    dem = Location(options.dem)
+    return [dem.document] if dem.is_collection else [*(matching_files(dem) or [dem])]
 
 
 def require_heights(options: SurfaceOptions) -> None:
