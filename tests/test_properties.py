@@ -21,7 +21,6 @@ from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, rpc_metadata, rpc_of_fields, write_rpb, write_rpc_txt
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import (
     KINDS,
     RPC,
@@ -43,6 +42,7 @@ from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.warp import engine as warp
 

@@ -19,7 +19,7 @@ from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import confined
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import Location
-from ortho_pipeline.files.storage.objects import Objects
+from ortho_pipeline.stores.objects import Objects
 
 #: Larger files beside an image are not metadata.
 _COMPANION_BYTES = 5_000_000

@@ -38,9 +38,9 @@ from ortho_pipeline.commands.mosaic.assembly import assemble
 from ortho_pipeline.errors import InputError, OrthoError, ReportError, error_document
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
 from ortho_pipeline.files.locations import Location
-from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.report.page.run import write_run_page
 from ortho_pipeline.report.stac import write_catalog
+from ortho_pipeline.runtime.process_limits import Progress
 from ortho_pipeline.warp.mosaic import Ortho, Overlap, measure_seam
 
 #: A larger file is not a report on a mosaic.

@@ -33,7 +33,6 @@ from ortho_pipeline.exchange import export as formats_of_models
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import retire, sha256
-from ortho_pipeline.files.process_limits import Progress, Resources, one_blas_thread
 from ortho_pipeline.files.traffic import bytes_read
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
@@ -46,6 +45,7 @@ from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.output import checked_options, require_whole
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.records import SceneReport
+from ortho_pipeline.runtime.process_limits import Progress, Resources, one_blas_thread
 from ortho_pipeline.surface import footprint
 
 if TYPE_CHECKING:

@@ -22,7 +22,6 @@ from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files import write_json, write_text
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.files.locations import located
-from ortho_pipeline.files.storage import kept
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.geodesy.proj_grids import fetch_missing, grids, proj_info
@@ -34,6 +33,7 @@ from ortho_pipeline.options.texts import counted
 from ortho_pipeline.plugins.unread import unread
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.report import document as report
+from ortho_pipeline.stores import kept
 from ortho_pipeline.surface import accuracy as dem_accuracy
 from ortho_pipeline.surface import footprint
 from ortho_pipeline.surface.cells.copernicus import extent_of

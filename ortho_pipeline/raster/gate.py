@@ -23,12 +23,12 @@ from typing import Any
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, completed
-from ortho_pipeline.files.beside import ask_beside
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, network_is_closed, place, within
 from ortho_pipeline.geodesy.crs_gate import refuse_files
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.references import NAMES_OF, PLAIN_VRT, Named, crs_texts, products_of_volume
+from ortho_pipeline.stores.beside import ask_beside
 
 gdal.UseExceptions()
 

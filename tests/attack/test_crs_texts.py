@@ -26,13 +26,13 @@ from pyproj.enums import PJType
 from ortho_pipeline.batch.runner import run
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CrsError, DatumError, InputError, OrthoError
-from ortho_pipeline.files.stac.item import read_item
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.geodesy.crs_gate import refuse_files
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.output import checked_options
 from ortho_pipeline.raster.source import open_dataset
+from ortho_pipeline.stores.stac.item import read_item
 from ortho_pipeline.surface.dem import open_dem
 
 _GEOGCS = (

@@ -123,7 +123,7 @@ def test_heights_of_unknown_quality_have_no_accuracy_and_void_ones_neither(tiny,
 
 
 def test_the_layer_does_not_depend_on_the_memory(tiny, tmp_path):
-    from ortho_pipeline.files.process_limits import Resources
+    from ortho_pipeline.runtime.process_limits import Resources
 
     sight, surface = Sight(corrected(tiny.model), grid_of(tiny)), open_dem(tiny.dem, "ellipsoid")
     found = []

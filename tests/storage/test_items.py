@@ -18,8 +18,8 @@ from ortho_pipeline.commands.stac.given import resolved
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc_files import write_rpc_txt
 from ortho_pipeline.files.locations import Location
-from ortho_pipeline.files.stac.item import item_of, read_item
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.stores.stac.item import item_of, read_item
 
 gdal.UseExceptions()
 TIFF, TEXT = "image/tiff; application=geotiff; profile=cloud-optimized", "text/plain"

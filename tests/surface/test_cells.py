@@ -24,9 +24,9 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import rectify
 from ortho_pipeline.commands.heights.automatic import extent_under
 from ortho_pipeline.errors import CoverageError, DatumError, InputError, StorageError
-from ortho_pipeline.files.storage import kept, objects
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
 from ortho_pipeline.plugins import open_scene
+from ortho_pipeline.stores import kept, objects
 from ortho_pipeline.surface.cells import sources
 from ortho_pipeline.surface.cells.assembled import open_cells
 from ortho_pipeline.surface.cells.copernicus import Cell, Extent, cells_of_list, columns_at, extent_of
@@ -345,7 +345,7 @@ def test_what_is_kept_is_checked_and_heals(bucket: PublicFolder, geoid: str) -> 
 
 _FETCHING = """
 import sys
-from ortho_pipeline.files.storage import kept, objects
+from ortho_pipeline.stores import kept, objects
 store = objects.Objects(sys.argv[1], allow_network=True)
 print(kept.kept("dem", store.of(sys.argv[2]), lambda path: store.fetch(sys.argv[2], path, 10**9)))
 """

@@ -14,9 +14,9 @@ from osgeo import gdal, osr
 
 from ortho_pipeline.commands import rectify
 from ortho_pipeline.errors import CrsError, DatumError, InputError
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.options import SurfaceOptions
 from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.dem import open_dem
 
 gdal.UseExceptions()

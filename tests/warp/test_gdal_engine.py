@@ -20,7 +20,6 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.exchange.rpc_fit import RpcExport
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import FrameCamera, ImageCorrection, SensorModel
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
@@ -28,6 +27,7 @@ from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem

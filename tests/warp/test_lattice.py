@@ -14,7 +14,6 @@ import pytest
 from orthos import rectify
 from osgeo import gdal
 
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.geodesy.crs import GroundTransform
 from ortho_pipeline.models import Pushbroom, SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
@@ -23,6 +22,7 @@ from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
 from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables
 from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem

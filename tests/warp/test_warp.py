@@ -22,10 +22,10 @@ from scipy.ndimage import minimum_filter
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import export_rpc, rpc_metadata
 from ortho_pipeline.files import sha256
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import RPC, SensorModel
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.flat import FlatSurface

@@ -20,12 +20,12 @@ from ortho_pipeline.exchange.rpc import files_of
 from ortho_pipeline.files import sha256, states
 from ortho_pipeline.files.json.values import software_version
 from ortho_pipeline.files.locations import Location
-from ortho_pipeline.files.process_limits import thread_pool
 from ortho_pipeline.files.traffic import bytes_read
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
+from ortho_pipeline.runtime.process_limits import thread_pool
 from ortho_pipeline.surface.base import Surface
 
 #: Roles of files that have pixels, and of those among them whose side-cars are entered too.

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.files.locations import Location
-from ortho_pipeline.files.process_limits import thread_pool
 from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.runtime.process_limits import thread_pool
 
 #: Windows that are read at a time; GDAL asks for the parts of each at once.
 _AT_ONCE = 6

@@ -11,13 +11,13 @@ import pyproj
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import CoverageError, CrsError, DatumError, completed
-from ortho_pipeline.files.beside import ask_beside
 from ortho_pipeline.files.locations import Location
-from ortho_pipeline.files.stac.collection import Collection
-from ortho_pipeline.files.stac.item import Asset
 from ortho_pipeline.geodesy.crs import Vertical, horizontal, parse_crs
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
 from ortho_pipeline.options.texts import Setting, Text, counted
+from ortho_pipeline.stores.beside import ask_beside
+from ortho_pipeline.stores.stac.collection import Collection
+from ortho_pipeline.stores.stac.item import Asset
 from ortho_pipeline.surface.base import parse_fill
 from ortho_pipeline.surface.cells.copernicus import Extent
 from ortho_pipeline.surface.dem import DemSurface, dem_of

@@ -12,11 +12,11 @@ import numpy as np
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import Location
-from ortho_pipeline.files.process_limits import thread_pool
-from ortho_pipeline.files.stac.collection import Collection
-from ortho_pipeline.files.storage.kept import kept
-from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.raster.source import open_pixels
+from ortho_pipeline.runtime.process_limits import thread_pool
+from ortho_pipeline.stores.kept import kept
+from ortho_pipeline.stores.objects import Objects
+from ortho_pipeline.stores.stac.collection import Collection
 from ortho_pipeline.surface.cells.copernicus import LARGEST, LIST, PUBLIC, PUBLIC_LAND, Cell, cells_of_list
 from ortho_pipeline.surface.dem_file import Affine
 

@@ -11,9 +11,9 @@ from urllib.parse import urljoin
 from ortho_pipeline.errors import InputError, StorageError
 from ortho_pipeline.files.locations import AnyPath, Location, require_network, within
 from ortho_pipeline.files.reading import parse_json, read_json
-from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.files.traffic import count
 from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.stores.objects import Objects
 
 #: Types of documents that hold items, or lead to them.
 COLLECTIONS = ("Collection", "Catalog", "FeatureCollection")

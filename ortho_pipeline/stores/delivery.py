@@ -17,9 +17,9 @@ from typing import Any
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.locations import STORES, Location
-from ortho_pipeline.files.process_limits import thread_pool
-from ortho_pipeline.files.storage.objects import Content, Objects
 from ortho_pipeline.files.whole import json_text
+from ortho_pipeline.runtime.process_limits import thread_pool
+from ortho_pipeline.stores.objects import Content, Objects
 
 DOCUMENT, SCHEMA_VERSION = "ortho-pipeline delivery", 1
 _RECORD = "_delivery.json"

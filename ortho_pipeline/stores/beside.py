@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterator
 
 from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, located
-from ortho_pipeline.files.process_limits import thread_pool
+from ortho_pipeline.runtime.process_limits import thread_pool
 
 #: Questions at a time.
 _AT_ONCE = 16
