@@ -40,6 +40,7 @@ from ortho_pipeline.models import RPC, ImageCorrection, SensorModel
 from ortho_pipeline.models.rpc_box import RPC_TERMS
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.warp.engine import rectify
 from ortho_pipeline.warp.job import WarpJob
 from ortho_pipeline.warp.layers.accuracy import Budget, write_accuracy
@@ -221,6 +222,7 @@ def ours(job: Job, out: Path, kernel: str = "bilinear", *extra: str) -> list[str
 API = """
 import sys, pyproj
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.warp.engine import rectify
@@ -229,7 +231,7 @@ image, dem, out, step, *extent = sys.argv[1:]
 grid = Grid.of_extent(pyproj.CRS("EPSG:32735"), [float(value) for value in extent], (float(step), float(step)))
 model = rpc_of_dataset(open_dataset(image))[0]
 def make():
-    surface = Surface.open(dem, "ellipsoid")
+    surface = open_dem(dem, "ellipsoid")
     rectify(WarpJob(model, RasterSource(image), surface, grid, driver="GTiff"), out)
 """
 
@@ -368,7 +370,7 @@ def table(runs: dict[str, list[Run]], megapixels: float, base: str) -> str:
 
 def alone(job: Job, model: SensorModel | None = None, kernel: str = "bilinear") -> float:
     """Return the seconds of the warp alone, in this process, with kernels loaded: no start-up, no report."""
-    surface, (xmin, ymin, xmax, ymax) = Surface.open(job.dem, "ellipsoid"), job.extent
+    surface, (xmin, ymin, xmax, ymax) = open_dem(job.dem, "ellipsoid"), job.extent
     grid = Grid.of_extent(pyproj.CRS.from_epsg(UTM), (xmin, ymin, xmax, ymax), (GSD, GSD))
     out = job.folder / "alone.tif"
     source = RasterSource(job.image)
@@ -446,7 +448,7 @@ def layers(job: Job, pairs: int) -> dict[str, list[tuple[float, float]]]:
         hiding = Hiding(out, heights, job.folder / "mask.tif")
         rectify(WarpJob(model, source, surface, grid, driver="GTiff"), hiding)
 
-    dem, dsm = Surface.open(job.dem, "ellipsoid"), Surface.open(job.write_dsm(), "ellipsoid")
+    dem, dsm = open_dem(job.dem, "ellipsoid"), open_dem(job.write_dsm(), "ellipsoid")
     todo = {
         "accuracy, DEM of 30 m": (accuracy, dem), "hidden left empty, DEM of 30 m": (empty, dem),
         "mask of hidden, DEM of 30 m": (mask, dem), "hidden left empty, DSM of 1 m": (empty, dsm),

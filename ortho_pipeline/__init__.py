@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.report.notebook.charts import plot as plot
     from ortho_pipeline.report.notebook.tables import html as html
     from ortho_pipeline.surface.base import Surface as Surface
+    from ortho_pipeline.surface.dem import open_dem as open_dem
 
 __version__: str
 
@@ -87,6 +88,7 @@ _HOMES = {
     "intersect": "block.intersection",
     "load_model": "exchange.model_file",
     "match_scene": "commands.control.matching",
+    "open_dem": "surface.dem",
     "open_scene": "plugins",
     "ortho_array": "commands.arrays.lazy",
     "plot": "report.notebook.charts",

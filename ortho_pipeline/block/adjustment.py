@@ -35,11 +35,11 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged
 from ortho_pipeline.estimation.problem import Prior
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import marks_warning
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 
 #: Parameters that move by more than this part of their sigma with the sigmas that were found are solved for again.
 _MOVED, _WEIGHINGS = 0.02, 3

@@ -23,12 +23,12 @@ from ortho_pipeline.estimation.family_fit import OWN, fit_family, fit_own
 from ortho_pipeline.estimation.fit import SIGNIFICANCE, Fit, Prior, fit
 from ortho_pipeline.estimation.ground_residuals import rmse_metres
 from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models import ImageCorrection, SensorModel, families, family_of
 from ortho_pipeline.models.correction import FREE
 from ortho_pipeline.options.texts import Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.control_hull import uncovered
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 
 #: What is adjusted over a scene's own model.
 CORRECTIONS = tuple(FREE)

@@ -30,10 +30,10 @@ from ortho_pipeline.estimation.spatial.common_error import CommonError
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors, shared_errors
 from ortho_pipeline.estimation.statistics import correlation_of, student_of, total_correlation_of
 from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 
 __all__ = ["Fit", "Prior", "fit", "root_mean_square"]
 

@@ -24,6 +24,7 @@ from ortho_pipeline.exchange.rpc import (
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.flat import FlatSurface
 
 #: What ``ortho export --format`` takes, and what the file's name ends with.
 ENDINGS = {
@@ -131,7 +132,7 @@ class Export:
         self.document["csm"] = {"max_error_px": write_csm(self.model, path, force=self.force)}
 
     def _where(self) -> str:
-        surface = self.surface or Surface.constant(self.model.reference_height)
+        surface = self.surface or FlatSurface(self.model.reference_height)
         return f" {surface.describe()}"
 
     def summary(self, model: str, source: str) -> str:

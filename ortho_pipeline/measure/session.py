@@ -22,7 +22,6 @@ from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import confined, sha256
 from ortho_pipeline.files.json.values import json_position
-from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.matching import Reference, View
 from ortho_pipeline.imaging.matching.targets import metres_per_pixel
@@ -34,6 +33,7 @@ from ortho_pipeline.measure.proposals import proposal_of
 from ortho_pipeline.measure.solution import Solution, figures, solve
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.runtime.process_limits import Progress
 from ortho_pipeline.surface.base import Surface
 
 #: A click is looked for within this many standard deviations of the prediction, and the pixels of a hand.

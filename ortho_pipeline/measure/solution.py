@@ -61,7 +61,7 @@ def solve(scene: Scene, points: Points, request: Request, surface: Surface, corr
     chosen = request.points.correction if correction is None else correction
     alone = replace(request, points=replace(request.points, correction=chosen), match=MatchOptions())
     try:
-        done = adjust(Resolved(alone, scene, surface, points, Ledger()))
+        done = adjust(Resolved(alone, scene, surface, points, None, Ledger()))
     except OrthoError as error:
         return Solution(scene.model, None, error.message)
     except np.linalg.LinAlgError as error:

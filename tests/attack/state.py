@@ -23,13 +23,13 @@ from ortho_pipeline import commands
 from ortho_pipeline.batch.records import Record
 from ortho_pipeline.batch.shared.leases import Lease, Leases, lease_document
 from ortho_pipeline.files import together
-from ortho_pipeline.files.storage import kept, objects
 from ortho_pipeline.files.whole import Outputs
 from ortho_pipeline.measure.block.session import open_block_session
 from ortho_pipeline.measure.journal import Journal
 from ortho_pipeline.measure.project import JOURNAL, Project
 from ortho_pipeline.measure.session import open_session
 from ortho_pipeline.options import MatchOptions, SurfaceOptions
+from ortho_pipeline.stores import kept, objects
 
 _COUNT = itertools.count()
 

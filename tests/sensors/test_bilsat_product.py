@@ -35,6 +35,7 @@ from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.simulation.page import text
 from ortho_pipeline.simulation.tables import is_missed
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 
 
 @pytest.fixture
@@ -217,7 +218,7 @@ def test_gdalwarp_with_the_exported_rpc_makes_the_same_ortho(product, tmp_path):
     dataset.WriteArray(np.stack([columns, rows]))
     dataset.SetMetadata(rpc_metadata(exported.rpc), "RPC")
     del dataset
-    surface = Surface.open(product / "dem.tif")
+    surface = open_dem(product / "dem.tif")
     # Finer than the source: where GDAL widens its kernel, that no longer keeps a ramp what it is.
     grid = Grid.of_extent(parse_crs("EPSG:32636"), (478e3, 4412e3, 492e3, 4426e3), (25.0, 25.0))
     rectify(model, RasterSource(source), surface, grid, tmp_path / "ours.tif", driver="GTiff", tolerance=0.005)

@@ -239,11 +239,11 @@ def test_sample_is_what_its_truth_says(sample):
 
 
 def test_sample_dem_is_the_terrain(sample):
-    from ortho_pipeline.surface.base import Surface
+    from ortho_pipeline.surface.dem import open_dem
 
     truth = json.loads((sample / "truth.json").read_text(encoding="utf-8"))
     terrain = Terrain(**truth["terrain"])
     ground = np.array([point["lon_lat_h"] for point in truth["points"]])
-    heights = Surface.open(sample / "dem.tif").heights(ground[:, :2], "EPSG:4979")
+    heights = open_dem(sample / "dem.tif").heights(ground[:, :2], "EPSG:4979")
     assert np.abs(heights - ground[:, 2]).max() < 0.5
     assert np.abs(terrain(ground[:, 0], ground[:, 1]) - ground[:, 2]).max() < 1e-6

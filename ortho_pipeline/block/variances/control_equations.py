@@ -14,8 +14,8 @@ from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.variances import dense_nodes
 from ortho_pipeline.block.variances.components import diagonal
-from ortho_pipeline.files.process_limits import parts_of, side_by_side
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.runtime.process_limits import parts_of, side_by_side
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.variances import node_kernel

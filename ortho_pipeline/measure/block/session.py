@@ -22,7 +22,6 @@ from ortho_pipeline.commands.resolved.resolving import on_surface
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import confined, sha256
-from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.geodesy.crs import horizontal, parse_crs
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.matching import Reference, View, open_references
@@ -41,6 +40,7 @@ from ortho_pipeline.options import CORRECTIONS, BlockOptions, MatchOptions, Scen
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.runtime.process_limits import Progress
 from ortho_pipeline.surface.accuracy import typical_sigma
 
 #: What a click may be off in any case (px), once there is an adjustment.

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import parse_json
-from ortho_pipeline.files.process_limits import thread_pool
 from ortho_pipeline.measure.block.session import BlockSession
 from ortho_pipeline.measure.project import Project
 from ortho_pipeline.measure.serving.entry import Entry
@@ -29,6 +28,7 @@ from ortho_pipeline.measure.serving.tiles import MOST, SIDE, Tiles
 from ortho_pipeline.measure.session import Session
 from ortho_pipeline.options import CORRECTIONS, OutputOptions, SceneOptions
 from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.runtime.process_limits import thread_pool
 
 if TYPE_CHECKING:
     from starlette.requests import Request

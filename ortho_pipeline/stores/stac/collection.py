@@ -3,31 +3,23 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 from urllib.parse import urlencode
 
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files.locations import AnyPath, is_address, url_of
-from ortho_pipeline.files.process_limits import thread_pool
-from ortho_pipeline.files.stac.documents import COLLECTIONS, read_document, target
-from ortho_pipeline.files.stac.item import Item, item_of, read_item
-from ortho_pipeline.files.stac.places import Box, any_meet, extent_boxes, questions
+from ortho_pipeline.files.locations import AnyPath, Location
+from ortho_pipeline.runtime.process_limits import thread_pool
+from ortho_pipeline.stores.stac.documents import COLLECTIONS, read_document, target
+from ortho_pipeline.stores.stac.item import Item, item_of, read_item
+from ortho_pipeline.stores.stac.places import Box, any_meet, extent_boxes, questions
 
 _REMEDY = "give a STAC collection: its JSON file, or its address in an API (…/collections/NAME)"
-_OF_API = re.compile(r"https?://[^?#]*/collections/[^/?#]+/?$")
 #: Items that are asked for at a time, and pages that are followed.
 _LIMIT, _PAGES = 100, 50
 #: Documents of a static collection that are read, and how many at a time; catalogs within each other.
 _MOST_DOCUMENTS, _AT_ONCE, _DEEPEST = 30_000, 16, 8
 _FEWER = "give a smaller collection, or a FeatureCollection file of the items that are meant"
-
-
-def is_collection(path: AnyPath) -> bool:
-    """Tell by its name whether something is a STAC collection: a JSON file, or a collection of an API."""
-    text = os.fspath(path)
-    return text.lower().partition("?")[0].endswith((".json", ".geojson")) or bool(_OF_API.match(text))
 
 
 class Collection:
@@ -105,7 +97,7 @@ class Collection:
 
     def _below(self, boxes: Sequence[Box], documents: list[str]) -> Iterator[Item]:
         """Yield the items that links of a static collection and of catalogs below it lead to."""
-        seen: set[str] = {url_of(self.address)}
+        seen: set[str] = {Location(self.address).url}
         wanted = self._named(self._links, self.address, seen)
         for _ in range(_DEEPEST):
             if not wanted:
@@ -197,4 +189,4 @@ def _object(feature: Any, address: str) -> Mapping[str, Any]:
     if not isinstance(feature, dict):
         raise InputError("an item is an object", file=address, field="features", remedy=_REMEDY)
     # An API leaves out of its answer what stands in it once.
-    return {"stac_version": "1.0.0", **feature} if is_address(address) else feature
+    return {"stac_version": "1.0.0", **feature} if Location(address).is_address else feature

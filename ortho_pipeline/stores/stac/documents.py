@@ -9,11 +9,11 @@ from typing import Any
 from urllib.parse import urljoin
 
 from ortho_pipeline.errors import InputError, StorageError
-from ortho_pipeline.files.locations import AnyPath, is_address, is_on_web, require_network, url_of, within
+from ortho_pipeline.files.locations import AnyPath, Location, require_network, within
 from ortho_pipeline.files.reading import parse_json, read_json
-from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.files.traffic import count
 from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.stores.objects import Objects
 
 #: Types of documents that hold items, or lead to them.
 COLLECTIONS = ("Collection", "Catalog", "FeatureCollection")
@@ -34,11 +34,11 @@ def read_document(address: AnyPath, *, allow_network: bool, paged: bool = False)
     StorageError
         If a server does not answer.
     """
-    text = url_of(address)
-    if is_on_web(text):
+    text = Location(address).url
+    if text.is_on_web:
         require_network(text, allow_network, paged=paged)
         found = parse_json(_answer(text), text, REMEDY)
-    elif is_address(text):
+    elif text.is_address:
         folder, _, name = text.rpartition("/")
         try:
             found = parse_json(Objects(folder, allow_network=allow_network).read(name, _MAX_BYTES)[0], text, REMEDY)
@@ -60,7 +60,7 @@ def _answer(url: str) -> bytes:
         """Follows to web servers only."""
 
         def redirect_request(self, req: Any, fp: Any, code: Any, msg: Any, headers: Any, newurl: str) -> Any:
-            return super().redirect_request(req, fp, code, msg, headers, newurl) if is_on_web(newurl) else None
+            return super().redirect_request(req, fp, code, msg, headers, newurl) if Location(newurl).is_on_web else None
 
     opener = urllib.request.build_opener(WebOnly)
     request = urllib.request.Request(url, headers={"User-Agent": "ortho-pipeline", "Accept": "application/json"})
@@ -96,13 +96,13 @@ def target(href: str, base: AnyPath, roots: tuple[AnyPath, ...] = ()) -> str:
     InputError
         If it is a file elsewhere on this machine: the document may be a stranger's.
     """
-    text, here = href.strip(), url_of(base)
-    if is_address(text):
+    text, here = Location(href.strip()), Location(base).url
+    if text.is_address:
         return text
     if not text or "\0" in text or text.startswith("/vsi") or (":" in text.partition("/")[0] and "://" in text):
         raise InputError(f"{text[:200]!r} is no place of a file", file=base, field="href", remedy=REMEDY)
-    if is_address(here):
-        if is_on_web(here):
+    if here.is_address:
+        if here.is_on_web:
             return urljoin(here, text)
         scheme, _, rest = here.partition("://")
         return f"{scheme}://{os.path.normpath(os.path.join(os.path.dirname(rest), text.lstrip('/')))}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fnmatch
 import json
-import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -13,10 +12,10 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files.locations import AnyPath, is_address, url_of
-from ortho_pipeline.files.stac.documents import COLLECTIONS, REMEDY, read_document, target
-from ortho_pipeline.files.stac.places import Box, boxes_of
+from ortho_pipeline.files.locations import AnyPath, Location
 from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.stores.stac.documents import COLLECTIONS, REMEDY, read_document, target
+from ortho_pipeline.stores.stac.places import Box, boxes_of
 
 #: Roles of what an image or a DEM is read from, the first first.
 _ROLES = ("data", "visual")
@@ -28,7 +27,6 @@ _RASTER_NAME = re.compile(r"\.(tiff?|jp2|ntf|nitf|img|vrt|dt[0-2]|hgt)$", re.IGN
 _TABLE_TYPE = re.compile(r"application/geo\+json|text/csv")
 _TABLE_NAME = re.compile(r"\.(csv|geojson|points|pts)$", re.IGNORECASE)
 _RPC_NAME = re.compile(r"rpc[^/]*\.(txt|xml)$|\.rpb$|\.rpc$", re.IGNORECASE)
-_ITEMS = re.compile(r"https?://[^?]*/collections/[^/?]+/items/[^/?#]+$")
 _SHOWN = 12
 #: How the projection extension names a system, the most explicit first; `proj:epsg` is that of its first version.
 _SYSTEMS = ("proj:wkt2", "proj:projjson", "proj:code", "proj:epsg")
@@ -168,21 +166,6 @@ class Item:
         return ", ".join(asset.key for asset in list(self.assets if assets is None else assets)[:_SHOWN])
 
 
-def is_item(path: object) -> bool:
-    """Tell by its name whether something may be a STAC item: a JSON file, or an address of an API's items."""
-    if not isinstance(path, str | os.PathLike):
-        return False
-    text = split(path)[0]
-    return text.lower().partition("?")[0].endswith((".json", ".geojson")) or bool(_ITEMS.match(text))
-
-
-def split(path: AnyPath) -> tuple[str, str]:
-    """Return an item's address and the key of the asset after its ``#``; empty where there is none."""
-    text = url_of(path)
-    address, _, key = text.partition("#") if is_address(text) or ".json#" in text.lower() else (text, "", "")
-    return address, key
-
-
 @reads(REMEDY)
 def read_item(path: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPath, ...] = ()) -> Item:
     """Read a STAC item.
@@ -215,10 +198,11 @@ def item_of(document: Mapping[str, Any], address: AnyPath, roots: tuple[AnyPath,
     assets = document.get("assets")
     if not isinstance(assets, dict):
         raise InputError("a STAC item has assets", file=address, field="assets", remedy=REMEDY)
+    place = Location(address).url
     own = next(
         (link["href"] for link in _list(document.get("links")) if isinstance(link, dict) and link.get("rel") == "self"
-         and isinstance(link.get("href"), str) and is_address(link["href"]) and is_address(url_of(address))),
-        url_of(address),
+         and isinstance(link.get("href"), str) and Location(link["href"]).is_address and place.is_address),
+        place,
     )  # fmt: skip
     found = []
     for key, asset in assets.items():
@@ -230,7 +214,7 @@ def item_of(document: Mapping[str, Any], address: AnyPath, roots: tuple[AnyPath,
         found.append(Asset(key, target(asset["href"], own, roots), roles, kind or "", systems))
     properties = document.get("properties")
     date = _date(properties) if isinstance(properties, dict) else 0.0
-    return Item(url_of(address), str(document.get("id", "")), tuple(found), boxes_of(document), date)
+    return Item(place, str(document.get("id", "")), tuple(found), boxes_of(document), date)
 
 
 def _systems(*places: Any) -> Iterator[str]:

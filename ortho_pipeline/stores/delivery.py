@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.locations import STORES, is_address
-from ortho_pipeline.files.process_limits import thread_pool
-from ortho_pipeline.files.storage.objects import Content, Objects
+from ortho_pipeline.files.locations import STORES, Location
 from ortho_pipeline.files.whole import json_text
+from ortho_pipeline.runtime.process_limits import thread_pool
+from ortho_pipeline.stores.objects import Content, Objects
 
 DOCUMENT, SCHEMA_VERSION = "ortho-pipeline delivery", 1
 _RECORD = "_delivery.json"
@@ -86,4 +86,4 @@ def _record_of(names: list[str], contents: list[Content]) -> bytes:
 
 def address_of(folder: str | os.PathLike[str] | None) -> str | None:
     """Return a folder as address, None where it lies on this machine."""
-    return os.fspath(folder) if folder is not None and is_address(folder) else None
+    return os.fspath(folder) if folder is not None and Location(folder).is_address else None

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.runtime.kernels.marked import Marked
 
 #: numba takes settings from a file of this name in the working folder, which may be somebody else's delivery.
 _SETTINGS = ".numba_config.yaml"
@@ -39,7 +40,7 @@ def is_loaded() -> bool:
     return "numba" in sys.modules
 
 
-class Kernel:
+class Kernel(Marked):
     """A function that is compiled for the types of its arguments when it is first called with such.
 
     It has all that numba's own object (`dispatcher`) has, which is made when it is first needed.
@@ -47,7 +48,7 @@ class Kernel:
 
     def __init__(self, function: Callable[..., Any], inline: bool = False) -> None:
         functools.update_wrapper(self, function)
-        self.py_func, self.inline = function, inline
+        super().__init__(function, inline=inline)
         self._made: Any = None
 
     def __call__(self, *given: Any, **named: Any) -> Any:
@@ -65,7 +66,7 @@ class Kernel:
         if self._made is None:
             with _lock:
                 _refuse_settings()
-                from ortho_pipeline.files.kernels import compiler
+                from ortho_pipeline.runtime.kernels import compiler
 
                 self._made = self._made or compiler.dispatcher(self)
         return self._made

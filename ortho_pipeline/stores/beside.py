@@ -11,8 +11,8 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 
-from ortho_pipeline.files.locations import AnyPath, VsiPath, is_far, located
-from ortho_pipeline.files.process_limits import thread_pool
+from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, located
+from ortho_pipeline.runtime.process_limits import thread_pool
 
 #: Questions at a time.
 _AT_ONCE = 16
@@ -44,7 +44,8 @@ def ask_beside(*paths: AnyPath | None, allow_network: bool = False) -> None:
     InputError
         If the network is not allowed.
     """
-    far = {os.fspath(located(path, allow_network=allow_network)) for path in paths if path is not None and is_far(path)}
+    given = (path for path in paths if path is not None and Location(path).is_far)
+    far = {os.fspath(located(path, allow_network=allow_network)) for path in given}
     new = [VsiPath(name) for name in sorted(far - _known)]
     if not new:
         return

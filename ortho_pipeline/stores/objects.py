@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError, OrthoError, StorageError
-from ortho_pipeline.files.locations import SCHEMES, is_address, require_network
+from ortho_pipeline.files.locations import SCHEMES, Location, require_network
 from ortho_pipeline.files.traffic import count
 
 #: How often a request is repeated, and for how long, before it has failed.
@@ -76,7 +76,7 @@ class Objects:
 
     def __init__(self, address: str, *, allow_network: bool) -> None:
         require_network(address, allow_network)
-        if not is_address(address):
+        if not Location(address).is_address:
             raise InputError(
                 "this is no address of a folder", file=address, remedy=f"one of {', '.join(SCHEMES)}, and a name"
             )

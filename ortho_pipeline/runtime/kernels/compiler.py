@@ -17,15 +17,15 @@ from typing import Any, ClassVar
 import numba
 from numba.core.caching import FunctionCache, NullCache
 
-from ortho_pipeline.files.compiled import Kernel
-from ortho_pipeline.files.kernels import places
+from ortho_pipeline.runtime.kernels import places
+from ortho_pipeline.runtime.kernels.marked import Marked
 
 log = logging.getLogger(__name__)
 
 _njit = functools.partial(numba.njit, nogil=True, error_model="numpy", boundscheck=False)
 
 
-def dispatcher(kernel: Kernel) -> Any:
+def dispatcher(kernel: Marked) -> Any:
     """Return numba's object for a kernel, with a cache of ours unless it is inlined; one kernel at a time."""
     function = kernel.py_func
     if kernel.inline:
@@ -105,7 +105,7 @@ def _sources(module: str) -> str:
     while todo:
         for value in vars(sys.modules[todo.pop()]).values():
             record = isinstance(value, type) and issubclass(value, tuple)
-            if (record or isinstance(value, Kernel)) and value.__module__ not in found:
+            if (record or isinstance(value, Marked)) and value.__module__ not in found:
                 found.add(value.__module__)
                 todo.append(value.__module__)
     files = (getattr(sys.modules[name], "__file__", None) for name in sorted(found - {"typing"}))

@@ -22,8 +22,8 @@ from pathlib import Path
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.folders import cache_folder
 from ortho_pipeline.files.reading import parse_json, read_bounded, sha256, states
-from ortho_pipeline.files.storage.objects import Content
 from ortho_pipeline.files.whole import Outputs, together, whole_or_nothing, write_json
+from ortho_pipeline.stores.objects import Content
 
 #: Environment variable: the folder of what is kept.
 FOLDER = "ORTHO_CACHE"
