@@ -111,7 +111,7 @@ class BlockPoints:
         if self.shape_image is not None:
             directions = checked_covariance(self.shape_image, rays)
             object.__setattr__(self, "shape_image", directions)
-            object.__setattr__(self, "_errors", ImageErrors(np.linalg.cholesky(directions)))
+            object.__setattr__(self, "_errors", ImageErrors(np.asarray(np.linalg.cholesky(directions))))
 
     def __repr__(self) -> str:
         roles = ", ".join(f"{(self.roles == role).sum()} {role}" for role in ROLES if (self.roles == role).any())

@@ -210,7 +210,7 @@ def _inverted(matrices: Array) -> tuple[Array, Array]:
 def _factors(matrices: Array) -> Array:
     """Return the lower Cholesky factors of matrices ``(b, k, k)``; NaN where they are not positive definite."""
     try:
-        return np.linalg.cholesky(matrices)
+        return np.asarray(np.linalg.cholesky(matrices))
     except np.linalg.LinAlgError:
         if len(matrices) == 1:
             return np.full_like(matrices, np.nan)
