@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.estimation.comparison import compare as compare
     from ortho_pipeline.estimation.fit import Fit as Fit
     from ortho_pipeline.estimation.fit import fit as fit
-    from ortho_pipeline.estimation.problem import Prior as Prior
+    from ortho_pipeline.estimation.observations.prior import Prior as Prior
     from ortho_pipeline.exchange.geodataframe import from_geodataframe as from_geodataframe
     from ortho_pipeline.exchange.geodataframe import to_geodataframe as to_geodataframe
     from ortho_pipeline.exchange.model_file import load_model as load_model
@@ -68,7 +68,7 @@ _HOMES = {
     "OutputOptions": "options",
     "PointOptions": "options",
     "Points": "points",
-    "Prior": "estimation.problem",
+    "Prior": "estimation.observations.prior",
     "RPC": "models",
     "RasterSource": "raster.source",
     "Scene": "hookspecs",

@@ -43,7 +43,7 @@ import pluggy
 if TYPE_CHECKING:
     from ortho_pipeline.display.notices import Notice
     from ortho_pipeline.estimation.fit import Fit
-    from ortho_pipeline.estimation.problem import Prior
+    from ortho_pipeline.estimation.observations.prior import Prior
     from ortho_pipeline.models.base import SensorModel
     from ortho_pipeline.points import Points
 

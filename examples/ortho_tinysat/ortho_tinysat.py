@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.geodesy.ellipsoid import geocentric
 from ortho_pipeline.hookspecs import Scene, Sensor, Study, hookimpl

@@ -15,7 +15,7 @@ from ortho_pipeline.commands.scene_fit import Adjusted, adjust
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres, rmse_metres
-from ortho_pipeline.estimation.problem import ImageErrors
+from ortho_pipeline.estimation.observations.image_errors import ImageErrors
 from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models.base import Array, SensorModel

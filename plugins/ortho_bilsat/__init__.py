@@ -12,7 +12,7 @@ from osgeo import gdal
 from ortho_bilsat.survey import MARK, Survey, read_survey
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.problem import priors_at
+from ortho_pipeline.estimation.observations.prior import priors_at
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.geodesy.ellipsoid import geodetic, orbital_from_ecef

@@ -13,7 +13,7 @@ from osgeo import gdal
 
 from ortho_frame.tables import Pose, Shot, is_reconstruction, read_camera, read_exterior
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.problem import Prior, priors_at
+from ortho_pipeline.estimation.observations.prior import Prior, priors_at
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models.base import Array

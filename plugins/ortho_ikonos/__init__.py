@@ -17,7 +17,7 @@ from ortho_ikonos.metadata import Component, Delivery, SourceImage, read_metadat
 from ortho_ikonos.order import ImageFile, Position, bands_of, position_of, rpc_file
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.problem import Prior, priors_at
+from ortho_pipeline.estimation.observations.prior import Prior, priors_at
 from ortho_pipeline.exchange.rpc import has_rpc, read_rpc, rpc_of_dataset
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import place

@@ -12,7 +12,7 @@ from osgeo import gdal
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import place

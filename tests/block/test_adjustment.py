@@ -25,7 +25,7 @@ from ortho_pipeline.block.reliability.standardised_residuals import standardise
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
 from ortho_pipeline.estimation.fit import fit
-from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import geocentric

@@ -25,7 +25,8 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.choice.expected_error import expectation
 from ortho_pipeline.estimation.choice.recommendation import expected_errors, recommend
-from ortho_pipeline.estimation.comparison import Comparison, Row, available_models, choose_models, compare
+from ortho_pipeline.estimation.choice.row import Row
+from ortho_pipeline.estimation.comparison import Comparison, available_models, choose_models, compare
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.exchange.rpc import read_rpc
 from ortho_pipeline.geodesy.crs import ground_transform

@@ -12,7 +12,7 @@ from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.points import BlockPoints, shape_of
 from ortho_pipeline.block.start import Start
-from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.measure.block.left_out import LeftOut

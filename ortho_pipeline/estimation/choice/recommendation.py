@@ -16,18 +16,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ortho_pipeline.estimation.choice.expected_error import Expectation, expectation, supported
+from ortho_pipeline.estimation.choice.row import Row
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.statistics import student_of
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
-
-if TYPE_CHECKING:
-    from ortho_pipeline.estimation.comparison import Row
 
 #: Chance of calling the corrections of the scene's own model worse than another one that is as good, one-sided.
 _SIGNIFICANTLY_WORSE = 0.05

@@ -1,11 +1,7 @@
 r"""Each measurement of a block had it taken no part, and how far it is from all others: its residual left out, and w.
 
-With rows of unit weight and the hat matrix :math:`H` of all of them at the solution, the part `k` (a ray, or the known
-ground of a point) has the misfit :math:`v_k`; left out it would have :math:`(I - H_{kk})^{-1} v_k`, and
-:math:`w^2 = v_k^T (I - H_{kk})^{-1} v_k`. Of a ray that alone gives its point a distance nothing is known along the
-other ray: only the part across it is said.
-
-Source: Baarda 1968; Cook and Weisberg 1982 (section 2.2, several rows at once).
+By `estimation.statistics.left_out`, of each ray and of the known ground of each point. Of a ray that alone gives its
+point a distance nothing is known along the other ray: only the part across it is said.
 """
 
 from __future__ import annotations
@@ -15,16 +11,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ortho_pipeline.block.adjustment import pseudo_of
 from ortho_pipeline.block.datum import with_datum
 from ortho_pipeline.block.equations.elimination import step_of
 from ortho_pipeline.block.equations.linear import Linear
-from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
-from ortho_pipeline.block.equations.unknowns import Mask
+from ortho_pipeline.block.equations.problem import BlockProblem, Selection, State
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.intersection import frame_of
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.block.start import Start
+from ortho_pipeline.estimation.statistics import left_out, squared_distances
 from ortho_pipeline.models.base import Array
 
 #: Directions in which all others tell less than this share of what a part tells itself: nothing tests it in them, and
@@ -64,16 +61,18 @@ class LeftOut:
         misfits = linear.misfits.minus(step.change)
         points, used = fit.points, linear.ordering.rays
         rays = np.where(fit.used_rays[:, None], np.nan, fit.residuals)
-        left, _, squares, ranks = _without(hats[0][used], misfits.rays[used])
-        rays[used] = problem.points.in_pixels(left, used)
-        tests = [(points.point[used], squares, ranks)]
+        of_rays = left_out(np.eye(2) - hats[0][used], misfits.rays[used], known=_KNOWN, testable=_TESTABLE)
+        rays[used] = problem.points.in_pixels(of_rays.misfits, used)
         grounded = linear.ordering.grounded
         ground = np.where(fit.used_ground[:, None], np.nan, fit.object_residuals)
-        left, known, squares, ranks = _without(hats[1][grounded], misfits.ground[grounded])
-        ground[grounded] = np.where(known.all(axis=1, keepdims=True), left * problem.ground_sigmas[grounded], np.nan)
-        tests.append((grounded, squares, ranks))
+        of_ground = left_out(np.eye(3) - hats[1][grounded], misfits.ground[grounded], known=_KNOWN, testable=_TESTABLE)
+        ground[grounded] = of_ground.whole * problem.on_points(linear.state.local, grounded).sigmas
         others = np.flatnonzero(~fit.used_ground & points.check & np.isfinite(fit.object_residuals).all(axis=1))
-        tests.append((others, _of_checks(fit, others), np.full(len(others), 3)))
+        tests = [
+            (points.point[used], of_rays.squares, of_rays.rank),
+            (grounded, of_ground.squares, of_ground.rank),
+            (others, _of_checks(fit, others), np.full(len(others), 3)),
+        ]
         return cls(rays, ground, *_farthest(tests, len(points), fit))
 
 
@@ -81,34 +80,15 @@ def _equations(fit: BlockFit, starts: Mapping[str, Start], hold: float | None) -
     """Return the observation equations at the solution, with the sigmas that were found."""
     points, models = fit.points, tuple(fit.models[label] for label in fit.points.images)
     begun = tuple(fit.start[label] for label in points.images)
+    priors = {label: start.priors for label, start in starts.items()}
     known = np.where(points.control[:, None], points.known_in(GEODETIC), np.nan)
-    problem = BlockProblem(points, begun, frame_of(begun, points), known, _priors(fit, starts))
+    problem = BlockProblem(points, begun, frame_of(begun, points), known, pseudo_of(begun, points, priors))
     local = problem.frame.of_geodetic(fit.ground)
     selection = Selection.of(fit.used_rays, fit.used_ground)
     problem, _ = with_datum(problem, State(begun, local), selection, hold)
     problem = fit.variances.applied(problem)
     problem = replace(problem, assumed=(max(problem.assumed[0], _LEAST), max(problem.assumed[1], _LEAST)))
     return problem, Linear.at(problem, State(models, local), selection)
-
-
-def _priors(fit: BlockFit, starts: Mapping[str, Start]) -> tuple[Pseudo, ...]:
-    """Return what is known of parameters by themselves."""
-    return tuple(
-        Pseudo(column, prior.mean, prior.sigma)
-        for column, (label, name) in enumerate(fit.parameters)
-        if (prior := starts[label].priors.get(name)) is not None
-    )
-
-
-def _without(hats: Array, misfits: Array) -> tuple[Array, Mask, Array, Index]:
-    """Return misfits ``(n, k)`` of parts left out, which axes of them are known, w squared, and how many are in it."""
-    redundancy, axes = np.linalg.eigh(np.eye(misfits.shape[1]) - hats)
-    known, testable = redundancy > _KNOWN, redundancy > _TESTABLE
-    turned = np.einsum("nij,ni->nj", axes, misfits)
-    alone = turned / np.where(known, redundancy, np.inf)
-    left = np.einsum("nij,nj->ni", axes, alone)
-    left[~known.any(axis=1)] = np.nan
-    return left, known, np.where(testable, turned * alone, 0.0).sum(axis=1), testable.sum(axis=1)
 
 
 def _of_checks(fit: BlockFit, checks: Index) -> Array:
@@ -118,7 +98,7 @@ def _of_checks(fit: BlockFit, checks: Index) -> Array:
     own = np.where(stated > 0, stated, (plan, plan, height))
     spread = fit.ground_covariance[checks] + own[:, :, None] ** 2 * np.eye(3)
     apart = fit.object_residuals[checks]
-    return np.asarray((apart * np.linalg.solve(spread, apart[:, :, None])[:, :, 0]).sum(axis=1))
+    return squared_distances(apart, spread)
 
 
 def _farthest(tests: list[tuple[Index, Array, Index]], count: int, fit: BlockFit) -> tuple[Array, Array]:
