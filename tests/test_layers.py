@@ -43,7 +43,6 @@ testing
 imaging
 block
 warp
-simulation
 report
 commands
 measure
@@ -289,7 +288,8 @@ def texts(path: Path) -> Iterator[str]:
 
 
 def test_messages_name_options_by_their_fields() -> None:
-    paths = [path for path in FILES + PLUGIN_FILES if not {"cli", "options"} & set(path.relative_to(ROOT).parts)]
+    words = {"cli", "options"}
+    paths = [path for path in FILES + PLUGIN_FILES if not words & {*path.relative_to(ROOT).parts, path.stem}]
     for where, text in ((path.relative_to(ROOT), text) for path in paths for text in texts(path)):
         typed = re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)
         if where.name != "study.py":  # the switches of a study are its own to name

@@ -52,11 +52,8 @@ COMMANDS = {
     "register": ("scene.bands", "Bring single bands IMAGES onto one of them and write one image of all, which opens as "
                                 "the reference did."),
     "report": ("scene.rectifying", "Write the plots of a report, each as a picture of its own."),
-    "reproduce": ("studies", "Compute the tables of the papers that this package implements, beside the papers' "
-                             "numbers."),
     "run": ("batch", "Make the orthos of all scenes that PIPELINE.yaml names."),
     "sensors": ("machine.installed", "List the sensors that are installed."),
-    "simulate": ("studies", "Make scenes of known truth."),
     "ties": ("matching", "Find tie points between overlapping IMAGEs: places that two of them or more show, with their "
                          "covariances."),
 }  # fmt: skip

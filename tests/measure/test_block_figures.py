@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ortho_studies.simulation.scanner import LineScanner
 
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
@@ -20,7 +21,6 @@ from ortho_pipeline.measure.block.planning import BlockGrid, next_of_block
 from ortho_pipeline.measure.block.solution import figures, solve
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.rational import RPC
-from ortho_pipeline.simulation.scanner import LineScanner
 
 LABELS = ("fore", "nadir", "aft")
 _BIAS = {"fore": (4.0, -3.0), "nadir": (-6.0, 2.0), "aft": (1.0, 5.0)}

@@ -9,9 +9,9 @@ import numpy as np
 import ortho_bilsat
 import ortho_frame
 import pytest
-from ortho_bilsat.experiment import ROWS, error_vectors, naive, reproduce
 from ortho_bilsat.survey import Survey, read_survey, write_survey
-from ortho_bilsat.truth import (
+from ortho_studies.bilsat.experiment import ROWS, error_vectors, naive, reproduce
+from ortho_studies.bilsat.truth import (
     FOCAL_LENGTH,
     MAP_CRS,
     PITCH,
@@ -22,6 +22,7 @@ from ortho_bilsat.truth import (
     Snapshot,
     render,
 )
+from ortho_studies.simulation.tables import is_within
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, TooFewPoints
@@ -34,7 +35,6 @@ from ortho_pipeline.models.frame.camera import FrameCamera
 from ortho_pipeline.models.frame.resection import resect
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.plugins import open_scene
-from ortho_pipeline.simulation.tables import is_within
 from ortho_pipeline.testing import check_sensor
 
 XS = Interior(SIZE, SIZE, FOCAL_LENGTH, PITCH, PITCH)

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import ortho_cartosat
 import pytest
-from ortho_cartosat import truth as simulated
 from ortho_cartosat.layout import partner_of, rpc_of
 from ortho_cartosat.metadata import read_metadata
-from ortho_cartosat.truth import BIASES, PLANE, Attitude, Scanner, StereoPair, aim
+from ortho_studies.cartosat import truth as simulated
+from ortho_studies.cartosat.truth import BIASES, PLANE, Attitude, Scanner, StereoPair, aim
+from ortho_studies.simulation.earth import EARTH_A
+from ortho_studies.simulation.scanner import LineScanner
 from osgeo import gdal
 
 from ortho_pipeline.errors import DegeneratePoints, InputError
@@ -24,8 +26,6 @@ from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
 from ortho_pipeline.points.selection import select_control
 from ortho_pipeline.raster.source import open_dataset
-from ortho_pipeline.simulation.earth import EARTH_A
-from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.testing import check_sensor
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -147,7 +147,7 @@ def test_smaller_images_cover_the_same_ground():
 
 
 def test_the_truth_shares_no_code_with_the_models_and_no_estimator_sees_it():
-    scene = ast.parse((ROOT / "plugins/ortho_cartosat/truth.py").read_text())
+    scene = ast.parse((ROOT / "plugins/ortho_studies/cartosat/truth.py").read_text())
     used = {
         node.module: {one.name for one in node.names} for node in ast.walk(scene) if isinstance(node, ast.ImportFrom)
     }
@@ -423,8 +423,8 @@ def test_crops_and_damaged_facts_are_warnings(pair_folder, tmp_path):
 
 @pytest.mark.parametrize("view", ["fore", "aft"])
 def test_metadata_place_an_image_within_500_pixels(view, tmp_path):
-    from ortho_cartosat.simulation import metadata_text
     from ortho_cartosat.start import pushbroom
+    from ortho_studies.cartosat.simulation import metadata_text
 
     pair = StereoPair.make(seed=1)
     path = tmp_path / "BAND_MET.TXT"

@@ -115,10 +115,3 @@ def with_examples(text: str | None, examples: Sequence[tuple[str, str]]) -> str 
         return text
     lines = [f"    {line}" for about, command in examples for line in (f"# {about}", command)]
     return "\n\n".join([inspect.cleandoc(text or ""), "\b\nExamples:", "\n".join(["\b", *lines])])
-
-
-def examples_of_study(group: str, name: str) -> Sequence[tuple[str, str]]:
-    """Return the example of a study's command: what a plugin brings has one, too."""
-    if group == "simulate":
-        return (("Always the same scene for the same seed:", f"ortho simulate {name} --seed 1 -o {name}_1"),)
-    return (("Quickly, with less certain percentiles:", f"ortho reproduce {name} --realisations 3 -o {name}_page"),)
