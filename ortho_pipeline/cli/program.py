@@ -44,8 +44,6 @@ COMMANDS = {
     "intersect": ("block", "Intersect the rays of points that were measured in several IMAGEs: ground coordinates with "
                            "their sigmas."),
     "match": ("matching", "Find control points of IMAGE by matching it with orthoimages of the same place."),
-    "measure": ("measuring", "Measure points of an IMAGE in the browser, beside its reference in the geometry of the "
-                             "image, or of several."),
     "models": ("machine.installed", "List the models that can be fitted to points alone."),
     "mosaic": ("batch", "Make one raster of ORTHOs that lie on one grid, and measure how well they agree."),
     "rectify": ("scene.rectifying", "Make the orthoimage of IMAGE, its adjusted model, and the accuracy report."),

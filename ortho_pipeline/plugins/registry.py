@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from types import MappingProxyType, ModuleType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import pluggy
 
@@ -27,7 +27,16 @@ if TYPE_CHECKING:
 
 BUNDLED = "ortho-pipeline"
 _COMMAND, _TARGET = re.compile(r"[a-z][a-z0-9-]*"), re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
-Offer = TypeVar("Offer")
+
+
+class Named(Protocol):
+    """What plugins offer: a value with a name."""
+
+    @property
+    def name(self) -> str: ...
+
+
+Offer = TypeVar("Offer", bound=Named)
 log = logging.getLogger(__name__)
 
 
@@ -173,7 +182,17 @@ class Registry:
     def named(
         self, hook: str, what: str, kind: type[Offer], faults: Callable[[Offer], Iterator[str]] = lambda _: iter(())
     ) -> Mapping[str, Offer]:
-        """Collect what a hook offers, by name: values of a kind; the first fault of an offer is that of its plugin."""
+        """Collect what a hook offers, by name.
+
+        Parameters
+        ----------
+        hook : str
+            It returns an iterable of values of `kind`.
+        what : str
+            What people call such a value.
+        faults : callable(offer) -> iterator of str
+            What is wrong with an offer; the first fault is an error of its plugin.
+        """
         offers: dict[str, Any] = {}
         advice = f"yield the {kind.__name__}, or return [{kind.__name__}(...)]"
         for plugin, offered in self._returned(hook, Iterable, list, advice):

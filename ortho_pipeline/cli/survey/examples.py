@@ -1,4 +1,4 @@
-"""Examples of every command: they stand in its help, and the tests run them in a copy of the sample data."""
+"""Examples of every command of the host: they stand in its help; tests run them in a copy of the sample data."""
 
 from __future__ import annotations
 
@@ -48,12 +48,6 @@ EXAMPLES: Mapping[str, Sequence[tuple[str, str]]] = {
         (
             "Control points from an orthoimage, and a page that shows them:",
             "ortho match scene.tif --reference reference.tif --dem dem.tif -o matches.geojson --report matches.html",
-        ),
-    ),
-    "measure": (
-        (
-            "Points by hand, beside the reference, in the browser:",
-            "ortho measure scene.tif --reference reference.tif --dem dem.tif -o points.geojson",
         ),
     ),
     "export": (

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from osgeo import gdal, osr
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import write_rpc_txt
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.files import write_text
-from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points, write_points
 from ortho_pipeline.raster.output import raster_output, written
@@ -151,7 +151,7 @@ def _write_points(measured: Points, cuts: list[Component], path: Path) -> None:
 
 
 def _write_image(
-    out: Path, cut: Component, whole: GeoScene, band: str, pixels: Array, rpc: bool
+    out: Path, cut: Component, whole: GeoScene, band: str, pixels: NDArray[np.uint16], rpc: bool
 ) -> Iterator[tuple[str, Path]]:
     grid = _of_band(cut.scene, band)
     name = "_".join(
@@ -169,7 +169,7 @@ def _write_image(
         yield f"rpc{name}".rstrip("_"), path
 
 
-def _write_tiff(path: Path, pixels: Array, grid: GeoScene) -> None:
+def _write_tiff(path: Path, pixels: NDArray[np.uint16], grid: GeoScene) -> None:
     system = osr.SpatialReference()
     system.SetFromUserInput(simulated.MAP_CRS)
     options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9"]

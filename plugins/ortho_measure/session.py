@@ -10,6 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from ortho_measure.marks import Mark, marks_of
+from ortho_measure.places import Geometry, Places, Sheet
+from ortho_measure.planning import Grid, Next, measure_next
+from ortho_measure.project import Project, moved, now, points_file
+from ortho_measure.proposals import proposal_of
+from ortho_measure.solution import Solution, figures, solve
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.crops import open_by_evidence
 from ortho_pipeline.commands.control.matching import open_reference_views, search_of
@@ -26,12 +32,6 @@ from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.matching import Reference, View
 from ortho_pipeline.imaging.matching.targets import metres_per_pixel
-from ortho_pipeline.measure.marks import Mark, marks_of
-from ortho_pipeline.measure.places import Geometry, Places, Sheet
-from ortho_pipeline.measure.planning import Grid, Next, measure_next
-from ortho_pipeline.measure.project import Project, moved, now, points_file
-from ortho_pipeline.measure.proposals import proposal_of
-from ortho_pipeline.measure.solution import Solution, figures, solve
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.surface.base import Surface

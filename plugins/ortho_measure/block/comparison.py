@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from ortho_measure.block.solution import BlockSolution, solve
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.measure.block.solution import BlockSolution, solve
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ortho_measure.project import Project
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.measure.project import Project
 from ortho_pipeline.raster.quicklook import preview_png, reduced_grid, shaded_png
 from ortho_pipeline.raster.regridded import Regridded, grid_of
 

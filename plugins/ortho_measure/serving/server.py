@@ -15,18 +15,18 @@ from collections.abc import Callable, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
+from ortho_measure.block.session import BlockSession
+from ortho_measure.project import Project
+from ortho_measure.serving.entry import Entry
+from ortho_measure.serving.guard import REPORT_POLICY, Admit, App, Guard
+from ortho_measure.serving.listener import LOOPBACK, QUEUE, Listener
+from ortho_measure.serving.log import repetitions_counted
+from ortho_measure.serving.making import PICTURES, Making
+from ortho_measure.serving.tiles import MOST, SIDE, Tiles
+from ortho_measure.session import Session
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import parse_json
 from ortho_pipeline.files.process_limits import thread_pool
-from ortho_pipeline.measure.block.session import BlockSession
-from ortho_pipeline.measure.project import Project
-from ortho_pipeline.measure.serving.entry import Entry
-from ortho_pipeline.measure.serving.guard import REPORT_POLICY, Admit, App, Guard
-from ortho_pipeline.measure.serving.listener import LOOPBACK, QUEUE, Listener
-from ortho_pipeline.measure.serving.log import repetitions_counted
-from ortho_pipeline.measure.serving.making import PICTURES, Making
-from ortho_pipeline.measure.serving.tiles import MOST, SIDE, Tiles
-from ortho_pipeline.measure.session import Session
 from ortho_pipeline.options import CORRECTIONS, OutputOptions, SceneOptions
 from ortho_pipeline.raster.block_cache import limit_cache
 
@@ -225,7 +225,7 @@ class _Given:
 
     def __init__(self, session: Project, tiles: Tiles) -> None:
         self._session, self._tiles, self._answers = session, tiles, _Answers(session, tiles)
-        room = resources.files("ortho_pipeline.measure")
+        room = resources.files("ortho_measure")
         self._files = {name: room.joinpath("page", name).read_bytes() for name in PAGE}
         self._workers = thread_pool(max(2, os.cpu_count() or 1), "measure")
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from ortho_measure.marks import GROUND_CRS, Mark, Marks, Ray, checked, errors_of
 from ortho_pipeline.block.points import BlockPoints, shape_of
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
-from ortho_pipeline.measure.marks import GROUND_CRS, Mark, Marks, Ray, checked, errors_of
 from ortho_pipeline.points.geojson import feature_of
 from ortho_pipeline.points.image_errors import says_more
 

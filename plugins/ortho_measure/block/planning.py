@@ -15,6 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ortho_measure.marks import GROUND_CRS
+from ortho_measure.places import Places
+from ortho_measure.planning import ALIKE, OFFERED, Grid, Next, apart
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.local_frame import GroundFrame
 from ortho_pipeline.errors import InputError
@@ -22,9 +25,6 @@ from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.imaging.matching import OtherScene, Target
 from ortho_pipeline.imaging.matching.chip_search import SIDE
 from ortho_pipeline.imaging.matching.targets import metres_per_pixel, shown_by
-from ortho_pipeline.measure.marks import GROUND_CRS
-from ortho_pipeline.measure.places import Places
-from ortho_pipeline.measure.planning import ALIKE, OFFERED, Grid, Next, apart
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE
 

@@ -10,6 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from ortho_measure.block.comparison import compare_corrections
+from ortho_measure.block.planning import BlockGrid, next_of_block
+from ortho_measure.block.proposals import TieSearch
+from ortho_measure.block.solution import BlockSolution, figures, solve
+from ortho_measure.block.table import block_points, document, marks_of_block
+from ortho_measure.marks import GROUND_CRS, Mark
+from ortho_measure.places import Geometry, Places, Sheet
+from ortho_measure.planning import Next
+from ortho_measure.project import Project, moved, now, points_file
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
@@ -27,15 +36,6 @@ from ortho_pipeline.geodesy.crs import horizontal, parse_crs
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.matching import Reference, View, open_references
 from ortho_pipeline.imaging.matching.targets import metres_per_pixel
-from ortho_pipeline.measure.block.comparison import compare_corrections
-from ortho_pipeline.measure.block.planning import BlockGrid, next_of_block
-from ortho_pipeline.measure.block.proposals import TieSearch
-from ortho_pipeline.measure.block.solution import BlockSolution, figures, solve
-from ortho_pipeline.measure.block.table import block_points, document, marks_of_block
-from ortho_pipeline.measure.marks import GROUND_CRS, Mark
-from ortho_pipeline.measure.places import Geometry, Places, Sheet
-from ortho_pipeline.measure.planning import Next
-from ortho_pipeline.measure.project import Project, moved, now, points_file
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options import CORRECTIONS, BlockOptions, MatchOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points

@@ -10,10 +10,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ortho_measure.marks import GROUND_CRS
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, parse_crs
 from ortho_pipeline.imaging.matching import Reference, Target, View
-from ortho_pipeline.measure.marks import GROUND_CRS
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.surface.base import Surface

@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ortho_measure.project import Project
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.imaging.matching.chips import Renderer
-from ortho_pipeline.measure.project import Project
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.output import png_bytes

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ortho_measure.places import Places
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.imaging.matching.candidates import candidates
 from ortho_pipeline.imaging.matching.chip_search import SIDE
 from ortho_pipeline.imaging.matching.targets import chip_factor, shown_by
-from ortho_pipeline.measure.places import Places
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE
 from ortho_pipeline.surface.rays import meet_surface

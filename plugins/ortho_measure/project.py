@@ -13,17 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from ortho_measure.journal import REMEDY as JOURNAL_REMEDY
+from ortho_measure.journal import Journal
+from ortho_measure.marks import GROUND_CRS, History, Mark, Marks, Written
+from ortho_measure.places import Geometry, Places, Sheet, ground_typed, linked
+from ortho_measure.planning import Next
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.files import write_json
 from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.files.process_limits import Progress
 from ortho_pipeline.imaging.matching import View
-from ortho_pipeline.measure.journal import REMEDY as JOURNAL_REMEDY
-from ortho_pipeline.measure.journal import Journal
-from ortho_pipeline.measure.marks import GROUND_CRS, History, Mark, Marks, Written
-from ortho_pipeline.measure.places import Geometry, Places, Sheet, ground_typed, linked
-from ortho_pipeline.measure.planning import Next
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.surface.base import Surface

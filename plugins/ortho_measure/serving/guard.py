@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any
 
-from ortho_pipeline.measure.serving.entry import REFUSED, Entry, leading_to
+from ortho_measure.serving.entry import REFUSED, Entry, leading_to
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]

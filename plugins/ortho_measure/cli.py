@@ -24,7 +24,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 
 if TYPE_CHECKING:
-    from ortho_pipeline.measure.project import Project
+    from ortho_measure.project import Project
 
 
 @click.command(cls=Command)
@@ -57,7 +57,7 @@ def measure(
     if missing:
         raise InputError(f"measuring in the browser needs {' and '.join(missing)}",
                          remedy='pip install "ortho-pipeline[measure]"')  # fmt: skip
-    from ortho_pipeline.measure.serving.server import serve
+    from ortho_measure.serving.server import serve
 
     session = _session(images, output, scene, points, surface, match)
     with contextlib.ExitStack() as until_end:
@@ -78,7 +78,7 @@ def _open_browser(address: str, points: Path, until_end: contextlib.ExitStack) -
     """Open the address by way of a file: everybody on this machine can read the command line of a browser."""
     import webbrowser
 
-    from ortho_pipeline.measure.serving.entry import private_file
+    from ortho_measure.serving.entry import private_file
 
     path = until_end.enter_context(private_file(address, points))
     if path is None:
@@ -99,10 +99,10 @@ def _session(
     """Open the session of one image, or of several."""
     name = output or "_".join([*(Path(image).stem for image in images[:2]), "points.geojson"])
     if len(images) == 1:
-        from ortho_pipeline.measure.session import open_session
+        from ortho_measure.session import open_session
 
         return open_session(images[0], name, scene=_first(scene), points=points, surface=surface, match=match)
-    from ortho_pipeline.measure.block.session import open_block_session
+    from ortho_measure.block.session import open_block_session
 
     for field in ("select", "fit_model", "model_crs", "prune", "params", "significance", "ridge", "near"):
         if getattr(points, field) != getattr(PointOptions, field):

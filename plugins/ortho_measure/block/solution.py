@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from ortho_measure.block.left_out import LeftOut
+from ortho_measure.solution import LEAST_CHECK_POINTS, SUSPICIOUS
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.files.json.values import json_position, json_value
-from ortho_pipeline.measure.block.left_out import LeftOut
-from ortho_pipeline.measure.solution import LEAST_CHECK_POINTS, SUSPICIOUS
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.report.block import KEPT_OUT

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ortho_measure.places import Places
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.files.json.values import json_position, json_value
@@ -24,7 +25,6 @@ from ortho_pipeline.imaging.matching.chip_search import MEASURED, SIDE, doubts, 
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.least_squares import Measured, measure
 from ortho_pipeline.imaging.matching.targets import chip_factor
-from ortho_pipeline.measure.places import Places
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE
 

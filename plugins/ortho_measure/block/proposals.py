@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from ortho_measure.places import Places
+from ortho_measure.proposals import NEAR, proposal_of, propose
 from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.imaging.matching import OtherScene
-from ortho_pipeline.measure.places import Places
-from ortho_pipeline.measure.proposals import NEAR, proposal_of, propose
 from ortho_pipeline.models.base import Array
 
 #: Height (m) over which the epipolar direction is asked for, and pixels over which derivatives are.
