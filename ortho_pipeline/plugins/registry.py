@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from types import MappingProxyType, ModuleType
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import pluggy
 
@@ -27,16 +27,6 @@ if TYPE_CHECKING:
 
 BUNDLED = "ortho-pipeline"
 _COMMAND, _TARGET = re.compile(r"[a-z][a-z0-9-]*"), re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
-
-
-class Named(Protocol):
-    """What plugins offer: a value with a name."""
-
-    @property
-    def name(self) -> str: ...
-
-
-Offer = TypeVar("Offer", bound=Named)
 log = logging.getLogger(__name__)
 
 
@@ -180,8 +170,8 @@ class Registry:
         return self.named("ortho_commands", "command", Subcommand, _command_faults)
 
     def named(
-        self, hook: str, what: str, kind: type[Offer], faults: Callable[[Offer], Iterator[str]] = lambda _: iter(())
-    ) -> Mapping[str, Offer]:
+        self, hook: str, what: str, kind: type, faults: Callable[[Any], Iterator[str]] = lambda _: iter(())
+    ) -> Mapping[str, Any]:
         """Collect what a hook offers, by name.
 
         Parameters
