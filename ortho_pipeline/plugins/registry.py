@@ -170,7 +170,7 @@ class Registry:
         return self.named("ortho_commands", "command", Subcommand, _command_faults)
 
     def named(
-        self, hook: str, what: str, kind: type, faults: Callable[[Any], Iterator[str]] = lambda _: iter(())
+        self, hook: str, what: str, kind: type[Any], faults: Callable[[Any], Iterator[str]] = lambda _: iter(())
     ) -> Mapping[str, Any]:
         """Collect what a hook offers, by name.
 
