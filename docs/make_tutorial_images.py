@@ -14,6 +14,7 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from ortho_studies.simulation.terrain import Landscape, Terrain
 from osgeo import gdal
 from scipy.ndimage import uniform_filter
 from sessions import run
@@ -21,7 +22,6 @@ from sessions import run
 import ortho_pipeline as op
 from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.network.drawing import plot_network
-from ortho_pipeline.simulation.terrain import Landscape, Terrain
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

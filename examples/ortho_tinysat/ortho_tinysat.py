@@ -11,7 +11,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.geodesy.ellipsoid import geocentric
-from ortho_pipeline.hookspecs import Scene, Sensor, Study, hookimpl
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models import SensorModel
 
 
@@ -94,10 +94,3 @@ def open_scene(dataset: Any, *, mounting: str = "0") -> Scene:
     known = {"roll": Prior(roll, np.radians(0.05)), "delay": Prior(0.0, 0.1)}
     facts = {"acquired": flight.get("acquired", "unknown")}
     return Scene("tinysat", dataset.GetDescription(), *size, {"tinysat": model}, str(path), facts=facts, priors=known)
-
-
-@hookimpl
-def ortho_studies() -> Iterable[Study]:
-    from ortho_tinysat_study import STUDY  # here: few commands need it, and all would wait for it
-
-    yield STUDY

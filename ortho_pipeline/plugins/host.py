@@ -13,7 +13,7 @@ from typing import Any
 
 from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed, described
 from ortho_pipeline.exchange.crop import placed
-from ortho_pipeline.hookspecs import Scene, Sensor, Study
+from ortho_pipeline.hookspecs import Scene, Sensor
 from ortho_pipeline.models import KINDS
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.plugins.contract import scene_faults
@@ -95,11 +95,6 @@ class Host:
     def broken(self) -> tuple[Broken, ...]:
         """Plugins that were left out, and why."""
         return self._registry.broken
-
-    @functools.cached_property
-    def studies(self) -> Mapping[str, Study]:
-        """The simulations and experiments by name; collected when they are first asked for."""
-        return self._registry.studies()
 
     def open_image(
         self,

@@ -15,7 +15,7 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.exchange.rpc_files import rpc_of_fields
-from ortho_pipeline.hookspecs import Scene, Sensor, Study, hookimpl
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.rational import RPC
 
@@ -53,15 +53,6 @@ def ortho_sensors() -> Iterable[Sensor]:
             },
         },
     )
-
-
-@hookimpl
-def ortho_studies() -> Iterable[Study]:
-    """Offer the study ``cartosat``."""
-    # An experiment takes a while to load, and few commands need it.
-    from ortho_cartosat.study import STUDY
-
-    yield STUDY
 
 
 def recognises(dataset: gdal.Dataset) -> bool:

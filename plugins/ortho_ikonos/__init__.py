@@ -22,7 +22,7 @@ from ortho_pipeline.exchange.rpc import has_rpc, read_rpc, rpc_of_dataset
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.geodesy.crs import ground_transform
-from ortho_pipeline.hookspecs import Piece, Scene, Sensor, Study, hookimpl
+from ortho_pipeline.hookspecs import Piece, Scene, Sensor, hookimpl
 from ortho_pipeline.models import MapPlane, SensorModel
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.options import numbers_of
@@ -52,15 +52,6 @@ def ortho_sensors() -> Iterable[Sensor]:
     """Offer the sensor ``ikonos``."""
     yield Sensor("ikonos", "IKONOS Geo products (po_* with metadata.txt, with or without RPC)", recognises, open_scene,
                  options=OPTIONS)  # fmt: skip
-
-
-@hookimpl
-def ortho_studies() -> Iterable[Study]:
-    """Offer the study ``ikonos``."""
-    # An experiment takes a while to load, and few commands need it.
-    from ortho_ikonos.study import STUDY
-
-    yield STUDY
 
 
 def recognises(dataset: gdal.Dataset) -> bool:

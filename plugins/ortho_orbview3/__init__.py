@@ -15,7 +15,7 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import place
-from ortho_pipeline.hookspecs import Scene, Sensor, Study, hookimpl
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.options.texts import Setting, Text
 
@@ -51,15 +51,6 @@ def ortho_sensors() -> Iterable[Sensor]:
             "label": "the label, where it is not <image>.pvl",
         },
     )
-
-
-@hookimpl
-def ortho_studies() -> Iterable[Study]:
-    """Offer the study ``orbview3``."""
-    # An experiment takes a while to load, and few commands need it.
-    from ortho_orbview3.study import STUDY
-
-    yield STUDY
 
 
 def recognises(dataset: gdal.Dataset) -> bool:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ortho_studies.simulation.scanner import LineScanner
 
 from ortho_pipeline import commands
 from ortho_pipeline.batch import plan as batch_plan
@@ -22,7 +23,6 @@ from ortho_pipeline.files import read_json
 from ortho_pipeline.imaging.matching import open_references
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.raster.source import open_dataset
-from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.stores.stac.item import read_item
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pyproj
 import pytest
-from ortho_cartosat.truth import StereoPair
+from ortho_studies.cartosat.truth import StereoPair
+from ortho_studies.simulation.scanner import LineScanner
 from scipy.stats import chi2
 
 from ortho_pipeline.block.adjustment import _prepared, adjust
@@ -35,7 +36,6 @@ from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.points.selection import select_control
 from ortho_pipeline.report.notebook.tables import html
-from ortho_pipeline.simulation.scanner import LineScanner
 
 LON, LAT = 33.35, 37.25
 SIZE = 4000

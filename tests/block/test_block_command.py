@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ortho_studies.simulation.scanner import LineScanner
 from osgeo import gdal
 from servers import moto_server
 
@@ -28,7 +29,6 @@ from ortho_pipeline.report.block import summary_text
 from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.delivered import accuracy_before
 from ortho_pipeline.report.wording import NO_SCALE
-from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.stores.objects import Objects
 
 LON, LAT, SIZE = 24.4, -33.65, 400

@@ -9,11 +9,11 @@ import os
 from pathlib import Path
 
 import pytest
+from ortho_measure.journal import Journal
 
 from ortho_pipeline.batch.records import locked
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import Lock, Outputs, append_line, together, write_text
-from ortho_pipeline.measure.journal import Journal
 from ortho_pipeline.stores import kept
 from ortho_pipeline.stores.objects import Content
 

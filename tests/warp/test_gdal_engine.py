@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
+from ortho_studies.simulation.scanner import LineScanner
 from orthos import rectify, rectify_gdal
 from osgeo import gdal
 
@@ -28,7 +29,6 @@ from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.runtime.process_limits import Resources
-from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.flat import FlatSurface

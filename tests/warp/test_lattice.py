@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
+from ortho_studies.simulation.scanner import LineScanner
 from orthos import rectify
 from osgeo import gdal
 
@@ -23,7 +24,6 @@ from ortho_pipeline.models.pushbroom.line_camera import LineCamera
 from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.runtime.process_limits import Resources
-from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.flat import FlatSurface
