@@ -6,8 +6,9 @@ asked for.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ortho_pipeline import _lazily
 
 if TYPE_CHECKING:
     from ortho_pipeline.commands.fitting import compare as compare
@@ -41,15 +42,9 @@ _NAMES = {
     ),
 }
 #: Public name -> module that holds it.
-_HOMES = {name: module for module, names in _NAMES.items() for name in names}
+_HOMES = {name: f"commands.{module}" for module, names in _NAMES.items() for name in names}
 
 __all__ = sorted(_HOMES)  # noqa: PLE0605
 
 if not TYPE_CHECKING:  # a checker knows the names from above, and no others
-
-    def __getattr__(name: str) -> Any:
-        if name not in _HOMES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-        globals()[name] = value
-        return value
+    __getattr__ = _lazily(__name__, _HOMES)
