@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 PROJECT_NAME = "ortho_pipeline"
 #: The entry-point groups, and the hooks that are called in the modules which each names.
 GROUPS = {
-    PROJECT_NAME: ("ortho_sensors", "ortho_models", "ortho_studies"),
+    PROJECT_NAME: ("ortho_sensors", "ortho_models", "ortho_formats", "ortho_studies"),
     "ortho_pipeline_commands": ("ortho_commands",),
 }
 hookspec = pluggy.HookspecMarker(PROJECT_NAME)
@@ -259,6 +259,36 @@ class Sensor:
 
 
 @dataclass(frozen=True)
+class Format:
+    """A format that sensor models are written in, by ``ortho export --format NAME``.
+
+    ::
+
+        @hookimpl
+        def ortho_formats():
+            yield Format("corners", "ground of the four corners", "_corners.json", write_corners)
+
+    Parameters
+    ----------
+    name : str
+        As it is typed: lower case, digits and dashes; unique among all plugins.
+    title : str
+        One line for ``ortho export --help``, such as "RPC as text".
+    ending : str
+        What the name of the file ends with, after the stem of the image: ``_corners.json``. No two formats share one.
+    write : callable(export, path) -> float
+        Writes the model of an `ortho_pipeline.plugin.Export` to the new file `path`. Returns the largest distance in
+        pixels between the file and the model. Raises `InputError` for a model that the format cannot express. If it
+        fails, the host removes the file.
+    """
+
+    name: str
+    title: str
+    ending: str
+    write: Callable[[Any, Path], float | None]
+
+
+@dataclass(frozen=True)
 class Simulated:
     """The outcome of a simulation: its files by name, and what to try with them (text for the terminal)."""
 
@@ -377,6 +407,12 @@ def ortho_models() -> Mapping[str, type[SensorModel]]:
 
     The name is the ``kind`` of the class, as `ortho_pipeline.models.model_from_dict` looks it up.
     """
+    raise NotImplementedError
+
+
+@hookspec
+def ortho_formats() -> Iterable[Format]:
+    """Return the formats that this plugin writes sensor models in."""
     raise NotImplementedError
 
 

@@ -3,15 +3,17 @@
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.exchange.export import Export
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.geodesy.ellipsoid import geocentric
-from ortho_pipeline.hookspecs import Scene, Sensor, Study, hookimpl
+from ortho_pipeline.hookspecs import Format, Scene, Sensor, Study, hookimpl
 from ortho_pipeline.models import SensorModel
 
 
@@ -101,3 +103,15 @@ def ortho_studies() -> Iterable[Study]:
     from ortho_tinysat_study import STUDY  # here: few commands need it, and all would wait for it
 
     yield STUDY
+
+
+@hookimpl
+def ortho_formats() -> Iterable[Format]:
+    yield Format("tinysat", "TinySat-1 flight with roll and delay", "_flight.json", write_flight)
+
+
+def write_flight(export: Export, path: Path) -> float:
+    if not isinstance(export.model, StraightScanner):
+        raise InputError("only TinySat-1 has such a flight", field="formats", remedy="take another format")
+    path.write_text(json.dumps({"camera": export.model.to_dict()}))
+    return 0.0

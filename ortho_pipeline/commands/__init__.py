@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.commands.scene import doctor as doctor
     from ortho_pipeline.commands.scene import edge as edge
     from ortho_pipeline.commands.scene import forget_kept_files as forget_kept_files
+    from ortho_pipeline.commands.scene import formats as formats
     from ortho_pipeline.commands.scene import info as info
     from ortho_pipeline.commands.scene import kept_files as kept_files
     from ortho_pipeline.commands.scene import models as models
@@ -34,6 +35,7 @@ _NAMES = {
         "doctor",
         "edge",
         "forget_kept_files",
+        "formats",
         "info",
         "kept_files",
         "models",

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+from ortho_csm.files import has_csm, read_csm
 from osgeo import gdal
 
 from ortho_asp.cameras import adjusted, read_adjust, read_aster, read_tsai
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.csm import has_csm, read_csm
 from ortho_pipeline.exchange.rpc_files import read_rpc_text
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.folders import listing

@@ -10,10 +10,11 @@ with o of ``m_ccdCenter`` (line first).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ortho_csm.state import State
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import ECCENTRICITY_SQUARED, SEMI_MAJOR, enu_from_ecef, geocentric
 from ortho_pipeline.models.base import Array
@@ -22,9 +23,6 @@ from ortho_pipeline.models.frame.orientation import geocentric_of_map, heights_b
 from ortho_pipeline.models.frame.working_frame import GEOGRAPHIC, MAP
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.tables import rotations_of_quaternions
-
-if TYPE_CHECKING:
-    from ortho_pipeline.exchange.csm import State
 
 HEIGHTS = (-500.0, 9000.0)
 #: Axes of the state's camera (x right, y down, z to the scene) in those of ours (x right, y up, z backwards).
