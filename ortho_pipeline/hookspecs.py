@@ -1,11 +1,10 @@
-"""All that a plugin author reads.
+"""The hooks, and what plugins return from them; authors import all of it from `ortho_pipeline.plugin`.
 
 A plugin is a module that is named in the entry-point group ``ortho_pipeline`` of an installed distribution
 (``tinysat = "tinysat_plugin"`` under ``[project.entry-points.ortho_pipeline]``). It translates what a vendor wrote
 into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole of a plugin::
 
-    from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-    from ortho_pipeline.exchange.rpc import rpc_of_dataset
+    from ortho_pipeline.plugin import Scene, Sensor, hookimpl, rpc_of_dataset
 
     @hookimpl
     def ortho_sensors():
@@ -19,11 +18,14 @@ into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole
         return Scene("tinysat", dataset.GetDescription(), dataset.RasterXSize, dataset.RasterYSize, {"rpc": rpc},
                      source, facts={"band": int(band)})
 
-Files beside an image are found from ``ortho_pipeline.files.locations.place(dataset.GetDescription())``, which has the
-methods of `pathlib.Path` for an image on disk and for one in an archive (docs/plugins.md).
+Files beside an image are found from ``ortho_pipeline.plugin.place(dataset.GetDescription())``, which has the methods of
+`pathlib.Path` for an image on disk and for one in an archive (docs/plugins.md).
 
 The host tries every scene at a few points before it works with it (`ortho_pipeline.plugins.contract`). Test more with
 `ortho_pipeline.testing.check_sensor`.
+
+The hooks stand here and not in `ortho_pipeline.plugin`: that module names readers and commands, and rooms below those
+use `Scene` too.
 
 A package that adds commands to ``ortho`` names a module in the group ``ortho_pipeline_commands``, which implements
 `ortho_commands`. That module is imported by ``ortho --help``: it declares the commands and imports nothing heavy. So
@@ -54,6 +56,7 @@ GROUPS = {
     "ortho_pipeline_commands": ("ortho_commands",),
 }
 hookspec = pluggy.HookspecMarker(PROJECT_NAME)
+#: Marks a function of a plugin as a hook.
 hookimpl = pluggy.HookimplMarker(PROJECT_NAME)
 
 

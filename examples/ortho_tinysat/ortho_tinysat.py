@@ -8,13 +8,19 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.problem import Prior
-from ortho_pipeline.exchange.export import Export
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.geodesy.ellipsoid import geocentric
-from ortho_pipeline.hookspecs import Format, Scene, Sensor, Study, hookimpl
-from ortho_pipeline.models import SensorModel
+from ortho_pipeline.plugin import (
+    Export,
+    Format,
+    InputError,
+    Prior,
+    Scene,
+    Sensor,
+    SensorModel,
+    Study,
+    geocentric,
+    hookimpl,
+    place,
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ortho_csm.files import write_csm
-from ortho_pipeline.exchange.export import Export
-from ortho_pipeline.hookspecs import Format, hookimpl
+from ortho_pipeline.plugin import Export, Format, hookimpl
 
 
 @hookimpl

@@ -19,13 +19,19 @@ import numpy as np
 from ortho_csm.frame import frame_fields, read_frame
 from ortho_csm.line_scanner import line_scanner_fields, read_line_scanner
 from ortho_csm.state import REMEDY, State
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files import parse_json, read_bounded
-from ortho_pipeline.geodesy.crs import ground_transform
-from ortho_pipeline.models.base import SensorModel, ground_of_grid
-from ortho_pipeline.models.frame.camera import FrameCamera
-from ortho_pipeline.models.pushbroom.scanner import Pushbroom
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.plugin import (
+    FrameCamera,
+    InputError,
+    Pushbroom,
+    SensorModel,
+    Setting,
+    Text,
+    ground_of_grid,
+    ground_transform,
+    parse_json,
+    read_bounded,
+    reads,
+)
 
 LINE_SCANNER, FRAME = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL", "USGS_ASTRO_FRAME_SENSOR_MODEL"
 _NAMES = (LINE_SCANNER, FRAME)

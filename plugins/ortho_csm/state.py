@@ -7,9 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.geodesy.ellipsoid import SEMI_MAJOR
-from ortho_pipeline.models.base import Array
+from ortho_pipeline.plugin import SEMI_MAJOR, Array, InputError
 
 MOST_VALUES = 2_000_000
 REMEDY = "write the state again with the program that it is of"
