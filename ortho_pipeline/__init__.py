@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -104,18 +105,29 @@ _HOMES = {
 
 __all__ = sorted(_HOMES)  # noqa: PLE0605
 
+
+def _lazily(door: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
+    """Return `__getattr__` for the module `door`: it loads each name from its home when the name is first used."""
+
+    def load(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {door!r} has no attribute {name!r}")
+        value = getattr(importlib.import_module(f"ortho_pipeline.{homes[name]}"), name)
+        setattr(sys.modules[door], name, value)
+        return value
+
+    return load
+
+
 if not TYPE_CHECKING:  # a checker knows the names from above, and no others
+    _load = _lazily(__name__, _HOMES)
 
     def __getattr__(name: str) -> Any:
         if name == "__version__":
             from importlib.metadata import version
 
             return version("ortho-pipeline")
-        if name not in _HOMES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-        globals()[name] = value
-        return value
+        return _load(name)
 
 
 #: What a notebook shows as a table: module and name of each type.

@@ -167,7 +167,7 @@ class NotConverged(ModelError):
 
 
 class PluginError(OrthoError):
-    """A plugin broke the contract of hookspecs.py."""
+    """A plugin broke the contract of `ortho_pipeline.plugin`."""
 
 
 class StorageError(OrthoError):

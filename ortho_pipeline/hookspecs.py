@@ -1,11 +1,10 @@
-"""All that a plugin author reads.
+"""The hooks, and what plugins return from them; authors import all of it from `ortho_pipeline.plugin`.
 
 A plugin is a module that is named in the entry-point group ``ortho_pipeline`` of an installed distribution
 (``tinysat = "tinysat_plugin"`` under ``[project.entry-points.ortho_pipeline]``). It translates what a vendor wrote
 into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole of a plugin::
 
-    from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-    from ortho_pipeline.exchange.rpc import rpc_of_dataset
+    from ortho_pipeline.plugin import Scene, Sensor, hookimpl, rpc_of_dataset
 
     @hookimpl
     def ortho_sensors():
@@ -19,11 +18,14 @@ into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole
         return Scene("tinysat", dataset.GetDescription(), dataset.RasterXSize, dataset.RasterYSize, {"rpc": rpc},
                      source, facts={"band": int(band)})
 
-Files beside an image are found from ``ortho_pipeline.files.locations.place(dataset.GetDescription())``, which has the
-methods of `pathlib.Path` for an image on disk and for one in an archive (docs/plugins.md).
+Files beside an image are found from ``ortho_pipeline.plugin.place(dataset.GetDescription())``, which has the methods of
+`pathlib.Path` for an image on disk and for one in an archive (docs/plugins.md).
 
 The host tries every scene at a few points before it works with it (`ortho_pipeline.plugins.contract`). Test more with
 `ortho_pipeline.testing.check_sensor`.
+
+The hooks stand here and not in `ortho_pipeline.plugin`: that module names readers and commands, and rooms below those
+use `Scene` too.
 
 A package that adds commands to ``ortho`` names a module in the group ``ortho_pipeline_commands``, which implements
 `ortho_commands`. That module is imported by ``ortho --help``: it declares the commands and imports nothing heavy. So
@@ -50,10 +52,11 @@ if TYPE_CHECKING:
 PROJECT_NAME = "ortho_pipeline"
 #: The entry-point groups, and the hooks that are called in the modules which each names.
 GROUPS = {
-    PROJECT_NAME: ("ortho_sensors", "ortho_models"),
+    PROJECT_NAME: ("ortho_sensors", "ortho_models", "ortho_formats"),
     "ortho_pipeline_commands": ("ortho_commands",),
 }
 hookspec = pluggy.HookspecMarker(PROJECT_NAME)
+#: Marks a function of a plugin as a hook.
 hookimpl = pluggy.HookimplMarker(PROJECT_NAME)
 
 
@@ -259,6 +262,36 @@ class Sensor:
 
 
 @dataclass(frozen=True)
+class Format:
+    """A format that sensor models are written in, by ``ortho export --format NAME``.
+
+    ::
+
+        @hookimpl
+        def ortho_formats():
+            yield Format("corners", "ground of the four corners", "_corners.json", write_corners)
+
+    Parameters
+    ----------
+    name : str
+        As it is typed: lower case, digits and dashes; unique among all plugins.
+    title : str
+        One line for ``ortho export --help``, such as "RPC as text".
+    ending : str
+        What the name of the file ends with, after the stem of the image: ``_corners.json``. No two formats share one.
+    write : callable(export, path) -> float
+        Writes the model of an `ortho_pipeline.plugin.Export` to the new file `path`. Returns the largest distance in
+        pixels between the file and the model. Raises `InputError` for a model that the format cannot express. If it
+        fails, the host removes the file.
+    """
+
+    name: str
+    title: str
+    ending: str
+    write: Callable[[Any, Path], float | None]
+
+
+@dataclass(frozen=True)
 class Subcommand:
     """A command of ``ortho`` that a package adds; its code is imported when somebody calls it.
 
@@ -298,6 +331,12 @@ def ortho_models() -> Mapping[str, type[SensorModel]]:
 
     The name is the ``kind`` of the class, as `ortho_pipeline.models.model_from_dict` looks it up.
     """
+    raise NotImplementedError
+
+
+@hookspec
+def ortho_formats() -> Iterable[Format]:
+    """Return the formats that this plugin writes sensor models in."""
     raise NotImplementedError
 
 

@@ -11,7 +11,7 @@ from ortho_tinysat import StraightScanner
 from osgeo import gdal
 
 import ortho_pipeline as op
-from ortho_pipeline.geodesy.ellipsoid import geocentric
+from ortho_pipeline.plugin import geocentric
 
 LON, LAT, SIZE, ROLL, DELAY = 12.5, 41.9, (120, 90), 1e-4, 0.004
 

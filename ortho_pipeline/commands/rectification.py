@@ -29,8 +29,8 @@ from ortho_pipeline.commands.scene_fit import adjust, adjustable
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, ReportError, completed
-from ortho_pipeline.exchange import export as formats_of_models
 from ortho_pipeline.exchange import rpc
+from ortho_pipeline.exchange.export import FORMATS, Export, check_formats
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import retire, sha256
 from ortho_pipeline.files.traffic import bytes_read
@@ -38,6 +38,7 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.plugins import Host
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.raster.block_cache import cache_restored, limit_cache
@@ -190,7 +191,7 @@ def export(
     image: str | os.PathLike[str],
     folder: str | os.PathLike[str],
     *,
-    formats: Sequence[str] = formats_of_models.FORMATS[:4],
+    formats: Sequence[str] = tuple(FORMATS)[:4],
     scene: SceneOptions = SceneOptions(),
     points: PointOptions = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
@@ -202,9 +203,9 @@ def export(
     Parameters
     ----------
     formats : sequence of str
-        Some of `exchange.export.FORMATS`: rpc-txt, rpb, vrt, tag, gcp, gcp-tag, geolocation, csm.
+        Names of formats: rpc-txt, rpb, vrt, tag, gcp, gcp-tag, geolocation, and those of plugins, such as csm.
     force : bool
-        Accept an RPC that stands for the model only to more than 0.1 px.
+        Accept a file that is more than 0.1 px off the model.
 
     Returns
     -------
@@ -216,9 +217,8 @@ def export(
     InputError
         For an unknown format, a geolocation without heights, and as `fit`.
     """
-    formats = formats_of_models.check_formats(formats)
-    stem = Path(image).stem
-    files = {name: Path(folder) / f"{stem}{formats_of_models.ENDINGS[name]}" for name in formats}
+    chosen = check_formats(formats, Host.discover().formats)
+    files = {one.name: Path(folder) / f"{Path(image).stem}{one.ending}" for one in chosen}
     request = Request(image, scene, points, surface, match)
     inputs.check_paths(files, request)
     adjusted, heights = adjust(resolved := adjustable(request)), resolved.surface
@@ -228,14 +228,14 @@ def export(
     with completed(adjusted.scene.model_source, of="model"):
         if heights is not None:
             heights = footprint.facing(adjusted.model, heights, *size)
-        job = formats_of_models.Export(
+        job = Export(
             dataset, adjusted.model, size, heights, adjustment.points.select(adjustment.used), adjustment.rejected,
             force=force,
         )  # fmt: skip
-        for name, path in files.items():
-            job.write(name, path)
+        for one in chosen:
+            job.write(one, files[one.name])
     document = {**job.document, "model": adjustment.model_name, "model_source": adjusted.scene.model_source}
-    return Result(files, document, job.summary(adjustment.model_name, adjusted.scene.model_source))
+    return Result(files, document, job.summary(adjustment.model_name, adjusted.scene.model_source, chosen))
 
 
 # -- parts -----------------------------------------------------------------------------------------------------------

@@ -55,6 +55,11 @@ def sensors() -> dict[str, Any]:
     return {"schema_version": SCHEMA_VERSION, "sensors": listed, "broken": [entry.to_json() for entry in host.broken]}
 
 
+def formats() -> dict[str, str]:
+    """Return the formats that models are written in, by name, each with its title; broken plugins are left out."""
+    return {name: one.title for name, one in plugins.Host(installed=True, lenient=True).formats.items()}
+
+
 @with_items
 def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> dict[str, Any]:
     """Describe a scene: sensor, size, models and their source, facts, position and ground sample distance.
@@ -240,6 +245,7 @@ def doctor(*, fetch_grids: bool = False) -> dict[str, Any]:
         "fetched": fetched,
         "plugins": [entry.to_json() for entry in host.plugins()],
         "sensors": list(host.sensors),
+        "formats": list(host.formats),
         "broken": [entry.to_json() for entry in host.broken],
         "cpus": os.cpu_count(),
     }

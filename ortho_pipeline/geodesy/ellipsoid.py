@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Semi-major axis (m) and squared eccentricity of WGS84.
+#: Semi-major axis of WGS84 (m).
 SEMI_MAJOR = 6378137.0
+#: Squared eccentricity of WGS84.
 ECCENTRICITY_SQUARED = 6.69437999014e-3
 #: Rotation of the Earth, radians per second.
 EARTH_RATE = 7.292115e-5

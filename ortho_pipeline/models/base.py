@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
 
+#: The type of all arrays of coordinates and parameters.
 Array = NDArray[np.float64]
 
 #: Newton's method ends when the image point is met this closely (pixels) ...

@@ -6,8 +6,9 @@ that packages add are found without them.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ortho_pipeline import _lazily
 
 if TYPE_CHECKING:
     from ortho_pipeline.plugins.host import Host as Host
@@ -16,10 +17,4 @@ if TYPE_CHECKING:
 __all__ = ["Host", "open_scene"]
 
 if not TYPE_CHECKING:  # a checker knows the names from above, and no others
-
-    def __getattr__(name: str) -> Any:
-        if name not in __all__:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(f"{__name__}.host"), name)
-        globals()[name] = value
-        return value
+    __getattr__ = _lazily(__name__, dict.fromkeys(__all__, "plugins.host"))

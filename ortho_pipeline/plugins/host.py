@@ -13,7 +13,8 @@ from typing import Any
 
 from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed, described
 from ortho_pipeline.exchange.crop import placed
-from ortho_pipeline.hookspecs import Scene, Sensor
+from ortho_pipeline.exchange.export import FORMATS
+from ortho_pipeline.hookspecs import Format, Scene, Sensor
 from ortho_pipeline.models import KINDS
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.plugins.contract import scene_faults
@@ -95,6 +96,11 @@ class Host:
     def broken(self) -> tuple[Broken, ...]:
         """Plugins that were left out, and why."""
         return self._registry.broken
+
+    @functools.cached_property
+    def formats(self) -> Mapping[str, Format]:
+        """The formats that models are written in, by name: those of the host, then those of plugins."""
+        return {**FORMATS, **self._registry.formats()}
 
     def open_image(
         self,

@@ -11,22 +11,24 @@ import difflib
 import logging
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
+from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any
 
 import pluggy
 
 from ortho_pipeline import hookspecs
-from ortho_pipeline.errors import PluginError, described
-from ortho_pipeline.hookspecs import Sensor, Subcommand
+from ortho_pipeline.errors import OrthoError, PluginError, described
+from ortho_pipeline.hookspecs import Format, Sensor, Subcommand
 
 if TYPE_CHECKING:
     from ortho_pipeline.models import SensorModel
 
 BUNDLED = "ortho-pipeline"
-_COMMAND, _TARGET = re.compile(r"[a-z][a-z0-9-]*"), re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+_TYPED, _TARGET = re.compile(r"[a-z][a-z0-9-]*"), re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+_ENDING = re.compile(r"[._-][A-Za-z0-9._-]*\.?[A-Za-z0-9]+")
 log = logging.getLogger(__name__)
 
 
@@ -88,7 +90,7 @@ class Registry:
     origin : dict of str to Provenance
         Of every plugin, by its name.
     owner : dict of str to str
-        The plugin that a sensor, a model family, a command or another offer belongs to.
+        The plugin that a sensor, a model family, a format, a command or another offer belongs to.
     broken : tuple of Broken
     """
 
@@ -164,6 +166,15 @@ class Registry:
                     self._claim(plugin, name, "model family")
                     families[name] = family
         return MappingProxyType(families)
+
+    def formats(self) -> Mapping[str, Format]:
+        """Collect the formats that plugins add to those of the host, by name; what they write is checked."""
+        from ortho_pipeline.exchange.export import FORMATS, RESERVED
+
+        self._reserved |= RESERVED
+        endings = {one.ending.casefold(): one.name for one in FORMATS.values()}
+        added = self.named("ortho_formats", "format", Format, lambda offer: _format_faults(offer, endings))
+        return {name: replace(one, write=_checked(one, self.owner[name])) for name, one in added.items()}
 
     def commands(self) -> Mapping[str, Subcommand]:
         """Collect the commands that packages add, by name."""
@@ -268,9 +279,49 @@ class Registry:
         self.owner[name] = plugin
 
 
+def _format_faults(offer: Format, endings: dict[str, str]) -> Iterator[str]:
+    """Yield what is wrong with an offered format; `endings` are those that are taken, with the formats' names."""
+    if not isinstance(offer.name, str) or not _TYPED.fullmatch(offer.name):
+        yield f"{offer.name!r} is not a name of a format: lower case, digits and dashes"
+    elif not isinstance(offer.title, str) or not offer.title.strip():
+        yield f"format {offer.name!r}: its title is empty"
+    elif not isinstance(offer.ending, str) or not _ENDING.fullmatch(offer.ending):
+        yield f"format {offer.name!r}: its ending {offer.ending!r} is not like '_name.json'"
+    elif not callable(offer.write):
+        yield f"format {offer.name!r}: write must be callable"
+    elif (other := endings.setdefault(offer.ending.casefold(), offer.name)) != offer.name:
+        yield f"format {offer.name!r}: the files of the format {other!r} end with {offer.ending!r} too"
+
+
+def _checked(offer: Format, plugin: str) -> Callable[[Any, Path], float]:
+    """Return the function that writes a plugin's format, whole or not at all; its errors name the plugin."""
+
+    def write(export: Any, path: Path) -> float:
+        from ortho_pipeline.files import whole_or_nothing
+
+        said = f"format {offer.name!r} of plugin {plugin}"
+        with whole_or_nothing(path) as temporary:
+            try:
+                worst = offer.write(export, temporary)
+            except OrthoError:
+                raise
+            except (Exception, SystemExit) as error:
+                raise PluginError(f"{said} failed ({described(error, offer.write)})", file=path) from error
+            if not temporary.stat().st_size:
+                raise PluginError(f"{said} wrote nothing", file=path, remedy="its author: write to the path by open()")
+            if isinstance(worst, bool) or not isinstance(worst, int | float) or not worst >= 0:
+                raise PluginError(
+                    f"{said}: write returned {worst!r}", file=path,
+                    remedy="its author: return the largest distance in pixels between the file and the model",
+                )  # fmt: skip
+        return float(worst)
+
+    return write
+
+
 def _command_faults(command: Subcommand) -> Iterator[str]:
     texts = (command.name, command.summary, command.target)
-    if not all(isinstance(text, str) for text in texts) or not _COMMAND.fullmatch(command.name):
+    if not all(isinstance(text, str) for text in texts) or not _TYPED.fullmatch(command.name):
         yield f"{command.name!r} is not a name of a command: lower case, digits and dashes"
     elif not _TARGET.fullmatch(command.target):
         yield f"command {command.name!r}: its target {command.target!r} is not 'package.module:name'"

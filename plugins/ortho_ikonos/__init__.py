@@ -15,19 +15,29 @@ from osgeo import gdal
 
 from ortho_ikonos.metadata import Component, Delivery, SourceImage, read_metadata
 from ortho_ikonos.order import ImageFile, Position, bands_of, position_of, rpc_file
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.observations.prior import Prior, priors_at
-from ortho_pipeline.exchange.rpc import has_rpc, read_rpc, rpc_of_dataset
-from ortho_pipeline.files import read_bounded
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.geodesy.crs import ground_transform
-from ortho_pipeline.hookspecs import Piece, Scene, Sensor, hookimpl
-from ortho_pipeline.models import MapPlane, SensorModel
-from ortho_pipeline.models.rational import RPC
-from ortho_pipeline.options import numbers_of
-from ortho_pipeline.options.texts import Setting, Text
-from ortho_pipeline.raster.source import open_dataset
+from ortho_pipeline.plugin import (
+    RPC,
+    InputError,
+    MapPlane,
+    Notice,
+    Piece,
+    Prior,
+    Scene,
+    Sensor,
+    SensorModel,
+    Setting,
+    Text,
+    ground_transform,
+    has_rpc,
+    hookimpl,
+    numbers_of,
+    open_dataset,
+    place,
+    priors_at,
+    read_bounded,
+    read_rpc,
+    rpc_of_dataset,
+)
 
 OPTIONS = {
     "metadata": "the metadata file, where it is not po_<order>_metadata.txt beside the image",

@@ -7,7 +7,7 @@ uvicorn, an extra, are loaded when a page is served.
 
 from collections.abc import Iterable
 
-from ortho_pipeline.hookspecs import Subcommand, hookimpl
+from ortho_pipeline.plugin import Subcommand, hookimpl
 
 
 @hookimpl

@@ -6,7 +6,7 @@ a study reads, `studies` finds and runs studies, `simulation` has what they shar
 
 from collections.abc import Iterable
 
-from ortho_pipeline.hookspecs import Subcommand, hookimpl
+from ortho_pipeline.plugin import Subcommand, hookimpl
 
 
 @hookimpl

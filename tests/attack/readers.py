@@ -20,6 +20,7 @@ import state
 from ortho_asp.cameras import read_adjust, read_aster, read_tsai
 from ortho_bilsat.survey import read_survey
 from ortho_cartosat.metadata import read_metadata as read_cartosat
+from ortho_csm.files import csm_text, read_csm
 from ortho_enmap import read_enmap
 from ortho_ikonos.metadata import read_header, read_metadata
 from ortho_maxar.isd import Isd, read_isd_pushbroom
@@ -36,7 +37,6 @@ from ortho_pipeline.batch.records import FileState, Record
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CrsError
-from ortho_pipeline.exchange.csm import csm_text, read_csm
 from ortho_pipeline.exchange.model_file import read_model_file, save_model
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpb, write_rpc_txt

@@ -35,6 +35,7 @@ def doctor(fetch_grids: bool, as_json: bool) -> None:
         say(f"fetched    {fetched['grid']} to {fetched['path']}")
     for plugin in document["plugins"]:
         say(f"plugin     {plugin['plugin']} ({plugin['distribution']} {plugin['version']})")
+    say(f"formats    {', '.join(document['formats'])}")
     for broken in document["broken"]:
         say(f"broken     {broken['plugin']}: {broken['error']}")
     return None

@@ -25,6 +25,7 @@ from ortho_pipeline.geodesy.ellipsoid import (
 )
 from ortho_pipeline.models.base import Array
 
+#: The frames that a camera can have its orientation in: tangential to the ellipsoid below it, or a map projection.
 TOPOCENTRIC, MAP = "topocentric", "map"
 #: The ground of a topocentric frame.
 GEOGRAPHIC = "EPSG:4979"

@@ -14,20 +14,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ortho_pipeline.geodesy.ellipsoid import ECCENTRICITY_SQUARED, SEMI_MAJOR, geocentric
-from ortho_pipeline.models import require_view
-from ortho_pipeline.models.base import Array
-from ortho_pipeline.models.pushbroom.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom.rotations import rotations
-from ortho_pipeline.models.pushbroom.scanner import Pushbroom
-from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables, rotations_of_quaternions
-
-if TYPE_CHECKING:
-    from ortho_pipeline.exchange.csm import State
+from ortho_csm.state import State
+from ortho_pipeline.plugin import (
+    ECCENTRICITY_SQUARED,
+    SEMI_MAJOR,
+    Array,
+    LineCamera,
+    Pushbroom,
+    geocentric,
+    pushbroom_of_tables,
+    require_view,
+    rotations,
+    rotations_of_quaternions,
+)
 
 #: Heights (m) of the ground where the state's are beyond all mountains.
 HEIGHTS = (-500.0, 9000.0)

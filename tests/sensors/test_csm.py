@@ -10,13 +10,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from ortho_csm.files import csm_text, read_csm, write_csm
 from ortho_maxar.isd import Isd, read_isd_pushbroom
 from ortho_spot.dimap import read_spot
 from products import isd_text, reversed_scan, spot_text
 from scipy.spatial.transform import Rotation
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.csm import csm_text, read_csm, write_csm
 from ortho_pipeline.geodesy.ellipsoid import geocentric, meet_height
 from ortho_pipeline.models import FrameCamera, ImageCorrection, Pushbroom
 from ortho_pipeline.models.base import Array, SensorModel

@@ -10,21 +10,26 @@ with o of ``m_ccdCenter`` (line first).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.geodesy.crs import ground_transform
-from ortho_pipeline.geodesy.ellipsoid import ECCENTRICITY_SQUARED, SEMI_MAJOR, enu_from_ecef, geocentric
-from ortho_pipeline.models.base import Array
-from ortho_pipeline.models.frame.camera import FrameCamera
-from ortho_pipeline.models.frame.orientation import geocentric_of_map, heights_below
-from ortho_pipeline.models.frame.working_frame import GEOGRAPHIC, MAP
-from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.models.pushbroom.tables import rotations_of_quaternions
-
-if TYPE_CHECKING:
-    from ortho_pipeline.exchange.csm import State
+from ortho_csm.state import State
+from ortho_pipeline.plugin import (
+    ECCENTRICITY_SQUARED,
+    GEOGRAPHIC,
+    SEMI_MAJOR,
+    TOPOCENTRIC,
+    Array,
+    FrameCamera,
+    Interior,
+    enu_from_ecef,
+    geocentric,
+    geocentric_of_map,
+    ground_transform,
+    heights_below,
+    rotations_of_quaternions,
+)
 
 HEIGHTS = (-500.0, 9000.0)
 #: Axes of the state's camera (x right, y down, z to the scene) in those of ours (x right, y up, z backwards).
@@ -97,7 +102,7 @@ def frame_fields(model: FrameCamera) -> dict[str, Any]:
 
 def _orientation(model: FrameCamera) -> tuple[Array, Array]:
     """Return the place in ECEF ``(3,)`` and the rotation ``(3, 3)`` from there to the camera."""
-    if model.frame == MAP:
+    if model.frame != TOPOCENTRIC:
         return geocentric_of_map(model.ground_crs, model.exterior)
     origin = np.array([model.origin])
     return geocentric(model.perspective_centre[None])[0], model.rotation @ enu_from_ecef(origin)[0]
