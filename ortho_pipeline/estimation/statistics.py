@@ -105,6 +105,12 @@ def unit_weight(square: float, freedom: float, least: float) -> float | None:
     return math.sqrt(square / freedom) if freedom > least else None
 
 
+def basis_of(columns: Array) -> Array:
+    """Return an orthonormal basis of columns ``(n, K)``."""
+    span, singular, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(span[:, singular > 1e-9 * singular[0]])
+
+
 def correlation_of(covariance: Array) -> Array:
     """Return the correlation matrix ``(P, P)`` of a covariance matrix; NaN for what has no variance."""
     sigma = np.sqrt(np.diag(covariance))
