@@ -20,7 +20,7 @@ _FINEST = 1e-4
 #: what is known counts as nothing.
 _FAR_LESS, _TOLD = 0.5, 1e-13
 #: Numbers of the equations of nodes that are in memory together: what a processor keeps near.
-_AT_ONCE = 1 << 17
+_AT_ONCE = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
