@@ -20,7 +20,7 @@ _FINEST = 1e-4
 #: what is known counts as nothing.
 _FAR_LESS, _TOLD = 0.5, 1e-13
 #: Numbers of the equations of nodes that are in memory together: what a processor keeps near.
-_AT_ONCE = 1 << 17
+_AT_ONCE = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class ControlEquations:
         ground = problem.on_points(linear.state.local, self.rows)
         self.observed, self.d = ground.observed, ground.apart
         self.u, by_params, self.ue = self._control(linear, ground.axes)
-        self.unstated = self.observed & (problem.points.sigma_ground[self.rows] == 0)
+        self.unstated = problem.unstated[self.rows]
         self.weights = ground.sigmas**-2.0
         own = self.u + diagonal(self.weights)
         self.root = _root(solved.cofactors, own, by_params, linear.pseudo_design)

@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres, metre_partials, with_reference_height
-from ortho_pipeline.estimation.statistics import student_of
+from ortho_pipeline.estimation.statistics import basis_of, student_of
 from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
@@ -398,8 +398,7 @@ def _basis(design: Array) -> Array:
         return np.zeros((2 * len(design), 0))
     rows = design.reshape(-1, design.shape[2])
     scale = np.linalg.norm(rows, axis=0)
-    left, singular, _ = np.linalg.svd(rows / np.where(scale > 0, scale, 1.0), full_matrices=False)
-    return np.asarray(left[:, singular > 1e-10 * singular[0]])
+    return basis_of(rows / np.where(scale > 0, scale, 1.0))
 
 
 def _projected(values: Array, basis: Array) -> Array:

@@ -34,6 +34,7 @@ import numpy as np
 
 from ortho_pipeline.estimation.problem import Solution
 from ortho_pipeline.estimation.spatial.common_error import CommonError
+from ortho_pipeline.estimation.statistics import basis_of
 from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.models.base import Array
 
@@ -194,7 +195,7 @@ class Neighbours:
         image, residuals, design = image[order], residuals[order], design[order]
         extent = float(np.ptp(image, axis=0).max())
         columns = np.concatenate([design[:, 0], design[:, 1]], axis=1)
-        span = _basis(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))
+        span = basis_of(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))
         n, p = span.shape
         if n < FEWEST_POINTS or n - p < FEWEST_POINTS / 2 or not extent > 0:
             return None
@@ -203,7 +204,7 @@ class Neighbours:
         least = np.clip(np.median(np.partition(distance, 1, axis=1)[:, 1]), _HEAP * extent, extent / 2)
         ranges = np.geomspace(least, extent, _RANGES)
         means = _cell_means(image)
-        explained = _basis(means @ span)
+        explained = basis_of(means @ span)
         if len(means) - explained.shape[1] < FEWEST_POINTS / 2:
             means, explained = np.eye(n), span
         left = means @ residuals
@@ -249,12 +250,6 @@ class Neighbours:
         share = shared / np.maximum(shared.sum(axis=0), 1e-300)
         mean = np.exp(share.T @ np.log(np.tile(self.ranges, len(_FAMILIES))))
         return excess, {"noise": np.sqrt(noise), "shared": np.sqrt(shared.sum(axis=0)), "range_px": mean}
-
-
-def _basis(columns: Array) -> Array:
-    """Return an orthonormal basis of columns ``(n, K)``."""
-    span, singular, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(span[:, singular > 1e-9 * singular[0]])
 
 
 def _cell_means(image: Array) -> Array:

@@ -20,13 +20,13 @@ from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.intersection import frame_of
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.points import Index
+from ortho_pipeline.block.reliability.standardised_residuals import TESTABLE
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.estimation.statistics import left_out, squared_distances
 from ortho_pipeline.models.base import Array
 
-#: Directions in which all others tell less than this share of what a part tells itself: nothing tests it in them, and
-#: nothing is known without it.
-_TESTABLE, _KNOWN = 0.01, 1e-8
+#: In directions in which all others tell less than this share of what a part tells itself, nothing is known without it.
+_KNOWN = 1e-8
 #: Ground is weighed with this sigma (m) at least: far below any pixel, and what others tell stays above rounding.
 _LEAST = 1e-3
 
@@ -61,11 +61,11 @@ class LeftOut:
         misfits = linear.misfits.minus(step.change)
         points, used = fit.points, linear.ordering.rays
         rays = np.where(fit.used_rays[:, None], np.nan, fit.residuals)
-        of_rays = left_out(np.eye(2) - hats[0][used], misfits.rays[used], known=_KNOWN, testable=_TESTABLE)
+        of_rays = left_out(np.eye(2) - hats[0][used], misfits.rays[used], known=_KNOWN, testable=TESTABLE)
         rays[used] = problem.points.in_pixels(of_rays.misfits, used)
         grounded = linear.ordering.grounded
         ground = np.where(fit.used_ground[:, None], np.nan, fit.object_residuals)
-        of_ground = left_out(np.eye(3) - hats[1][grounded], misfits.ground[grounded], known=_KNOWN, testable=_TESTABLE)
+        of_ground = left_out(np.eye(3) - hats[1][grounded], misfits.ground[grounded], known=_KNOWN, testable=TESTABLE)
         ground[grounded] = of_ground.whole * problem.on_points(linear.state.local, grounded).sigmas
         others = np.flatnonzero(~fit.used_ground & points.check & np.isfinite(fit.object_residuals).all(axis=1))
         tests = [
